@@ -5,16 +5,17 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from dynamics import Robot
-from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, ServoGains
+from dynamics.closed_loop import Drives, FrameTiming, FrictionLaw, LoopSettings, ServoGains
+from dynamics.closed_loop.drives import DRIVES, DriveName
 from dynamics.errors import ParameterError
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
 from identify.scenario import Model, Plant, Scenario
-from identify.scenario.sections import ACTUATOR_KEYS, Section
+from identify.scenario.sections import ACTUATOR_KEYS, AUTO, FILTERED, Section
 
 NOMINAL = "initial"
 """The parameter set that is meant where none is named."""
@@ -26,9 +27,10 @@ def model_settings(robot: Robot, scenario: Scenario) -> LoopSettings:
 
 
 def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> LoopSettings:
-    """The scenario's servo and timing, with the friction law and the steps of the plant or of the model.
+    """The scenario's servo, timing and torque limit, with the laws of friction and of the drives and the steps of the
+    plant or of the model.
 
-    Raises ScenarioError for a law whose constants are those of the other kind of actuators.
+    Raises ScenarioError for a constant that is one of the other kind of actuators.
     """
     servo, timing = scenario.servo, scenario.timing
     velocities = [of_actuators(robot, side, name) for name in ("smoothing_velocity", "stribeck_velocity")]
@@ -37,7 +39,34 @@ def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> Loop
         timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
         friction=FrictionLaw(side.friction, velocities[0], side.static_ratio, velocities[1]),
         steps_per_frame=side.steps_per_frame,
+        drives=Drives(
+            torque_limit=of_actuators(robot, scenario.control, "torque_limit"),
+            law=side.drive_law,
+            filter_time=side.derivative_filter_s if side.drive_law == FILTERED else None,
+        ),
     )
+
+
+def with_drive(scenario: Scenario, law: DriveName) -> Scenario:
+    """The scenario with the law of the drives that an identification settled, where it leaves that to the record."""
+    return scenario.with_overrides(drive_settings(law)) if scenario.model.drive == AUTO else scenario
+
+
+def drive_settings(law: DriveName) -> dict[str, str | None]:
+    """Settings of a model whose drives have a law, where the scenario leaves it to the record, by dotted path."""
+    return {"model.drive": law} | ({} if law == FILTERED else {"model.derivative_filter_s": None})
+
+
+def settled_drive(identification: Any) -> DriveName:
+    """The law of the drives of an identification entry of a result: the PID where it says none.
+
+    Raises RecordError: an unknown one.
+    """
+    drive = identification.get("drive") if isinstance(identification, dict) else None
+    law = drive.get("law") if isinstance(drive, dict) else "pid"
+    if law not in DRIVES:
+        raise RecordError(f"identification.drive.law is {law!r}; valid: {', '.join(DRIVES)}")
+    return cast("DriveName", law)
 
 
 def check_parameter_set(robot: Robot, set_name: str) -> None:

@@ -25,7 +25,7 @@ from identify.files.run_folder import RunFolder, check_entries, load_result, rms
 from identify.files.versions import versions
 from identify.geometry.outcome import GeometryOutcome
 from identify.geometry.run import calibrated_for_a_run
-from identify.loop_parameters import check_parameter_set
+from identify.loop_parameters import check_parameter_set, settled_drive, with_drive
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
@@ -42,7 +42,7 @@ from identify.reporting.run_result import add_truth, parameter_vector, predictio
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import estimator_settings, with_estimator_settings
 from identify.trajectory import TrajectorySet, check_travel, load_trajectories, save_trajectories
-from identify.validation.unseen import model_run, predicted_runs, run_unseen
+from identify.validation.unseen import model_on_record, model_run, predicted_runs, run_unseen
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
@@ -173,8 +173,8 @@ def _identified(
 ) -> _Identified:
     began, robot = time.perf_counter(), known_geometry(scenario, folder).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
-    reference = recorded_reference(next(iter(records.values())))
-    before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
+    first, scenario = next(iter(records.values())), with_drive(scenario, result.drive.law)
+    before, after = (model_on_record(robot, scenario, values, first) for values in (result.initial, result.estimate))
     return _Identified(records, result, (before, after), time.perf_counter() - began)
 
 
@@ -230,12 +230,14 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
     covariance = files.covariance_of(robot)
     models = _identified_models(robot, run_folder, result)
+    scenario = with_drive(scenario, settled_drive(result["identification"]))
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress, known)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
     records = [files.experiment, *(run.record for run in runs)]
-    references = [recorded_reference(seen) for seen in records]
-    model_poses = [[model_run(robot, scenario, values, reference) for values in models] for reference in references]
+    model_poses = [[model_on_record(robot, scenario, values, files.experiment) for values in models]]
+    for reference in (recorded_reference(seen) for seen in records[1:]):
+        model_poses.append([model_run(robot, scenario, values, reference) for values in models])
     predictions = predicted_runs(robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress)
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [

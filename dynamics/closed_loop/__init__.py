@@ -8,10 +8,10 @@ Written once, in the `*_kernels`, which numba compiles and which also run as the
 a run before them.
 """
 
+from dynamics.closed_loop.drives import DriveName, Drives
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.closed_loop.problem import (
     Controller,
-    Drives,
     EveryFrame,
     FrameTiming,
     LoopSettings,
@@ -28,6 +28,7 @@ from dynamics.closed_loop.simulate import prepare, simulate, simulate_batch
 __all__ = [
     "ClosedLoopRun",
     "Controller",
+    "DriveName",
     "Drives",
     "EveryFrame",
     "FrameTiming",

@@ -138,7 +138,8 @@ def _failure(problem: LoopProblem, status: int, frame: int, memory: Memory, reco
 
 def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
     start, chart, sizes = problem.start, problem.robot.geometry.chart, problem.sizes
-    slope = start.joint_integral_sensitivity
+    slope, still = start.joint_integral_sensitivity, np.zeros((sizes.joints, sizes.parameters))
+    by_command = still if start.command_sensitivity is None else start.command_sensitivity
     given = {
         "reference": chart.coordinates(problem.reference.poses),
         "reference_rate": chart.coordinates(problem.reference.rates),
@@ -147,12 +148,22 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "lost": np.zeros(0, bool) if problem.lost is None else np.ascontiguousarray(problem.lost),
         "noise": np.zeros((0, 0)) if problem.noise is None else chart.coordinates(problem.noise),
         "start_commands": start.commands,
-        "start_integral_sensitivity": np.zeros((sizes.joints, sizes.parameters)) if slope is None else slope,
+        "start_integral_sensitivity": still if slope is None else slope,
+        "start_servo_sensitivity": _servo_sensitivity(problem, by_command),
+        "start_command_sensitivity": by_command,
     }
     views = {name: np.ascontiguousarray(array).view() for name, array in given.items()}
     for view in views.values():  # kernels are compiled for each kind of array that they are given, so all are of one
         view.flags.writeable = False
     return Plan(**views, spans=command_schedule(problem))
+
+
+def _servo_sensitivity(problem: LoopProblem, by_command: np.ndarray) -> np.ndarray:
+    """How the servo's integral (m, p), which makes the command at rest, follows the parameters as that does (n, p)."""
+    ki, size = problem.settings.servo.ki, problem.sizes.coordinates
+    if not ki or not by_command.any() or problem.feedforward is not None:
+        return np.zeros((size, by_command.shape[1]))
+    return np.linalg.solve(problem.servo_robot.coordinate_jacobian(problem.start.pose), by_command) / ki
 
 
 def _fill(
@@ -170,7 +181,10 @@ def _fill(
     for name, found in addresses.items():
         task[name] = found
     task.servo_motion = servo_motion.address
-    rigid, task.coulomb, task.viscous, (task.lp, task.li, task.ld) = problem.robot.layout.split(problem.parameters)
+    rigid, task.coulomb, task.viscous, gains = problem.robot.layout.split(problem.parameters)
+    law = settings.drives.joint_law(gains)
+    for name, value in law._asdict().items():
+        task[name] = value
     task.kp, task.kd, task.ki = settings.servo.kp, settings.servo.kd, settings.servo.ki
     task.friction = settings.friction.record
     task.period = problem.period
@@ -183,10 +197,11 @@ def _fill(
         task.motor_inertia = settings.elasticity.motor_inertia
     task.rigid = rigid
     rest = np.zeros(sizes.joints)
+    filtered = rest[: sizes.filters] if start.filtered_rate is None else start.filtered_rate[: sizes.filters]
     motor = [rest if part is None else part for part in (start.motor_angle, start.motor_rate)]
     chart = problem.robot.geometry.chart
     now.state = np.concatenate(
-        [chart.coordinates(start.pose), chart.coordinates(start.pose_rate), start.joint_integral, *motor]
+        [chart.coordinates(start.pose), chart.coordinates(start.pose_rate), start.joint_integral, filtered, *motor]
     )
     now.servo_integral, now.last_measured = start.servo_integral, chart.coordinates(start.last_measured)
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0

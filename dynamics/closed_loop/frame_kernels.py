@@ -25,6 +25,10 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
         now.mode[i] = 0 if status != OK or abs(velocity) <= NO_MARGIN else 1 if velocity > 0 else -1
     if task.sensitivities:
         copy_rows(plan.start_integral_sensitivity, d.x[2 * size :], now.step_column)
+        copy_rows(plan.start_servo_sensitivity, d.integral[:], now.step_column)
+        copy_rows(plan.start_command_sensitivity, d.issued[len(d.issued) - 1], now.step_column)
+        if len(plan.commands) == 0 and len(plan.feedforward) == 0:
+            copy_rows(plan.start_command_sensitivity, d.last_command[:], now.step_column)
     if now.start_moves:
         column = now.step_column + 1
         for i in range(2 * size + count):
@@ -44,14 +48,16 @@ def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> 
     for i in range(count):
         record.joint_integral[k, i] = now.state[2 * size + i]
         if task.stiffness > 0:
-            record.motor_angle[k, i] = now.state[2 * size + count + i]
-            record.motor_rate[k, i] = now.state[2 * size + 2 * count + i]
+            record.motor_angle[k, i] = now.state[len(now.state) - 2 * count + i]
+            record.motor_rate[k, i] = now.state[len(now.state) - count + i]
+        if task.filter_time > 0:
+            record.filtered_rate[k, i] = now.state[2 * size + count + i]
     if not task.sensitivities:
         return
     keep_rows(now, d.x[:size], record.pose_sensitivity[k], record.start_sensitivity[k])
     if k + 1 == len(record.pose):
-        rows = len(d.x)
-        keep_rows(now, d.x[:], record.end_sensitivity[:rows], record.end_start_sensitivity[:rows])
+        rows = 2 * size + count
+        keep_rows(now, d.x[:rows], record.end_sensitivity[:rows], record.end_start_sensitivity[:rows])
         keep_rows(now, d.integral[:], record.end_sensitivity[rows:], record.end_start_sensitivity[rows:])
 
 
@@ -154,7 +160,7 @@ def apply_command(task: Record, now: Record, d: Record, plan: Record, record: Re
         now.command_slope[i] = now.command_rate[i] if now.ramping else 0.0
     if not task.sensitivities:
         return
-    rows = len(d.issued) - 1  # the last one stays zero: commands of the start are given
+    rows = len(d.issued) - 1  # the last one is of the commands of the start
     newer = d.issued[number % rows if number >= 0 else rows]
     older = d.issued[(number - 1) % rows if number > 0 else rows]
     for i in range(len(value)):

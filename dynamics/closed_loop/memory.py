@@ -26,13 +26,15 @@ class Plan(NamedTuple):
     noise: np.ndarray
     start_commands: np.ndarray
     start_integral_sensitivity: np.ndarray
+    start_servo_sensitivity: np.ndarray
+    start_command_sensitivity: np.ndarray
     spans: CommandSchedule
 
 
 RECORDED = (
     "pose:fm pose_rate:fm torque:fn command:fn measured:fm measured_ok:f joint_integral:fn servo_integral:fm "
     "pose_sensitivity:fmp start_sensitivity:fms end_sensitivity:Sp end_start_sensitivity:Ss "
-    "motor_angle:en motor_rate:en"
+    "motor_angle:en motor_rate:en filtered_rate:Fn"
 )
 """What a run writes (see `ClosedLoopRun`), with its dimensions by their letters (see `empty_record`)."""
 
@@ -46,6 +48,7 @@ def empty_record(problem: LoopProblem) -> Any:
     length["p"] = sizes.parameters if problem.sensitivities else 0
     length["s"] = sizes.start if problem.start_sensitivities else 0
     length["e"] = frames if problem.settings.elasticity else 0
+    length["F"] = frames if sizes.filters else 0
     shapes = [tuple(length[letter] for letter in letters) for letters in re.findall(r":(\w+)", RECORDED)]
     return Record(*[np.zeros(shape, bool if len(shape) == 1 else float) for shape in shapes])
 
@@ -68,8 +71,8 @@ class Memory(NamedTuple):
 LAYOUT = {
     "task": "equation_of_motion! free_acceleration! response! motion_derivatives! rate_map_derivative! "
     "slope_derivative! servo_motion! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! "
-    "sensitivities! servo_knows! measured! lp li ld kp kd ki "
-    "stiffness damping motor_inertia period torques! torque_limit rigid:r coulomb:n viscous:n friction=friction",
+    "sensitivities! servo_knows! measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping "
+    "motor_inertia period torques! torque_limit filter_time rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
@@ -78,25 +81,27 @@ LAYOUT = {
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
     # and what else the columns of `slope_derivative` share
     "derivatives": "by_pose:mm by_rate:mm columns:mr crank_by_pose:nm crank_by_rate:nm jacobian:nm pushing:nm "
-    "factor:mm damping:n gains:3 inputs:d",
+    "factor:mm damping:n by_error:n by_integral:n by_command_rate:n inputs:d",
     # first what `response` and, from the factor on, `free_acceleration` take, in their order
     "evaluation": "row:m factor:mm bias:m jacobian:nm push:n state:s slope:s time bias_acceleration:n angle:n "
     "velocity:n spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
-    # first the rows of `slope_derivative`; k: what it returns of each stage
-    "tangent": "trial:xw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw issued:cnw time:w length:w "
+    # first the rows of `slope_derivative`; k: what it returns of each stage,
+    # and before the torques the slopes of filtered rates, whose trials are `filtered`
+    "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w length:w "
     "stage_time:w margin:w command:nw command_slope:nw last_command:nw force:nw last_measured:mw integral:mw "
     "demand:mw moved:mw",
 }
 """Fields of the records: a name with its dimensions by their letters (see `record_type`), one number without. `!` marks
 integers, `=` another record. Angle and velocity of elastic joints are those of the motors; the mass matrix is kept as
-its Cholesky factor; issued commands stay while they are on their way, the last one zero."""
+its Cholesky factor; issued commands stay while they are on their way, the last one is of those of the start."""
 
 
 @lru_cache(maxsize=64)
 def record_type(name: str, sizes: Sizes) -> np.dtype:
     """Layout of a record for a robot."""
-    n, m, r = sizes.joints, sizes.coordinates, sizes.rigid
-    length = {"n": n, "m": m, "r": r, "s": 2 * m + 3 * n, "x": 2 * m + n, "y": 2 * m + 2 * n, "3": 3, "4": 4}
+    n, m, r, f = sizes.joints, sizes.coordinates, sizes.rigid, sizes.filters
+    length = {"n": n, "m": m, "r": r, "s": 2 * m + 3 * n + f, "x": 2 * m + n + f, "3": 3, "4": 4}
+    length |= {"b": 2 * m + n, "f": max(f, 1), "y": 2 * m + 2 * n + f}
     g = sizes.geometry
     length |= {
         "M": 2 * m + g,

@@ -113,18 +113,30 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
         copy(known.jacobian[i], at.jacobian[i])
     for i in range(count):
         if task.stiffness > 0:  # from here on the motors stand for the cranks in what joint PID and friction feel
-            motor, motor_rate = state[first + count + i], state[first + 2 * count + i]
+            motor, motor_rate = state[len(state) - 2 * count + i], state[len(state) - count + i]
             wound, winding = motor - at.angle[i], motor_rate - at.velocity[i]
             at.spring[i] = task.stiffness * wound + task.damping * winding
             at.angle[i], at.velocity[i] = motor, motor_rate
         at.error[i] = now.command[i] + now.command_slope[i] * at.time - at.angle[i]
-        damped = task.ld * (now.command_rate[i] - at.velocity[i])
+        damped = task.ld * (task.rate_weight * now.command_rate[i] - at.velocity[i])
+        if task.filter_time > 0:
+            damped = task.ld * state[first + count + i]
         at.torque[i] = task.lp * at.error[i] + damped + task.li * state[first + i]
+        if task.lx > 0:
+            at.torque[i] -= task.lx * at.angle[i]
         if task.torques:
             at.torque[i], at.error[i] = now.command[i] + now.command_slope[i] * at.time, 0.0
         if task.torque_limit > 0:
             at.torque[i] = min(max(at.torque[i], -task.torque_limit), task.torque_limit)
     return OK
+
+
+@kernel
+def follows_law(task: Record, at: Record, joint: int) -> float:
+    """1 where the drive's law says what the torque is, 0 where that is commanded, or at its limit."""
+    if task.torques or (task.torque_limit > 0 and abs(at.torque[joint]) >= task.torque_limit):
+        return 0.0
+    return 1.0
 
 
 @kernel
@@ -158,11 +170,16 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
             at.net_torque[i] -= slip_friction(task, i, at.velocity[i], now.mode[i])
     copy(at.state[size : 2 * size], at.slope[:size])
     copy(at.error[:], at.slope[2 * size : 2 * size + count])
+    if task.filter_time > 0:
+        for i in range(count):
+            unfiltered = task.rate_weight * now.command_rate[i] - at.velocity[i]
+            at.slope[2 * size + count + i] = (unfiltered - at.state[2 * size + count + i]) / task.filter_time
     if task.stiffness > 0:
-        copy(at.velocity[:], at.slope[2 * size + count : 2 * size + 2 * count])
+        motors = len(at.slope) - 2 * count
+        copy(at.velocity[:], at.slope[motors : motors + count])
         for i in range(count):
             left = at.net_torque[i] - at.spring[i]
-            at.slope[2 * size + 2 * count + i] = left / task.motor_inertia if now.mode[i] != 0 else 0.0
+            at.slope[motors + count + i] = left / task.motor_inertia if now.mode[i] != 0 else 0.0
             if now.mode[i] == 0:
                 at.stick_force[i] = left
                 at.net_torque[i] -= left

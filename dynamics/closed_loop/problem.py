@@ -7,7 +7,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dynamics.checks import Shape, check_choice, check_type, flag, floats, real, whole
+from dynamics.checks import Shape, check_choice, check_type, floats, real, whole
+from dynamics.closed_loop.drives import ABOVE_ZERO, PID, READS, DriveName, Drives
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
 from dynamics.legs.numbers import MOST_NUMBERS
@@ -79,20 +80,6 @@ class FrameTiming:
 
 
 @dataclass(frozen=True)
-class Drives:
-    """What the actuators take and give: joint commands, which the joint PID follows, or torques themselves; the largest
-    torque, N m or N (None: no limit)."""
-
-    torques: bool = False
-    torque_limit: float | None = None
-
-    def __post_init__(self) -> None:
-        flag("torques", self.torques, SimulationError)
-        if self.torque_limit is not None:
-            real("torque limit", self.torque_limit, SimulationError, above=0, unit=" N m or N")
-
-
-@dataclass(frozen=True)
 class LoopSettings:
     """What the loop is made of besides the robot: servo, timing, friction law, Runge-Kutta steps per frame, the
     elasticity of the joints (None: rigid), and the drives."""
@@ -102,7 +89,7 @@ class LoopSettings:
     friction: FrictionLaw = field(default_factory=FrictionLaw)
     steps_per_frame: int = 4
     elasticity: JointElasticity | None = None
-    drives: Drives = field(default_factory=Drives)
+    drives: Drives = PID
 
     def __post_init__(self) -> None:
         kinds = {"servo": ServoGains, "timing": FrameTiming, "friction": FrictionLaw, "drives": Drives}
@@ -136,7 +123,7 @@ class Reference:
         return f"Reference({len(self.poses)} frames)"
 
 
-OPTIONAL = ("joint_integral_sensitivity", "motor_angle", "motor_rate")
+OPTIONAL = ("joint_integral_sensitivity", "command_sensitivity", "motor_angle", "motor_rate", "filtered_rate")
 
 
 @dataclass(frozen=True)
@@ -147,8 +134,10 @@ class StartState:
     poses by their coordinates, in this order, are what start_sensitivity differentiates by (24 in all for rss6).
     commands (k, n): the commands issued before, rad or m, oldest first (the first one also acted before), and
     last_measured (6,): the pose measured one frame before; both are records.
-    joint_integral_sensitivity (n, p): how the joint PID integral follows the parameters; None where it is just given.
-    motor_angle (n,) and motor_rate (n,): of elastic joints only.
+    joint_integral_sensitivity, command_sensitivity (n, p): how the joint PID integral and the commands before, with the
+    servo integral that makes them, follow the parameters; None where they are just given.
+    motor_angle (n,) and motor_rate (n,): of elastic joints only. filtered_rate (n,): of the errors, in drives that
+    filter it; None: none.
     Raises SimulationError for a wrong shape or a number that is not finite; the sizes of a robot are asked for when a
     run begins.
     """
@@ -160,12 +149,14 @@ class StartState:
     commands: np.ndarray
     last_measured: np.ndarray
     joint_integral_sensitivity: np.ndarray | None = None
+    command_sensitivity: np.ndarray | None = None
     motor_angle: np.ndarray | None = None
     motor_rate: np.ndarray | None = None
+    filtered_rate: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         poses: dict[str, Shape] = dict.fromkeys(("pose", "pose_rate", "last_measured"), (6,))
-        shapes = poses | dict.fromkeys(("commands", "joint_integral_sensitivity"), ("N", "N"))
+        shapes = poses | dict.fromkeys(("commands", "joint_integral_sensitivity", "command_sensitivity"), ("N", "N"))
         for name in self.__dataclass_fields__:
             if getattr(self, name) is None and name in OPTIONAL:
                 continue
@@ -177,9 +168,12 @@ class StartState:
     def check_sizes(self, robot: Robot) -> None:
         """Raise SimulationError, naming the part, where this is no state of a robot."""
         joints, parameters = robot.layout.joints, len(robot.layout.names)
-        wanted: dict[str, tuple[int, ...]] = dict.fromkeys(("joint_integral", "motor_angle", "motor_rate"), (joints,))
+        wanted: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("joint_integral", "motor_angle", "motor_rate", "filtered_rate"), (joints,)
+        )
         wanted |= {"servo_integral": (len(robot.coordinate_names),), "commands": (len(self.commands), joints)}
-        for name, shape in (wanted | {"joint_integral_sensitivity": (joints, parameters)}).items():
+        wanted |= dict.fromkeys(("joint_integral_sensitivity", "command_sensitivity"), (joints, parameters))
+        for name, shape in wanted.items():
             found = getattr(self, name)
             if found is not None and found.shape != shape:
                 raise SimulationError(f"start {name} of {robot.name} must have shape {shape}, got {found.shape}")
@@ -189,12 +183,13 @@ class StartState:
 class Sizes:
     """Numbers of joints, of coordinates of the platform, of parameters of the rigid bodies, and room for so many
     geometric numbers, the last arguments of functions (see `Robot.moved`): the same for most robots, as kernels are
-    compiled for sizes."""
+    compiled for sizes; filters: joints whose drives filter a rate."""
 
     joints: int
     coordinates: int
     rigid: int
     geometry: int = 0
+    filters: int = 0
 
     @property
     def parameters(self) -> int:
@@ -250,17 +245,22 @@ class LoopProblem:
             joints=motion.outputs[2][0],
             coordinates=motion.inputs[0],
             rigid=motion.inputs[2],
+            filters=motion.outputs[2][0] if self.settings.drives.filter_time else 0,
             geometry=max(MOST_NUMBERS * motion.outputs[2][0], len(motion.constants), len(known.constants)),
         )
 
 
-def checked_loop_parameters(robot: Robot, parameters: object) -> np.ndarray:
-    """The dynamic parameters of a robot and lp, li, ld. Raises SimulationError, or ParameterError for a dynamic one."""
+def checked_loop_parameters(robot: Robot, parameters: object, drive: DriveName = "pid") -> np.ndarray:
+    """The dynamic parameters of a robot and lp, li, ld, as the law of its drives needs them. Raises SimulationError, or
+    ParameterError for a dynamic one."""
     layout = robot.layout
     values = floats("loop parameters", parameters, (len(layout.names),), error=SimulationError, finite=False)
     layout.check(values[layout.dynamic])
     for name, value in zip(layout.joint_pid_names, values[layout.joint_pid], strict=True):
-        least, above = (None, 0) if name == "joint_pid.li" else (0, None)
+        gain = name.split(".")[1]
+        least, above = (None, 0) if gain in ABOVE_ZERO[drive] else (0, None)
+        if gain not in READS[drive]:
+            least = None
         real(name, value, SimulationError, least=least, above=above)
     return values
 
@@ -280,6 +280,7 @@ def equilibrium(
     servo_robot: Robot | None = None,
     elasticity: JointElasticity | None = None,
     fed_forward: bool = False,
+    drives: Drives = PID,
 ) -> StartState:
     """State of rest at a pose (6,), friction unloaded, for all parameters; servo_robot as in `closed_loop.simulate`.
     fed_forward: whether a feedforward commands the joints where they are, so that the servo's part is none.
@@ -288,20 +289,20 @@ def equilibrium(
     """
     check_type("robot", robot, Robot, SimulationError)
     check_type("servo", servo, ServoGains, SimulationError)
-    parameters, pose = checked_loop_parameters(robot, parameters), floats("pose", pose, (6,))
-    rest, li, free = np.zeros(6), parameters[robot.layout.joint_pid][1], robot.geometry.chart.basis
+    parameters, pose = checked_loop_parameters(robot, parameters, drives.law), floats("pose", pose, (6,))
+    rest, free, law = np.zeros(6), robot.geometry.chart.basis, drives.joint_law(parameters[robot.layout.joint_pid])
     check_start_pose(robot, parameters, pose)
     angles = robot.inverse_kinematics(pose)
     torque_map = np.linalg.solve((robot.joint_jacobian(pose) @ free).T, free.T @ robot.regressor(pose, rest, rest))
-    integral = torque_map @ parameters[robot.layout.dynamic] / li
-    zero = np.zeros((len(integral), 1))
-    sensitivity = np.hstack([torque_map / li, zero, -integral[:, None] / li, zero])  # by lp, li, ld in the end
-    motors = {}
+    torque, motors = torque_map @ parameters[robot.layout.dynamic], {}
     if elasticity is not None:
-        angles = angles + li * integral / elasticity.stiffness
-        motors = {"motor_angle": angles, "motor_rate": np.zeros(len(integral))}
+        angles = angles + torque / elasticity.stiffness
+        motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
+    command, integral = law.held(torque, angles)
+    by_command, by_integral = law.held_by_parameters(torque, angles, torque_map)
     known = servo_robot or robot
     servo_integral = np.zeros(free.shape[1])
     if servo.ki and not fed_forward:
-        servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), angles) / servo.ki
-    return StartState(pose, rest, integral, servo_integral, angles[None], pose, sensitivity, **motors)
+        servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), command) / servo.ki
+    moving = by_command if by_command.any() else None
+    return StartState(pose, rest, integral, servo_integral, command[None], pose, by_integral, moving, **motors)

@@ -16,7 +16,8 @@ class ClosedLoopRun:
     measurement was good; joint PID integral (n,) and servo integral (m,) as the frame begins; derivatives of the poses
     by the parameters (frames, 6, p) and by the s = 3 m + n entries of the start (frames, 6, s; see StartState), and of
     those of the last frame's state by both, end_sensitivity (s, p) and end_start_sensitivity (s, s), each or None;
-    angle and rate of the motors of elastic joints, or None; number of stick-slip events; the start."""
+    angle and rate of the motors of elastic joints, and the rates of the joints' errors that drives filter, or None;
+    number of stick-slip events; the start."""
 
     time: np.ndarray
     pose: np.ndarray
@@ -33,6 +34,7 @@ class ClosedLoopRun:
     end_start_sensitivity: np.ndarray | None
     motor_angle: np.ndarray | None
     motor_rate: np.ndarray | None
+    filtered_rate: np.ndarray | None
     events: int
     start: StartState
 
@@ -60,6 +62,7 @@ class ClosedLoopRun:
             self.measured[frame - 1],
             motor_angle=None if self.motor_angle is None else self.motor_angle[frame],
             motor_rate=None if self.motor_rate is None else self.motor_rate[frame],
+            filtered_rate=None if self.filtered_rate is None else self.filtered_rate[frame],
         )
 
 

@@ -15,7 +15,15 @@ from dynamics.closed_loop.linear_algebra_kernels import (
     fill,
     solve_rows,
 )
-from dynamics.closed_loop.motion_kernels import OK, dry_level, dry_slope, hold_compliance, mode_margin, stuck_joints
+from dynamics.closed_loop.motion_kernels import (
+    OK,
+    dry_level,
+    dry_slope,
+    follows_law,
+    hold_compliance,
+    mode_margin,
+    stuck_joints,
+)
 from dynamics.compiled.kernel import Array, Record, call, call_columns, entry, invoke, kernel
 
 FRACTION = (0.0, 0.5, 0.5, 1.0)
@@ -43,10 +51,13 @@ def share_with_columns(task: Record, now: Record, at: Record) -> None:
     known = now.derivatives
     copy_rows(at.jacobian, known.jacobian, len(at.bias))
     copy_rows(at.factor, known.factor, len(at.bias))
-    known.gains[0], known.gains[1], known.gains[2] = task.lp, task.li, task.ld
+    filtering = task.filter_time > 0
     for i in range(len(now.mode)):
-        mode, slips = now.mode[i], now.mode[i] != 0
-        known.damping[i] = task.ld
+        mode, slips, law = now.mode[i], now.mode[i] != 0, follows_law(task, at, i)
+        known.by_error[i] = law * (task.lp + task.lx)
+        known.by_integral[i] = law * task.li
+        known.by_command_rate[i] = 0.0 if filtering else law * task.rate_weight * task.ld
+        known.damping[i] = 0.0 if filtering else law * task.ld
         if slips:
             known.damping[i] += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
         for j in range(len(at.bias)):
@@ -63,32 +74,61 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record) -> Non
         for k in range(rigid):
             d.push[i, k] = -now.derivatives.columns[i, k]
     for i in range(count):
-        mode = now.mode[i]
-        d.direct[i, lp] = at.error[i]
-        d.direct[i, lp + 1] = at.state[first + i]
-        d.direct[i, lp + 2] = now.command_rate[i] - at.velocity[i]
-        d.direct[i, rigid + i] = -dry_level(task.friction, at.velocity[i], mode) if mode != 0 else 0.0
-        d.direct[i, rigid + count + i] = -at.velocity[i] if mode != 0 else 0.0
+        mode, row, law = now.mode[i], d.direct[i], follows_law(task, at, i)
+        rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
+        if task.lx > 0 or task.filter_time > 0:
+            fill(row, 0.0)
+            add_row(-law * task.lx, d.acting[i], row, now.width)  # with lx added to lp, it is of error less command
+        if task.filter_time > 0:
+            rate = at.state[first + count + i]
+            add_row(law * task.ld, d.filtered[i], row, now.width)
+        for k in (lp, lp + 1, lp + 2, rigid + i, rigid + count + i):
+            if task.lx == 0 and task.filter_time == 0:
+                row[k] = 0.0
+        row[lp] += law * task.reads[0] * at.error[i]
+        row[lp + 1] += law * task.reads[1] * at.state[first + i]
+        row[lp + 2] += law * task.reads[2] * rate
+        for k in range(3):
+            row[lp + k] -= law * task.lx_by[k] * at.angle[i]
+        row[rigid + i] -= dry_level(task.friction, at.velocity[i], mode) if mode != 0 else 0.0
+        row[rigid + count + i] -= at.velocity[i] if mode != 0 else 0.0
+
+
+@kernel
+def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
+    """Derivative of the slopes of filtered rates, which in `d.k[k]` stand before the net torques."""
+    size, count, width = len(at.bias), len(now.mode), now.width
+    first = 2 * size + count
+    slopes, torque = d.k[k, first : first + count], d.k[k, first + count :]
+    copy_rows(slopes, torque, width)
+    clear(slopes, width)
+    add_product(-0.5 / task.filter_time, now.derivatives.crank_by_rate, d.trial[:size], slopes, width)
+    add_product(-1 / task.filter_time, at.jacobian, d.trial[size : 2 * size], slopes, width)
+    for i in range(count):
+        add_row(task.rate_weight / task.filter_time, d.command_rate[i], slopes[i], width)
+        add_row(-1 / task.filter_time, d.filtered[i], slopes[i], width)
 
 
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Derivative of the slope at one state, and behind it of the net torques, into `d.k[k]`: implicitly, for those of
-    the state and the time in `d.trial` and `d.stage_time`. See `slope_derivative`.
+    the state and the time in `d.trial`, `d.filtered` and `d.stage_time`. See `slope_derivative`.
     """
     size, count, width, known = len(at.bias), len(now.mode), now.width, now.derivatives
     pose, rate = d.trial[:size], d.trial[size : 2 * size]
-    acceleration, torque = d.k[k, size : 2 * size], d.k[k, 2 * size + count :]
+    acceleration, torque = d.k[k, size : 2 * size], d.k[k, len(d.k[k]) - count :]
     state = at.state
     differentiate_motion(task, now, state[:size], state[size : 2 * size], at.slope[size : 2 * size], at.net_torque[:])
     share_with_columns(task, now, at)
-    fixed_state_tangent(task, now, at, d)
     copy_rows(d.command[:], d.acting[:], width)
     for i in range(count):
         if now.ramping:
             add_row(at.time, d.command_slope[i], d.acting[i], width)
             add_row(now.command_slope[i], d.stage_time[:], d.acting[i], width)
+    fixed_state_tangent(task, now, at, d)
     call_columns(task.slope_derivative, known.by_pose, d.trial, d.k[k], width)
+    if task.filter_time > 0:
+        filtered_tangent(task, now, at, d, k)
     stuck = stuck_joints(now)
     if len(stuck) == 0:
         return OK
@@ -114,12 +154,22 @@ def give_back(at: Record, d: Record, stuck: int, rows: Array, width: int) -> Non
 
 
 @kernel
-def move_tangent(now: Record, at: Record, d: Record, stage: int, h: float, fraction: float, moved: Array) -> None:
-    """Add fraction (h slope's derivative + d_length slope) at a stage."""
+def move_tangent(
+    now: Record, at: Record, d: Record, stage: int, h: float, fraction: float, moved: Array, first: int
+) -> None:
+    """Add fraction (h slope's derivative + d_length slope) at a stage to rows of unknowns, from the `first` on."""
     for i in range(len(moved)):
-        add_row(fraction * h, d.k[stage, i], moved[i], now.width)
+        add_row(fraction * h, d.k[stage, first + i], moved[i], now.width)
         if now.length_moves:
-            add_row(fraction * at[stage].slope[i], d.length[:], moved[i], now.width)
+            add_row(fraction * at[stage].slope[first + i], d.length[:], moved[i], now.width)
+
+
+@kernel
+def try_tangent(now: Record, d: Record) -> None:
+    """Begin a trial at the derivatives as they are."""
+    count = len(d.trial)
+    copy_rows(d.x[:count], d.trial[:], now.width)
+    copy_rows(d.x[count:], d.filtered[:], now.width)
 
 
 @kernel
@@ -145,9 +195,9 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
     else:
         copy(d.time[:], d.stage_time[:])
         d.stage_time[column] = 1.0
-        copy_rows(d.x[:], d.trial[:], width)
+        try_tangent(now, d)
         invoke(task.slope_tangent, task, now, end, d, 0)
-        torque = d.k[0, 2 * size + len(now.mode) + joint]
+        torque = d.k[0, len(d.k[0]) - len(now.mode) + joint]
         add_row(1.0 if end.stick_force[joint] > 0 else -1.0, torque, d.margin[:], width)
         d.margin[len(task.rigid) + joint] -= task.friction.static_level
     approach = d.margin[column]
@@ -171,14 +221,16 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
     for k in range(4):
-        copy_rows(d.x[:], d.trial[:], now.width)
+        try_tangent(now, d)
         if k > 0:
-            move_tangent(now, at, d, k - 1, h, FRACTION[k], d.trial[:])
+            move_tangent(now, at, d, k - 1, h, FRACTION[k], d.trial[:], 0)
+            late = len(d.trial)
+            move_tangent(now, at, d, k - 1, h, FRACTION[k], d.filtered[: len(d.x) - late], late)
         copy(d.time[:], d.stage_time[:])
         add_row(FRACTION[k], d.length[:], d.stage_time[:], now.width)
         invoke(task.slope_tangent, task, now, at[k], d, k)
     for k in range(4):
-        move_tangent(now, at, d, k, h, WEIGHT[k], d.x[:])
+        move_tangent(now, at, d, k, h, WEIGHT[k], d.x[:], 0)
     if cut:
         length_tangent(task, now, at[END], d)
     add_row(1.0, d.length[:], d.time[:], now.width)

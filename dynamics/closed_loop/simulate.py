@@ -14,7 +14,6 @@ import numpy as np
 from dynamics.checks import Shape, check_type, flag, floats, mask, shown, whole
 from dynamics.closed_loop.problem import (
     Controller,
-    Drives,
     EveryFrame,
     FrameTiming,
     LoopProblem,
@@ -87,7 +86,7 @@ def simulate(
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = flag("compiled", compiled, SimulationError)
     _check_reach(robot, reference)
-    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters)
+    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters, settings.drives.law)
     feedforward = _checked_rows("feedforward", feedforward, (frames, robot.layout.joints))
     if start is None:
         known, at = (parameters.tobytes(), reference.poses[0].tobytes()), (servo_robot, feedforward is not None)
@@ -182,7 +181,8 @@ def _at_rest(
 ) -> StartState:
     """The state of rest at a pose (6,), for all parameters; found once for the runs of one model, and frozen."""
     values, elasticity = np.frombuffer(parameters), settings.elasticity
-    start = equilibrium(robot, values, np.frombuffer(pose), settings.servo, servo_robot, elasticity, fed_forward)
+    servo, drives = settings.servo, settings.drives
+    start = equilibrium(robot, values, np.frombuffer(pose), servo, servo_robot, elasticity, fed_forward, drives)
     start = _driven(robot, values, settings, start)
     for part in vars(start).values():
         if part is not None:
@@ -243,8 +243,6 @@ def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:
         "drives that take torques need a controller or commands: the servo commands joints": driven
         and not controlled
         and problem.commands is None,
-        "sensitivities are those of the joint PID: pass settings with the usual drives": derived
-        and problem.settings.drives != Drives(),
         "commands take the place of any controller: pass controller=None": controlled and problem.commands is not None,
     }
     for words, excluded in refusals.items():

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
+from dynamics.closed_loop.drives import Drives, JointLaw
 from dynamics.closed_loop.problem import (
     FrameTiming,
     LoopSettings,
@@ -38,7 +39,7 @@ def frame_map(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose
     The state: coordinates, their rates, joint PID integrals, coordinates measured at the last frame, servo integrals,
     and the commands on their way, the latest first. Raises what `closed_loop.equilibrium` raises.
     """
-    return _frame_map(_near_rest(robot, parameters, pose), settings)
+    return _frame_map(_near_rest(robot, parameters, pose, settings.drives), settings)
 
 
 def pose_response(
@@ -49,7 +50,7 @@ def pose_response(
 
     Raises what `closed_loop.equilibrium` raises.
     """
-    near = _near_rest(robot, parameters, pose)
+    near = _near_rest(robot, parameters, pose, settings.drives)
     size = near.jacobian.shape[1]
     map_, by_desired = np.split(_with_desired(near, settings), [-size], axis=1)
     one, period = np.eye(len(map_)), 1 / settings.timing.frame_rate_hz
@@ -70,7 +71,7 @@ def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
     period, servo = 1 / timing.frame_rate_hz, _servo(robot, settings)
     whole = floor(timing.latency_s / period + 1e-9)
     rest = max(0.0, timing.latency_s - whole * period)
-    inner, kept = 2 * size + joints, whole + 2
+    inner, kept = len(robot.motion) - 3 * joints, whole + 2
     states = inner + 2 * size + kept * joints
     start, desired = np.eye(states, states + size), np.eye(size, states + size, states)
     coordinates, integral = start[:size] - desired, start[inner + size : inner + 2 * size]
@@ -90,12 +91,12 @@ def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
 
 def spectral_radius(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
     """Largest magnitude of the eigenvalues of `frame_map`: the loop is stable below 1."""
-    return _radius(_near_rest(robot, parameters, pose), settings)
+    return _radius(_near_rest(robot, parameters, pose, settings.drives), settings)
 
 
 def gain_margin(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
     """Factor by which the gains of the servo may grow, or below 1 have to shrink, until the loop is just stable."""
-    near = _near_rest(robot, parameters, pose)
+    near = _near_rest(robot, parameters, pose, settings.drives)
 
     def radius(factor: float) -> float:
         gains = settings.servo
@@ -110,7 +111,7 @@ def lowest_frame_rate(robot: Robot, parameters: np.ndarray, settings: LoopSettin
 
     Above the settings' rate where it is not stable there. NaN where no rate makes it stable.
     """
-    rate, near = settings.timing.frame_rate_hz, _near_rest(robot, parameters, pose)
+    rate, near = settings.timing.frame_rate_hz, _near_rest(robot, parameters, pose, settings.drives)
 
     def radius(hz: float) -> float:
         timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
@@ -141,39 +142,52 @@ class _NearRest(NamedTuple):
     turning: np.ndarray
 
 
-def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> _NearRest:
-    parameters = checked_loop_parameters(robot, parameters)
+def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray, drives: Drives) -> _NearRest:
+    parameters = checked_loop_parameters(robot, parameters, drives.law)
     check_start_pose(robot, parameters, pose)
-    jacobian = robot.coordinate_jacobian(pose)
-    demand = np.linalg.solve(jacobian, robot.inverse_kinematics(pose))
+    jacobian, law = robot.coordinate_jacobian(pose), drives.joint_law(parameters[robot.layout.joint_pid])
+    holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
+    demand = np.linalg.solve(jacobian, law.held(holding, robot.inverse_kinematics(pose))[0])
     (turning,) = _values(robot, "rate_map_derivative", robot.coordinates(pose), demand)
-    return _NearRest(_joint_loop(robot, parameters, pose), jacobian, turning)
+    return _NearRest(_joint_loop(robot, parameters, pose, law), jacobian, turning)
 
 
 def _radius(robot: _NearRest, settings: LoopSettings) -> float:
     return float(np.abs(np.linalg.eigvals(_frame_map(robot, settings))).max())
 
 
-def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """d/dt of [q, q_dot, joint integrals, command, slope of the command, U_dot] by these, square: a command changes
-    with its slope, and what the joint PID takes for U_dot need not be that."""
+def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray, law: JointLaw) -> np.ndarray:
+    """d/dt of [q, q_dot, joint integrals, filtered rates where there are any, command, slope of the command, U_dot] by
+    these, square: a command changes with its slope, and what the drive takes for U_dot need not be that. An integral
+    that nothing reads dies out."""
     q, joints = robot.coordinates(pose), robot.layout.joints
-    rigid, _, viscous, (lp, li, ld) = robot.layout.split(parameters)
+    rigid, _, viscous, _ = robot.layout.split(parameters)
+    lp, li, ld, filtering = law.lp, law.li, law.ld, law.filter_time > 0
     at_rest, size = np.zeros(len(q)), len(q)
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
     mass, _, jacobian, *_ = _values(robot, "equation_of_motion", q, at_rest, rigid)
     by_pose, by_rate, *_ = _values(robot, "motion_derivatives", q, at_rest, at_rest, holding, rigid)
     push = np.linalg.solve(mass, jacobian.T)
-    inner = 2 * size + joints
+    inner = 2 * size + joints * (1 + filtering)
     system = np.zeros((inner + 3 * joints, inner + 3 * joints))
-    at, moving, summed = slice(0, size), slice(size, 2 * size), slice(2 * size, inner)
+    at, moving, summed = slice(0, size), slice(size, 2 * size), slice(2 * size, 2 * size + joints)
+    filtered = slice(2 * size + joints, inner)
     command, slope, rate = (slice(inner + k * joints, inner + (k + 1) * joints) for k in range(3))
     system[at, moving] = np.eye(size)
-    system[moving, at] = -np.linalg.solve(mass, by_pose) - lp * push @ jacobian
-    system[moving, moving] = -np.linalg.solve(mass, by_rate) - push @ ((ld + viscous)[:, None] * jacobian)
+    system[moving, at] = -np.linalg.solve(mass, by_pose) - (lp + law.lx) * push @ jacobian
+    system[moving, moving] = -np.linalg.solve(mass, by_rate) - push @ (
+        (ld * (not filtering) + viscous)[:, None] * jacobian
+    )
     system[moving, summed] = li * push
-    system[moving, command], system[moving, rate] = lp * push, ld * push
+    system[moving, command] = lp * push
+    if filtering:
+        system[moving, filtered] = ld * push
+        system[filtered, moving], system[filtered, rate] = -jacobian / law.filter_time, np.eye(joints) / law.filter_time
+        system[filtered, filtered] = -np.eye(joints) / law.filter_time
+    else:
+        system[moving, rate] = law.rate_weight * ld * push
     system[summed, at], system[summed, command] = -jacobian, np.eye(joints)
+    system[summed, summed] = -np.eye(joints) if li == 0 else 0.0
     system[command, slope] = np.eye(joints)
     return system
 

@@ -14,7 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dynamics.closed_loop.problem import Drives, EveryFrame
+from dynamics.closed_loop.drives import Drives
+from dynamics.closed_loop.problem import EveryFrame
 from dynamics.control.inverse_dynamics import spans
 from dynamics.control.law import Assignment, LawInLoop
 from dynamics.control.observer import Estimate

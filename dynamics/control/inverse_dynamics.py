@@ -5,6 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
+from dynamics.closed_loop.drives import Drives
 from dynamics.closed_loop.joints import FrictionLaw
 from dynamics.robot import Robot
 
@@ -37,6 +38,11 @@ class Model:
     def dynamic(self) -> np.ndarray:
         """Parameters without those of the joint PID."""
         return self.parameters[self.robot.layout.dynamic]
+
+    def held(self, pose: np.ndarray, drives: Drives) -> tuple[np.ndarray, np.ndarray]:
+        """Joint commands (n,) and integrals (n,) of the drives of a robot at rest at a pose (6,), friction unloaded."""
+        law, rest = drives.joint_law(self.parameters[self.robot.layout.joint_pid]), np.zeros((1, 6))
+        return law.held(self.torque(pose[None], rest, rest)[0], self.robot.inverse_kinematics(pose))
 
     def torque(
         self, pose: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, dry_along: np.ndarray | None = None

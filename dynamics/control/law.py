@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dynamics.closed_loop.problem import Controller, Drives, EveryFrame, LoopSettings
+from dynamics.closed_loop.drives import Drives
+from dynamics.closed_loop.problem import Controller, EveryFrame, LoopSettings
 from dynamics.control.inverse_dynamics import Model, Motion
 from dynamics.control.observer import Estimate, Observer
 
@@ -50,15 +51,15 @@ class Assignment:
 
     def watched(self, drives: Drives) -> Observer:
         """An observer of the run."""
-        pose, robot = self.desired(0.0)[0], self.model.robot
-        holding = self.holding if drives.torques else robot.inverse_kinematics(pose)
+        holding = self.holding if drives.torques else self.model.held(self.desired(0.0)[0], drives)[0]
         settings = replace(self.settings, drives=drives)
-        return Observer(self.model, settings, pose, holding, self.latencies, self.noise)
+        return Observer(self.model, settings, self.desired(0.0)[0], holding, self.latencies, self.noise)
 
 
 @dataclass(frozen=True)
 class LawInLoop:
-    """What a law gives `closed_loop.simulate`, and what its observer, if any, expected of each frame."""
+    """What a law gives `closed_loop.simulate`, and what its observer, if any, expected of each frame; of the drives it
+    decides whether they take torques."""
 
     feedforward: np.ndarray | None = None
     controller: Controller | EveryFrame | None = None

@@ -78,7 +78,8 @@ class Observer:
         self._period, self._time = 1 / timing.frame_rate_hz, 0.0
         self._motion = robot.functions["equation_of_motion"]
         self._derivatives = robot.functions["motion_derivatives"]
-        rigid, self._coulomb, self._viscous, self._gains = robot.layout.split(model.parameters)
+        rigid, self._coulomb, self._viscous, gains = robot.layout.split(model.parameters)
+        self._law = settings.drives.joint_law(gains)
         self._rigid = rigid[None]
         self._m, self._n = len(robot.coordinate_names), robot.layout.joints
         self._arrivals, self._commands = [-np.inf, -np.inf], [holding, holding]
@@ -92,7 +93,7 @@ class Observer:
         if self._drives.torques:
             self._state[2 * m + n : 2 * m + 2 * n] = torque - holding
         else:
-            self._state[2 * m : 2 * m + n] = torque / self._gains[1]
+            self._state[2 * m : 2 * m + n] = self._model.held(pose, self._drives)[1]
         scale = np.full(n, np.abs(torque).mean())
         self._walk = np.diag(np.concatenate([np.zeros(2 * m + n), (WALK * scale) ** 2, np.zeros(n)]))
         jacobian, free = robot.coordinate_jacobian(pose), robot.geometry.chart.basis
@@ -219,16 +220,18 @@ class Observer:
     def _slope(
         self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, command_rate: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        m, n, (lp, li, ld) = self._m, self._n, self._gains
+        m, n, law = self._m, self._n, self._law
+        li, ld, stiff = law.li, law.ld, law.lp + law.lx
         q, rate, integral, disturbance, more = np.split(state, [m, 2 * m, 2 * m + n, 2 * m + 2 * n])
         found = self._motion(q[None], rate[None], self._rigid)
-        mass, bias, jacobian, _, angle = (part[0] for part in found)
+        mass, bias, jacobian, _, angle, *_ = (part[0] for part in found)
         velocity, error = jacobian @ rate, command - angle[:, 0]
         level, by_velocity, unsure, width = self._expected_friction(
             velocity, jacobian, covariance[m : 2 * m, m : 2 * m]
         )
         pid = not self._drives.torques
-        torque = lp * error + ld * (command_rate - velocity) + li * integral if pid else command
+        by_error = law.lp * error + li * integral - law.lx * angle[:, 0]
+        torque = by_error + ld * (law.rate_weight * command_rate - velocity) if pid else command
         limit = self._drives.torque_limit
         torque = torque if limit is None else np.clip(torque, -limit, limit)
         net = torque + disturbance - (self._viscous + more) * velocity - self._coulomb * level
@@ -236,7 +239,7 @@ class Observer:
         given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
         by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*given))
         damping = (ld * pid + self._viscous + more + self._coulomb * by_velocity)[:, None]
-        net_by_q = -lp * pid * jacobian - damping * (turning / 2)
+        net_by_q = -stiff * pid * jacobian - damping * (turning / 2)
         push = np.linalg.solve(mass, jacobian.T)
         by_state = np.zeros((len(state), len(state)))
         by_state[:m, m : 2 * m] = np.eye(m)

@@ -33,7 +33,8 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     none was stuck.
 
     What all columns share: what `motion_derivatives` returns; J_theta (n, m), and the same with zeros for stuck joints;
-    the Cholesky factor (m, m); by what a joint's torque falls with its velocity (n,); lp, li, ld. In each column the
+    the Cholesky factor (m, m); by what a joint's torque falls with its velocity (n,), and grows with its error, the
+    integral of that and the command's rate (n,). In each column the
     derivatives of pose and rate (m,), joint integral, command and its rate (n,); of -M q_ddot - b (m,) and of the
     torque (n,) at a fixed state.
     In each column then: those of rate, acceleration (m,), command error and torque (n,).
@@ -41,23 +42,23 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     n = layout.joints
     by_pose, by_rate, factor = (ca.SX.sym(name, m, m) for name in ("by_pose", "by_rate", "factor"))
     joint_by_pose, joint_by_rate, jacobian, pushing = (ca.SX.sym(f"joints{k}", n, m) for k in range(4))
-    columns, damping, gains = ca.SX.sym("columns", m, layout.rigid.stop), ca.SX.sym("damping", n), ca.SX.sym("gains", 3)
+    columns, (damping, *gains) = ca.SX.sym("columns", m, layout.rigid.stop), (ca.SX.sym(f"by{k}", n) for k in range(4))
     pose, rate, push = (ca.vertsplit(ca.SX.sym(name, m)) for name in ("pose", "rate", "push"))
     integral, command, command_rate, direct = (ca.vertsplit(ca.SX.sym(f"of_joints{k}", n)) for k in range(4))
-    lp, li, ld = ca.vertsplit(gains)
+    by_error, by_integral, by_command_rate = gains
     errors, torques = [], []
     for i in range(n):
         errors.append(summed(command[i], ca.horzsplit(-jacobian[i, :]), pose))
         velocity = summed(ca.SX(0), ca.horzsplit(0.5 * joint_by_rate[i, :]), pose)
         velocity = summed(velocity, ca.horzsplit(jacobian[i, :]), rate)
         felt = [errors[i], command_rate[i], velocity, integral[i], direct[i]]
-        torques.append(summed(ca.SX(0), [lp, ld, -damping[i], li, ca.SX(1)], felt))
+        torques.append(summed(ca.SX(0), [by_error[i], by_command_rate[i], -damping[i], by_integral[i], ca.SX(1)], felt))
     accelerations = []
     for j in range(m):
         left = summed(push[j], ca.horzsplit(-by_pose[j, :]), pose)
         left = summed(left, ca.horzsplit(-by_rate[j, :]), rate)
         accelerations.append(summed(left, ca.vertsplit(pushing[:, j]), torques))
-    common = [by_pose, by_rate, columns, joint_by_pose, joint_by_rate, jacobian, pushing, factor, damping, gains]
+    common = [by_pose, by_rate, columns, joint_by_pose, joint_by_rate, jacobian, pushing, factor, damping, *gains]
     rows = [ca.vertcat(*row) for row in (pose, rate, integral, command, command_rate, push, direct)]
     outputs = [rate, _solved(factor, accelerations), errors, torques]
     found = ca.Function("slope_derivative", [*common, *rows], [ca.vertcat(*row) for row in outputs])

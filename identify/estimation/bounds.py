@@ -108,8 +108,9 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     """Bounds of all parameters; physical: only masses and inertias that a rigid body can have."""
     layout, names = guess.layout, guess.layout.names
     matrix, lower = np.eye(len(names)), np.zeros(len(names))
-    for place in (names.index(name) for name in ("platform.mass", "joint_pid.li")):
+    for place in (names.index(name) for name in guess.above_zero):
         lower[place] = SMALLEST_SHARE * guess.values[place]
+    lower[guess.fixed] = -1.0  # they stay at zero by what is known of them, not by a bound
     if physical:
         lower[layout.rigid] = np.maximum(lower[layout.rigid], SMALLEST)
     statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]

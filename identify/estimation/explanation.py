@@ -200,22 +200,25 @@ class Explanation:
         return (*driven, *self.whiteness.warnings())
 
 
-def explanation(driven: OutputErrorProblem, parameters: Array, misfit: Misfit) -> Explanation:
-    """Judge the model from the command-driven problem at its own optimum (p,), and the misfit of the estimate.
+def explanation(driven: OutputErrorProblem, parameters: Array, misfit: Misfit, rng: np.random.Generator) -> Explanation:
+    """Judge the model from the command-driven problem at its own optimum (p,), and the misfit of the estimate; rng: for
+    what a fit has taken out of the residuals.
 
     Raises EstimationError with too few good frames.
     """
-    residuals, ok = _residuals(driven, parameters)
+    residuals, ok = _residuals(driven, parameters, rng)
     return Explanation(misfit, misfit_of_white(residuals[ok]), whiteness(residuals, ok))
 
 
-def _residuals(driven: OutputErrorProblem, parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _residuals(
+    driven: OutputErrorProblem, parameters: Array, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.bool_]]:
     """All whitened residuals (N, 6), NaN where lost, and the good frames (N,): one record after the other, with a gap
     of all lags of the whiteness test between them."""
     gap, residuals, ok = np.full((LAGS, 6), np.nan), [], []
     for run in driven.runs:
         rows = np.full(run.measured.shape, np.nan)
-        rows[run.ok] = run.misses(parameters)
+        rows[run.ok] = run.white_misses(parameters, rng)
         residuals += [rows, gap]
         ok += [run.ok, np.zeros(LAGS, dtype=bool)]
     return np.concatenate(residuals), np.concatenate(ok)

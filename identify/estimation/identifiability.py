@@ -194,7 +194,7 @@ def conditioning(
     """Conditioning of an estimate (p,) from the information (p, p) of the poses and of what is known beside them."""
     everything = np.linalg.eigvalsh((information + known) * np.outer(guess.std, guess.std))
     count = base.combinations.shape[1]
-    gains = np.arange(count, len(estimate))
+    gains = count + np.flatnonzero(np.diag(information)[count:])  # without those that the law of the drives lacks
     seen = np.concatenate([base.pivots, gains])
     size = np.concatenate([np.sqrt(base.combinations**2 @ guess.std[:count] ** 2), guess.std[gains]])
     values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])
@@ -241,6 +241,8 @@ def judge(
     gain = robot.layout.names.index("joint_pid.lp")
     prior_share = variance_share(each, uncertainty.of_guess, uncertainty.covariance)
     gain_left = float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])
+    if not uncertainty.information[gain, gain]:  # commands that are torques show the scale themselves
+        gain_left = 0.0
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
     bounded = bounded_estimate(
         estimate,

@@ -14,17 +14,20 @@ from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.common_errors import common_error_estimates
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
+from identify.estimation.drive_choice import choose_drive
 from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
-from identify.estimation.prior import StartingGuess, starting_guess
+from identify.estimation.prior import StartingGuess, model_guess
 from identify.estimation.result import IdentificationResult
 from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
+from identify.loop_parameters import with_drive
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.drift import drift_warnings
+from identify.record.law import SERVO, recorded_law
 from identify.record.provenance import recorded_seed
 from identify.record.recorded_run import recorded_run
 from identify.runtime import one_thread
@@ -46,11 +49,17 @@ def identify(
     start, or that bears the noise. Raises ScenarioError: a parameter set that the robot does not have, or a starting
     guess that no model has. Raises dynamics.DynamicsError: poses that the robot cannot reach.
     """
-    progress = progress or SilentProgress()
+    progress, began = progress or SilentProgress(), time.perf_counter()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
+    scenario = under_its_law(scenario, records)
     problem = output_error_problem(records, robot, scenario)
+    in_loop = not any(run.settings.drives.torques for run in problem.runs)
+    drive = choose_drive(lambda named: output_error_problem(records, robot, named), scenario, progress, in_loop)
+    if drive.asked:
+        scenario = with_drive(scenario, drive.law)
+        problem = output_error_problem(records, robot, scenario)
     rng = mixed_generator(UNCERTAINTY, recorded_seed(records[0]))
-    began = time.perf_counter()
+    chosen = time.perf_counter()
     warm = linear_warm_start(problem, scenario)
     warmed = time.perf_counter()
     searches = output_error_searches(problem, scenario, warm, progress)
@@ -61,11 +70,12 @@ def identify(
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
     by_commands = searches["command_driven"]
     driven = judged if method == "command_driven" else by_commands.linearised()
-    explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit)
+    explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
     return IdentificationResult(
         layout=robot.layout,
+        drive=drive,
         initial=problem.guess.values,
         warm_start=warm,
         estimate=solution.parameters,
@@ -82,9 +92,22 @@ def identify(
         expected_noise_ratio=explained.misfit.expected,
         noise_ratio_std=explained.misfit.std,
         whiteness=explained.whiteness,
-        seconds={"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched},
-        **vars(judgement) | {"warnings": (*drift_warnings(records), *judgement.warnings)},
+        seconds={
+            "drive": chosen - began,
+            "warm_start": warmed - chosen,
+            "search": searched - warmed,
+            "uncertainty": ended - searched,
+        },
+        **vars(judgement) | {"warnings": (*drift_warnings(records), *drive.warnings(), *judgement.warnings)},
     )
+
+
+def under_its_law(scenario: Scenario, records: Sequence[xr.Dataset]) -> Scenario:
+    """The scenario with the method that fits the law under which a record was made: the model can close the loop of the
+    servo, and under any other law gets the logged commands."""
+    if all(recorded_law(record) == SERVO for record in records):
+        return scenario
+    return scenario.with_overrides({"identification.method": "command_driven"})
 
 
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
@@ -112,9 +135,10 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
 def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
     """The scenario's starting guess. Raises ScenarioError where the robot has none of the name, or no model has it."""
     settings = scenario.identification
-    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
+    law = scenario.model.drive_law
+    guess = model_guess(robot, scenario)
     try:
-        checked_loop_parameters(robot, guess.values)
+        checked_loop_parameters(robot, guess.values, law)
     except DynamicsError as error:
         known = ", ".join(settings.prior) or "nothing"
         raise ScenarioError(

@@ -112,7 +112,8 @@ def measured_states(chain: list[Segment], parameters: Array, scenario: Scenario)
     place, rate, _ = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
     _, _, command_integral = effective_command(run.logged, scenario)
     angle_integral = running_integral(run.robot.inverse_kinematics(run.robot.pose(place)), rate_hz)
-    rest = equilibrium(run.robot, parameters + run.payload, run.reference.poses[0], run.settings.servo)
+    servo, drives = run.settings.servo, run.settings.drives
+    rest = equilibrium(run.robot, parameters + run.payload, run.reference.poses[0], servo, drives=drives)
     states = np.hstack([place, rate, rest.joint_integral + command_integral - angle_integral])
     return np.asarray(states[[part.first for part in chain]], dtype=float)
 

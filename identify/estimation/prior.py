@@ -12,20 +12,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynamics import Robot
+from dynamics.closed_loop.drives import ABOVE_ZERO, READS, DriveName
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import check_parameter_set
-from identify.scenario import PriorValue
+from identify.scenario import PriorValue, Scenario
 
 
 @dataclass(frozen=True)
 class StartingGuess:
-    """What is known before the experiment of a robot's parameters: values (p,) and standard deviations (p,), SI."""
+    """What is known before the experiment of a robot's parameters: values (p,) and standard deviations (p,), SI; the
+    law of its drives, which fixes the gains that it does not read at zero."""
 
     layout: ParameterLayout
     values: Array
     std: Array
+    drive: DriveName = "pid"
+
+    @property
+    def fixed(self) -> NDArray[np.bool_]:
+        """Gains (p,) that the law of the drives does not read."""
+        read = [f"joint_pid.{gain}" for gain in READS[self.drive]]
+        return np.isin(self.layout.names, self.layout.joint_pid_names) & ~np.isin(self.layout.names, read)
+
+    @property
+    def above_zero(self) -> tuple[str, ...]:
+        """Parameters without which there is no model."""
+        return ("platform.mass", *(f"joint_pid.{gain}" for gain in ABOVE_ZERO[self.drive]))
 
     @property
     def rows(self) -> Array:
@@ -33,8 +47,16 @@ class StartingGuess:
         return np.diag(1 / self.std)
 
 
+FIXED = 1e-9
+"""Standard deviation of a gain that the law of the drives does not read, in those of the others."""
+
+
 def starting_guess(
-    robot: Robot, set_name: str, relative_std: float, known: Mapping[str, PriorValue] = MappingProxyType({})
+    robot: Robot,
+    set_name: str,
+    relative_std: float,
+    known: Mapping[str, PriorValue] = MappingProxyType({}),
+    drive: DriveName = "pid",
 ) -> StartingGuess:
     """The named parameter set of the robot file, uncertain by a fraction of each parameter's size, but for those of
     which a value and its standard deviation are known.
@@ -48,7 +70,15 @@ def starting_guess(
     for name, prior in known.items():
         place = robot.layout.names.index(name)
         values[place], std[place] = prior.value, prior.std
-    return StartingGuess(robot.layout, values, std)
+    guess = StartingGuess(robot.layout, values, std, drive)
+    values[guess.fixed], std[guess.fixed] = 0.0, FIXED * std[guess.fixed]
+    return guess
+
+
+def model_guess(robot: Robot, scenario: Scenario) -> StartingGuess:
+    """The starting guess of a scenario's model. Raises as `starting_guess`."""
+    settings, model = scenario.identification, scenario.model
+    return starting_guess(robot, model.start_parameters, settings.start_std, settings.prior, model.drive_law)
 
 
 WEIGHTLESS = 0.01

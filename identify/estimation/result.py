@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynamics.parameters import ParameterLayout
+from dynamics.closed_loop.drives import READS, cascade_gains
+from dynamics.parameters import JOINT_PID, ParameterLayout
 from identify.arrays import Array
 from identify.estimation.common_errors import CommonErrorEstimates
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
+from identify.estimation.drive_choice import DriveChoice
 from identify.estimation.explanation import Misfit, Whiteness
 from identify.estimation.identifiability import RESTS_ON_PRIOR, Conditioning, GroupEstimates
 from identify.estimation.scale_anchor import ScaleAnchor
@@ -30,18 +32,19 @@ STRONGEST = 10
 class IdentificationResult:
     """What one record says about the parameters of a robot, in the order of its `layout`; SI.
 
-    initial, warm_start, estimate, std (p,), covariance (p, p), the last two as they were without bounds; intervals (p,
-    2): 95 %, cut at the bounds; identifiable (p,) bool; prior_share (p,): of the variance, what errors of the starting
-    guess make, and common_share (p,) by kind: what those that all poses of a record have in common; groups,
-    group_intervals: what the record says of the base parameters; base_rank: independent groups that the trajectory
-    excites by the paper's rule; iterations and evaluations: of all searches; stop_reason: of the last; searches: their
-    names in order, and costs: after each iteration, one tuple a search; active_bounds: what holds the estimate back, as
-    "platform.Izz <= Ixx + Iyy"; noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what
-    the sensor's noise alone would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model
-    driven by the logged commands.
+    drive: the law of the drives; initial, warm_start, estimate, std (p,), covariance (p, p), the last two as they were
+    without bounds; intervals (p, 2): 95 %, cut at the bounds; identifiable (p,) bool; prior_share (p,): of the
+    variance, what errors of the starting guess make, and common_share (p,) by kind: what those that all poses of a
+    record have in common; groups, group_intervals: what the record says of the base parameters; base_rank: independent
+    groups that the trajectory excites by the paper's rule; iterations and evaluations: of all searches; stop_reason: of
+    the last; searches: their names in order, and costs: after each iteration, one tuple a search; active_bounds: what
+    holds the estimate back, as "platform.Izz <= Ixx + Iyy"; noise_ratio: mean squared whitened residual, to compare
+    with expected_noise_ratio, what the sensor's noise alone would leave, give or take noise_ratio_std; whiteness: test
+    of the residuals of the model driven by the logged commands.
     """
 
     layout: ParameterLayout
+    drive: DriveChoice
     initial: Array
     warm_start: Array
     estimate: Array
@@ -130,9 +133,29 @@ class IdentificationResult:
             "nuisance_estimates": dict(zip(common.names, common.estimate.tolist(), strict=True)),
             "nuisance_prior_std": dict(zip(common.names, common.prior_std.tolist(), strict=True)),
             "base_rank": self.base_rank,
+            "drive": self._drive(),
             "parameters": {name: self._parameter(k) for k, name in enumerate(self.names)},
             "groups": {name: self._group(k) for k, name in enumerate(self.groups.names)},
         }
+
+    def _drive(self) -> dict[str, Any]:
+        """The law of the drives, how probable each is, and which gains it has not; of a cascade its own gains."""
+        law, gains = self.drive.law, self.layout.joint_pid
+        entry: dict[str, Any] = {
+            "law": law,
+            "decided_by": "record" if self.drive.asked else "scenario",
+            "sure": self.drive.sure,
+            "probabilities": dict(self.drive.probabilities),
+            "in_loop": self.drive.in_loop,
+            "fixed_at_zero": [f"joint_pid.{name}" for name in JOINT_PID if name not in READS[law]],
+        }
+        if law == "cascade" and self.drive.in_loop:
+            own, by_gains = cascade_gains(self.estimate[gains])
+            std = np.sqrt(np.diag(by_gains @ self.covariance[gains, gains] @ by_gains.T))
+            units = "1/s", self.layout.unit("joint_pid.ld"), self.layout.unit("joint_pid.lp")
+            rows = zip(own._fields, units, map(float, own), std.tolist(), strict=True)
+            entry["gains"] = {name: {"unit": unit, "estimate": value, "std": err} for name, unit, value, err in rows}
+        return entry
 
     def _parameter(self, k: int) -> dict[str, Any]:
         return {

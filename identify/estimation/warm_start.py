@@ -9,6 +9,9 @@ platform with fewer freedoms its coordinates count, along which the wrench Gamma
 of one joint, whose dry friction is known only while it slips: rows of joints near rest are left out. The equation is
 homogeneous: the scale anchor, and weakly the starting guess, decide the common factor.
 
+That is the PID. In other laws of the drives the torque is in proportion to the gains, too, and so the sum of its
+derivatives by these, times these; those of a cascade depend on ratios of the gains, for which the latest fit stands.
+
 What all poses of a run have in common, or a geometry that is known only so well, moves theta by e d, with d of standard
 deviation one. That stands in the equation with lp and with li: as errors of the rows that go on along a run, lp0 e and
 li0 integral(e) with the gains of the starting guess, they are marginalised (`record.common_errors`).
@@ -18,9 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import lsq_linear
+from scipy.signal import lfilter
 
 from dynamics import Robot
+from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
+from identify.estimation.bounds import SMALLEST_SHARE
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
@@ -42,30 +48,44 @@ REWEIGHTINGS = 3
 def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
     """Parameters (p,) fitted to the measured poses and commands of the problem's runs.
 
-    Each run has its own starting torques; what a known payload adds stands on the right side. The residual's size is
+    Each run has its own starting torques; what a known payload adds stands on the right side, as do torques that were
+    commanded. The residual's size is
     estimated from the fit itself, so that the starting guess counts as much as it should.
     """
-    matrix, right, common = _stacked(problem, scenario)
-    count, rows = len(problem.guess.values), np.column_stack([matrix, right])
+    guess, noise = problem.guess, 0.1
+    count, pid = len(guess.values), guess.layout.joint_pid
+    drives = problem.runs[0].settings.drives
+    law = drives.joint_law(guess.values[pid])
+    matrix, right, common = _stacked(problem, scenario, law)
     lower = np.concatenate([np.zeros(count), np.full(matrix.shape[1] - count, -np.inf)])
-    noise = 0.1
     for _ in range(REWEIGHTINGS):
+        rows = np.column_stack([matrix, right])
         whitened = rows / noise
         if common.shape[1]:
             whitened = Marginal.of(common / noise).whiten(whitened)
-        solution = bounded_fit(whitened[:, :-1], whitened[:, -1], problem.guess, problem.anchor, lower)
+        solution = bounded_fit(whitened[:, :-1], whitened[:, -1], guess, problem.anchor, lower)
         noise = max(noise * float(np.sqrt(np.mean((whitened @ np.append(solution, -1.0)) ** 2))), 1e-9)
+        if law.lx:
+            law = drives.joint_law(np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
+            matrix, right, common = _stacked(problem, scenario, law)
     return np.maximum(solution[:count], 0.0)
 
 
-def _stacked(problem: OutputErrorProblem, scenario: Scenario) -> tuple[Array, Array, Array]:
+def _stacked(problem: OutputErrorProblem, scenario: Scenario, law: JointLaw) -> tuple[Array, Array, Array]:
     """Equations of all runs: matrix (rows, p + n runs), right side (rows,) and common errors (rows, k), N m or N."""
     matrices, right, common, runs = [], [], [], problem.runs
     layout = runs[0].robot.layout
     count, joints = len(layout.names), layout.joints
     for place, run in enumerate(runs):
-        balance, slipping = joint_balance(run.robot, run.without_gaps(), run.logged, scenario)
+        balance, slipping = joint_balance(run.robot, run.without_gaps(), run.logged, scenario, law)
         columns = balance[slipping]
+        if run.settings.drives.torques:
+            columns[:, layout.joint_pid] = 0.0
+            matrices.append(columns[:, :count])
+            felt = effective_command(run.logged, scenario)[0][slipping]
+            right.append(felt - columns[:, :count] @ run.payload)
+            common.append(np.zeros((len(columns), 0)))
+            continue
         matrix = np.zeros((len(columns), count + joints * len(runs)))
         matrix[:, :count] = columns[:, :count]
         matrix[:, count + joints * place :][:, :joints] = columns[:, count:]
@@ -89,9 +109,11 @@ def _common_torques(run: RecordedRun, guess: StartingGuess, scenario: Scenario) 
 
 
 def joint_balance(
-    robot: Robot, measured: Array, commands: Array, scenario: Scenario
+    robot: Robot, measured: Array, commands: Array, scenario: Scenario, law: JointLaw
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Torque balance of every joint (N, n, p + n) of poses (N, 6) and commands (N, n), and where it slips (N, n).
+
+    law: of the drives.
 
     Columns: the dynamic parameters, which give the joint's torque, then lp, li, ld and the starting torques, which give
     the controller's with the opposite sign; N m or N per unit of each.
@@ -109,8 +131,10 @@ def joint_balance(
     angle_integral = running_integral(angle, rate_hz)
     count, joints = len(measured), robot.layout.joints
     start = np.broadcast_to(-np.eye(joints), (count, joints, joints))
-    pid = -np.stack([command - angle, integral - angle_integral, command_rate - velocity], axis=2)
-    columns = np.concatenate([torque_map @ regressor, pid, start], axis=2)
+    rate = low_pass(law.rate_weight * command_rate - velocity, law.filter_time, rate_hz)
+    pid = np.stack([command - angle, integral - angle_integral, rate], axis=2)
+    by_gains = law.reads * pid - law.lx_by * angle[:, :, None]
+    columns = np.concatenate([torque_map @ regressor, -by_gains, start], axis=2)
     slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
     edge = max(1, round(EDGE_FRACTION * count))
     slipping[:edge] = slipping[count - edge :] = False
@@ -131,6 +155,14 @@ def effective_command(commands: Array, scenario: Scenario) -> tuple[Array, Array
     felt = spline(np.clip(times - lag, 0.0, None))
     rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
     return felt, rate, running_integral(felt, rate_hz)
+
+
+def low_pass(samples: Array, time_constant: float, rate_hz: float) -> Array:
+    """Samples (N, ...) through a filter of first order (s; 0: none), which knows the first of them from before."""
+    if not time_constant:
+        return samples
+    half, rest = 0.5 / (rate_hz * time_constant), samples[:1]
+    return rest + lfilter([half, half], [1 + half, half - 1], samples - rest, axis=0)
 
 
 def running_integral(samples: Array, rate_hz: float) -> Array:

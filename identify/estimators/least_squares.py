@@ -71,11 +71,12 @@ def torque_equations(
     """Equations of poses (N, 6) and torques (N, n) of a run with its logged commands; those of the joints that slip, or
     of the ones given (N, n)."""
     timing, filtering = scenario.timing, scenario.filter
-    balance, found = joint_balance(run.robot, poses, run.logged, scenario)
+    layout, guess = run.robot.layout, run.robot.parameter_sets[scenario.model.start_parameters]
+    law = run.settings.drives.joint_law(guess.joint_pid)
+    balance, found = joint_balance(run.robot, poses, run.logged, scenario, law)
     rows = found if slipping is None else slipping
     columns = balance[rows]
     smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)[rows]
-    layout = run.robot.layout
     dynamic, others = layout.dynamic, slice(layout.dynamic.stop, None)
     matrix = np.zeros((2 * len(columns), columns.shape[1]))
     matrix[: len(columns), dynamic] = columns[:, dynamic]

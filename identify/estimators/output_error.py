@@ -9,7 +9,6 @@ from identify.errors import EstimationError
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
-from identify.estimation.prior import StartingGuess
 from identify.estimation.warm_start import REWEIGHTINGS, linear_warm_start
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.progress import SilentProgress
@@ -38,9 +37,10 @@ def known_pid(evidence: Evidence) -> Estimate:
         raise EstimationError("the gains of the joint PID are not known: this estimator needs lp, li and ld")
     guess = evidence.problem.guess
     values, std, gains = guess.values.copy(), guess.std.copy(), guess.layout.joint_pid
-    values[gains] = evidence.known_gains
-    std[gains] = KNOWN * np.abs(evidence.known_gains)
-    known = StartingGuess(guess.layout, values, std)
+    read = ~guess.fixed[gains]
+    values[gains] = np.where(read, evidence.known_gains, 0.0)
+    std[gains] = np.where(read, KNOWN * np.abs(evidence.known_gains), std[gains])
+    known = replace(guess, values=values, std=std)
     return _searched(evidence, replace(evidence.problem, guess=known), "closed_loop")
 
 

@@ -22,7 +22,8 @@ joint error that the PID needs for them,
 
     d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
 
-One period in the steady state counts for all, so the start of the run is left out.
+One period in the steady state counts for all, so the start of the run is left out, as are what the drives of a cascade
+have beside a PID's terms.
 """
 
 from dataclasses import dataclass
@@ -37,7 +38,7 @@ from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, simulate
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.estimation.prior import StartingGuess, starting_guess
+from identify.estimation.prior import StartingGuess, model_guess
 from identify.estimation.scale_anchor import MEASURED_PARAMETER, default_std
 from identify.excitation.criteria import Criterion, smoothing_of
 from identify.excitation.motion import Unknowns, log_determinant, regressor, sample_times, tracked_motion
@@ -66,7 +67,7 @@ class Knowledge:
 def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
     """The scenario's starting guess with its prior, anchor and sensor."""
     settings = scenario.identification
-    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
+    guess = model_guess(robot, scenario)
     prior = np.eye(len(robot.layout.names))
     anchor = settings.scale_anchor
     if anchor in MEASURED_PARAMETER:

@@ -14,6 +14,8 @@ import numpy as np
 import xarray as xr
 
 from dynamics import Robot
+from dynamics.closed_loop.drives import joint_law
+from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.experiment.truth import true_parameters
@@ -103,9 +105,12 @@ def measure_joints(
     at_encoder = "motor_angle" if "motor_angle" in truth else "joint_angle"
     angle, command = truth[at_encoder].values, record["command"].values
     known = true_parameters(truth)
-    gains = np.array([known[f"joint_pid.{name}"] for name in ("lp", "ld")])
+    gains = np.array([known[f"joint_pid.{name}"] for name in JOINT_PID])
+    law = joint_law(truth.attrs.get("plant_drive", "pid"), gains, truth.attrs.get("plant_derivative_filter_s"))
     each = np.full(len(command), timing.latency_s) if latencies is None else latencies
-    torque = frame_mean(truth["joint_torque"].values, command, angle[0], gains, timing, each)
+    sampled = truth["joint_torque"].values
+    at_jump = np.array([law.lp, 0.0 if law.filter_time else law.rate_weight * law.ld])
+    torque = frame_mean(sampled, command, law.held(sampled[0], angle[0])[0], at_jump, timing, each)
     torque = torque + instruments.torque_noise * rng.standard_normal(torque.shape)
     read = angle + instruments.encoder_noise * rng.standard_normal(angle.shape)
     step = instruments.encoder_resolution
@@ -118,16 +123,14 @@ def measure_joints(
     return channels.assign_attrs(instruments.figures)
 
 
-def frame_mean(
-    torque: Array, command: Array, start_angle: Array, gains: Array, timing: Timing, latencies: Array
-) -> Array:
+def frame_mean(torque: Array, command: Array, start: Array, gains: Array, timing: Timing, latencies: Array) -> Array:
     """Torque (N, n) averaged over one frame around each sample, from samples of a torque that jumps with each command.
 
-    The jump is lp dU + ld dU_dot, without lp dU where commands (N, n) ramp; before the first one the command is
-    `start_angle` (n,). gains: lp, ld; latencies (N,), s, of the frames' commands. A jump s before or after a sample is
+    The jump is lp dU + ld dU_dot, without lp dU where commands (N, n) ramp; before the first one the command is `start`
+    (n,). gains: lp, ld; latencies (N,), s, of the frames' commands. A jump s before or after a sample is
     in it or not, and in the mean over a frame T for T/2 - s: the difference is taken off the sample.
     """
-    issued = np.vstack([start_angle, start_angle, command])
+    issued = np.vstack([start, start, command])
     step = np.diff(issued, axis=0)
     jump = gains[1] * timing.frame_rate_hz * np.diff(step, axis=0)
     if timing.hold == "zero":

@@ -70,11 +70,12 @@ class Plant:
         """
         parameters = self.parameters if load is None else self.parameters + load
         settings = self._settings_at(parameters, reference.poses[0])
-        known, law = None if self.robot is self.nominal else self.nominal, law or LawInLoop(drives=settings.drives)
+        known, law = None if self.robot is self.nominal else self.nominal, law or LawInLoop()
+        settings = replace(settings, drives=replace(settings.drives, torques=law.drives.torques))
         asked: dict[str, Any] = {"feedforward": law.feedforward, "controller": law.controller}
         asked |= {"latencies": latencies, "servo_robot": known}
         try:
-            return simulate(self.robot, parameters, reference, replace(settings, drives=law.drives), sensor, **asked)
+            return simulate(self.robot, parameters, reference, settings, sensor, **asked)
         except LoopFailure as error:
             if law.controller is not None:
                 raise
@@ -94,7 +95,7 @@ class Plant:
             mismatch=self._mismatch(run),
             prismatic=self.robot.layout.prismatic,
         )
-        switches = self.scenario.plant.model_dump(exclude_none=True)
+        switches = self.scenario.plant.model_dump(exclude_none=True, exclude={"drive_gains"})  # parameters hold them
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 
     def _mismatch(self, run: ClosedLoopRun) -> dict[str, ArrayLike]:
@@ -135,10 +136,18 @@ def build_plant(
         scenario=scenario,
         nominal=known.robot,
         robot=true_robot(nominal, scenario, seed, known),
-        parameters=starting_guess(nominal, switches.parameters, 1.0).values,
+        parameters=true_parameters(nominal, switches),
         settings=settings,
         geometry_covariance=known.covariance,
     )
+
+
+def true_parameters(nominal: Robot, switches: PlantSwitches) -> Array:
+    """The true parameters (p,): of a named set, with the gains of the drives that the plant states."""
+    values, layout = starting_guess(nominal, switches.parameters, 1.0, drive=switches.drive).values, nominal.layout
+    for name, gain in switches.drive_gains.items():
+        values[layout.names.index(f"joint_pid.{name}")] = gain
+    return values
 
 
 def true_robot(nominal: Robot, scenario: Scenario, seed: int, known: KnownGeometry) -> Robot:

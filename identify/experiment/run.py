@@ -15,9 +15,11 @@ from cmmsim.drift_watch import DriftWatch
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, prepare
 from identify.arrays import Array
+from identify.estimation.prior import model_guess
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation.design import design_trajectories
 from identify.experiment.known_rig import known_rig
+from identify.experiment.law_in_loop import NamedMotion, Seen, prepared
 from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, sensor_file, with_renderer
 from identify.filtering import spline_derivatives, without_gaps
@@ -37,6 +39,7 @@ from identify.record import recording
 from identify.record.common_errors import CommonErrors, store_common_errors
 from identify.record.drift import store_finding
 from identify.record.geometry_errors import store_geometry_covariance
+from identify.record.law import SERVO, store_law
 from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
 from identify.scenario import Scenario
@@ -119,11 +122,11 @@ def excitation_run(
     payload: bool = False,
 ) -> Experiment:
     """Run the plant along the exciting trajectory, bare or under the scenario's load. Raises as `run_plant` does."""
-    duration_s = plant.scenario.excitation.duration_s
+    duration_s, law = plant.scenario.excitation.duration_s, plant.scenario.excitation.law
     if not payload:
-        return run_plant(plant, sensor, trajectory, duration_s, seed, 0, advance)
+        return run_plant(plant, sensor, trajectory, duration_s, seed, 0, advance, law=law)
     load = drawn_load(plant.robot.layout, plant.scenario, np.random.default_rng(stream_seed(seed, LOAD)))
-    return run_plant(plant, sensor, trajectory, duration_s, seed, PAYLOAD_RUN, advance, load)
+    return run_plant(plant, sensor, trajectory, duration_s, seed, PAYLOAD_RUN, advance, load, law)
 
 
 def run_plant(
@@ -135,10 +138,13 @@ def run_plant(
     run: int,
     advance: Advance = lambda n=1: None,
     load: PlatformLoad | None = None,
+    law: str = SERVO,
 ) -> Experiment:
-    """Run the plant along a trajectory; `run`: number of the run (0: excitation); `load`: what the platform carries.
+    """Run the plant along a trajectory; `run`: number of the run (0: excitation); `load`: what the platform carries;
+    `law`: under which it runs, with the scenario's starting model, and the load as stated.
 
-    Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
+    Raises TrajectoryError before the run when the trajectory leaves the travel, ScenarioError for a law that cannot be,
+    LoopFailure when the loop is unstable.
     """
     scenario, times = plant.scenario, plant.scenario.timing.frame_times(duration_s)
     check_travel(plant.nominal, trajectory, times, **scenario.excitation.singularity_limits)
@@ -148,8 +154,15 @@ def run_plant(
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
     latencies = _true_latencies(scenario, len(times), seed, run)
     true_load = None if load is None else load.true
-    done = plant.run(reference, RateSensor(eye.measure), latencies, true_load)
+    in_loop = None
+    if law != SERVO:
+        motion = NamedMotion("the trajectory", trajectory, duration_s)
+        model = model_guess(plant.nominal, scenario).values + (0.0 if load is None else load.stated)
+        in_loop = prepared(plant, law, model, motion, Seen(eye.measure, eye.covariances.__getitem__), latencies)
+    done = plant.run(reference, RateSensor(eye.measure), latencies, true_load, in_loop)
     record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
+    if in_loop is not None:
+        store_law(record, law, in_loop.drives)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
     if not scenario.rig.exact and isinstance(sensor, cmmsim.Sensor) and done.measured_ok.any():

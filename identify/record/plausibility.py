@@ -28,16 +28,19 @@ OTHER_UNITS = {"mm": (1e-3, 1.0), "degrees": (1.0, np.pi / 180), "mm and degrees
 """Factors of positions and of angles from units in which records come by mistake."""
 
 
-def check_plausible(robot: Robot, reference: Reference, measured: Array, ok: NDArray[np.bool_], logged: Array) -> None:
+def check_plausible(
+    robot: Robot, reference: Reference, measured: Array, ok: NDArray[np.bool_], logged: Array | None
+) -> None:
     """Refuse a record that does not begin at rest, or is in other units or frames than the robot.
 
-    measured: poses (N, 6), NaN where lost; ok (N,); logged: commands (N, n).
+    measured: poses (N, 6), NaN where lost; ok (N,); logged: joint commands (N, n), if any.
     Raises EstimationError, with the frame, what was found, and units in which it would fit.
     """
     _check_reach(robot, reference.poses)
     _check_rest(reference)
     _check_measured(reference, measured, ok)
-    _check_commands(robot, reference, logged)
+    if logged is not None:
+        _check_commands(robot, reference, logged)
 
 
 def _check_reach(robot: Robot, poses: Array) -> None:

@@ -26,6 +26,7 @@ from identify.record.checks import (
 )
 from identify.record.common_errors import NONE, CommonErrors, Marginal, read_common_errors
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
+from identify.record.law import takes_torques
 from identify.record.payload import recorded_payload
 from identify.record.plausibility import check_plausible
 from identify.record.recording import poses
@@ -123,6 +124,13 @@ class RecordedRun:
         return np.concatenate([modes, by_geometry], axis=2)
 
     @property
+    def latency_s(self) -> float | None:
+        """Latency of the model's commands, with the common error that it has of that; None: that of its timing."""
+        if self.drawn is None or not self.common.latency_std:
+            return None
+        return max(self.settings.timing.latency_s + self.common.latency_std * float(self.drawn[-1]), 0.0)
+
+    @property
     def errors_had(self) -> Array:
         """Common errors (k,) that the model has, of those that its loop can have: of the poses, and the latency's."""
         count = len(self.common.names) + bool(self.common.latency_std)
@@ -140,9 +148,7 @@ class RecordedRun:
         error = noise
         if self.drawn is not None and self.common.names and not self.driven:
             error = self.common.modes @ self.drawn[: len(self.common.names)] + (0.0 if noise is None else noise)
-        latency_s = None
-        if self.drawn is not None and self.common.latency_std:
-            latency_s = max(self.settings.timing.latency_s + self.common.latency_std * float(self.drawn[-1]), 0.0)
+        latency_s = self.latency_s
         return simulate(
             robot or self.robot,
             parameters + self.payload,
@@ -163,6 +169,11 @@ class RecordedRun:
     def misses(self, parameters: Array) -> Array:
         """Whitened pose residuals model - measurement (n, 6) of the good frames. Raises LoopFailure."""
         return self._missed(self.simulate(parameters))
+
+    def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
+        """`misses` (n, 6) of a model driven by the logged commands, which are white if it is right; rng: for what a fit
+        to the poses themselves has taken out of them. Raises LoopFailure."""
+        return self.misses(parameters)
 
     def residuals(self, parameters: Array) -> tuple[Array, Array]:
         """`misses` (n, 6), and their Jacobian (n, 6, p)."""
@@ -229,7 +240,8 @@ def recorded_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Record
     run = _run(record, robot, scenario)
     check_reference(run.reference, scenario)
     check_channels(robot.geometry.chart, run.measured, run.logged, run.ok)
-    check_plausible(robot, run.reference, run.measured, run.ok, run.logged)
+    joint_commands = None if run.settings.drives.torques else run.logged
+    check_plausible(robot, run.reference, run.measured, run.ok, joint_commands)
     return run
 
 
@@ -266,7 +278,12 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
         payload=load,
         payload_std=load_std,
     )
-    return replace(run, common=_common_errors(record, scenario, run))
+    run = replace(run, common=_common_errors(record, scenario, run))
+    if not takes_torques(record):
+        return run
+    from identify.record.torque_run import torque_run  # stands on this file
+
+    return torque_run(run, scenario)
 
 
 def _common_errors(record: xr.Dataset, scenario: Scenario, run: RecordedRun) -> CommonErrors:

@@ -40,6 +40,8 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
     anchor = identification["scale_anchor"]
     said, gain = ANCHORS.get(anchor, anchor), identification["parameters"].get("joint_pid.lp", {})
     share = gain.get("prior_share") or 0.0
+    if not identification.get("drive", {}).get("in_loop", True):
+        return "The overall scale is that of the torques that were commanded."
     if anchor == "prior" or share <= RESTS_ON_PRIOR:
         return f"The overall scale is fixed by {said}."
     return (
@@ -87,6 +89,38 @@ def correlation_table(result: dict[str, Any]) -> Table:
     )
 
 
+DRIVES = {
+    "pid": "a PID",
+    "pd": "a PD: no integral",
+    "pi": "a PI: no derivative",
+    "cascade": "a P-PI cascade, position around velocity",
+    "pid_filtered": "a PID whose rate is filtered",
+}
+"""Laws of the drives in words."""
+
+
+def drive_sentence(identification: Mapping[str, Any]) -> str:
+    """What law the drives have, and how that is known; nothing of the usual one that nobody asked about."""
+    drive = identification.get("drive")
+    if drive is not None and not drive.get("in_loop", True):
+        return "The drives took torques: the record says nothing of the law by which they follow joint commands."
+    if drive is None or (drive["decided_by"] == "scenario" and drive["law"] == "pid"):
+        return ""
+    said = f"The law of the drives is {DRIVES[drive['law']]}"
+    if drive["decided_by"] == "scenario":
+        said += ", as the scenario states."
+    else:
+        others = {name: p for name, p in drive["probabilities"].items() if name != drive["law"] and p >= 0.001}
+        rest = ", ".join(f"{name} {100 * p:.2g} %" for name, p in others.items()) or "no other above 0.1 %"
+        known = "the record tells" if drive["sure"] else "the record cannot tell: this is the most probable"
+        said += f"; {known} (probability {100 * drive['probabilities'][drive['law']]:.3g} %; {rest})."
+    own = ", ".join(
+        f"{name} = {with_deviation(one['estimate'], one['std'])} {one['unit']}"
+        for name, one in drive.get("gains", {}).items()
+    )
+    return f"{said} As such drives name them its gains are {own}." if own else said
+
+
 def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
     """Why parameters are not identified, in a sentence each, with the names of those that it is true of."""
     parameters, groups = identification["parameters"], identification.get("groups", {}).values()
@@ -95,14 +129,19 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
     left = [name for name, p in parameters.items() if not p["identifiable"]]
     if left and len(left) == len(parameters):
         return [("the model does not explain the record, so that no estimate can be trusted", left)]
-    shown = alone | {name for name in parameters if name.startswith("joint_pid.")}
+    fixed = set(identification.get("drive", {}).get("fixed_at_zero", ()))
+    shown = (alone | {name for name in parameters if name.startswith("joint_pid.")}) - fixed
+    outside = set() if identification.get("drive", {}).get("in_loop", True) else shown - alone
+    shown -= outside
     kinds = {
+        "the law of the drives has no such gain": [name for name in left if name in fixed],
+        "the drives took torques, and these gains had no part in the run": [name for name in left if name in outside],
         "motion shows them only in sums with others, and not one by one; the sums are what is known": [
             name for name in left if name in summed
         ],
         "this record shows them too badly. It neither halves what the starting value left open, nor leaves less than "
         "half of their size in doubt. More or faster motion may show them": [n for n in left if n in shown],
-        "no motion of this robot depends on them": [name for name in left if name not in summed | shown],
+        "no motion of this robot depends on them": [n for n in left if n not in summed | shown | fixed | outside],
     }
     return [(reason, names) for reason, names in kinds.items() if names]
 

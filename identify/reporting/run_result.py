@@ -11,7 +11,7 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import rms_figures
-from identify.loop_parameters import parameter_column, parameter_entries
+from identify.loop_parameters import parameter_column, parameter_entries, settled_drive
 from identify.record import recording
 from identify.validation.unseen import PosePrediction
 
@@ -31,7 +31,7 @@ def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) 
     """
     values = parameter_column(identification, column, robot.layout.names)
     try:
-        return checked_loop_parameters(robot, values)
+        return checked_loop_parameters(robot, values, settled_drive(identification))
     except DynamicsError as error:
         raise RecordError(f"{column}: {error}") from None
 

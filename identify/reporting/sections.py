@@ -88,6 +88,7 @@ def parameter_section(data: RunData) -> Section:
         + " Identified means that it at least halves what the starting value left open, and leaves less than half of "
         "the quantity in doubt.",
         parameter_tables.scale_sentence(found),
+        *filter(None, [parameter_tables.drive_sentence(found)]),
         *_prior_text(found),
         *_conditioning_text(found.get("conditioning")),
     ]

@@ -1,7 +1,7 @@
 """The sections of a scenario. Each field states its unit and its limits; what a section checks concerns it alone."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -45,6 +45,32 @@ FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
 }
 """The constants each law needs, one key of each; it takes no others."""
 
+DriveName = Literal["pid", "pd", "pi", "cascade", "pid_filtered"]
+"""Laws by which drives make torques of joint commands: the paper's PID, parts of it, P-PI, or with a filtered rate; see
+`closed_loop.drives`."""
+
+FILTERED: DriveName = "pid_filtered"
+
+AUTO = "auto"
+
+
+def check_filter(drive: str, seconds: float | None) -> None:
+    """Raise ValueError for a drive without its filter, or a filter that belongs to another."""
+    if (drive == FILTERED) != (seconds is not None):
+        raise ValueError(
+            f"drive = {drive!r} with derivative_filter_s = {seconds}: the law {FILTERED} needs it, and no other has it"
+        )
+
+
+DRIVE_GAINS: dict[str, tuple[str, ...]] = {
+    "pid": ("lp", "li", "ld"),
+    "pd": ("lp", "ld"),
+    "pi": ("lp", "li"),
+    "cascade": ("lp", "li", "ld"),
+    "pid_filtered": ("lp", "li", "ld"),
+}
+"""Gains that each of them reads."""
+
 ACTUATOR_KEYS = {
     "smoothing_velocity": ("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),
     "stribeck_velocity": ("stribeck_velocity_rad_s", "stribeck_velocity_m_s"),
@@ -81,7 +107,8 @@ class Servo(Section):
 
 
 class Control(Section):
-    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the law pid."""
+    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the law pid, but for
+    the excitation, which has a key of its own. The torque limit is that of all runs, and the model knows it."""
 
     law: str = Field("pid", description=f"{', '.join(LAWS)}, or module:function")
     observer: bool = Field(
@@ -137,6 +164,11 @@ class Plant(_Friction):
     """
 
     parameters: str = Field("identified", description="named parameter set of the robot file, the truth")
+    drive: DriveName = Field("pid", description="law of the drives: the paper's PID, PD, PI, P-PI, or a filtered PID")
+    derivative_filter_s: float | None = quantity(None, "s", "time constant of the drive pid_filtered", gt=0, le=1)
+    drive_gains: dict[str, float] = Field(
+        {}, description="of the drives, instead of the set's: { lp = 10.5, li = 30.0, ld = 0.3 }, in the units of these"
+    )
     steps_per_frame: int = quantity(16, "1", "integration steps a frame; elastic joints take more", ge=1, le=10_000)
     geometry_error_m: float = quantity(
         0.0, "m", "standard deviation of each coordinate of the joint centres from the robot file's", ge=0, le=1e-3
@@ -157,12 +189,50 @@ class Plant(_Friction):
     motor_inertia_kg_m2: float = quantity(3e-4, "kg m2", "share of a driven body's inertia before that spring", gt=0)
     motor_mass_kg: float = quantity(0.3, "kg", "share of its mass, where actuators slide", gt=0)
 
+    @property
+    def drive_law(self) -> DriveName:
+        """Law of the drives."""
+        return self.drive
+
+    @model_validator(mode="after")
+    def _gains_are_those_of_the_law(self) -> "Plant":
+        check_filter(self.drive, self.derivative_filter_s)
+        reads = DRIVE_GAINS[self.drive]
+        for name, value in self.drive_gains.items():
+            if name not in reads or not value > 0:
+                raise ValueError(
+                    f"drive_gains.{name} = {value:g}: the law {self.drive} has the gains {', '.join(reads)}, all > 0"
+                )
+        return self
+
 
 class Model(_Friction):
     """The estimator's model of the robot."""
 
     start_parameters: str = Field("initial", description="named parameter set of the robot file, the starting guess")
+    drive: Literal["pid", "pd", "pi", "cascade", "pid_filtered", "auto"] = Field(
+        "pid", description="law of the drives; auto: that for which the record speaks"
+    )
+    derivative_filter_s: float | None = quantity(
+        None, "s", "time constant of the drive pid_filtered, which auto considers where it is stated", gt=0, le=1
+    )
     steps_per_frame: int = quantity(4, "1", "integration steps a frame", ge=1, le=10_000)
+
+    @property
+    def drive_law(self) -> DriveName:
+        """Law of the drives; where the record is to tell, that of the paper until it has."""
+        return "pid" if self.drive == "auto" else self.drive
+
+    @property
+    def drives_considered(self) -> tuple[DriveName, ...]:
+        """Laws of the drives that `auto` chooses between."""
+        return tuple(law for law in get_args(DriveName) if law != FILTERED or self.derivative_filter_s)
+
+    @model_validator(mode="after")
+    def _filter_fits_the_law(self) -> "Model":
+        if self.drive != AUTO:
+            check_filter(self.drive, self.derivative_filter_s)
+        return self
 
 
 class Excitation(Section):
@@ -189,6 +259,11 @@ class Excitation(Section):
     max_joint_velocity_m_s: float = quantity(0.2, "m/s", "the same, where actuators slide", gt=0)
     least_leverage: float = quantity(0.05, "1", "least leverage of an actuator on its leg (J_a1)", ge=0, lt=1)
     most_condition: float = quantity(20.0, "1", "largest condition number of J_a2 without unit, of the 2-norm", ge=1)
+    law: str = Field(
+        "pid",
+        description=f"law of the run, which knows the starting model: {', '.join(LAWS)}, or module:function; under "
+        "another than pid the model gets the logged commands",
+    )
     generations: int = quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)
 
     @property
@@ -201,6 +276,12 @@ class Excitation(Section):
     def _can_be_found(cls, criterion: str) -> str:
         check_choice(criterion, "criterion", CRITERIA, ValueError)
         return criterion
+
+    @field_validator("law")
+    @classmethod
+    def _law_can_be_found(cls, law: str) -> str:
+        check_choice(law, "law", LAWS, ValueError)
+        return law
 
 
 class Filter(Section):

@@ -12,27 +12,18 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot
-from dynamics.control.inverse_dynamics import Motion
 from dynamics.errors import DynamicsError
 from dynamics.kinematics.chart import POSE_NAMES, Chart
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.design import unseen_trajectories
+from identify.experiment.law_in_loop import NamedMotion
 from identify.scenario import Scenario
 from identify.trajectory import box_of
 
 COLUMNS = ("t", *POSE_NAMES)
 FEWEST_ROWS = 6
 """That a spline of fifth degree needs."""
-
-
-@dataclass(frozen=True)
-class NamedMotion:
-    """A motion, how it is called, and how long it takes, s."""
-
-    name: str
-    motion: Motion
-    duration_s: float
 
 
 @dataclass(frozen=True)

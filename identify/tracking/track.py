@@ -8,23 +8,25 @@ from typing import Any
 import numpy as np
 
 import cmmsim
+from dynamics.closed_loop import DriveName
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify
 from identify.estimation.prior import starting_guess
 from identify.excitation.design import design_trajectories
+from identify.experiment.law_in_loop import NamedMotion, Seen, prepared
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor
 from identify.experiment.sensor_in_loop import SensorInLoop, with_renderer
 from identify.files.run_folder import RunFolder, load_result, rms_figures
 from identify.files.versions import versions
-from identify.loop_parameters import parameter_column
+from identify.loop_parameters import parameter_column, settled_drive
 from identify.progress import Progress
 from identify.random_streams import LATENCY, NOISE, TRACKED, child, stream_seed
 from identify.scenario import Scenario, load_scenario
-from identify.tracking.following import Seen, by_drawing, by_images, follow, prepared
-from identify.tracking.motions import NamedMotion, motions
+from identify.tracking.following import by_drawing, by_images, follow
+from identify.tracking.motions import motions
 
 MODELS = ("initial", "identified", "true")
 """The scenario's starting model, the identified one, and the plant's parameters."""
@@ -37,13 +39,21 @@ EXACT = ("sensor", "model", "latency")
 
 
 @dataclass(frozen=True)
+class KnownModel:
+    """Parameters (p,) of a model, and the law of its drives."""
+
+    parameters: Array
+    drive: DriveName
+
+
+@dataclass(frozen=True)
 class Tracking:
-    """What is followed how: all laws with all models (p,) by name on all motions."""
+    """What is followed how: all laws with all models by name on all motions."""
 
     plant: Plant
     sensor: cmmsim.Sensor
     motions: Sequence[NamedMotion]
-    models: dict[str, Array]
+    models: dict[str, KnownModel]
     laws: Sequence[str]
     seed: int
 
@@ -65,11 +75,11 @@ def track(
     scenario = with_renderer(scenario)
     plant = build_plant(scenario)
     followed = motions(plant.nominal, scenario, seed, own)
-    known = {name: model_parameters(plant, name, run_folder) for name in models if name != "identified" or run_folder}
+    known = {name: known_model(plant, name, run_folder) for name in models if name != "identified" or run_folder}
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
     for law in laws:  # refused before the sensor is taught
         for motion in followed:
-            prepared(plant, law, plant.parameters, motion, unseen)
+            prepared(plant, law, plant.parameters, motion, unseen, drive=scenario.plant.drive)
     sensor = taught_sensor(scenario, plant.nominal, seed, progress)
     if "identified" in models and not run_folder:
         known["identified"] = _identified(plant, sensor, seed, progress)
@@ -87,16 +97,17 @@ def track(
     }
 
 
-def model_parameters(plant: Plant, model: str, run_folder: Path | None) -> Array:
-    """Parameters (p,) of a model by its name in `MODELS`; the identified ones are those of a folder of a run.
+def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel:
+    """A model by its name in `MODELS`; the identified one is that of a folder of a run.
 
     Raises RecordError: no result with estimates in the folder, or a run of another robot.
     """
-    robot = plant.nominal
+    robot, scenario = plant.nominal, plant.scenario
     if model == "true":
-        return plant.parameters
+        return KnownModel(plant.parameters, scenario.plant.drive)
     if model == "initial":
-        return starting_guess(robot, plant.scenario.model.start_parameters, 1.0).values
+        law = scenario.model.drive_law
+        return KnownModel(starting_guess(robot, scenario.model.start_parameters, 1.0, drive=law).values, law)
     assert run_folder is not None
     path, own = run_folder / "result.json", plant.scenario.robot
     RunFolder(run_folder).require("scenario.toml", "result.json")
@@ -104,21 +115,23 @@ def model_parameters(plant: Plant, model: str, run_folder: Path | None) -> Array
     if other != own:
         raise RecordError(f"{run_folder} holds a run of {other}, not of {own}")
     try:
-        column = parameter_column(load_result(path).get("identification"), "estimate", robot.layout.names)
+        identification = load_result(path).get("identification")
+        column = parameter_column(identification, "estimate", robot.layout.names)
+        return KnownModel(np.array(column), settled_drive(identification))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
-    return np.array(column)
 
 
-def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progress) -> Array:
-    """Estimates (p,) from the scenario's excitation, which runs under the law pid."""
+def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progress) -> KnownModel:
+    """The model from the scenario's excitation, which runs under the law pid."""
     scenario = plant.scenario
     if scenario.identification.scale_anchor == "payload":
         raise ScenarioError("identification.scale_anchor = payload needs two runs: identify first, and pass --run DIR")
     trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
     with progress.stage("record", scenario.timing.frames(scenario.excitation.duration_s)) as advance:
         experiment = excitation_run(plant, sensor, trajectories.excitation, seed, advance)
-    return identify(experiment.record, plant.nominal, scenario, progress).estimate
+    found = identify(experiment.record, plant.nominal, scenario, progress)
+    return KnownModel(found.estimate, found.drive.law)
 
 
 def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
@@ -141,7 +154,7 @@ def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
 
 def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]:
     """One law with one model on all motions."""
-    robot, parameters = task.plant.robot, task.models[model]
+    robot, known = task.plant.robot, task.models[model]
     errors, rows, effort, normalised, covariances, lost = [], [], [], [], [], 0
     free = robot.geometry.chart.basis
     common = free.T @ task.sensor.taught.calibration_covariance(robot.home_pose) @ free
@@ -150,7 +163,7 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
         eye = SensorInLoop(task.sensor, robot, stream_seed(task.seed, NOISE, FIRST_RUN + number), advance)
         seen = by_images(eye)
         try:
-            done = follow(task.plant, law, parameters, motion, seen, latencies)
+            done = follow(task.plant, law, known.parameters, motion, seen, latencies, known.drive)
         except DynamicsError as error:
             return {"failed": f"{motion.name}: {error}"} | rms_figures(np.full((1, 6), np.nan))
         errors.append(done.errors)
@@ -168,25 +181,25 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
         "saturated_frames": sum(row["saturated_frames"] for row in rows),
         "lost_frames": lost,
         "observer_normalised_error": float(np.mean(normalised)) if normalised else None,
-        "shares": _shares(task, law, parameters, np.mean(covariances, axis=0)),
+        "shares": _shares(task, law, known, np.mean(covariances, axis=0)),
         "motions": rows,
     }
 
 
-def _shares(task: Tracking, law: str, parameters: Array, covariance: Array) -> dict[str, Any]:
+def _shares(task: Tracking, law: str, known: KnownModel, covariance: Array) -> dict[str, Any]:
     """Shares of the squared error that go when sensor, model or latency is made exact, of positions and orientations;
     by runs whose poses are drawn with the noise that the sensor stated."""
-    base = _drawn(task, law, parameters, covariance, None)
+    base = _drawn(task, law, known, covariance, None)
     shares = {}
     for what in EXACT:
-        exact = _drawn(task, law, parameters, covariance, what)
+        exact = _drawn(task, law, known, covariance, what)
         with np.errstate(invalid="ignore", divide="ignore"):
             left = [np.nansum(exact[part]) / np.nansum(base[part]) for part in (slice(0, 3), slice(3, 6))]
         shares[what] = dict(zip(("position", "orientation"), (1 - np.array(left)).tolist(), strict=True))
     return shares
 
 
-def _drawn(task: Tracking, law: str, parameters: Array, covariance: Array, exact: str | None) -> Array:
+def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact: str | None) -> Array:
     """Mean squared errors (6,) over all motions, with one thing exact."""
     plant = task.plant
     if exact == "latency":
@@ -197,10 +210,11 @@ def _drawn(task: Tracking, law: str, parameters: Array, covariance: Array, exact
         rng = np.random.default_rng(child(task.seed, TRACKED, number))
         lost = rng.random(plant.scenario.timing.frames(motion.duration_s)) < dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")
-        known = plant.parameters if exact == "model" else parameters
+        known = known_model(plant, "true", None) if exact == "model" else model
         latencies = None if exact == "latency" else _latencies(task, number, motion)
         try:
-            squares.append(follow(plant, law, known, motion, seen, latencies).errors ** 2)
+            done = follow(plant, law, known.parameters, motion, seen, latencies, known.drive)
+            squares.append(done.errors**2)
         except DynamicsError:
             return np.full(6, np.nan)
     return np.asarray(np.concatenate(squares).mean(axis=0))

@@ -30,13 +30,16 @@ from identify.estimators.estimator import Estimate, Estimator, Evidence, joint_c
 from identify.experiment.joint_instruments import JointInstruments, measure_joints, read_channels
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
 from identify.files.dataset import write_groups
-from identify.files.run_folder import rms_figures, rms_row
+from identify.files.run_folder import load_result, rms_figures, rms_row
+from identify.loop_parameters import settled_drive, with_drive
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
 from identify.record.known_geometry import known_geometry
+from identify.record.law import takes_torques
 from identify.record.provenance import RunFiles
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, load_scenario
+from identify.scenario.sections import AUTO
 from identify.validation.unseen import model_run
 
 START = "starting guess"
@@ -109,6 +112,13 @@ def compare_on_run(
     """
     folder, record = files.folder, files.experiment
     scenario, truth = load_scenario(folder.scenario), read_truth(folder.experiment)
+    if takes_torques(record):
+        raise EstimationError(
+            "the commands of this record are torques, and the estimators compared need joint commands: record the "
+            "excitation under excitation.law = pid or feedforward"
+        )
+    if scenario.model.drive == AUTO:
+        scenario = with_drive(scenario, settled_drive(load_result(folder.result).get("identification")))
     robot, channels = known_geometry(scenario, folder.path).robot, folder.path / "instruments.nc"
     write_groups(channels, {"": instrumented(record, truth, scenario, instruments, seed)})
     unseen = zip(files.validation, read_truth_runs(folder.validation), strict=True)
@@ -184,7 +194,8 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
         nothing = (np.nan, np.nan, np.nan, np.nan, np.nan, np.nan)
         return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
     pid = asked.robot.layout.joint_pid
-    groups, gains = asked.group_errors(found.parameters), found.parameters[pid] / asked.true[pid] - 1
+    groups, read = asked.group_errors(found.parameters), np.flatnonzero(asked.true[pid]) + pid.start
+    gains = found.parameters[read] / asked.true[read] - 1
     distances = (_rms(groups), float(np.median(np.abs(groups))), _rms(gains), *asked.pose_distance(found.parameters))
     return Score(name, estimator.title, estimator.uses, *distances, **vars(found), names=asked.robot.layout.names)
 

@@ -30,7 +30,8 @@ from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
 from identify.record.known_geometry import KnownGeometry
-from identify.record.recorded_run import RecordedRun, watched_run
+from identify.record.law import SERVO, recorded_law
+from identify.record.recorded_run import RecordedRun, recorded_reference, watched_run
 from identify.runtime import cores
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
@@ -78,6 +79,18 @@ def model_run(robot: Robot, scenario: Scenario, parameters: Array, reference: Re
         return simulate(robot, parameters, reference, model_settings(robot, scenario)).pose
     except LoopFailure:
         return np.full_like(reference.poses, np.nan)
+
+
+def model_on_record(robot: Robot, scenario: Scenario, parameters: Array, record: xr.Dataset) -> Array:
+    """Poses (N, 6) of the model on the motion of a record: in the servo's loop where that made the record, and under
+    the logged commands where another law did; NaN throughout where it is unstable. Raises as `model_run`."""
+    if recorded_law(record) == SERVO:
+        return model_run(robot, scenario, parameters, recorded_reference(record))
+    run = watched_run(record, robot, scenario).driven_by_commands()
+    try:
+        return run.model_poses(parameters)
+    except LoopFailure:
+        return np.full_like(run.measured, np.nan)
 
 
 REPETITIONS = 4
@@ -228,7 +241,8 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     Raises dynamics.DynamicsError: parameters of another shape, not finite, or outside their range. Raises
     TrajectoryError: no unseen trajectory keeps the robot's limits.
     """
-    values, plant = checked_loop_parameters(robot, parameters), build_plant(scenario, robot, seed)
+    values = checked_loop_parameters(robot, parameters, scenario.model.drive_law)
+    plant = build_plant(scenario, robot, seed)
     times = scenario.timing.frame_times(scenario.validation.duration_s)
     references = [path.reference(times) for path in unseen_trajectories(robot, scenario, seed)]
     model = [model_run(robot, scenario, values, reference) for reference in references]

@@ -19,11 +19,11 @@ from dynamics.errors import DynamicsError, SimulationError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
+from identify.experiment.law_in_loop import feedback
 from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distances, sensor_file
 from identify.loop_parameters import model_settings
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Excitation, Scenario
-from identify.tracking.following import feedback
 
 SAMPLES = 2000
 """Joint coordinates over the travel."""

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import dynamics
 from dynamics import closed_loop
+from dynamics.closed_loop.drives import PID
 from dynamics.geometry import RobotGeometry
 
 BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
@@ -172,6 +173,7 @@ class Loop:
         steps: int = 4,
         friction: closed_loop.FrictionLaw | None = None,
         elasticity: closed_loop.JointElasticity | None = None,
+        drives: closed_loop.Drives = PID,
     ) -> closed_loop.LoopSettings:
         """The paper's servo gains; 60 Hz, no delay, zero hold, exact friction unless told otherwise."""
         name = "smoothed" if smoothing_velocity else "coulomb_viscous"
@@ -181,6 +183,7 @@ class Loop:
             friction or closed_loop.FrictionLaw(name, smoothing_velocity),
             steps,
             elasticity,
+            drives,
         )
 
     def run(

@@ -5,21 +5,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynamics.closed_loop import FrameTiming, LoopFailure, LoopSettings, ServoGains, equilibrium, stability
+from dynamics.closed_loop import Drives, FrameTiming, LoopFailure, LoopSettings, ServoGains, equilibrium, stability
+from dynamics.closed_loop.drives import DRIVES
 from tests.dynamics.conftest import at_rest
 
 PERIOD = 1 / 60
 SERVO = ServoGains(0.3, 0.001, 2.4)
 
 
-@pytest.mark.parametrize("hold", ["zero", "linear"])
-@pytest.mark.parametrize("latency", [0.0, 0.004, PERIOD, 2.7 * PERIOD])
-def test_small_deviations_follow_the_map_from_frame_to_frame(loop, hold, latency):
+@pytest.mark.parametrize(
+    ("hold", "latency", "law"),
+    [
+        *((hold, latency, "pid") for hold in ("zero", "linear") for latency in (0.0, 0.004, PERIOD, 2.7 * PERIOD)),
+        *(("linear", 0.004, law) for law in DRIVES[1:-1]),
+        pytest.param("linear", 0.004, DRIVES[-1], marks=pytest.mark.thorough),
+    ],
+)
+def test_small_deviations_follow_the_map_from_frame_to_frame(loop, hold, latency, law):
     """Half a second from a pose 1e-6 off, without dry friction: nothing but the square of the deviation is missing."""
     robot, values, frames, off = loop.robot, loop.parameters.copy(), 30, 1e-6
     values[robot.layout.coulomb] = 0.0
-    settings = LoopSettings(SERVO, FrameTiming(60.0, latency, hold), steps_per_frame=20)
-    start, direction = equilibrium(robot, values, robot.home_pose, SERVO), np.random.default_rng(0).standard_normal(6)
+    drives = Drives(law=law, filter_time=0.008 if law == "pid_filtered" else None)
+    settings = LoopSettings(SERVO, FrameTiming(60.0, latency, hold), steps_per_frame=20, drives=drives)
+    start = equilibrium(robot, values, robot.home_pose, SERVO, drives=drives)
+    direction = np.random.default_rng(0).standard_normal(6)
     starts = [start, replace(start, pose=start.pose + off * direction)]
     still, moved = (loop.run(at_rest(start.pose, frames), settings, values, start=each).pose for each in starts)
     one_frame = stability.frame_map(robot, values, settings, robot.home_pose)

@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import LoopFailure, equilibrium, simulate
+from dynamics.closed_loop.drives import joint_law
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.chart import Chart
 from dynamics.robot_file import ParameterSet, RobotDescription
@@ -140,7 +141,8 @@ def test_the_warm_starts_equation_holds_for_the_true_parameters(robot):
     scenario, layout, parameters = quick(), robot.layout, truth_of(robot)
     parameters[layout.coulomb] = 0.0
     _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters, robot=robot)
-    columns, slipping = joint_balance(robot, run.pose, run.command, scenario)
+    law = joint_law("pid", parameters[layout.joint_pid])
+    columns, slipping = joint_balance(robot, run.pose, run.command, scenario, law)
     columns, pid = columns[slipping], layout.joint_pid
     start = equilibrium(robot, parameters, run.pose[0], build_plant(scenario, robot).settings.servo)
     balance = columns @ np.concatenate([parameters, start.joint_integral * parameters[pid][1]])

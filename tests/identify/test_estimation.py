@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dynamics.closed_loop import LoopFailure, equilibrium, simulate
+from dynamics.closed_loop.drives import joint_law
 from dynamics.errors import ParameterError
 from identify.errors import EstimationError
 from identify.estimation.covariance import correlation_matrix, estimate_uncertainty
@@ -71,7 +72,8 @@ def test_warm_start_equation_holds_for_the_true_parameters(scenario):
     parameters = truth()
     parameters[52:58] = 0
     _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters)
-    columns, slipping = joint_balance(rss6(), run.pose, run.command, scenario)
+    law = joint_law("pid", parameters[64:])
+    columns, slipping = joint_balance(rss6(), run.pose, run.command, scenario, law)
     columns = columns[slipping]
     start = equilibrium(rss6(), parameters, run.pose[0], build_plant(scenario, rss6()).settings.servo)
     unknowns = np.concatenate([parameters, start.joint_integral * parameters[65]])

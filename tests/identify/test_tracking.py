@@ -9,13 +9,14 @@ from dynamics import load_robot
 from dynamics.control.law import LawInLoop
 from dynamics.errors import SimulationError
 from identify.errors import RecordError, ScenarioError, TrajectoryError
+from identify.experiment.law_in_loop import NamedMotion, prepared
 from identify.experiment.plant import build_plant
 from identify.files.run_folder import RunFolder, save_result
 from identify.scenario import load_scenario
 from identify.studies.rows.sensor import DrawnSensor
 from identify.tracking import track as tracking
-from identify.tracking.following import by_drawing, follow, prepared
-from identify.tracking.motions import NamedMotion, circle, read_motion, square
+from identify.tracking.following import by_drawing, follow
+from identify.tracking.motions import circle, read_motion, square
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import SIGMA, rss6, trajectory
 
@@ -185,9 +186,9 @@ def test_the_identified_model_is_that_of_a_run(tmp_path):
     run.scenario.write_text(chosen.scenario.to_toml())
     estimates = {name: {"estimate": float(k)} for k, name in enumerate(rss6().layout.names)}
     save_result(run.result, {"identification": {"parameters": estimates}})
-    known = tracking.model_parameters(chosen, "identified", tmp_path)
+    known = tracking.known_model(chosen, "identified", tmp_path).parameters
     assert np.array_equal(known, np.arange(len(estimates)))
-    said = refusal(RecordError, tracking.model_parameters, plant(robot="rus6"), "identified", tmp_path)
+    said = refusal(RecordError, tracking.known_model, plant(robot="rus6"), "identified", tmp_path)
     assert "holds a run of rss6, not of rus6" in said
 
 

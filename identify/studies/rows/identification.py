@@ -24,7 +24,7 @@ from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor
 from identify.experiment.truth import true_poses
-from identify.loop_parameters import model_settings
+from identify.loop_parameters import model_settings, with_drive
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.record.recorded_run import recorded_reference
@@ -159,13 +159,15 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
     made = recorded(scenario, seed, options)
     plant, unseen = made.plant, made.unseen
     result = identify_record(made.records, plant.nominal, scenario)
+    plant = replace(plant, scenario=with_drive(scenario, result.drive.law))
     row = _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
     row |= _unseen_figures(result, plant, unseen) | coverage(result, plant, unseen, made.number)
     if not options.unaware:
         return row
     unaware = scenario.with_overrides({"identification.nuisances": []})
     result = identify_record(made.records, plant.nominal, unaware)
-    covered = coverage(result, replace(plant, scenario=unaware), unseen, made.number)
+    plant = replace(plant, scenario=with_drive(unaware, result.drive.law))
+    covered = coverage(result, plant, unseen, made.number)
     return row | {f"unaware_{name}": value for name, value in covered.items()}
 
 
@@ -196,7 +198,8 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     row: Row = {}
     for figure, values in (("std", result.std), ("error", result.estimate - truth)):
         for name, (_, members) in CHOSEN.items():
-            index = getattr(result.layout, members)
+            index = np.arange(len(truth))[getattr(result.layout, members)]
+            index = index[truth[index] != 0]  # drives may lack a gain
             row[f"{name}_{figure}_percent"] = 100.0 * float(np.sqrt(np.mean((values[index] / truth[index]) ** 2)))
     groups = result.groups
     true_groups = groups.combinations @ truth[result.layout.dynamic]

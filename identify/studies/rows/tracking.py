@@ -4,12 +4,12 @@ Both see the same motions with the same noise. The model is the starting one, th
 own, or the true one; or one between the truth and the starting model; or, in all parameters, wrong by a share.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor
@@ -23,7 +23,7 @@ from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT,
 from identify.studies.rows.sensor import rms_um
 from identify.tracking.following import Followed, by_images, follow
 from identify.tracking.motions import NamedMotion, motions
-from identify.tracking.track import FIRST_RUN, model_parameters
+from identify.tracking.track import FIRST_RUN, KnownModel, known_model
 
 EXPERIMENT, SIGNS = 0, 1
 
@@ -71,7 +71,8 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
     plant = build_plant(scenario, robot, number)
     sensor = taught_sensor(scenario, robot, number, SilentProgress())
     signs = np.random.default_rng(stream_seed(seed, SIGNS)).choice([-1.0, 1.0], len(plant.parameters))
-    model = _model(plant, sensor, number, options) * (1.0 + options.off * signs)
+    model = _model(plant, sensor, number, options)
+    model = replace(model, parameters=model.parameters * (1.0 + options.off * signs))
     unseen = motions(robot, scenario, number)[: scenario.validation.count]
     done = [_followed(plant, sensor, options.law, model, motion, number + k) for k, motion in enumerate(unseen)]
     beside = [_followed(plant, sensor, "pid", model, motion, number + k) for k, motion in enumerate(unseen)]
@@ -81,26 +82,29 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
     return _figures(done, beside) | ({"observer_normalised_error": float(np.mean(known))} if known else {})
 
 
-def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptions) -> Array:
-    """Parameters (p,) of the model that the law knows."""
+def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptions) -> KnownModel:
+    """The model that the law knows."""
     if options.model_error is not None:
-        start = model_parameters(plant, "initial", None)
-        return plant.parameters + options.model_error * (start - plant.parameters)
+        start = known_model(plant, "initial", None)
+        between = plant.parameters + options.model_error * (start.parameters - plant.parameters)
+        return replace(start, parameters=between)
     if options.model != "identified":
-        return model_parameters(plant, options.model, None)
+        return known_model(plant, options.model, None)
     trajectory = designed_trajectories(plant.scenario, options.trajectory_seed).excitation
     record = excitation_run(plant, sensor, trajectory, number).record
-    return identify_record(record, plant.nominal, plant.scenario).estimate
+    found = identify_record(record, plant.nominal, plant.scenario)
+    return KnownModel(found.estimate, found.drive.law)
 
 
-def _followed(plant: Plant, sensor: PoseSensor, law: str, model: Array, motion: NamedMotion, number: int) -> Followed:
+def _followed(
+    plant: Plant, sensor: PoseSensor, law: str, model: KnownModel, motion: NamedMotion, number: int
+) -> Followed:
     """A run under a law, whose noise and latencies are of a number."""
     timing = plant.scenario.timing
     rng = np.random.default_rng(stream_seed(number, LATENCY, FIRST_RUN))
     eye = SensorInLoop(sensor, plant.robot, stream_seed(number, NOISE, FIRST_RUN))
-    return follow(
-        plant, law, model, motion, by_images(eye), timing.drawn_latencies(timing.frames(motion.duration_s), rng)
-    )
+    latencies = timing.drawn_latencies(timing.frames(motion.duration_s), rng)
+    return follow(plant, law, model.parameters, motion, by_images(eye), latencies, model.drive)
 
 
 def _figures(done: list[Followed], beside: list[Followed]) -> Row:

@@ -1,0 +1,146 @@
+"""Which law the drives have: the evidence of a record for each of those that are known, and how sure it makes one.
+
+Each law is a model of its own: warm start, then the search for the optimum of the output error under the logged
+commands, whose residuals are white. About the optimum the cost is a parabola, so that the evidence, the probability of
+the record with all parameters integrated out over what was known of them before, is (Laplace's method)
+
+    ln p(record | law) = -(cost + ln det W - ln det P) / 2 + the same for all,
+
+W the information of poses and prior at the optimum, P that of the prior: a gain that a law has and the record does not
+need costs what it could have been. Before the record all laws are as probable. Where the best of them misses the
+record by more than noise explains, all costs are divided by its share: what no law explains rules none out.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynamics import DynamicsError
+from dynamics.closed_loop.drives import DriveName
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_search import Search, output_error_searches
+from identify.estimation.warm_start import linear_warm_start
+from identify.loop_parameters import drive_settings
+from identify.progress import Progress, SilentProgress
+from identify.scenario import Scenario
+from identify.scenario.sections import AUTO
+
+SURE = 0.95
+"""Probability from which on a record tells the law."""
+
+FIRST, HOPELESS = 4, 10.0
+"""Iterations for every law at first, and how many times the best cost they may leave for it to go on: laws that the
+record shows are there by then, while others may search for long."""
+
+
+@dataclass(frozen=True)
+class DriveChoice:
+    """The law of the drives, and how probable each is: 1 for one that the scenario names; in_loop: whether it acted as
+    the record was made, which it does not where the drives took torques."""
+
+    law: DriveName
+    probabilities: Mapping[str, float]
+    in_loop: bool = True
+
+    @property
+    def asked(self) -> bool:
+        """Whether the record was asked."""
+        return len(self.probabilities) > 1
+
+    @property
+    def sure(self) -> bool:
+        """Whether the record tells the law."""
+        return self.probabilities[self.law] >= SURE
+
+    def warnings(self) -> tuple[str, ...]:
+        """One line where the record cannot tell the law, or says nothing of it."""
+        if not self.in_loop:
+            return (
+                "the drives took torques: the law by which they follow joint commands is not in this record, and its "
+                "gains are those of the starting values",
+            )
+        if self.sure:
+            return ()
+        said = ", ".join(f"{name} {value:.0%}" for name, value in self.probabilities.items() if value >= 0.01)
+        return (
+            f"the record cannot tell the law of the drives ({said}): the gains are those of {self.law}; move the robot "
+            "faster or longer, or state the law in model.drive",
+        )
+
+
+def choose_drive(
+    problem_of: Callable[[Scenario], OutputErrorProblem], scenario: Scenario, progress: Progress, in_loop: bool = True
+) -> DriveChoice:
+    """The law that a scenario names or, where it leaves that to the record, the most probable; problem_of: the output
+    error of a scenario that names one; in_loop: whether the law acted in the record.
+
+    Raises EstimationError: no law gives a model that runs; and as `problem_of` does.
+    """
+    law = scenario.model.drive_law
+    if not in_loop:
+        return DriveChoice(law, {law: 1.0}, in_loop)
+    if scenario.model.drive != AUTO:
+        return DriveChoice(law, {law: 1.0})
+    laws = scenario.model.drives_considered
+    with progress.stage("laws of the drives", 2 * len(laws)) as advance:
+        first, failed = {}, []
+        for law in laws:
+            own = _asking(scenario, law, FIRST)
+            try:
+                problem = problem_of(own)
+                first[law] = _searched(problem, own, linear_warm_start(problem, own))
+            except (EstimationError, DynamicsError) as error:
+                failed.append(f"{law}: {error}")
+            advance()
+        if not first:
+            raise EstimationError(f"no law of the drives gives a model that runs: {'; '.join(failed)}")
+        limit = HOPELESS * min(one.solution.costs[-1] for one in first.values())
+        found = {}
+        for law, one in first.items():
+            if one.solution.costs[-1] <= limit:
+                own = _asking(scenario, law, scenario.identification.max_iterations)
+                found[law] = evidence(_searched(problem_of(own), own, one.solution.parameters))
+        advance(len(laws))
+    return DriveChoice(*_weighed(found, laws))
+
+
+def _asking(scenario: Scenario, law: DriveName, iterations: int) -> Scenario:
+    searched = {"identification.method": "command_driven", "identification.max_iterations": iterations}
+    return scenario.with_overrides({**drive_settings(law), **searched})
+
+
+def _searched(problem: OutputErrorProblem, scenario: Scenario, start: Array) -> Search:
+    """The search for the optimum under the logged commands. Raises EstimationError: no model that runs."""
+    return output_error_searches(problem, scenario, start, SilentProgress())["command_driven"]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a record says of a law: cost at the optimum, that of the poses alone over their number, and ln det W - ln
+    det P."""
+
+    cost: float
+    misfit: float
+    narrowed: float
+
+
+def evidence(found: Search) -> Evidence:
+    """What a finished search says of its law. Raises LoopFailure."""
+    parameters, judged = found.solution.parameters, found.linearised()
+    cost, factor, _ = judged.linearise(parameters)
+    known, _ = judged.known(parameters)
+    poses = 6 * sum(int(np.count_nonzero(run.ok)) for run in judged.runs)
+    narrowed = 2 * np.log(np.abs(np.diag(factor))).sum() - np.linalg.slogdet(judged.known_information())[1]
+    return Evidence(cost, (cost - float(known @ known)) / poses, float(narrowed))
+
+
+def _weighed(found: Mapping[DriveName, Evidence], laws: Sequence[DriveName]) -> tuple[DriveName, dict[str, float]]:
+    """The most probable law, and the probability of each; a law that gives no model has none."""
+    misfit = max(1.0, min(one.misfit for one in found.values()))
+    logarithms = {law: -(one.cost / misfit + one.narrowed) / 2 for law, one in found.items()}
+    best = max(logarithms, key=lambda law: logarithms[law])
+    weights = {law: float(np.exp(logarithms[law] - logarithms[best])) if law in found else 0.0 for law in laws}
+    return best, {law: weight / sum(weights.values()) for law, weight in weights.items()}
