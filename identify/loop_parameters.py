@@ -15,7 +15,8 @@ from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
 from identify.scenario import Model, Plant, Scenario
-from identify.scenario.sections import ACTUATOR_KEYS, AUTO, FILTERED, Section
+from identify.scenario.plant_sections import AUTO, FILTERED
+from identify.scenario.section import ACTUATOR_KEYS, Section
 
 NOMINAL = "initial"
 """The parameter set that is meant where none is named."""

@@ -26,7 +26,7 @@ from identify.estimation.warm_start import linear_warm_start
 from identify.loop_parameters import drive_settings
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Scenario
-from identify.scenario.sections import AUTO
+from identify.scenario.plant_sections import AUTO
 
 SURE = 0.95
 """Probability from which on a record tells the law."""

@@ -17,7 +17,7 @@ from identify.experiment.plant import Plant
 from identify.loop_parameters import model_settings
 from identify.plugins import LAWS, chosen
 from identify.scenario import Scenario
-from identify.scenario.sections import FILTERED
+from identify.scenario.plant_sections import FILTERED
 
 FASTEST = 0.5
 """Bandwidth of computed_torque with an observer, times the time between two frames: its gains may then double."""

@@ -26,7 +26,8 @@ from identify.record.provenance import recorded_scenario
 from identify.record.recording import build_record, read
 from identify.scenario import Scenario
 from identify.scenario.scenario import SCENARIOS, scenario_schema
-from identify.scenario.sections import LOAD_UNITS, Section, quantity
+from identify.scenario.section import Section, quantity
+from identify.scenario.sections import LOAD_UNITS
 from identify.scenario.settings_file import one_line
 
 DESCRIPTION = "record"

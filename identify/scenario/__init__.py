@@ -1,7 +1,8 @@
 """Scenarios: everything that decides a synthetic experiment, read from TOML and checked as a whole."""
 
+from identify.scenario.plant_sections import Model, Plant
 from identify.scenario.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
-from identify.scenario.sections import Excitation, Filter, Model, Plant, PriorValue
+from identify.scenario.sections import Excitation, Filter, PriorValue
 from identify.scenario.timing import Timing
 
 __all__ = [

@@ -12,20 +12,17 @@ from pydantic import Field, field_validator, model_validator
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
 from identify.scenario.parameter_names import check_parameter_names
+from identify.scenario.plant_sections import Control, Model, Plant, Servo
+from identify.scenario.section import Section
 from identify.scenario.sections import (
     GEOMETRY_KNOWN,
     RIG_KNOWN,
-    Control,
     Excitation,
     Filter,
     Geometry,
     Identification,
-    Model,
     Payload,
-    Plant,
     Rig,
-    Section,
-    Servo,
     Validation,
 )
 from identify.scenario.settings_file import SettingsFiles, to_toml

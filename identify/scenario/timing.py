@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from identify.arrays import Array
-from identify.scenario.sections import Section, quantity
+from identify.scenario.section import Section, quantity
 from identify.scenario.settings_file import one_line
 
 if TYPE_CHECKING:

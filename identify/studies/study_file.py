@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from identify.errors import StudyError
 from identify.scenario.scenario import SCENARIOS
-from identify.scenario.sections import Section
+from identify.scenario.section import Section
 from identify.scenario.settings_file import SettingsFiles, one_line
 
 

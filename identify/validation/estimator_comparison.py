@@ -39,7 +39,7 @@ from identify.record.law import takes_torques
 from identify.record.provenance import RunFiles
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, load_scenario
-from identify.scenario.sections import AUTO
+from identify.scenario.plant_sections import AUTO
 from identify.validation.unseen import model_run
 
 START = "starting guess"

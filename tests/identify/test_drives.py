@@ -16,7 +16,7 @@ from identify.experiment.plant import build_plant
 from identify.loop_parameters import settled_drive, with_drive
 from identify.progress import SilentProgress
 from identify.reporting.parameter_tables import drive_sentence, unidentified
-from identify.scenario.sections import DRIVE_GAINS, DriveName
+from identify.scenario.plant_sections import DRIVE_GAINS, DriveName
 from tests.identify.synthetic import LAYOUT, NAMES, quick, rss6, run_plant
 
 GAINS = {"lp": 10.5, "li": 11.4, "ld": 0.164}

@@ -18,7 +18,7 @@ from identify.experiment.truth import true_poses
 from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.scenario import Scenario
-from identify.scenario.sections import Section
+from identify.scenario.section import Section
 from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row
 from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 

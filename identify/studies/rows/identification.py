@@ -30,7 +30,8 @@ from identify.random_streams import stream_seed
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario, scenario_from_toml
-from identify.scenario.sections import Rig, Section
+from identify.scenario.section import Section
+from identify.scenario.sections import Rig
 from identify.studies.rows.coverage import coverage
 from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing
 from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um

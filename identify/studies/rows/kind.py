@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from cmmsim.files import read_sensor_file
 from identify.errors import StudyError
 from identify.scenario import Scenario
-from identify.scenario.sections import Section
+from identify.scenario.section import Section
 from identify.scenario.settings_file import one_line
 from identify.scenario.timing import IN_FILE
 from identify.studies.study_file import Range, Study

@@ -16,7 +16,7 @@ from identify.errors import EstimationError
 from identify.excitation.design import drawn_trajectory
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.scenario.sections import Section
+from identify.scenario.section import Section
 from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, timing
 from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
 from identify.trajectory import FourierTrajectory

@@ -19,7 +19,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.scenario.sections import Section
+from identify.scenario.section import Section
 from identify.studies.rows.kind import BOX, NOISE_OFF, PICTURES, Column, Idle, Kind, Reads, Row, timing
 from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
 

@@ -17,7 +17,7 @@ from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop
 from identify.progress import SilentProgress
 from identify.random_streams import LATENCY, NOISE, stream_seed
 from identify.scenario import Scenario
-from identify.scenario.sections import Section
+from identify.scenario.section import Section
 from identify.studies.rows.identification import designed_trajectories, robot_named
 from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row
 from identify.studies.rows.sensor import rms_um

@@ -1,0 +1,31 @@
+"""What every section of a scenario is: fields with units and limits, and the keys of a robot's actuators."""
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+ACTUATOR_KEYS = {
+    "smoothing_velocity": ("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),
+    "stribeck_velocity": ("stribeck_velocity_rad_s", "stribeck_velocity_m_s"),
+    "joint_stiffness": ("joint_stiffness_N_m_rad", "joint_stiffness_N_m"),
+    "joint_damping": ("joint_damping_N_m_s_rad", "joint_damping_N_s_m"),
+    "motor_inertia": ("motor_inertia_kg_m2", "motor_mass_kg"),
+    "travel_margin": ("travel_margin_rad", "travel_margin_m"),
+    "encoder_noise": ("encoder_noise_rad", "encoder_noise_m"),
+    "encoder_resolution": ("encoder_resolution_rad", "encoder_resolution_m"),
+    "encoder_offset": ("encoder_offset_rad", "encoder_offset_m"),
+    "torque_limit": ("torque_limit_N_m", "torque_limit_N"),
+    "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
+}
+"""Settings of the joints: their key where a robot's actuators turn, and where they slide."""
+
+
+def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
+    """A field with a unit; `limits`: as pydantic names them, such as ge and lt."""
+    return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)
+
+
+class Section(BaseModel):
+    """What all sections are: frozen, of exact types, with known keys and finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
