@@ -221,7 +221,8 @@ ALONE = {
         "stribeck_velocity_m_s")),
     "scenario.plant.parameters", "scenario.model.start_parameters",
     "scenario.rig.known", "scenario.rig.errors", "scenario.rig.drift",
-    "scenario.identification.nuisances", "scenario.control.law",
+    "scenario.identification.nuisances", "scenario.control.law", "scenario.excitation.law",
+    "scenario.plant.drive_gains", "scenario.plant.derivative_filter_s", "scenario.model.derivative_filter_s",
 }  # fmt: skip
 """Keys whose other values are names, or stand with others: not tried by `with_others`."""
 
