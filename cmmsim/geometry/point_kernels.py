@@ -133,18 +133,21 @@ def rigid_step(
 
 
 @compiled
-def turn_by(vector: Array, rotation: Array) -> None:
-    """Turn a rotation (3,3) by a rotation vector (3,) (Rodrigues)."""
-    angle = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+def move_by(transform: Array, change: Array) -> None:
+    """Move a transform (4,4) by ``change`` (6,) [dt, dphi], in the axes of its output."""
+    turn = change[3:]
+    angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     first = math.sin(angle) / angle if angle > 1e-9 else 1.0
     second = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
     for j in range(3):
-        x = vector[1] * rotation[2, j] - vector[2] * rotation[1, j]
-        y = vector[2] * rotation[0, j] - vector[0] * rotation[2, j]
-        z = vector[0] * rotation[1, j] - vector[1] * rotation[0, j]
-        rotation[0, j] += first * x + second * (vector[1] * z - vector[2] * y)
-        rotation[1, j] += first * y + second * (vector[2] * x - vector[0] * z)
-        rotation[2, j] += first * z + second * (vector[0] * y - vector[1] * x)
+        x = turn[1] * transform[2, j] - turn[2] * transform[1, j]
+        y = turn[2] * transform[0, j] - turn[0] * transform[2, j]
+        z = turn[0] * transform[1, j] - turn[1] * transform[0, j]
+        transform[0, j] += first * x + second * (turn[1] * z - turn[2] * y)
+        transform[1, j] += first * y + second * (turn[2] * x - turn[0] * z)
+        transform[2, j] += first * z + second * (turn[0] * y - turn[1] * x)
+    for i in range(3):
+        transform[i, 3] += change[i]
 
 
 @compiled
@@ -161,6 +164,4 @@ def rigid_fits(
         own = slice(starts[f], starts[f + 1])
         for _ in range(steps if starts[f + 1] > starts[f] else 0):
             rigid_step(source[own], target[own], weights[own], transforms[f], covariances[f], change)
-            turn_by(change[3:], transforms[f, :3, :3])
-            for i in range(3):
-                transforms[f, i, 3] += change[i]
+            move_by(transforms[f], change)

@@ -40,24 +40,6 @@ def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
 
 
 @compiled
-def move_by(transform: Array, change: Array) -> None:
-    """Move a transform (4,4) by ``change`` (6,) [dt, dphi], in the axes of its output."""
-    turn = change[3:]
-    angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-    first = math.sin(angle) / angle if angle > 1e-9 else 1.0
-    second = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
-    for j in range(3):
-        x = turn[1] * transform[2, j] - turn[2] * transform[1, j]
-        y = turn[2] * transform[0, j] - turn[0] * transform[2, j]
-        z = turn[0] * transform[1, j] - turn[1] * transform[0, j]
-        transform[0, j] += first * x + second * (turn[1] * z - turn[2] * y)
-        transform[1, j] += first * y + second * (turn[2] * x - turn[0] * z)
-        transform[2, j] += first * z + second * (turn[0] * y - turn[1] * x)
-    for i in range(3):
-        transform[i, 3] += change[i]
-
-
-@compiled
 def project(camera: Array, x_m: float, y_m: float, depth: float) -> tuple:
     """Pixel u, v of a point in the axes of a camera with these figures (9,), and the slope xx, xy, yx, yy of the image
     by ideal pixels there."""

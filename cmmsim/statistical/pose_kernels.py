@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
+from cmmsim.geometry.point_kernels import move_by
 from cmmsim.statistical.camera_kernels import (
     carry,
     ellipse_of,
     faces,
     light_at,
-    move_by,
     multiply,
     pose_transform,
     project,

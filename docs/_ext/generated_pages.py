@@ -24,6 +24,21 @@ PAGES: dict[str, Callable[[], str]] = {
     "api_dynamics.md": lambda: api_pages.package("dynamics"),
     "api_identify.md": lambda: api_pages.package("identify"),
 }
+FOLLOWED = {
+    "position_rms_um": "position, µm",
+    "orientation_rms_urad": "orientation, µrad",
+    "position_share_percent": "position over that of `pid`, %",
+    "orientation_share_percent": "orientation over that of `pid`, %",
+}
+"""Figures of a motion that is followed."""
+
+COVERED = {
+    "intervals": "quantities identified",
+    "covered_percent": "of their 95 % intervals hold, %",
+    "poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
+}
+"""Figures of stated uncertainty against the truth."""
+
 FIGURES: dict[str, Callable[[Path], str]] = {
     "goals.md": kept_figures.goals,
     "excitation_errors.md": kept_figures.excitation_errors,
@@ -65,50 +80,28 @@ FIGURES: dict[str, Callable[[Path], str]] = {
     "answer_interval_coverage.md": kept_figures.answer(
         "interval_coverage",
         {"scenario.robot": "robot"},
-        {
-            "intervals": "quantities identified",
-            "covered_percent": "of their 95 % intervals hold, %",
-            "poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
-        },
+        COVERED,
     ),
     "answer_inexact.md": kept_figures.answer(
         "inexact",
         {"scenario.rig.known": "cameras known"},
-        {
-            "intervals": "quantities identified",
-            "covered_percent": "of their 95 % intervals hold, %",
-            "poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
-        },
+        COVERED,
     ),
     "answer_inexact_unaware.md": kept_figures.answer(
         "inexact_unaware",
         {"scenario.rig.known": "cameras known"},
-        {
-            "unaware_intervals": "quantities identified",
-            "unaware_covered_percent": "of their 95 % intervals hold, %",
-            "unaware_poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
-        },
+        {f"unaware_{name}": said for name, said in COVERED.items()},
     ),
     "answer_estimators.md": kept_figures.leaderboard,
     "answer_control_value.md": kept_figures.answer(
         "control_value",
         {"options.law": "law", "options.model_error": "error of the model, starting model 1"},
-        {
-            "position_rms_um": "position, µm",
-            "orientation_rms_urad": "orientation, µrad",
-            "position_share_percent": "position over that of `pid`, %",
-            "orientation_share_percent": "orientation over that of `pid`, %",
-        },
+        FOLLOWED,
     ),
     "answer_control_laws.md": kept_figures.answer(
         "control_laws",
         {"options.law": "law", "options.model": "model"},
-        {
-            "position_rms_um": "position, µm",
-            "orientation_rms_urad": "orientation, µrad",
-            "position_share_percent": "position over that of `pid`, %",
-            "orientation_share_percent": "orientation over that of `pid`, %",
-        },
+        FOLLOWED,
     ),
 }
 

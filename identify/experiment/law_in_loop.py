@@ -14,6 +14,7 @@ from dynamics.workspace import check_motion
 from identify.arrays import Array
 from identify.errors import ScenarioError, TrajectoryError
 from identify.experiment.plant import Plant
+from identify.experiment.sensor_in_loop import SensorInLoop
 from identify.loop_parameters import model_settings
 from identify.plugins import LAWS, chosen
 from identify.scenario import Scenario
@@ -43,6 +44,11 @@ class Seen:
 
     measure: Callable[[int, float, Array, Array], Array | None]
     noise: Callable[[int], Array]
+
+
+def by_images(eye: SensorInLoop) -> Seen:
+    """By the sensor."""
+    return Seen(eye.measure, lambda frame: eye.covariances[frame])
 
 
 def prepared(

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, DriveName, RateSensor, Reference
 from identify.arrays import Array
 from identify.experiment.law_in_loop import NamedMotion, Seen, prepared
 from identify.experiment.plant import Plant
-from identify.experiment.sensor_in_loop import SensorInLoop
 
 
 @dataclass(frozen=True)
@@ -33,19 +33,14 @@ class Followed:
         limit = self.torque_limit
         return 0 if limit is None else int((np.abs(self.run.torque) >= limit * (1 - 1e-12)).any(axis=1).sum())
 
-    def normalised_squared_error(self, coordinates: Array, common: Array) -> float | None:
-        """Mean e^T P^-1 e / m of what the observer expected of the true coordinates (N, m); None without observer.
-        common (m, m): covariance of what all measured poses have in common, which no observer can find."""
+    def normalised_squared_error(self, robot: Robot, common: Array) -> float | None:
+        """Mean e^T P^-1 e / m of what the observer expected of the robot's true coordinates; None without observer.
+        common (6, 6): covariance of what all measured poses have in common, which no observer can find."""
         if self.expected is None:
             return None
-        errors = coordinates - self.expected[0]
-        weighted = np.linalg.solve(self.expected[1] + common, errors[..., None])[..., 0]
+        errors, free = robot.coordinates(self.run.pose) - self.expected[0], robot.geometry.chart.basis
+        weighted = np.linalg.solve(self.expected[1] + free.T @ common @ free, errors[..., None])[..., 0]
         return float(np.mean(np.sum(errors * weighted, axis=1)) / errors.shape[1])
-
-
-def by_images(eye: SensorInLoop) -> Seen:
-    """By the sensor."""
-    return Seen(eye.measure, lambda frame: eye.covariances[frame])
 
 
 def by_drawing(covariance: Array, lost: NDArray[np.bool_], rng: np.random.Generator, exact: bool = False) -> Seen:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 import cmmsim
 from dynamics.closed_loop import DriveName
@@ -15,17 +16,17 @@ from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify
 from identify.estimation.prior import starting_guess
 from identify.excitation.design import design_trajectories
-from identify.experiment.law_in_loop import NamedMotion, Seen, prepared
+from identify.experiment.law_in_loop import NamedMotion, Seen, by_images, prepared
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor
-from identify.experiment.sensor_in_loop import SensorInLoop, with_renderer
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, with_renderer
 from identify.files.run_folder import RunFolder, load_result, rms_figures
 from identify.files.versions import versions
 from identify.loop_parameters import parameter_column, settled_drive
-from identify.progress import Progress
+from identify.progress import Advance, Progress
 from identify.random_streams import LATENCY, NOISE, TRACKED, child, stream_seed
 from identify.scenario import Scenario, load_scenario
-from identify.tracking.following import by_drawing, by_images, follow
+from identify.tracking.following import Followed, by_drawing, follow
 from identify.tracking.motions import motions
 
 MODELS = ("initial", "identified", "true")
@@ -123,15 +124,37 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
 
 
 def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progress) -> KnownModel:
-    """The model from the scenario's excitation, which runs under the law pid."""
+    """The model from the scenario's excitation."""
     scenario = plant.scenario
     if scenario.identification.scale_anchor == "payload":
         raise ScenarioError("identification.scale_anchor = payload needs two runs: identify first, and pass --run DIR")
     trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
     with progress.stage("record", scenario.timing.frames(scenario.excitation.duration_s)) as advance:
-        experiment = excitation_run(plant, sensor, trajectories.excitation, seed, advance)
-    found = identify(experiment.record, plant.nominal, scenario, progress)
+        record = excitation_run(plant, sensor, trajectories.excitation, seed, advance).record
+    return identified_model(plant, record, progress)
+
+
+def identified_model(plant: Plant, record: xr.Dataset, progress: Progress) -> KnownModel:
+    """The model that a record of a plant gives. Raises what an identification raises."""
+    found = identify(record, plant.nominal, plant.scenario, progress)
     return KnownModel(found.estimate, found.drive.law)
+
+
+def follow_by_images(
+    plant: Plant,
+    sensor: PoseSensor,
+    law: str,
+    model: KnownModel,
+    motion: NamedMotion,
+    seed: int,
+    number: int = 0,
+    advance: Advance = lambda n=1: None,
+) -> tuple[Followed, Seen]:
+    """A motion followed under a law with a model, and by what the loop saw; noise and latencies are those of a seed and
+    of the motion's number. Raises as `follow`."""
+    seen = by_images(SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, FIRST_RUN + number), advance))
+    latencies = _latencies(plant, motion, seed, number)
+    return follow(plant, law, model.parameters, motion, seen, latencies, model.drive), seen
 
 
 def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
@@ -156,21 +179,17 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
     """One law with one model on all motions."""
     robot, known = task.plant.robot, task.models[model]
     errors, rows, effort, normalised, covariances, lost = [], [], [], [], [], 0
-    free = robot.geometry.chart.basis
-    common = free.T @ task.sensor.taught.calibration_covariance(robot.home_pose) @ free
+    common = task.sensor.taught.calibration_covariance(robot.home_pose)
     for number, motion in enumerate(task.motions):
-        latencies = _latencies(task, number, motion)
-        eye = SensorInLoop(task.sensor, robot, stream_seed(task.seed, NOISE, FIRST_RUN + number), advance)
-        seen = by_images(eye)
         try:
-            done = follow(task.plant, law, known.parameters, motion, seen, latencies, known.drive)
+            done, seen = follow_by_images(task.plant, task.sensor, law, known, motion, task.seed, number, advance)
         except DynamicsError as error:
             return {"failed": f"{motion.name}: {error}"} | rms_figures(np.full((1, 6), np.nan))
         errors.append(done.errors)
         lost += int((~done.run.measured_ok).sum())
         effort.append(done.run.torque)
         covariances += [seen.noise(int(frame)) for frame in np.flatnonzero(done.run.measured_ok)]
-        found = done.normalised_squared_error(robot.coordinates(done.run.pose), common)
+        found = done.normalised_squared_error(robot, common)
         normalised += [] if found is None else [found]
         rows.append({"motion": motion.name, **rms_figures(done.errors), "saturated_frames": done.saturated})
     torque = np.concatenate(effort)
@@ -211,7 +230,7 @@ def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact
         lost = rng.random(plant.scenario.timing.frames(motion.duration_s)) < dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")
         known = known_model(plant, "true", None) if exact == "model" else model
-        latencies = None if exact == "latency" else _latencies(task, number, motion)
+        latencies = None if exact == "latency" else _latencies(task.plant, motion, task.seed, number)
         try:
             done = follow(plant, law, known.parameters, motion, seen, latencies, known.drive)
             squares.append(done.errors**2)
@@ -220,7 +239,7 @@ def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact
     return np.asarray(np.concatenate(squares).mean(axis=0))
 
 
-def _latencies(task: Tracking, number: int, motion: NamedMotion) -> Array | None:
-    timing = task.plant.scenario.timing
-    rng = np.random.default_rng(stream_seed(task.seed, LATENCY, FIRST_RUN + number))
+def _latencies(plant: Plant, motion: NamedMotion, seed: int, number: int) -> Array | None:
+    timing = plant.scenario.timing
+    rng = np.random.default_rng(stream_seed(seed, LATENCY, FIRST_RUN + number))
     return timing.drawn_latencies(timing.frames(motion.duration_s), rng)

@@ -10,20 +10,19 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from identify.estimation.identification import identify as identify_record
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor
-from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop
+from identify.experiment.sensor_in_loop import PoseSensor
 from identify.progress import SilentProgress
-from identify.random_streams import LATENCY, NOISE, stream_seed
+from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
 from identify.studies.rows.identification import designed_trajectories, robot_named
-from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row
+from identify.studies.rows.kind import NOISE_OFF, PICTURES, PLANT, Column, Kind, Reads, Row
 from identify.studies.rows.sensor import rms_um
-from identify.tracking.following import Followed, by_images, follow
-from identify.tracking.motions import NamedMotion, motions
-from identify.tracking.track import FIRST_RUN, KnownModel, known_model
+from identify.tracking.following import Followed
+from identify.tracking.motions import motions
+from identify.tracking.track import KnownModel, follow_by_images, identified_model, known_model
 
 EXPERIMENT, SIGNS = 0, 1
 
@@ -56,7 +55,7 @@ class TrackingOptions(Section):
 
 READS = Reads(
     (
-        *PICTURES, *PATH, *LIMITS, "scenario.robot", "scenario.rig.", "scenario.geometry.known", "scenario.timing.",
+        *PICTURES, "scenario.robot", "scenario.rig.", "scenario.geometry.known", "scenario.timing.",
         "sensor.timing.", "scenario.servo.", "scenario.plant.", "scenario.model.", "scenario.control.",
         "scenario.validation.", "scenario.excitation.", "scenario.identification.",
     ),
@@ -74,10 +73,12 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
     model = _model(plant, sensor, number, options)
     model = replace(model, parameters=model.parameters * (1.0 + options.off * signs))
     unseen = motions(robot, scenario, number)[: scenario.validation.count]
-    done = [_followed(plant, sensor, options.law, model, motion, number + k) for k, motion in enumerate(unseen)]
-    beside = [_followed(plant, sensor, "pid", model, motion, number + k) for k, motion in enumerate(unseen)]
-    free, common = robot.geometry.chart.basis, sensor.taught.calibration_covariance(robot.home_pose)
-    normalised = [one.normalised_squared_error(robot.coordinates(one.run.pose), free.T @ common @ free) for one in done]
+    done, beside = (
+        [follow_by_images(plant, sensor, law, model, motion, number + k)[0] for k, motion in enumerate(unseen)]
+        for law in (options.law, "pid")
+    )
+    common = sensor.taught.calibration_covariance(robot.home_pose)
+    normalised = [one.normalised_squared_error(robot, common) for one in done]
     known = [value for value in normalised if value is not None]
     return _figures(done, beside) | ({"observer_normalised_error": float(np.mean(known))} if known else {})
 
@@ -92,19 +93,7 @@ def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptio
         return known_model(plant, options.model, None)
     trajectory = designed_trajectories(plant.scenario, options.trajectory_seed).excitation
     record = excitation_run(plant, sensor, trajectory, number).record
-    found = identify_record(record, plant.nominal, plant.scenario)
-    return KnownModel(found.estimate, found.drive.law)
-
-
-def _followed(
-    plant: Plant, sensor: PoseSensor, law: str, model: KnownModel, motion: NamedMotion, number: int
-) -> Followed:
-    """A run under a law, whose noise and latencies are of a number."""
-    timing = plant.scenario.timing
-    rng = np.random.default_rng(stream_seed(number, LATENCY, FIRST_RUN))
-    eye = SensorInLoop(sensor, plant.robot, stream_seed(number, NOISE, FIRST_RUN))
-    latencies = timing.drawn_latencies(timing.frames(motion.duration_s), rng)
-    return follow(plant, law, model.parameters, motion, by_images(eye), latencies, model.drive)
+    return identified_model(plant, record, SilentProgress())
 
 
 def _figures(done: list[Followed], beside: list[Followed]) -> Row:
