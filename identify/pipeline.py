@@ -184,12 +184,13 @@ def _write_identified(run_folder: RunFolder, found: _Identified, scenario: Scena
     seen, result = found.record, found.result
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
     before, after = found.models
-    made_of = {name: digest(one) for name, one in found.records.items()} | {"covariance.nc": digest(result.covariance)}
+    covariance = result.whole_covariance
+    made_of = {name: digest(one) for name, one in found.records.items()} | {"covariance.nc": digest(covariance)}
     if seed is None:
         runs = write_model_runs(run_folder.model, build_model_run(seen["time"].values, before, after))
         made_of["model.nc"] = digest(runs)
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
-    write_covariance(run_folder.covariance, result.layout, result.covariance)
+    write_covariance(run_folder.covariance, result.layout, covariance, result.common_errors.names)
     save_result(
         run_folder.result,
         {
@@ -238,7 +239,10 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     model_poses = [[model_on_record(robot, scenario, values, files.experiment) for values in models]]
     for reference in (recorded_reference(seen) for seen in records[1:]):
         model_poses.append([model_run(robot, scenario, values, reference) for values in models])
-    predictions = predicted_runs(robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress)
+    found = result["identification"].get("nuisance_estimates", {})
+    predictions = predicted_runs(
+        robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress, found
+    )
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [
         build_model_run(seen["time"].values, initial, identified, std)

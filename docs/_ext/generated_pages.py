@@ -36,6 +36,7 @@ COVERED = {
     "intervals": "quantities identified",
     "covered_percent": "of their 95 % intervals hold, %",
     "poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
+    "predicted_position_rms_um": "error of predicted positions, µm",
 }
 """Figures of stated uncertainty against the truth."""
 

@@ -16,19 +16,30 @@ from identify.record.recorded_run import RecordedRun
 
 @dataclass(frozen=True)
 class CommonErrorEstimates:
-    """names of the errors of one record, each ending with its unit; prior_std, estimate and std (k,) of each."""
+    """names of the errors of one record, each ending with its unit; prior_std and estimate (k,) of each, covariance (k,
+    k), and that of the robot's parameters with them (p, k)."""
 
     names: tuple[str, ...]
     prior_std: Array
     estimate: Array
-    std: Array
+    covariance: Array
+    with_parameters: Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (k,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def most_likely(run: RecordedRun, parameters: Array) -> Array:
     """The common errors (k,) of a run `with_common_errors` at the optimum (p,), in standard deviations beforehand."""
     assert run.marginal is not None
-    modes, had = run.marginal.modes, run.marginal.had
-    missed = run.without_common_errors().misses(parameters).ravel() - had  # in standard deviations of the noise alone
+    missed = run.without_common_errors().misses(parameters).ravel() - run.marginal.had
+    return most_likely_of(run.marginal.modes, missed)
+
+
+def most_likely_of(modes: Array, missed: Array) -> Array:
+    """Those (k,) with modes (m, k) of residuals (m,), all in standard deviations of the noise alone."""
     return np.asarray(-np.linalg.solve(np.eye(modes.shape[1]) + modes.T @ modes, modes.T @ missed))
 
 
@@ -40,22 +51,19 @@ def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[A
     ]
 
 
-def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> CommonErrorEstimates:
+def common_error_estimates(problem: OutputErrorProblem, parameters: Array, whole: Array) -> CommonErrorEstimates:
     """What the first record of a problem `with_common_errors` says at its optimum (p,) of what its poses have in
-    common."""
-    run = problem.runs[0]
+    common; whole (p + k, p + k): covariance of parameters and of that, in standard deviations beforehand."""
+    run, count = problem.runs[0], len(parameters)
     if run.marginal is None:
         nothing = np.zeros(0)
-        return CommonErrorEstimates((), nothing, nothing, nothing)
-    names, factor, modes = run.common.all_names, run.common.whole_factor, run.marginal.modes
-    slopes = run.without_common_errors().residuals(parameters)[1]
-    rows = np.column_stack([slopes.reshape(len(modes), -1), modes])
-    information = rows.T @ rows
-    count = len(parameters)
-    information[:count, :count] += problem.known_information()
-    information[count:, count:] += np.eye(len(names))
-    scale = 1.0 / np.sqrt(np.diag(information))
-    covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
-    spread = factor @ covariance[count:, count:] @ factor.T
-    prior_std = np.sqrt(np.diag(factor @ factor.T))
-    return CommonErrorEstimates(names, prior_std, factor @ most_likely(run, parameters), np.sqrt(np.diag(spread)))
+        return CommonErrorEstimates((), nothing, nothing, np.zeros((0, 0)), np.zeros((count, 0)))
+    factor = run.common.whole_factor
+    own = slice(count, count + len(factor))
+    return CommonErrorEstimates(
+        run.common.all_names,
+        np.sqrt(np.diag(factor @ factor.T)),
+        factor @ most_likely(run, parameters),
+        factor @ whole[own, own] @ factor.T,
+        whole[:count, own] @ factor.T,
+    )

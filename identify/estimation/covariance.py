@@ -10,6 +10,10 @@ residuals, and W^-1 is all.
 Where either misses the record by more than noise explains, what its error does to the scores is added (`explanation`).
 It is all computed in units where W is one.
 
+Errors that all poses of a record have in common, of cameras, teaching, clocks and geometry, are parameters of the same
+problem: their modes M stand in J behind the others, and each is known beforehand to one standard deviation. So the
+record says what it taught of them, and how far that and the parameters err together.
+
 A known load errs, too. Under the load L the model has the parameters p + L: an error of the load moves the residuals of
 its records by J dL, with J their Jacobian by the parameters, and the scores by J^T J dL. With S the covariance of the
 load, the scores spread by H S H beside the noise, where H = J^T J sums over all records made under this load. Where the
@@ -18,15 +22,16 @@ load shows the scale, one that is a percent heavier than stated makes all parame
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from dynamics.closed_loop import ClosedLoopRun, LoopFailure
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.estimation.common_errors import most_likely_of
 from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
 from identify.estimation.output_error import OutputErrorProblem
 from identify.progress import Advance
@@ -42,18 +47,27 @@ FEWEST = 50
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance (p, p) of the estimate, were there no bounds, and the parts of it (p, p) that errors of the starting
-    guess make, and, by their kinds, errors that all poses of a record have in common; information (p, p) that the poses
-    alone hold; gradient (p,): J^T r of poses and all that is known beside them, at the estimate; misfit of the record;
-    unstable: repeated experiments that ended early and were left out."""
+    """What is known of an estimate (p,), were there no bounds.
 
-    covariance: Array
+    whole (p + k, p + k): covariance of the estimate, and behind it of the k numbers, record by record, of which what
+    poses have in common is made, in their standard deviations beforehand. of_guess (p, p): the part of the estimate's
+    covariance that errors of the starting guess make, and of_common, by their kinds, what those in common make;
+    information (p, p) that the poses alone hold; gradient (p,): J^T r of poses and all that is known beside them, at
+    the estimate; misfit of the record; unstable: repeated experiments that ended early and were left out.
+    """
+
+    whole: Array
     of_guess: Array
     of_common: dict[str, Array]
     information: Array
     gradient: Array
     misfit: Misfit
     unstable: int = 0
+
+    @property
+    def covariance(self) -> Array:
+        """Of the estimate (p, p)."""
+        return self.whole[: len(self.gradient), : len(self.gradient)]
 
     @property
     def std(self) -> Array:
@@ -78,53 +92,88 @@ def estimate_uncertainty(
 
     Raises EstimationError when too many of them are unstable.
     """
-    found = [run.residuals(parameters) for run in problem.runs]
+    runs, size = problem.runs, len(parameters)
+    linear = _linearised(runs, parameters)
+    pairs = list(zip(runs, linear, strict=True))
+    found = [(run.without_common(one.missed), run.without_common(one.slopes)) for run, one in pairs]
     known, known_rows = problem.known(parameters)
     gradient = known @ known_rows + sum(np.tensordot(r, j, 2) for r, j in found)
-    informations = [_information(j) for _, j in found]
-    information = np.asarray(sum(informations))
-    units = _units([known_rows, *(j.reshape(-1, len(parameters)) for _, j in found)])
-    shown = [(r, j @ units) for r, j in found]
+    information = np.asarray(sum(_information(j) for _, j in found))
+    whole = linear[0].rows.shape[2]
+    known_rows = block_diag(known_rows, np.eye(whole - size))
+    units = _units([known_rows, *(one.rows.reshape(-1, whole) for one in linear)])
+    shown = [replace(one, rows=one.rows @ units) for one in linear]
     scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
     if misfit.significant:
-        model = sum(coloured_score_covariance(r, j, run.ok) for (r, j), run in zip(shown, problem.runs, strict=True))
+        model = sum(coloured_score_covariance(one.left, one.rows, run.ok) for run, one in zip(runs, shown, strict=True))
         scores = scores + misfit.share_of_model * model
-    if any(run.payload_std.any() for run in problem.runs):
-        scores = scores + load_score_covariance(problem.runs, informations, units)
-    prior = _information(known_rows @ units)
-    covariance = units @ (scores + prior) @ units.T
-    of_guess = np.asarray(_information(problem.guess.rows @ units @ units.T))
-    of_common: dict[str, Array] = {}
-    for run, (_, jacobian) in zip(problem.runs, shown, strict=True):
-        for kind, spread in _common_scores(run, jacobian).items():
-            of_common[kind] = of_common.get(kind, 0.0) + units @ spread @ units.T
+    if any(run.payload_std.any() for run in runs):
+        moved = [np.tensordot(one.rows, one.slopes, ((0, 1), (0, 1))) for one in shown]
+        scores = scores + load_score_covariance(runs, moved)
+    covariance = units @ (scores + _information(known_rows @ units)) @ units.T
     return Uncertainty(
-        (covariance + covariance.T) / 2, of_guess, of_common, information, np.asarray(gradient), misfit, unstable
+        (covariance + covariance.T) / 2,
+        _information(problem.guess.rows @ units[:size] @ units[:size].T),
+        _of_common(runs, units[:size] @ units[size:].T),
+        information,
+        np.asarray(gradient),
+        misfit,
+        unstable,
     )
 
 
-def _common_scores(run: RecordedRun, jacobian: Array) -> dict[str, Array]:
-    """Covariance (p, p) of the scores J^T r that each kind of errors in common to all poses of a record makes; J (n, 6,
-    p)."""
-    if run.marginal is None:
-        return {}
-    modes = run.marginal.whiten(run.marginal.modes)
-    rows = jacobian.reshape(-1, jacobian.shape[2])
-    return {kind: _information(one.T @ rows) for kind, one in run.common.by_kind(modes).items()}
+@dataclass(frozen=True)
+class _Linear:
+    """Of one record, in standard deviations of the noise: what the model misses (n, 6), its derivatives by the
+    parameters (n, 6, p) and by the parameters and all numbers in common, of whichever record (n, 6, p + k), and its own
+    modes (n, 6, k)."""
+
+    missed: Array
+    slopes: Array
+    rows: Array
+    modes: Array
+
+    @property
+    def left(self) -> Array:
+        """What it misses (n, 6) with the most likely common errors."""
+        modes = self.modes.reshape(self.missed.size, -1)
+        return self.missed + self.modes @ most_likely_of(modes, self.missed.ravel())
 
 
-def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array], units: Array) -> Array:
-    """Covariance (p, p) of the scores T^T J^T r that the loads' standard deviations make, to first order.
+def _linearised(runs: Sequence[RecordedRun], parameters: Array) -> list[_Linear]:
+    """Of each run, with the numbers in common record by record behind the parameters (p,)."""
+    modes = [run.whitened_modes for run in runs]
+    counts = [one.shape[2] for one in modes]
+    found = []
+    for number, (run, own) in enumerate(zip(runs, modes, strict=True)):
+        missed, slopes = run.residuals_in_noise(parameters)
+        before, after = (np.zeros((*missed.shape, sum(some))) for some in (counts[:number], counts[number + 1 :]))
+        found.append(_Linear(missed, slopes, np.concatenate([slopes, before, own, after], axis=2), own))
+    return found
 
-    information: J^T J (p, p) of each run's residuals; units: T (p, p). Runs that state the same load, equally well
-    known, share its error; different loads err independently.
+
+def _of_common(runs: Sequence[RecordedRun], moved: Array) -> dict[str, Array]:
+    """Covariance (p, p) of an estimate that each kind of errors in common to all poses of a record makes; moved (p, k):
+    what each of their numbers makes of it."""
+    of_common: dict[str, Array] = {}
+    for run in runs:
+        own, moved = np.split(moved, [run.whitened_modes.shape[2]], axis=1)
+        for kind, part in run.common.by_kind(own).items() if own.size else ():
+            of_common[kind] = of_common.get(kind, 0.0) + part @ part.T
+    return of_common
+
+
+def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array]) -> Array:
+    """Covariance (q, q) of the scores T^T J^T r that the loads' standard deviations make, to first order.
+
+    information: T^T J^T J (q, p) of each run's residuals. Runs that state the same load, equally well known, share its
+    error; different loads err independently.
     """
-    size = len(units)
     shown: dict[tuple[float, ...], Array] = {}
     for run, one in zip(runs, information, strict=True):
         load = (*run.payload, *run.payload_std)
-        shown[load] = shown.get(load, np.zeros((size, size))) + one
-    spread = [units.T @ total * np.array(load[size:]) for load, total in shown.items()]
+        shown[load] = shown.get(load, np.zeros_like(one)) + one
+    spread = [total * np.array(load[total.shape[1] :]) for load, total in shown.items()]
     return np.asarray(sum(one @ one.T for one in spread), dtype=float)
 
 
@@ -147,19 +196,20 @@ def _information(jacobian: Array) -> Array:
 def _noise(
     problem: OutputErrorProblem,
     parameters: Array,
-    found: list[tuple[Array, Array]],
+    found: list[_Linear],
     rng: np.random.Generator,
     advance: Advance,
 ) -> tuple[Array, Misfit, int]:
-    """Covariance (p, p) of the scores that noise makes, the misfit beyond it, and how many repetitions ended early.
+    """Covariance (q, q) of the scores that noise makes, the misfit beyond it, and how many repetitions ended early.
 
-    found: residuals (n, 6) of each run and their Jacobian (n, 6, p), in the units of the scores. Where the model's
-    error decides, or its residuals are white, no experiment is repeated.
+    found: of each run, its rows in the units of the scores. Where the model's error decides, or its residuals are
+    white, no experiment is repeated.
     """
-    white = misfit_of_white(np.concatenate([residual for residual, _ in found]))
+    runs = zip(problem.runs, found, strict=True)
+    white = misfit_of_white(np.concatenate([run.without_common(one.missed) for run, one in runs]))
     if white.decides or all(run.driven for run in problem.runs):
         advance(DRAWS)
-        return np.asarray(sum(_information(jacobian) for _, jacobian in found)), white, 0
+        return np.asarray(sum(_information(one.rows) for one in found)), white, 0
     scores, squares = _repeated_scores(problem, parameters, found, rng, advance)
     unstable = DRAWS - len(scores)
     if len(scores) < FEWEST:
@@ -174,22 +224,27 @@ def _noise(
 def _repeated_scores(
     problem: OutputErrorProblem,
     parameters: Array,
-    found: list[tuple[Array, Array]],
+    found: list[_Linear],
     rng: np.random.Generator,
     advance: Advance,
 ) -> tuple[list[Array], list[float]]:
-    """Scores J^T r and mean squared residuals of the repeated experiments whose loop is stable."""
+    """Scores J^T r of noise and mean squared residuals of noise and common errors, of the repeated experiments whose
+    loop is stable."""
 
     def repeat(draws: np.random.Generator) -> tuple[Array, float] | None:
         try:
             repeated = [repeated_experiment(run, parameters, draws).measured for run in problem.runs]
         except LoopFailure:
             return None
-        drawn = [
-            residual + run.whiten(run.measured - poses) + _drawn_in_common(run, draws).reshape(residual.shape)
-            for run, (residual, _), poses in zip(problem.runs, found, repeated, strict=True)
+        noise = [
+            one.missed + run.whiten(run.measured - poses)
+            for run, one, poses in zip(problem.runs, found, repeated, strict=True)
         ]
-        score = np.asarray(sum(np.tensordot(r, j, 2) for r, (_, j) in zip(drawn, found, strict=True)))
+        drawn = [
+            run.without_common(residual + one.modes @ draws.standard_normal(one.modes.shape[2]))
+            for run, one, residual in zip(problem.runs, found, noise, strict=True)
+        ]
+        score = np.asarray(sum(np.tensordot(r, one.rows, 2) for r, one in zip(noise, found, strict=True)))
         return score, float(np.mean(np.concatenate(drawn) ** 2))
 
     results = []
@@ -198,13 +253,6 @@ def _repeated_scores(
             results += [result] if result else []
             advance()
     return [score for score, _ in results], [square for _, square in results]
-
-
-def _drawn_in_common(run: RecordedRun, rng: np.random.Generator) -> Array:
-    """What one draw of the errors that all poses have in common is in whitened residuals (n * 6,)."""
-    if run.marginal is None:
-        return np.zeros(6 * np.count_nonzero(run.ok))
-    return run.marginal.whiten(run.marginal.modes @ rng.standard_normal(run.marginal.modes.shape[1]))
 
 
 def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> ClosedLoopRun:

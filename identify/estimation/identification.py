@@ -82,7 +82,7 @@ def identify(
         std=uncertainty.std,
         covariance=uncertainty.covariance,
         scale_anchor=problem.anchor,
-        common_errors=common_error_estimates(judged, solution.parameters),
+        common_errors=common_error_estimates(judged, solution.parameters, uncertainty.whole),
         iterations=sum(one.solution.iterations for one in searches.values()),
         evaluations=sum(one.solution.evaluations for one in searches.values()),
         stop_reason=solution.stop_reason,

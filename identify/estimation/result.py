@@ -106,6 +106,12 @@ class IdentificationResult:
         }
         return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
 
+    @property
+    def whole_covariance(self) -> Array:
+        """Covariance (p + k, p + k) of the estimates, and behind them of what all poses have in common."""
+        common = self.common_errors
+        return np.block([[self.covariance, common.with_parameters], [common.with_parameters.T, common.covariance]])
+
     def save(self, path: Path | str) -> None:
         """Write a JSON file whose "identification" is that of a run's result.json; commands take its estimates."""
         save_result(path, {"identification": self.to_dict()})

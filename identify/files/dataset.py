@@ -4,7 +4,7 @@ Files are written whole or not at all, and read with clear errors. `covariance.n
 parameters, in their SI units.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -189,9 +189,10 @@ VARIABLE = "covariance"
 DIMENSIONS = ("parameter", "parameter_2")
 
 
-def write_covariance(path: Path | str, layout: ParameterLayout, covariance: Array) -> None:
-    """Write the covariance (p, p) of a robot's parameters."""
-    write_covariance_of(path, {name: layout.unit(name) for name in layout.names}, covariance)
+def write_covariance(path: Path | str, layout: ParameterLayout, covariance: Array, others: Sequence[str] = ()) -> None:
+    """Write the covariance (p + k, p + k) of a robot's parameters and of k others, whose names end with their units."""
+    units = {name: layout.unit(name) for name in layout.names} | {name: name.rpartition("_")[2] for name in others}
+    write_covariance_of(path, units, covariance)
 
 
 def write_covariance_of(path: Path | str, units: Mapping[str, str], covariance: Array) -> None:

@@ -151,12 +151,13 @@ class RunFiles:
 
     @property
     def covariance(self) -> Array:
-        """Of the estimates (p, p)."""
+        """Of the estimates (p, p), and behind them of what all poses have in common, where a result has that."""
         return self.named_covariance[1]
 
     def covariance_of(self, robot: Robot) -> Array:
-        """Of the estimates (p, p) of a robot. Raises RecordError where the file is of other parameters."""
-        found, names = self.named_covariance[0], robot.layout.names
+        """`covariance` of a robot's parameters. Raises RecordError where the file is of others."""
+        names = robot.layout.names
+        found = self.named_covariance[0][: len(names)]
         if found != names:
             said = ", ".join(sorted(set(found) ^ set(names))) or "another order"
             raise RecordError(f"{self.folder.covariance} is of other parameters than the result: {said}")

@@ -168,7 +168,7 @@ class RecordedRun:
 
     def misses(self, parameters: Array) -> Array:
         """Whitened pose residuals model - measurement (n, 6) of the good frames. Raises LoopFailure."""
-        return self._missed(self.simulate(parameters))
+        return self.without_common(self._missed(self.simulate(parameters)))
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
         """`misses` (n, 6) of a model driven by the logged commands, which are white if it is right; rng: for what a fit
@@ -177,28 +177,33 @@ class RecordedRun:
 
     def residuals(self, parameters: Array) -> tuple[Array, Array]:
         """`misses` (n, 6), and their Jacobian (n, 6, p)."""
+        missed, jacobian = self.residuals_in_noise(parameters)
+        return self.without_common(missed), self.without_common(jacobian)
+
+    def residuals_in_noise(self, parameters: Array) -> tuple[Array, Array]:
+        """The same in standard deviations of the noise alone."""
         run = self.simulate(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
-        jacobian = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
-        return self._missed(run), self._without_common(jacobian)
+        return self._missed(run), np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
 
     def _missed(self, run: ClosedLoopRun) -> Array:
-        """What a run of the model misses of the measurements (n, 6); its common errors count as none."""
+        """What a run of the model misses of the measurements (n, 6), in standard deviations of the noise alone; its
+        common errors count as none."""
         seen = run.pose if self.driven or self.drawn is None else run.measured
-        whitened = self._in_noise(seen - self.measured)
-        if self.marginal is not None:
-            whitened = whitened - self.marginal.had.reshape(whitened.shape)
-        return self._without_common(whitened)
+        missed = self.whiten(seen - self.measured)
+        return missed if self.marginal is None else missed - self.marginal.had.reshape(missed.shape)
 
     def whiten(self, differences: Array) -> Array:
-        """Pose differences (N, 6) at the good frames in standard deviations of the sensor, (n, 6)."""
-        return self._without_common(self._in_noise(differences))
-
-    def _in_noise(self, differences: Array) -> Array:
-        """The same in those of the noise alone."""
+        """Pose differences (N, 6) at the good frames in standard deviations of the noise, (n, 6)."""
         return np.asarray(differences[self.ok] @ self.whitener.T, dtype=float)
 
-    def _without_common(self, rows: Array) -> Array:
+    @property
+    def whitened_modes(self) -> Array:
+        """Those (n, 6, k) of a run `with_common_errors`, at the good frames in standard deviations of the noise."""
+        count = np.count_nonzero(self.ok)
+        return np.zeros((count, 6, 0)) if self.marginal is None else self.marginal.modes.reshape(count, 6, -1)
+
+    def without_common(self, rows: Array) -> Array:
         """Rows (n, 6, ...) in standard deviations of the noise, in those of noise and common errors."""
         if self.marginal is None:
             return rows

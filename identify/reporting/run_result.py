@@ -73,12 +73,14 @@ def validation_entry(record: xr.Dataset, truth: xr.Dataset, initial: Array, iden
 
 
 def prediction_entry(prediction: PosePrediction, truth: xr.Dataset) -> dict[str, Any]:
-    """How far the plant was expected from the identified model, RMS over the run, and the error found in its units."""
-    std = 1e6 * np.sqrt(np.mean(prediction.std**2, axis=0))
+    """How far the plant was expected from the predicted poses, RMS over the run, how far it was, and that squared in
+    units of what was expected."""
+    std, true = 1e6 * np.sqrt(np.mean(prediction.std**2, axis=0)), true_poses(truth)
     return {
         "predicted": {
             "position_std_um": std[:3].tolist(),
             "orientation_std_urad": std[3:].tolist(),
-            "normalised_squared_error": prediction.normalised_squared_error(true_poses(truth)),
+            "normalised_squared_error": prediction.normalised_squared_error(true),
+            **rms_figures(prediction.poses - true),
         }
     }

@@ -155,17 +155,19 @@ def prediction_table(result: dict[str, Any]) -> Table:
     """Predicted deviation of the plant from the identified model beside the deviation found, on unseen trajectories."""
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
-        ratio = run.get("predicted", {}).get("normalised_squared_error")
+        predicted = run.get("predicted", {})
         rows.append((f"{n}: predicted", *map(number, predicted_row(run)), ""))
-        rows.append((f"{n}: found", *_rms(rms_row(run["true"])), number(ratio)))
+        found = rms_row(predicted if "position_rms_um" in predicted else run["true"])
+        rows.append((f"{n}: found", *_rms(found), number(predicted.get("normalised_squared_error"))))
     return Table(
-        "How far the true robot was expected from the model, and how far it was, RMS",
+        "How far the true robot was expected from the predicted poses, and how far it was, RMS",
         ("run", *AXIS_HEADER, "found²/predicted²"),
         tuple(rows),
-        "Predicted from the uncertainty of the parameters, and from what the cameras' noise does to the robot through "
-        "the servo. The last column is the squared error in units of what was predicted: one on average where the "
-        "prediction is right. The runs share one set of parameters, so they stray together; and the frames that the "
-        "cameras were taught, whose error moves the robot as a whole, are not predicted.",
+        "Predicted by the identified model and what its record taught of errors in common to all frames; how far, from "
+        "the uncertainty of both, and from what the cameras' noise does to the robot through the servo. The last "
+        "column is the squared error in units of what was predicted: one on average where the prediction is right. "
+        "The runs share one set of parameters, so they stray together. Where cameras and taught frames count as exact, "
+        "their error, which moves the robot as a whole, is not predicted.",
         folded=True,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from multiprocessing.sharedctypes import Synchronized
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 import cmmsim
 from dynamics import Robot
@@ -107,7 +108,7 @@ class PosePrediction:
     motion, which no model can foretell: its covariance is sampled by repeated experiments on the identified model, and
     is taken to be the same all along the motion. And what all measured poses have in common, as far as the record
     states it, and the geometry: the servo takes the platform where such an error does not show, the whole motion with
-    the same draw.
+    the same draw. What the record of the identification taught of that draw is in poses and covariance.
     """
 
     chart: Chart
@@ -131,20 +132,46 @@ class PosePrediction:
         return float(np.mean(np.sum(errors * weighted, axis=1))) / free.shape[1]
 
 
-def predict_poses(run: RecordedRun, parameters: Array, covariance: Array, rng: np.random.Generator) -> PosePrediction:
+def predict_poses(
+    run: RecordedRun,
+    parameters: Array,
+    covariance: Array,
+    rng: np.random.Generator,
+    learned: Mapping[str, float] | None = None,
+) -> PosePrediction:
     """Predict a run with estimated parameters (p,) of covariance (p, p).
+
+    learned: estimates, by name, of k errors that the poses of this run have in common with those of the record; then
+    the covariance (p + k, p + k) is theirs, too. Otherwise they are as well known as the run states.
 
     Of the run only the reference, the sensor's covariance and the lost frames count, not what was measured.
     Raises LoopFailure where the model, or its repetition with the sensor's noise, is unstable.
     """
+    likely, root, known = _known_in_common(run, covariance, len(parameters), learned or {})
+    inside = len(run.errors_had)
+    run = run.having(likely[:inside])
     model = run.simulate(parameters, sensitivities=True)
     assert model.pose_sensitivity is not None
     drawn = [repeated_experiment(run, parameters, rng).pose - model.pose for _ in range(REPETITIONS)]
     noise = np.concatenate(drawn)
-    from_parameters = model.pose_sensitivity @ covariance @ model.pose_sensitivity.transpose(0, 2, 1)
     common = run.pose_modes(parameters)
-    covariance = from_parameters + noise.T @ noise / len(noise) + common @ common.transpose(0, 2, 1)
-    return PosePrediction(run.robot.geometry.chart, model.pose, covariance)
+    slopes = np.concatenate([model.pose_sensitivity, common @ root], axis=2)
+    spread = slopes @ known @ slopes.transpose(0, 2, 1) + noise.T @ noise / len(noise)
+    return PosePrediction(run.robot.geometry.chart, model.pose + common[:, :, inside:] @ likely[inside:], spread)
+
+
+def _known_in_common(
+    run: RecordedRun, covariance: Array, parameters: int, learned: Mapping[str, float]
+) -> tuple[Array, Array, Array]:
+    """What is known of the errors that a run's poses have in common: the most likely of the independent numbers (k,) of
+    which they are made, what turns k known numbers into these (k, k), and the covariance (p + k, p + k) of parameters
+    and known numbers."""
+    names = run.common.all_names
+    if names and tuple(learned) == names:
+        root = np.asarray(np.linalg.pinv(run.common.whole_factor))
+        return root @ np.array([*learned.values()]), root, covariance
+    each = np.eye(len(names))
+    return np.zeros(len(names)), each, np.asarray(block_diag(covariance[:parameters, :parameters], each))
 
 
 def predicted_runs(
@@ -155,8 +182,10 @@ def predicted_runs(
     covariance: Array,
     seed: int,
     progress: Progress,
+    learned: Mapping[str, float] | None = None,
 ) -> list[PosePrediction]:
-    """What the identified model (p,) with its covariance (p, p) predicts for the plant on the references of records.
+    """What the identified model (p,) with its covariance (p, p) predicts for the plant on the references of records;
+    learned: as of `predict_poses`.
 
     NaN throughout where its loop is unstable, or too little was measured to know the sensor's noise.
 
@@ -168,7 +197,7 @@ def predicted_runs(
         for number, record in enumerate(records, start=1):
             rng = np.random.default_rng(stream_seed(seed, PREDICTION, number))
             try:
-                prediction = predict_poses(watched_run(record, robot, scenario), parameters, covariance, rng)
+                prediction = predict_poses(watched_run(record, robot, scenario), parameters, covariance, rng, learned)
             except (LoopFailure, TooFewFramesError):
                 shape = (record.sizes["time"], 6)
                 chart = robot.geometry.chart

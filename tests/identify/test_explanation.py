@@ -76,11 +76,12 @@ def test_of_information_that_no_computer_inverts_the_variances_are_right_and_pos
 
     def found(scale):
         run = SimpleNamespace(
-            residuals=lambda parameters: (scale * noise, jacobian),
+            residuals_in_noise=lambda parameters: (scale * noise, jacobian),
+            without_common=lambda rows: rows,
+            whitened_modes=np.zeros((frames, 6, 0)),
             driven=True,
             ok=np.ones(frames, dtype=bool),
             payload_std=np.zeros(size),
-            marginal=None,
         )
         guess = SimpleNamespace(rows=np.eye(size))
         problem = SimpleNamespace(runs=(run,), known=lambda parameters: (np.zeros(size), np.eye(size)), guess=guess)

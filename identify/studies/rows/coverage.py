@@ -12,29 +12,36 @@ from identify.experiment.run import Experiment
 from identify.experiment.truth import true_poses
 from identify.progress import SilentProgress
 from identify.studies.rows.kind import Row
+from identify.studies.rows.sensor import rms_um
 from identify.validation.unseen import predicted_runs
 
 
 def coverage(result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int) -> Row:
-    """How many intervals of what is identified hold the truth, and how many true coordinates on unseen trajectories are
-    where they are predicted."""
+    """How many intervals of what is identified hold the truth, how many true coordinates on unseen trajectories are
+    where they are predicted, and how far from the true positions the predicted ones are."""
     held = [inside for *_, identified, inside in quantities(result, plant.parameters) if identified]
-    found = _poses_covered(result, plant, unseen, seed)
-    row: Row = {"intervals": len(held), "poses_covered_percent": 100.0 * float(np.mean(found))}
+    errors, variances = _predicted(result, plant, unseen, seed)
+    free = plant.nominal.geometry.chart.basis
+    within = np.abs(errors @ free) < HALF_WIDTH * np.sqrt(np.diagonal(free.T @ variances @ free, axis1=1, axis2=2))
+    row: Row = {
+        "intervals": len(held),
+        "poses_covered_percent": 100.0 * float(np.mean(within)),
+        "predicted_position_rms_um": rms_um(errors[:, :3]),
+    }
     return row | ({"covered_percent": 100.0 * float(np.mean(held))} if held else {})
 
 
-def _poses_covered(result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int) -> Array:
-    """Whether each true coordinate (frames, m) is within its 95 % interval."""
-    robot, free, records = plant.nominal, plant.nominal.geometry.chart.basis, [one.record for one in unseen]
-    estimated = result.estimate, result.covariance
-    predicted = predicted_runs(robot, plant.scenario, records, *estimated, seed, SilentProgress())
-    pairs = [(true_poses(one.truth) - of_one.poses, of_one) for one, of_one in zip(unseen, predicted, strict=True)]
-    errors = np.concatenate([error @ free for error, _ in pairs])
-    variances = np.concatenate(
-        [np.diagonal(free.T @ of_one.covariance @ free, axis1=1, axis2=2) for _, of_one in pairs]
-    )
-    return np.abs(errors) < HALF_WIDTH * np.sqrt(variances)
+def _predicted(
+    result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int
+) -> tuple[Array, Array]:
+    """Errors of predicted poses (frames, 6) on all unseen trajectories, and the covariance stated of them (frames, 6,
+    6)."""
+    records = [one.record for one in unseen]
+    learned = dict(zip(result.common_errors.names, result.common_errors.estimate.tolist(), strict=True))
+    estimated = result.estimate, result.whole_covariance
+    predicted = predicted_runs(plant.nominal, plant.scenario, records, *estimated, seed, SilentProgress(), learned)
+    errors = [true_poses(one.truth) - of_one.poses for one, of_one in zip(unseen, predicted, strict=True)]
+    return np.concatenate(errors), np.concatenate([one.covariance for one in predicted])
 
 
 def quantities(result: IdentificationResult, truth: Array) -> Iterator[tuple[str, float, float, bool, bool]]:

@@ -77,9 +77,13 @@ COLUMNS = {
         "urad", "error of the model's orientation on unseen trajectories, rms over axes", main=True
     ),
     "poses_covered_percent": Column("%", "of true coordinates on unseen trajectories, those within the 95 % predicted"),
+    "predicted_position_rms_um": Column(
+        "um", "error of the predicted position there, with what the record taught of sensor and geometry"
+    ),
     "unaware_intervals": Column("1", "the same without a word of what all frames have in common"),
     "unaware_covered_percent": Column("%", "the same without a word of what all frames have in common"),
     "unaware_poses_covered_percent": Column("%", "the same without a word of what all frames have in common"),
+    "unaware_predicted_position_rms_um": Column("um", "the same without a word of what all frames have in common"),
 }
 
 
