@@ -14,9 +14,12 @@ import cmmsim
 from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from identify.errors import RecordError
 from identify.estimation.identification import identify, output_error_problem
+from identify.progress import SilentProgress
 from identify.record.common_errors import CommonErrors, Marginal, read_common_errors, store_common_errors
+from identify.record.recorded_run import recorded_reference
 from identify.record.recording import poses
 from identify.reporting.tables import common_error_table
+from identify.validation.unseen import model_run, predicted_runs
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
 NAMES = ("left.fx_px", "left.cx_px", "right.cx_px", "taught.base.rz_rad", "taught.platform.tx_m")
@@ -43,12 +46,19 @@ def changes(poses):
 COVARIANCE = np.diag([1.0, 0.5, 2.0, 1.0, 0.2]) ** 2 + 0.3 * np.outer([1, 0, 1, 0, 0], [1, 0, 1, 0, 0])
 
 
-def experiment(seed, scenario):
-    """A record of five seconds with one draw of the errors, with what it states of them; and the draw."""
+def experiment(seed, scenario, trajectory_seed=0):
+    """A record of five seconds with one draw of the errors, whatever the motion, with what it states of them; the run
+    of the plant, and the draw."""
     drawn = np.random.default_rng(seed + 100).multivariate_normal(np.zeros(5), COVARIANCE)
-    record, _ = run_plant(scenario, seed, duration_s=5.0, bias=lambda frame, pose: changes(pose[None])[0] @ drawn)
+    record, run = run_plant(
+        scenario,
+        seed,
+        duration_s=5.0,
+        trajectory_seed=trajectory_seed,
+        bias=lambda frame, pose: changes(pose[None])[0] @ drawn,
+    )
     store_common_errors(record, CommonErrors(NAMES, changes(poses(record, "measured")), COVARIANCE))
-    return record, drawn
+    return record, run, drawn
 
 
 def test_whitened_residuals_have_a_covariance_of_one():
@@ -63,7 +73,7 @@ def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them
     """Without being told of them, the model seems wrong. Told, it is right, estimates lie within their deviations, and
     the record shows the errors themselves three times better than they were known."""
     scenario = quick(**{"identification.method": method})
-    record, drawn = experiment(1, scenario)
+    record, _, drawn = experiment(1, scenario)
     result = identify(record, rss6(), scenario)
     assert not result.warnings
     assert result.identifiable.sum() >= 20
@@ -82,6 +92,26 @@ def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them
     if method == "command_driven":  # a servo takes the platform where most of an error does not show
         assert (found.std < 0.3 * found.prior_std).all()
         assert ignorant.noise_ratio > 1.5 * result.noise_ratio
+
+
+@pytest.mark.parametrize("method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)])
+def test_poses_of_unseen_motion_are_predicted_with_what_the_record_taught(method):
+    """The same errors lead the servo beside another motion, too. What the record taught of them takes most of that from
+    the prediction, whose errors are as large as it states."""
+    scenario, robot = quick(**{"identification.method": method}), rss6()
+    record, _, _ = experiment(1, scenario)
+    result = identify(record, robot, scenario)
+    unseen, run, _ = experiment(1, scenario, trajectory_seed=1)
+    learned = dict(zip(result.common_errors.names, result.common_errors.estimate, strict=True))
+    model = robot, scenario, [unseen], result.estimate
+    (taught,) = predicted_runs(*model, result.whole_covariance, 0, SilentProgress(), learned)
+    (before,) = predicted_runs(*model, result.covariance, 0, SilentProgress())
+    np.testing.assert_array_equal(before.poses, model_run(robot, scenario, result.estimate, recorded_reference(unseen)))
+    sizes = [np.sqrt(np.mean(((one.poses - run.pose) / SIGMA) ** 2)) for one in (taught, before)]
+    stated = [np.sqrt(np.mean((one.std / SIGMA) ** 2)) for one in (taught, before)]
+    assert sizes[0] < 0.6 * sizes[1]
+    assert stated[0] < 0.6 * stated[1]
+    assert 0.3 < taught.normalised_squared_error(run.pose) < 3.0
 
 
 @pytest.mark.parametrize("method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)])
@@ -171,7 +201,7 @@ def test_a_record_without_them_is_whitened_as_ever():
     ],
 )
 def test_a_record_that_states_no_covariance_is_refused_in_one_line(spoil, words):
-    record, _ = experiment(0, quick())
+    record, _, _ = experiment(0, quick())
     with pytest.raises(RecordError, match=words) as error:
         read_common_errors(spoil(record), KINDS)
     assert "\n" not in str(error.value)
