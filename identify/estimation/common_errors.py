@@ -5,6 +5,7 @@ modes M of the common errors, parameters p and errors z (of unit variance before
 |z|^2 with what is known of p. The parameters' search has z eliminated; at its optimum z = -(1 + M^T M)^-1 M^T r.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,36 @@ def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[A
         np.zeros(0) if run.marginal is None else most_likely(run, parameters)[: len(run.errors_had)]
         for run in problem.runs
     ]
+
+
+def shared_draws(runs: Sequence[RecordedRun]) -> tuple[list[RecordedRun], Array]:
+    """The first run of each draw of errors in common to all poses, and what makes the numbers of all runs (k,), record
+    by record, of those of these alone (k, d). Records that state the same errors, equally well known, share a draw."""
+    firsts: list[RecordedRun] = []
+    for run in runs:
+        if not any(run.common.known_as(first.common) for first in firsts):
+            firsts.append(run)
+
+    def made_of(run: RecordedRun, first: RecordedRun) -> Array:
+        own, other = (one.whitened_modes.shape[2] for one in (run, first))
+        if run is first:
+            return np.eye(own)
+        if not own or not run.common.known_as(first.common):
+            return np.zeros((own, other))
+        return np.asarray(np.linalg.pinv(run.common.whole_factor) @ first.common.whole_factor)
+
+    return firsts, np.vstack([np.hstack([made_of(run, first) for first in firsts]) for run in runs])
+
+
+def covariance_by_kind(runs: Sequence[RecordedRun], moved: Array) -> dict[str, Array]:
+    """Covariance (p, p) of an estimate that each kind of errors in common to all poses of a record makes; moved (p, k):
+    what each of their numbers makes of it, run by run."""
+    of_common: dict[str, Array] = {}
+    for run in runs:
+        own, moved = np.split(moved, [run.whitened_modes.shape[2]], axis=1)
+        for kind, part in run.common.by_kind(own).items() if own.size else ():
+            of_common[kind] = of_common.get(kind, 0.0) + part @ part.T
+    return of_common
 
 
 def common_error_estimates(problem: OutputErrorProblem, parameters: Array, whole: Array) -> CommonErrorEstimates:

@@ -12,7 +12,8 @@ It is all computed in units where W is one.
 
 Errors that all poses of a record have in common, of cameras, teaching, clocks and geometry, are parameters of the same
 problem: their modes M stand in J behind the others, and each is known beforehand to one standard deviation. So the
-record says what it taught of them, and how far that and the parameters err together.
+record says what it taught of them, and how far that and the parameters err together. The search estimates those of
+every record apart; where records share one draw of them, the covariance of the estimate is that of a shared draw.
 
 A known load errs, too. Under the load L the model has the parameters p + L: an error of the load moves the residuals of
 its records by J dL, with J their Jacobian by the parameters, and the scores by J^T J dL. With S the covariance of the
@@ -31,7 +32,7 @@ from scipy.linalg import block_diag, solve_triangular
 from dynamics.closed_loop import ClosedLoopRun, LoopFailure
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.common_errors import most_likely_of
+from identify.estimation.common_errors import covariance_by_kind, most_likely_of, shared_draws
 from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
 from identify.estimation.output_error import OutputErrorProblem
 from identify.progress import Advance
@@ -99,9 +100,9 @@ def estimate_uncertainty(
     known, known_rows = problem.known(parameters)
     gradient = known @ known_rows + sum(np.tensordot(r, j, 2) for r, j in found)
     information = np.asarray(sum(_information(j) for _, j in found))
-    whole = linear[0].rows.shape[2]
-    known_rows = block_diag(known_rows, np.eye(whole - size))
-    units = _units([known_rows, *(one.rows.reshape(-1, whole) for one in linear)])
+    whole, (firsts, drawn) = linear[0].rows.shape[2], shared_draws(runs)
+    all_known = block_diag(known_rows, np.eye(whole - size))
+    units = _units([all_known, *(one.rows.reshape(-1, whole) for one in linear)])
     shown = [replace(one, rows=one.rows @ units) for one in linear]
     scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
     if misfit.significant:
@@ -110,11 +111,12 @@ def estimate_uncertainty(
     if any(run.payload_std.any() for run in runs):
         moved = [np.tensordot(one.rows, one.slopes, ((0, 1), (0, 1))) for one in shown]
         scores = scores + load_score_covariance(runs, moved)
-    covariance = units @ (scores + _information(known_rows @ units)) @ units.T
+    beforehand = _information(known_rows @ units[:size]) + _information(drawn.T @ units[size:])
+    covariance = units @ (scores + beforehand) @ units.T
     return Uncertainty(
         (covariance + covariance.T) / 2,
         _information(problem.guess.rows @ units[:size] @ units[:size].T),
-        _of_common(runs, units[:size] @ units[size:].T),
+        covariance_by_kind(firsts, units[:size] @ units[size:].T @ drawn),
         information,
         np.asarray(gradient),
         misfit,
@@ -150,17 +152,6 @@ def _linearised(runs: Sequence[RecordedRun], parameters: Array) -> list[_Linear]
         before, after = (np.zeros((*missed.shape, sum(some))) for some in (counts[:number], counts[number + 1 :]))
         found.append(_Linear(missed, slopes, np.concatenate([slopes, before, own, after], axis=2), own))
     return found
-
-
-def _of_common(runs: Sequence[RecordedRun], moved: Array) -> dict[str, Array]:
-    """Covariance (p, p) of an estimate that each kind of errors in common to all poses of a record makes; moved (p, k):
-    what each of their numbers makes of it."""
-    of_common: dict[str, Array] = {}
-    for run in runs:
-        own, moved = np.split(moved, [run.whitened_modes.shape[2]], axis=1)
-        for kind, part in run.common.by_kind(own).items() if own.size else ():
-            of_common[kind] = of_common.get(kind, 0.0) + part @ part.T
-    return of_common
 
 
 def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array]) -> Array:

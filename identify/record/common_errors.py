@@ -51,6 +51,14 @@ class CommonErrors:
         latency = [np.full((1, 1), self.latency_std)] if self.latency_std else []
         return np.asarray(block_diag(self.factor, *latency, *([self.geometry.factor] if self.geometry else [])))
 
+    def known_as(self, other: "CommonErrors") -> bool:
+        """Whether these are the errors that others are, and as well known."""
+        pairs = [(self.covariance, other.covariance)]
+        if self.geometry and other.geometry:
+            pairs.append((self.geometry.covariance, other.geometry.covariance))
+        same = self.all_names == other.all_names and self.latency_std == other.latency_std
+        return same and all(np.array_equal(*pair) for pair in pairs)
+
     def by_kind(self, modes: Array) -> dict[str, Array]:
         """Of what independent numbers of standard deviation one, whose factor is `whole_factor`, do (..., k), the part
         of each kind (..., k); errors of one kind say nothing of those of another."""

@@ -6,6 +6,7 @@ turns that couple into positions, of some deviations of the noise. What a real r
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import pytest
 import cmmsim
 from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from identify.errors import RecordError
+from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
 from identify.progress import SilentProgress
 from identify.record.common_errors import CommonErrors, Marginal, read_common_errors, store_common_errors
@@ -184,6 +186,49 @@ def test_eliminated_errors_are_those_that_would_be_estimated_beside_the_paramete
     np.testing.assert_allclose(
         np.linalg.inv((w := marginal.whiten(jacobian)).T @ w), np.linalg.inv(both.T @ both)[:3, :3], rtol=1e-9
     )
+
+
+def test_records_that_share_a_draw_do_not_average_it():
+    """Two records of a linear problem, worked out densely: what the estimate, which takes their errors for independent,
+    makes of noise, of one draw in both or of two, and of a guess. In another basis the second record's numbers are
+    others, and their draw the same."""
+    rng, frames, size = np.random.default_rng(6), 20, 3
+    told = CommonErrors(NAMES[:2], np.zeros((frames, 6, 2)), np.diag([1.0, 4.0]))
+    jacobians, basis = rng.standard_normal((2, frames, 6, size)), np.linalg.qr(rng.standard_normal((2, 2)))[0]
+    modes = 3.0 * rng.standard_normal((2, frames, 6, 2))
+
+    def run(number, common, turn):
+        marginal = Marginal.of((modes[number] @ turn).reshape(-1, 2))
+        return SimpleNamespace(
+            residuals_in_noise=lambda parameters: (0.1 * np.ones((frames, 6)), jacobians[number]),
+            without_common=lambda rows: marginal.whiten(rows.reshape(6 * frames, -1)).reshape(rows.shape),
+            whitened_modes=modes[number] @ turn,
+            common=SimpleNamespace(**{"known_as": common.known_as, "whole_factor": common.factor @ turn},
+                by_kind=common.by_kind, covariance=common.covariance, geometry=None, latency_std=0.0,
+                all_names=common.all_names),
+            driven=True,
+            ok=np.ones(frames, dtype=bool),
+            payload_std=np.zeros(size),
+        )  # fmt: skip
+
+    def covariance(second):
+        runs = run(0, told, np.eye(2)), run(1, second, basis)
+        guess = SimpleNamespace(rows=np.eye(size))
+        problem = SimpleNamespace(runs=runs, known=lambda parameters: (np.zeros(size), np.eye(size)), guess=guess)
+        return estimate_uncertainty(problem, np.zeros(size), np.random.default_rng(0))
+
+    rows, seen = jacobians.reshape(2, -1, size), modes.reshape(2, -1, 2)
+    left = [np.linalg.solve(np.eye(6 * frames) + m @ m.T, j) for j, m in zip(rows, seen, strict=True)]
+    gain = np.linalg.inv(np.eye(size) + sum(j.T @ w for j, w in zip(rows, left, strict=True)))
+    apart = [w.T @ m for w, m in zip(left, seen, strict=True)]
+    noise = np.eye(size) + sum(w.T @ w for w in left)
+    for second, common in (
+        (told, (apart[0] + apart[1]) @ (apart[0] + apart[1]).T),
+        (replace(told, covariance=np.diag([1.0, 4.1])), apart[0] @ apart[0].T + apart[1] @ apart[1].T),
+    ):
+        found = covariance(second)
+        np.testing.assert_allclose(found.covariance, gain @ (noise + common) @ gain, rtol=1e-9)
+        np.testing.assert_allclose(found.of_common["rig"], gain @ common @ gain, rtol=1e-9)
 
 
 def test_a_record_without_them_is_whitened_as_ever():

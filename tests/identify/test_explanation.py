@@ -11,6 +11,7 @@ from identify.errors import EstimationError
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white, whiteness
 from identify.estimation.identification import identify
+from identify.record.common_errors import NONE
 from tests.identify.synthetic import quick, rss6, run_plant
 
 
@@ -79,6 +80,7 @@ def test_of_information_that_no_computer_inverts_the_variances_are_right_and_pos
             residuals_in_noise=lambda parameters: (scale * noise, jacobian),
             without_common=lambda rows: rows,
             whitened_modes=np.zeros((frames, 6, 0)),
+            common=NONE,
             driven=True,
             ok=np.ones(frames, dtype=bool),
             payload_std=np.zeros(size),
