@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
-from cmmsim.geometry.disc_kernels import blur_window, cover_window, inverse_of
+from cmmsim.geometry.disc_kernels import blur_window, inverse_of
 from cmmsim.geometry.point_kernels import factor, invert_factored, solve_factored
+from cmmsim.geometry.rim_kernels import cover_window
 
 UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
 SMALLEST_START_PX = 1.2
+RANK_STEPS = 256  # a grey value each at 8 bit
 
 
 class FitSettings(NamedTuple):
@@ -56,11 +58,54 @@ def nth_smallest(values: Array, n: int) -> float:
 
 
 @compiled
+def two_of_rank(values: Array, low_rank: int, high_rank: int) -> tuple:
+    """The values with ``low_rank`` and with ``high_rank`` smaller ones, of finite ones; reorders ``values``.
+
+    They are counted in even steps between the smallest and the largest, and sorted only where a rank falls.
+    """
+    smallest, largest = values[0], values[0]
+    for value in values:
+        smallest, largest = min(smallest, value), max(largest, value)
+    if not smallest < largest:
+        return smallest, largest
+    scale, counts = (RANK_STEPS - 1) / (largest - smallest), np.zeros(RANK_STEPS, np.int64)
+    for value in values:
+        counts[int((value - smallest) * scale)] += 1
+    low_step, low_before = step_of_rank(counts, low_rank)
+    high_step, high_before = step_of_rank(counts, high_rank)
+    found = np.empty(max(counts[low_step], counts[high_step]))
+    low = nth_in_step(values, smallest, scale, low_step, found, low_rank - low_before)
+    return low, nth_in_step(values, smallest, scale, high_step, found, high_rank - high_before)
+
+
+@compiled
+def step_of_rank(counts: Array, rank: int) -> tuple:
+    """The step in which the value with ``rank`` smaller ones falls, and how many fall before."""
+    step, before = 0, 0
+    while before + counts[step] <= rank:
+        before += counts[step]
+        step += 1
+    return step, before
+
+
+@compiled
+def nth_in_step(values: Array, smallest: float, scale: float, step: int, found: Array, n: int) -> float:
+    """The value of a step with ``n`` smaller ones in it; ``found`` is overwritten."""
+    count, same = 0, True
+    for value in values:
+        if int((value - smallest) * scale) == step:
+            found[count] = value
+            same = same and value == found[0]
+            count += 1
+    return found[0] if same else nth_smallest(found[:count], n)
+
+
+@compiled
 def moments(window: Array) -> tuple:
     """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w) of floats."""
     flat = window.flatten()
-    ground = nth_smallest(flat, len(flat) // 3)
-    contrast = max(nth_smallest(flat, len(flat) - 6) - ground, 1.0)
+    ground, bright = two_of_rank(flat, len(flat) // 3, len(flat) - 6)
+    contrast = max(bright - ground, 1.0)
     area, x, y, xx, xy, yy = 1e-300, 0.0, 0.0, 0.0, 0.0, 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
@@ -139,14 +184,12 @@ def accumulate(
             residual = window[row, column] - mean
             misfit += weight * residual * residual
             row_of[5] = share
-            on_rim = change[0] != 0.0 or change[1] != 0.0
-            if on_rim:
-                for i in range(5):
-                    row_of[i] = contrast * change[i]
-            for i in range(0 if on_rim else 5, UNKNOWNS):
+            for i in range(5):
+                row_of[i] = contrast * change[i]
+            for i in range(UNKNOWNS):
                 weighted = weight * row_of[i]
                 right[i] += weighted * residual
-                for j in range(0 if on_rim else 5, i + 1):
+                for j in range(i + 1):
                     normal[i, j] += weighted * row_of[j]
     dark, bright = 1.0 / variance_at(ground, settings), 1.0 / variance_at(ground + contrast, settings)
     normal[6, 6] += dark * outside + bright * inside

@@ -1,8 +1,4 @@
-"""Compiled: discs as a camera sees them, and their light in each pixel, sharp and blurred.
-
-The formulas stand in ``disc_image``. An ellipse comes as its centre and the matrix m = A^-1 (2,2) that carries px into
-the axes of the unit disc.
-"""
+"""Compiled: discs as a camera sees them, and their blurred light in each pixel; the formulas stand in ``disc_image``."""
 
 from __future__ import annotations
 
@@ -76,149 +72,12 @@ def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> 
 
 
 @compiled
-def side_share(start_x: float, start_y: float, step_x: float, step_y: float) -> tuple[float, float, float]:
-    """Twice the signed area, in disc units, between the disc's centre and one side: its part inside gives a triangle,
-    the parts outside give sectors. Also where the side enters and leaves the disc."""
-    start2 = start_x * start_x + start_y * start_y
-    step2 = step_x * step_x + step_y * step_y
-    dot = start_x * step_x + start_y * step_y
-    cross = start_x * step_y - start_y * step_x
-    within = step2 - cross * cross  # dot² - step² (start² - 1), by Lagrange's identity
-    if within <= 0.0:  # the line passes the disc: one sector
-        return math.atan2(cross, start2 + dot), 0.0, 0.0
-    root = math.sqrt(within)
-    enter, leave = min(max((-dot - root) / step2, 0.0), 1.0), min(max((-dot + root) / step2, 0.0), 1.0)
-    if enter == leave:  # the side does, not its line
-        return math.atan2(cross, start2 + dot), enter, leave
-    area = (leave - enter) * cross
-    if enter > 0.0:
-        area += math.atan2(enter * cross, start2 + enter * dot)
-    if leave < 1.0:
-        area += math.atan2((1.0 - leave) * cross, start2 + (1.0 + leave) * dot + leave * step2)
-    return area, enter, leave
-
-
-@compiled
-def reach_of_pixel(m: Array) -> float:
-    """Largest distance, in disc units, of a pixel's points from its middle."""
-    return 0.5 * math.sqrt(
-        max((m[0, 0] + m[0, 1]) ** 2 + (m[1, 0] + m[1, 1]) ** 2, (m[0, 0] - m[0, 1]) ** 2 + (m[1, 0] - m[1, 1]) ** 2)
-    )
-
-
-@compiled
-def into_disc(x: float, y: float, m: Array) -> tuple[float, float]:
-    """A place in px from the ellipse's centre, in disc units."""
-    return m[0, 0] * x + m[0, 1] * y, m[1, 0] * x + m[1, 1] * y
-
-
-@compiled
-def sides_of(column: int, row: int, x: float, y: float, m: Array, before: tuple, below: Array) -> tuple:
-    """``side_share`` of the four sides of the pixel in this column and row with middle (x, y): low, high, left, right.
-
-    Neighbours have a side in common: ``before`` is (column, *right side) of the last pixel asked for in this row, and
-    ``below`` (w,4) holds (row, *upper side) of the last one in each column, which is renewed.
-    """
-    a_x, a_y = into_disc(x - 0.5, y - 0.5, m)  # the corner (left, low)
-    if before[0] == column - 1:
-        left = before[1], before[2], before[3]
-    else:
-        left = side_share(a_x, a_y, m[0, 1], m[1, 1])
-    last = below[column]
-    if last[0] == row - 1:
-        low = last[1], last[2], last[3]
-    else:
-        low = side_share(a_x, a_y, m[0, 0], m[1, 0])
-    high = side_share(a_x + m[0, 1], a_y + m[1, 1], m[0, 0], m[1, 0])
-    right = side_share(a_x + m[0, 0], a_y + m[1, 0], m[0, 1], m[1, 1])
-    last[0], last[1], last[2], last[3] = row, high[0], high[1], high[2]
-    return low, high, left, right
-
-
-@compiled
-def share_within(m: Array, low: tuple, high: tuple, left: tuple, right: tuple) -> float:
-    """Share of a pixel from the ``side_share`` of its sides."""
-    return 0.5 / (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]) * (low[0] - high[0] + right[0] - left[0])
-
-
-@compiled
-def cover_within(
-    x: float, y: float, m: Array, of_low: tuple, of_high: tuple, of_left: tuple, of_right: tuple
-) -> tuple[float, float, float, float, float, float]:
-    """Share of the pixel with middle (x, y), px from the ellipse's centre, and its derivatives by [c_x, c_y, A_xx,
-    A_xy, A_yy], from the ``side_share`` of its four sides, of which two run along x and two along y: along each the
-    boundary moves by v = dc + dA A^-1 (x - c)."""
-    left, right, low, high = x - 0.5, x + 0.5, y - 0.5, y + 0.5
-    (_, low_in, low_out), (_, high_in, high_out) = of_low, of_high
-    (_, left_in, left_out), (_, right_in, right_out) = of_left, of_right
-    share = share_within(m, of_low, of_high, of_left, of_right)
-
-    in_low, in_high, in_left, in_right = low_out - low_in, high_out - high_in, left_out - left_in, right_out - right_in
-    mid_low, mid_high = left + 0.5 * (low_in + low_out), left + 0.5 * (high_in + high_out)
-    mid_left, mid_right = low + 0.5 * (left_in + left_out), low + 0.5 * (right_in + right_out)
-    # flux through the sides of m (x - c), row by row: up through those along x, rightwards through those along y
-    up_0 = in_high * (m[0, 0] * mid_high + m[0, 1] * high) - in_low * (m[0, 0] * mid_low + m[0, 1] * low)
-    up_1 = in_high * (m[1, 0] * mid_high + m[1, 1] * high) - in_low * (m[1, 0] * mid_low + m[1, 1] * low)
-    across_0 = in_right * (m[0, 0] * right + m[0, 1] * mid_right) - in_left * (m[0, 0] * left + m[0, 1] * mid_left)
-    across_1 = in_right * (m[1, 0] * right + m[1, 1] * mid_right) - in_left * (m[1, 0] * left + m[1, 1] * mid_left)
-    by_xx = m[0, 0] * share - across_0
-    by_xy = (m[0, 1] + m[1, 0]) * share - across_1 - up_0
-    by_yy = m[1, 1] * share - up_1
-    return share, in_left - in_right, in_low - in_high, by_xx, by_xy, by_yy
-
-
-@compiled
-def rim_between(reach: float) -> tuple:
-    """Squared distances, in disc units, up to which a pixel that reaches so far from its middle lies wholly inside of a
-    disc, and from which on outside."""
-    return (1.0 - reach) ** 2 if reach < 1.0 else -1.0, (1.0 + reach) ** 2
-
-
-@compiled
 def inverse_of(shape: Array) -> Array:
     """Inverse (2,2) of a (2,2) matrix."""
     det = shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0]
     m = np.empty((2, 2))
     m[0, 0], m[0, 1], m[1, 0], m[1, 1] = shape[1, 1] / det, -shape[0, 1] / det, -shape[1, 0] / det, shape[0, 0] / det
     return m
-
-
-@compiled
-def cover_window(centre_x: float, centre_y: float, shape: Array, shares: Array, derivatives: Array) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5); only pixels on the rim need more than a distance, and
-    neighbours have a side in common."""
-    height, width = shares.shape
-    m = inverse_of(shape)
-    reach = reach_of_pixel(m)
-    inner, outer = rim_between(reach)
-    extent_x, extent_y = math.hypot(shape[0, 0], shape[0, 1]), math.hypot(shape[1, 0], shape[1, 1])
-    first, last = max(0, math.ceil(centre_x - extent_x - 0.5)), min(width, math.floor(centre_x + extent_x + 1.5))
-    top, bottom = max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))
-    below = np.full((width, 4), -2.0)
-    shares[:] = 0.0
-    derivatives[:] = 0.0
-    for row in range(top, bottom):
-        before = -2.0, 0.0, 0.0, 0.0
-        for column in range(first, last):
-            x, y = column - centre_x, row - centre_y
-            u, v = into_disc(x, y, m)
-            distance2 = u * u + v * v
-            if distance2 <= inner:
-                shares[row, column] = 1.0
-            elif distance2 < outer:
-                low, high, left, right = sides_of(column, row, x, y, m, before, below)
-                before = float(column), right[0], right[1], right[2]
-                share, by_x, by_y, by_xx, by_xy, by_yy = cover_within(x, y, m, low, high, left, right)
-                shares[row, column] = share
-                into = derivatives[row, column]
-                into[0], into[1], into[2], into[3], into[4] = by_x, by_y, by_xx, by_xy, by_yy
-
-
-@compiled
-def cover_windows(centres: Array, shapes: Array, shares: Array, derivatives: Array) -> None:
-    """``cover_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives (n,h,w,5)."""
-    for k in range(len(centres)):
-        cover_window(centres[k, 0], centres[k, 1], shapes[k], shares[k], derivatives[k])
 
 
 REACH = 5.5  # standard deviations from the rim beyond which no light is followed: 4e-8 of it

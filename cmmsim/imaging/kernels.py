@@ -8,14 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
-from cmmsim.geometry.disc_kernels import (
-    into_disc,
-    inverse_of,
-    reach_of_pixel,
-    rim_between,
-    share_within,
-    sides_of,
-)
+from cmmsim.geometry.rim_kernels import cover_by_ellipse, empty_cover
 
 
 @compiled
@@ -211,27 +204,19 @@ def shown_share(behind: Array, covers: Array, row: int, column: int) -> float:
 def lay_disc(image: Array, centre_x: float, centre_y: float, k: int, discs: Discs, covers: Array) -> None:
     """Lay disc ``k`` over a window (h, w), its centre given in px of the window."""
     height, width = image.shape
-    m = inverse_of(discs.shapes[k])
-    inner, outer = rim_between(reach_of_pixel(m))
     extent_x, extent_y = discs.extents[k]
     first, last = max(0, math.ceil(centre_x - extent_x - 0.5)), min(width, math.floor(centre_x + extent_x + 1.5))
     top, bottom = max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))
-    below = np.full((width, 4), -2.0)
+    if first >= last or top >= bottom:
+        return
+    cover = empty_cover(bottom - top, last - first, np.empty((0, 0, 5)))
+    cover_by_ellipse(centre_x - first, centre_y - top, discs.shapes[k], cover)
     for row in range(top, bottom):
-        before = -2.0, 0.0, 0.0, 0.0
         for column in range(first, last):
-            x, y = column - centre_x, row - centre_y
-            u, v = into_disc(x, y, m)
-            distance2 = u * u + v * v
-            if distance2 >= outer:
-                continue
-            share = 1.0
-            if distance2 > inner:
-                low, high, left, right = sides_of(column, row, x, y, m, before, below)
-                before = float(column), right[0], right[1], right[2]
-                share = share_within(m, low, high, left, right)
-            share *= shown_share(discs.behind[k], covers, row, column)
-            image[row, column] += share * (discs.levels[k] - image[row, column])
+            share = cover.shares[row - top, column - first]
+            if share != 0.0:
+                share *= shown_share(discs.behind[k], covers, row, column)
+                image[row, column] += share * (discs.levels[k] - image[row, column])
 
 
 @compiled
