@@ -40,6 +40,8 @@ class FitSettings(NamedTuple):
 def nth_smallest(values: Array, n: int) -> float:
     """The value with ``n`` smaller ones (Hoare's selection); reorders ``values``."""
     first, last = 0, len(values) - 1
+    if last > 0 and all_alike(values):
+        return values[0]
     while first < last:
         pivot, low, high = values[n], first, last
         while low <= high:
@@ -58,24 +60,45 @@ def nth_smallest(values: Array, n: int) -> float:
 
 
 @compiled
-def two_of_rank(values: Array, low_rank: int, high_rank: int) -> tuple:
-    """The values with ``low_rank`` and with ``high_rank`` smaller ones, of finite ones; reorders ``values``.
+def all_alike(values: Array) -> bool:
+    """Whether all values are the same number."""
+    different = 0
+    for value in values:
+        different += value != values[0]
+    return different == 0
 
-    They are counted in even steps between the smallest and the largest, and sorted only where a rank falls.
+
+@compiled
+def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
+    """The values of a window (h, w) with ``low_rank`` and with ``high_rank`` smaller ones; all are finite.
+
+    They are counted in even steps from the smallest to the largest, and sorted only within the steps that hold these.
     """
-    smallest, largest = values[0], values[0]
-    for value in values:
-        smallest, largest = min(smallest, value), max(largest, value)
-    if not smallest < largest:
+    width, smallest, largest = window.shape[1], window[0, 0], window[0, 0]
+    for row in range(window.shape[0]):
+        for column in range(width):
+            value = window[row, column]
+            smallest, largest = value if value < smallest else smallest, value if value > largest else largest
+    if smallest == largest:
         return smallest, largest
-    scale, counts = (RANK_STEPS - 1) / (largest - smallest), np.zeros(RANK_STEPS, np.int64)
-    for value in values:
-        counts[int((value - smallest) * scale)] += 1
-    low_step, low_before = step_of_rank(counts, low_rank)
-    high_step, high_before = step_of_rank(counts, high_rank)
-    found = np.empty(max(counts[low_step], counts[high_step]))
-    low = nth_in_step(values, smallest, scale, low_step, found, low_rank - low_before)
-    return low, nth_in_step(values, smallest, scale, high_step, found, high_rank - high_before)
+    scale, counts = (RANK_STEPS - 1) / (largest - smallest), np.zeros(RANK_STEPS, np.int32)
+    steps = np.empty(window.shape, np.int32)
+    for row in range(window.shape[0]):
+        for column in range(width):
+            steps[row, column] = int((window[row, column] - smallest) * scale)
+            counts[steps[row, column]] += 1
+    low, low_before = step_of_rank(counts, low_rank)
+    high, high_before = step_of_rank(counts, high_rank)
+    found, count = np.empty((2, window.size + 1)), np.zeros(2, np.int64)
+    for row in range(window.shape[0]):
+        for column in range(width):  # a place is taken by the next one where the value was none to be kept
+            found[0, count[0]] = found[1, count[1]] = window[row, column]
+            count[0] += steps[row, column] == low
+            count[1] += steps[row, column] == high
+    return (
+        nth_smallest(found[0, : count[0]], low_rank - low_before),
+        nth_smallest(found[1, : count[1]], high_rank - high_before),
+    )
 
 
 @compiled
@@ -89,26 +112,15 @@ def step_of_rank(counts: Array, rank: int) -> tuple:
 
 
 @compiled
-def nth_in_step(values: Array, smallest: float, scale: float, step: int, found: Array, n: int) -> float:
-    """The value of a step with ``n`` smaller ones in it; ``found`` is overwritten."""
-    count, same = 0, True
-    for value in values:
-        if int((value - smallest) * scale) == step:
-            found[count] = value
-            same = same and value == found[0]
-            count += 1
-    return found[0] if same else nth_smallest(found[:count], n)
-
-
-@compiled
 def moments(window: Array) -> tuple:
     """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w) of floats."""
-    flat = window.flatten()
-    ground, bright = two_of_rank(flat, len(flat) // 3, len(flat) - 6)
+    ground, bright = two_of_rank(window, window.size // 3, window.size - 6)
     contrast = max(bright - ground, 1.0)
     area, x, y, xx, xy, yy = 1e-300, 0.0, 0.0, 0.0, 0.0, 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
+            if window[row, column] - ground < 0.9 * CORE_SHARE * contrast:
+                continue
             share = (window[row, column] - ground) / contrast
             if share > CORE_SHARE:
                 share = min(share, 1.0)
@@ -160,37 +172,31 @@ def accumulate(
 
     Pixels wholly outside or inside of the ellipse share a mean, and only their residuals' sums are needed.
     """
-    normal[:], right[:], misfit = 0.0, 0.0, 0.0
-    row_of = np.empty(UNKNOWNS)
-    row_of[6] = 1.0
+    rows, count, misfit = np.empty((window.size, UNKNOWNS + 2)), 0, 0.0
     outside, outside_sum, outside_squares, inside, inside_sum, inside_squares = 0, 0.0, 0.0, 0, 0.0, 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
             if not mask[row, column]:
                 continue
-            share, change = shares[row, column], derivatives[row, column]
+            share = shares[row, column]
             mean = ground + contrast * share
+            residual = window[row, column] - mean
             if share == 0.0:
                 outside += 1
-                outside_sum += window[row, column] - mean
-                outside_squares += (window[row, column] - mean) ** 2
-                continue
-            if share == 1.0:
+                outside_sum += residual
+                outside_squares += residual * residual
+            elif share == 1.0:
                 inside += 1
-                inside_sum += window[row, column] - mean
-                inside_squares += (window[row, column] - mean) ** 2
-                continue
-            weight = 1.0 / variance_at(mean, settings)
-            residual = window[row, column] - mean
-            misfit += weight * residual * residual
-            row_of[5] = share
-            for i in range(5):
-                row_of[i] = contrast * change[i]
-            for i in range(UNKNOWNS):
-                weighted = weight * row_of[i]
-                right[i] += weighted * residual
-                for j in range(i + 1):
-                    normal[i, j] += weighted * row_of[j]
+                inside_sum += residual
+                inside_squares += residual * residual
+            else:
+                weight, change, found = 1.0 / variance_at(mean, settings), derivatives[row, column], rows[count]
+                misfit += weight * residual * residual
+                for i in range(5):
+                    found[i] = contrast * change[i]
+                found[5], found[6], found[7], found[8] = share, 1.0, residual, weight
+                count += 1
+    add_products(rows[:count], normal, right)
     dark, bright = 1.0 / variance_at(ground, settings), 1.0 / variance_at(ground + contrast, settings)
     normal[6, 6] += dark * outside + bright * inside
     normal[5, 5] += bright * inside
@@ -198,6 +204,29 @@ def accumulate(
     right[6] += dark * outside_sum + bright * inside_sum
     right[5] += bright * inside_sum
     return misfit + dark * outside_squares + bright * inside_squares
+
+
+@compiled
+def add_products(rows: Array, normal: Array, right: Array) -> None:
+    """Fill the normal matrix (7,7) and the right-hand side (7,) of rows (n,9): the slopes by seven parameters, the
+    residual, and the weight. Sums that are variables of their own are added in vector lanes."""
+    for i in range(UNKNOWNS):
+        s_0, s_1, s_2, s_3, s_4, s_5, s_6, s_7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for n in range(len(rows)):
+            row = rows[n]
+            weighted = row[8] * row[i]
+            s_0 += weighted * row[0]
+            s_1 += weighted * row[1]
+            s_2 += weighted * row[2]
+            s_3 += weighted * row[3]
+            s_4 += weighted * row[4]
+            s_5 += weighted * row[5]
+            s_6 += weighted * row[6]
+            s_7 += weighted * row[7]
+        sums = normal[i]
+        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], right[i] = (
+            s_0, s_1, s_2, s_3, s_4, s_5, s_6, s_7,
+        )  # fmt: skip
 
 
 @compiled

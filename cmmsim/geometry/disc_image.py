@@ -15,11 +15,11 @@ is the tangent of the unit circle and a the shift of the ellipse's centre. So
 
 For a round J A and a quadratic w_i = ½ H_ijk u_j u_k this is a_i = (H_ijj + 2 H_jij) / 8.
 
-**Coverage.** By Green's theorem the area of the ellipse in a pixel is the integral of (x - left) dy over the arcs of the
-rim in it, plus the whole rise dy of those arcs of its row that lie right of it. On an arc x = c + A u, where u = (cos t,
-sin t) goes from one crossing of the lines between pixels to the next, and the integrals of u_i du_j follow from its ends
-and its angle. A change of c or A moves the rim with a velocity v = dc + dA u, and changes the share by the flux of v
-through the pixel's own arcs, whose outward normal is (dy, -dx): integrals of the same kind.
+**Coverage.** By Green's theorem the area of the ellipse in a pixel is the integral of (x - left) dy over the arcs of
+the rim in it, plus the whole rise dy of those arcs of its row that lie right of it. On an arc x = c + A u, where
+u = (cos t, sin t) goes from one crossing of the lines between pixels to the next, and the integrals of u_i du_j follow
+from its ends and its angle. A change of c or A moves the rim with a velocity v = dc + dA u, and changes the share by
+the flux of v through the pixel's own arcs, whose outward normal is (dy, -dx): integrals of the same kind.
 
 **Blurred coverage.** With a Gaussian point spread the share of light in a pixel is the integral over the ellipse of
 g_i(x) g_j(y), where g_i(x) is what the point spread carries from a point x into pixel i. By the divergence theorem it

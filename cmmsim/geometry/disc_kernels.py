@@ -1,4 +1,4 @@
-"""Compiled: discs as a camera sees them, and their blurred light in each pixel; the formulas stand in ``disc_image``."""
+"""Compiled: discs as a camera sees them, and their blurred light in pixels; the formulas stand in ``disc_image``."""
 
 from __future__ import annotations
 

@@ -38,14 +38,20 @@ def solve_factored(lower: Array, right: Array) -> None:
 
 @compiled
 def invert_factored(lower: Array, inverse: Array) -> None:
-    """Fill ``inverse``, the leading (m,m) part of the inverse of L L'."""
-    column = np.empty(len(lower))
-    for k in range(len(inverse)):
-        column[:] = 0.0
-        column[k] = 1.0
-        solve_factored(lower, column)
-        for i in range(len(inverse)):
-            inverse[i, k] = column[i]
+    """Fill ``inverse``, the leading (m,m) part of the inverse of L L': K' K with the inverse K of L."""
+    n, m = len(lower), len(inverse)
+    root = np.empty((n, m))
+    for k in range(m):
+        for i in range(k, n):
+            rest = 1.0 if i == k else 0.0
+            for j in range(k, i):
+                rest -= lower[i, j] * root[j, k]
+            root[i, k] = rest / lower[i, i]
+        for i in range(k + 1):
+            total = 0.0
+            for j in range(k, n):
+                total += root[j, i] * root[j, k]
+            inverse[i, k] = inverse[k, i] = total
 
 
 @compiled

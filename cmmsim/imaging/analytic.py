@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array
-from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, View, same_exposure
+from cmmsim.imaging.renderer import Drawable, Renderer
 from cmmsim.imaging.scene import TOUCHING, ConvexSolid, DiscStack, Mesh
+from cmmsim.imaging.views import NEAR, View, Views
 
 if TYPE_CHECKING:
     from cmmsim.imaging.view_kernels import Scene
@@ -30,13 +31,14 @@ def draw_windows(
     if drawable not in _SCENES:
         _SCENES[drawable] = scene_of(drawable)
     scene = _SCENES[drawable]
-    width, height = views[0].size
+    views = Views.of(views)
+    width, height = views.size
     images = np.full((len(views), height, width), background, dtype=np.float32)
-    for group in same_exposure(views):
-        view, corners = views[group[0]], np.array([views[k].corner for k in group], dtype=float)
-        camera, moves = view.camera, np.ascontiguousarray(view.camera_from_bodies)
+    corners = np.asarray(views.corners, dtype=float)
+    for shown in views.exposures:
+        camera, moves = shown.camera, np.ascontiguousarray(shown.camera_from_bodies)
         figures = camera.focal_lengths, camera.centre, NEAR, TOUCHING
-        draw_view(scene, moves, *figures, images, np.array(group), corners, supersampling)
+        draw_view(scene, moves, *figures, images, shown.windows, corners[shown.windows], supersampling)
     return images
 
 

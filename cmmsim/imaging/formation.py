@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.pose import Array, frozen
-from cmmsim.imaging.renderer import Drawable, Renderer, View
+from cmmsim.imaging.renderer import Drawable, Renderer
+from cmmsim.imaging.views import Views
 
 _QUADRATIC = frozen([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])  # from values at -1, 0, 1
 # Fine pixels along each side of a pixel: the point spread smooths what resampling leaves, without it edges need more.
@@ -115,8 +116,7 @@ class ImageFormation:
         self, sides: Sequence[tuple[PinholeCamera, Array, NDArray]], size: int, supersampling: int
     ) -> list[NDArray[np.float32]]:
         """Windows of one size as the renderer draws them."""
-        views = [View(camera, bodies, (int(x), int(y)), (size, size)) for camera, bodies, at in sides for x, y in at]
-        images = self.renderer.draw(self.drawable, views, supersampling, self.background)
+        images = self.renderer.draw(self.drawable, Views.of_sides(sides, (size, size)), supersampling, self.background)
         return np.split(images, np.cumsum([len(at) for _, _, at in sides])[:-1])
 
     def _formed(

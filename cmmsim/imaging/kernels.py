@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
-from cmmsim.geometry.rim_kernels import cover_by_ellipse, empty_cover
+from cmmsim.geometry.rim_kernels import cover_window
 
 
 @compiled
@@ -209,14 +209,16 @@ def lay_disc(image: Array, centre_x: float, centre_y: float, k: int, discs: Disc
     top, bottom = max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))
     if first >= last or top >= bottom:
         return
-    cover = empty_cover(bottom - top, last - first, np.empty((0, 0, 5)))
-    cover_by_ellipse(centre_x - first, centre_y - top, discs.shapes[k], cover)
+    shares, none = np.empty((bottom - top, last - first)), np.empty((0, 0, 5))
+    cover_window(centre_x - first, centre_y - top, discs.shapes[k], shares, none)
+    level = discs.levels[k]
     for row in range(top, bottom):
-        for column in range(first, last):
-            share = cover.shares[row - top, column - first]
-            if share != 0.0:
-                share *= shown_share(discs.behind[k], covers, row, column)
-                image[row, column] += share * (discs.levels[k] - image[row, column])
+        own, under = shares[row - top], image[row, first:last]
+        if discs.behind[k].any():
+            for column in range(len(own)):
+                own[column] *= shown_share(discs.behind[k], covers, row, first + column)
+        for column in range(len(own)):
+            under[column] += own[column] * (level - under[column])
 
 
 @compiled

@@ -9,7 +9,6 @@ before the plane of a disc sees the disc, for all of the solid lies behind that 
 fills a window, its level is all that shows of it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +16,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array, frozen
-from cmmsim.imaging.renderer import FAR, NEAR, Drawable, View, window_bounds
+from cmmsim.imaging.renderer import Drawable
 from cmmsim.imaging.scene import ConvexSolid, Disc, DiscStack, Mesh
+from cmmsim.imaging.views import FAR, NEAR, Exposure, Views
 
 RIM_SAMPLES = 1.8
 LARGEST_SAG = 0.08  # samples by which a side of the polygon may fall short of the rim
@@ -132,24 +132,22 @@ class LaidSolids:
             for k, solid in self._solids.items()
         }
 
-    def laid(self, views: Sequence[View], groups: Sequence[NDArray[np.int_]], reaching: NDArray[np.bool_]) -> Laid:
-        """Which windows need no depths.
-
-        ``groups``: indices of the views of each camera and exposure; ``reaching`` (n views, patches): see Drawable.
-        """
+    def laid(self, views: Views, reaching: NDArray[np.bool_]) -> Laid:
+        """Which windows need no depths; ``reaching`` (n views, patches): see Drawable."""
         laid = Laid(np.full(len(views), -1), np.zeros(len(views), dtype=bool))
-        few, bounds = reaching.sum(axis=1) <= 2, window_bounds(views)
-        for group in groups:
+        few, bounds = reaching.sum(axis=1) <= 2, views.bounds
+        for shown in views.exposures:
+            group = shown.windows
             for k in self._solids:
                 members = group[few[group] & reaching[group, k]]
                 if len(members):
-                    others = reaching[members] & ~self._seen_over(k, views[members[0]])
+                    others = reaching[members] & ~self._seen_over(k, shown)
                     alone = members[~others.any(axis=1)]
                     laid.solid[alone] = k
-                    laid.filled[alone] = self._fills(k, views[members[0]], bounds[alone])
+                    laid.filled[alone] = self._fills(k, shown, bounds[alone])
         return laid
 
-    def _seen_over(self, solid: int, view: View) -> NDArray[np.bool_]:
+    def _seen_over(self, solid: int, view: Exposure) -> NDArray[np.bool_]:
         """The solid itself, and the stacks of discs on it that show their upper side (patches,)."""
         move = view.camera_from_bodies[self._body_index[solid]]
         eye = -move[:3, 3] @ move[:3, :3]
@@ -157,7 +155,7 @@ class LaidSolids:
         seen[solid] = True
         return seen
 
-    def _fills(self, solid: int, view: View, bounds: Array) -> NDArray[np.bool_]:
+    def _fills(self, solid: int, view: Exposure, bounds: Array) -> NDArray[np.bool_]:
         """Whether the solid shows at all corners of windows with ``bounds`` (n,4), px, and so all over them."""
         camera, move = view.camera, view.camera_from_bodies[self._body_index[solid]]
         depths = self._solids[solid].vertices @ move[2, :3] + move[2, 3]

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError, OpenGLMissingError
 from cmmsim.imaging.pyrender_meshes import LaidSolids, disc_mesh
-from cmmsim.imaging.renderer import Drawable, Renderer, View, projections, same_exposure
+from cmmsim.imaging.renderer import Drawable, Renderer
 from cmmsim.imaging.scene import DiscStack, Mesh
+from cmmsim.imaging.views import View, Views
 
 ATLAS_SIDE_PX = 2048
 KEPT_FRAME_BUFFERS = 12
@@ -40,7 +41,8 @@ def render_windows(
     """
     from cmmsim.imaging.kernels import mean_of_cells  # compiles, so it is loaded where it is first needed
 
-    width, height = views[0].size
+    views = Views.of(views)
+    width, height = views.size
     cell_w, cell_h = width * supersampling, height * supersampling
     columns = max(1, min(ATLAS_SIDE_PX // cell_w, int(np.ceil(np.sqrt(len(views))))))
     per_pass = columns * max(1, ATLAS_SIDE_PX // cell_h)
@@ -115,7 +117,7 @@ class _Atlas:
     def draw(
         self,
         drawable: Drawable,
-        views: Sequence[View],
+        views: Views,
         cell: tuple[int, int],
         columns: int,
         rows: int,
@@ -123,18 +125,16 @@ class _Atlas:
     ) -> NDArray[np.uint8]:
         """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid until the next."""
         self._context._platform.make_current()
-        patches, solids = self._uploaded(drawable, views[0].camera.focal_px * cell[0] / views[0].size[0])
+        patches, solids = self._uploaded(drawable, views.exposures[0].camera.focal_px * cell[0] / views.size[0])
         frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
         frame_buffer.bind()
-        groups = [np.array(group) for group in same_exposure(views)]
-        reaching = drawable.reaching(views, groups)
-        laid = solids.laid(views, groups, reaching)
+        reaching = drawable.reaching(views)
+        laid = solids.laid(views, reaching)
         reaching[np.flatnonzero(laid.filled), laid.solid[laid.filled]] = False
         places = [((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))]
         self._clear(np.where(laid.filled, solids.levels[laid.solid], background), places, bool((laid.solid < 0).any()))
         self._program._bind()
-        moves = np.array([view.camera_from_bodies for view in views])
-        clip_from_bodies = (projections(views)[:, None] @ moves).astype(np.float32)
+        clip_from_bodies = views.clip_from_bodies().astype(np.float32)
         per_piece = -(-rows // PIECES) * columns
         shown: list[list[int]] = [[] for _ in views]
         for k, p in np.argwhere(reaching).tolist():

@@ -17,50 +17,10 @@ from cmmsim.errors import OpenGLMissingError
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene import Patch
+from cmmsim.imaging.views import NEAR, View, Views
 from cmmsim.plugins import AUTO, RENDERERS, find
 
-NEAR, FAR = 0.2, 10.0  # m
 _WARNED: dict[str | tuple[str, type[Warning], int], int] = {}  # what this process has said once is not said again
-
-
-@dataclass(frozen=True)
-class View:
-    """One window of a camera with a perfect lens: camera_from_body transforms (b,4,4), its first pixel (x, y) and its
-    size (w, h) px."""
-
-    camera: PinholeCamera
-    camera_from_bodies: Array
-    corner: tuple[float, float]
-    size: tuple[int, int]
-
-
-def projections(views: Sequence[View]) -> Array:
-    """Clip-from-camera matrices (n,4,4) for OpenCV camera axes; row 0 of a drawing is the window's top row.
-
-    The half pixel turns OpenCV's pixel-centre convention into OpenGL's pixel-corner convention.
-    """
-    principal = np.array([v.camera.centre for v in views]) + 0.5 - np.array([v.corner for v in views])
-    focal, size = np.array([v.camera.focal_lengths for v in views]), np.array([v.size for v in views])
-    matrices = np.zeros((len(views), 4, 4))
-    for i in range(2):
-        matrices[:, i, i], matrices[:, i, 2] = 2.0 * focal[:, i] / size[:, i], 2.0 * principal[:, i] / size[:, i] - 1.0
-    matrices[:, 2, 2], matrices[:, 2, 3] = (FAR + NEAR) / (FAR - NEAR), -2.0 * FAR * NEAR / (FAR - NEAR)
-    matrices[:, 3, 2] = 1.0
-    return matrices
-
-
-def window_bounds(views: Sequence[View]) -> Array:
-    """Lowest x, y and highest x, y (n,4) of windows, px: the outer edges of their first and last pixels."""
-    first = np.array([view.corner for view in views]) - 0.5
-    return np.hstack([first, first + np.array([view.size for view in views])])
-
-
-def same_exposure(views: Sequence[View]) -> list[list[int]]:
-    """Indices of the views, grouped by camera and exposure."""
-    groups: dict[tuple[int, int], list[int]] = {}
-    for k, view in enumerate(views):
-        groups.setdefault((id(view.camera), id(view.camera_from_bodies)), []).append(k)
-    return list(groups.values())
 
 
 class Drawable:
@@ -73,15 +33,13 @@ class Drawable:
         self.boxes = np.array([[*zip(*product(*p.bounds.T), strict=True), np.ones(8)] for p in patches])
         self.distance = distance
 
-    def reaching(self, views: Sequence[View], groups: Sequence[NDArray[np.int_]]) -> NDArray[np.bool_]:
-        """Which patches may show in each window (n views, n patches): bounding boxes against windows.
-
-        ``groups``: indices of the views of each camera and exposure.
-        """
-        windows, result = window_bounds(views), np.zeros((len(views), len(self.patches)), dtype=bool)
-        for group in groups:
-            view = views[group[0]]
-            result[group] = self.reaching_windows(view.camera, view.camera_from_bodies, windows[group])
+    def reaching(self, views: Views) -> NDArray[np.bool_]:
+        """Which patches may show in each window (n views, n patches): bounding boxes against windows."""
+        windows, result = views.bounds, np.zeros((len(views), len(self.patches)), dtype=bool)
+        for shown in views.exposures:
+            result[shown.windows] = self.reaching_windows(
+                shown.camera, shown.camera_from_bodies, windows[shown.windows]
+            )
         return result
 
     def reaching_windows(self, camera: PinholeCamera, camera_from_bodies: Array, bounds: Array) -> NDArray[np.bool_]:

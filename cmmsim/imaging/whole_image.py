@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.formation import ImageFormation, Side
-from cmmsim.imaging.renderer import View
+from cmmsim.imaging.views import View
 
 PASTED_SIZE = 24  # px side of the finely drawn window around a bright spot
 LARGEST_PASTED_SIZE = 96  # px: a larger spot is left coarse

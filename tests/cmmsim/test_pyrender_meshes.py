@@ -11,8 +11,9 @@ from cmmsim.imaging import pyrender_renderer as render
 from cmmsim.imaging.exposure import SUPERSAMPLING
 from cmmsim.imaging.kernels import mean_of_cells
 from cmmsim.imaging.pyrender_meshes import GROUND_SIDES, LARGEST_SAG, RIM_SAMPLES, Laid, LaidSolids, disc_mesh
-from cmmsim.imaging.renderer import NEAR, Drawable, View, same_exposure
+from cmmsim.imaging.renderer import Drawable
 from cmmsim.imaging.scene import Disc, DiscStack, rod, rod_transform, solid_mesh
+from cmmsim.imaging.views import NEAR, View, Views
 from cmmsim.sensor import load_sensor
 
 CAMERA = PinholeCamera(1000.0, 500.0, 400.0, 1001, 801)
@@ -44,8 +45,8 @@ def looking_down(corners, size=14):
 
 
 def laid(drawable, views):
-    groups = [np.array(group) for group in same_exposure(views)]
-    return LaidSolids(drawable).laid(views, groups, drawable.reaching(views, groups))
+    together = Views.of(views)
+    return LaidSolids(drawable).laid(together, drawable.reaching(together))
 
 
 def test_sticker_on_a_box_is_laid_and_the_box_fills_the_window():
@@ -131,7 +132,7 @@ def test_reaching_patches_are_those_whose_corners_span_the_window():
     bodies = np.stack([pose_to_transform([*place, *rng.uniform(-1, 1, 3)]) for place in places])
     drawable = Drawable(meshes, np.arange(40), 1.0)
     views = [View(CAMERA, bodies, (int(x), int(y)), (30, 20)) for x, y in rng.uniform(0, 800, (50, 2))]
-    found = drawable.reaching(views, [np.arange(50)])
+    found = drawable.reaching(Views.of(views))
     for p, (mesh, body) in enumerate(zip(meshes, bodies, strict=True)):
         points = mesh.vertices @ body[:3, :3].T + body[:3, 3]
         pixels = CAMERA.project(points)[0]
