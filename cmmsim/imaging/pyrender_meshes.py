@@ -6,9 +6,11 @@ what they are, so that what is drawn comes close to the disc faster with more sa
 
 **Painter's order.** Windows that show one solid and at most one stack of discs that lies on it need no depths: a camera
 before the plane of a disc sees the disc, for all of the solid lies behind that plane. Where the solid is convex and
-fills a window, its level is all that shows of it.
+fills a window, its level is all that shows of it. A sticker's dark ring, then, is most of the window: it is taken for
+the ground, over which the solid is drawn as a band around the ring, with the same edge, in far fewer drawn pixels.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +25,7 @@ from cmmsim.imaging.views import FAR, NEAR, Exposure, Views
 RIM_SAMPLES = 1.8
 LARGEST_SAG = 0.08  # samples by which a side of the polygon may fall short of the rim
 FEWEST_SIDES, GROUND_SIDES = 16, 16
+BAND_REACH = 5.0  # radii of a ring to which a band around it reaches
 RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
 CLEARANCE = 1e-6  # m by which a disc must lie over its solid
 FLATTEST = 1e-6  # volume of a solid over that of a cube as long; a flatter one fills no window
@@ -36,10 +39,22 @@ def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
     The uppermost disc has a soft rim where another one lies below it; the others are coarse and sharp.
     """
     *grounds, top = stack.discs
-    pieces = [
-        _soft_disc(top, grounds[-1].level, sample) if grounds else _sharp_disc(top, _sides(top.radius, sample)),
-        *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds)),
-    ]
+    uppermost = _soft_disc(top, grounds[-1].level, sample) if grounds else _sharp_disc(top, _sides(top.radius, sample))
+    return _joined([uppermost, *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds))])
+
+
+def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
+    """As ``disc_mesh``, where the lowest of several discs is a window's ground: a band of ``level`` lies around it."""
+    lowest, *grounds = stack.discs[:-1]
+    corners = [_corners(lowest, reach * lowest.radius, GROUND_SIDES) for reach in (1.0, BAND_REACH)]
+    band = Mesh(np.concatenate(corners), _band_triangles(GROUND_SIDES), np.full(2 * GROUND_SIDES, level))
+    around = (grounds[-1] if grounds else lowest).level
+    uppermost = _soft_disc(stack.discs[-1], around, sample)
+    return _joined([uppermost, *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds)), band])
+
+
+def _joined(pieces: Sequence[Mesh]) -> Mesh:
+    """One mesh of several."""
     first = np.cumsum([0, *(len(p.vertices) for p in pieces)])
     return Mesh(
         np.concatenate([p.vertices for p in pieces]),
@@ -98,16 +113,18 @@ def _balanced_triangles(sides: int) -> NDArray[np.int_]:
 
 @dataclass(frozen=True)
 class Laid:
-    """For each of n windows the patch of its only solid, or -1 where depths are needed; and whether that fills it."""
+    """For each of n windows the patch of its only solid, or -1 where depths are needed; whether that fills it; and the
+    stack whose lowest disc may then be taken for its ground, or -1."""
 
     solid: NDArray[np.int_]
     filled: NDArray[np.bool_]
+    ringed: NDArray[np.int_]
 
 
 class LaidSolids:
     """The convex solids of a drawable, each of one level, and the stacks of discs that lie on them.
 
-    levels (patches,): of the solids, NaN for other patches.
+    levels (patches,): of the solids, and of the lowest discs of stacks; NaN for other patches.
     """
 
     def __init__(self, drawable: Drawable) -> None:
@@ -116,8 +133,12 @@ class LaidSolids:
             k: ConvexSolid(p.vertices) for k, p in enumerate(patches) if isinstance(p, Mesh) and _is_plain_convex(p)
         }
         self.levels = np.array(
-            [p.levels[0] if k in self._solids and isinstance(p, Mesh) else np.nan for k, p in enumerate(patches)]
+            [
+                p.discs[0].level if isinstance(p, DiscStack) else p.levels[0] if k in self._solids else np.nan
+                for k, p in enumerate(patches)
+            ]
         )
+        self._lowest = {k: p.discs[0] for k, p in enumerate(patches) if isinstance(p, DiscStack) and len(p.discs) > 1}
         self._normals = np.array([p.discs[-1].normal if isinstance(p, DiscStack) else np.zeros(3) for p in patches])
         self._heights = np.array(
             [p.discs[-1].centre @ p.discs[-1].normal if isinstance(p, DiscStack) else 0.0 for p in patches]
@@ -134,7 +155,7 @@ class LaidSolids:
 
     def laid(self, views: Views, reaching: NDArray[np.bool_]) -> Laid:
         """Which windows need no depths; ``reaching`` (n views, patches): see Drawable."""
-        laid = Laid(np.full(len(views), -1), np.zeros(len(views), dtype=bool))
+        laid = Laid(np.full(len(views), -1), np.zeros(len(views), dtype=bool), np.full(len(views), -1))
         few, bounds = reaching.sum(axis=1) <= 2, views.bounds
         for shown in views.exposures:
             group = shown.windows
@@ -144,8 +165,18 @@ class LaidSolids:
                     others = reaching[members] & ~self._seen_over(k, shown)
                     alone = members[~others.any(axis=1)]
                     laid.solid[alone] = k
-                    laid.filled[alone] = self._fills(k, shown, bounds[alone])
+                    rays = np.ones((len(alone), 4, 3))
+                    corners = (bounds[alone] + RIM_PX * OUTWARDS)[:, CORNERS]
+                    rays[..., :2] = (corners - shown.camera.centre) / shown.camera.focal_lengths
+                    laid.filled[alone] = self._fills(k, shown, rays)
+                    stacks = np.where(np.arange(reaching.shape[1]) == k, False, reaching[alone])
+                    own = np.where(laid.filled[alone] & stacks.any(axis=1), stacks.argmax(axis=1), -1)
+                    laid.ringed[alone] = np.where(self._banded(own, k, shown, rays), own, -1)
         return laid
+
+    def carrier(self, stack: int) -> int | None:
+        """The solid on which a stack with a lowest disc lies, or None."""
+        return next((k for k in self._solids if stack in self._lowest and self._lying[k][stack]), None)
 
     def _seen_over(self, solid: int, view: Exposure) -> NDArray[np.bool_]:
         """The solid itself, and the stacks of discs on it that show their upper side (patches,)."""
@@ -155,15 +186,30 @@ class LaidSolids:
         seen[solid] = True
         return seen
 
-    def _fills(self, solid: int, view: Exposure, bounds: Array) -> NDArray[np.bool_]:
-        """Whether the solid shows at all corners of windows with ``bounds`` (n,4), px, and so all over them."""
-        camera, move = view.camera, view.camera_from_bodies[self._body_index[solid]]
+    def _fills(self, solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
+        """Whether the solid shows along ``rays`` (n,4,3) to all corners of windows, and so all over them."""
+        move = view.camera_from_bodies[self._body_index[solid]]
         depths = self._solids[solid].vertices @ move[2, :3] + move[2, 3]
         if depths.min() <= NEAR or depths.max() >= FAR:
-            return np.zeros(len(bounds), dtype=bool)
-        rays = np.ones((len(bounds), 4, 3))
-        rays[..., :2] = ((bounds + RIM_PX * OUTWARDS)[:, CORNERS] - camera.centre) / camera.focal_lengths
+            return np.zeros(len(rays), dtype=bool)
         return np.asarray(self._solids[solid].hides(move, FAR * rays).all(axis=1))
+
+    def _banded(self, stacks: NDArray[np.int_], solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
+        """Whether a band around the lowest disc of each stack (n,), on the solid, covers the corners of its window."""
+        banded = np.array([k in self._lowest for k in stacks], dtype=bool)
+        if banded.any():
+            discs = [self._lowest[k] for k in stacks[banded]]
+            centres, normals = np.array([disc.centre for disc in discs]), np.array([disc.normal for disc in discs])
+            reach = BAND_REACH * np.cos(np.pi / GROUND_SIDES) * np.array([disc.radius for disc in discs])
+            move = view.camera_from_bodies[self._body_index[solid]]
+            eye, along = -move[:3, 3] @ move[:3, :3], rays[banded] @ move[:3, :3]
+            slopes = np.einsum("nci,ni->nc", along, normals)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = np.einsum("ni,ni->n", normals, centres - eye)[:, None] / slopes
+                gaps = eye + share[..., None] * along - centres[:, None]
+                covered = (slopes < 0.0) & (np.einsum("nci,nci->nc", gaps, gaps) < reach[:, None] ** 2)
+            banded[banded] = covered.all(axis=1)
+        return banded
 
 
 def _is_plain_convex(mesh: Mesh) -> bool:

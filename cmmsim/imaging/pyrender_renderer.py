@@ -5,15 +5,15 @@ which draws faster than pyrender's four. Each window is drawn into its own cell 
 projection, drawn larger by the supersampling factor, and averaged in linear light. Every drawn pixel has one sample:
 several of pyrender's multisampling cost more than they gain on the stickers' soft rims. A cell draws only the patches
 whose bounding box reaches into it. Projection and camera_from_body are multiplied in double precision, so that the
-shader sees one well-scaled matrix. Depths are asked for only where they are needed, and a solid that fills a cell is
-its ground, see ``LaidSolids``.
+shader sees one well-scaled matrix. Depths are asked for only where they are needed, and a solid that fills a cell, or
+the dark ring of its sticker, is its ground, see ``LaidSolids``.
 Pieces of the atlas are handed over as they are ready, so that OpenGL fills them while the next ones are prepared.
 """
 
 import ctypes
 import os
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError, OpenGLMissingError
-from cmmsim.imaging.pyrender_meshes import LaidSolids, disc_mesh
+from cmmsim.imaging.pyrender_meshes import LaidSolids, disc_mesh, ringed_mesh
 from cmmsim.imaging.renderer import Drawable, Renderer
-from cmmsim.imaging.scene import DiscStack, Mesh
+from cmmsim.imaging.scene import DiscStack, Mesh, Patch
 from cmmsim.imaging.views import View, Views
 
 ATLAS_SIDE_PX = 2048
@@ -78,18 +78,21 @@ def _shared_atlas() -> "_Atlas":
 @dataclass(frozen=True)
 class _Patch:
     """A patch in OpenGL's memory: ``indices`` of its triangles from the front to the back, then, from ``backwards`` on,
-    as many for the other way."""
+    as many for the other way, at a place in bytes; solid: whether it is no stack of discs."""
 
     vertex_array: int
     indices: int
-    backwards: ctypes.c_void_p
+    backwards: int
+    solid: bool
 
 
 @dataclass(frozen=True)
 class _Uploaded:
-    """What is known of a drawable: its patches by the number of drawn pixels a radian, and what lies over what."""
+    """What is known of a drawable: its patches by the number of drawn pixels a radian, and those of them that may be
+    drawn around their own lowest disc; what lies over what."""
 
     patches: dict[float, list[_Patch]]
+    ringed: dict[float, list[_Patch]]
     solids: LaidSolids
 
 
@@ -98,13 +101,16 @@ class _Atlas:
 
     def __init__(self, pyrender: Any) -> None:
         from OpenGL import GL
-        from OpenGL.raw.GL.VERSION import GL_1_0, GL_1_1, GL_2_0, GL_3_0  # without the conversion of arguments
         from pyrender.renderer import Renderer
 
         self._gl, self._pyrender = GL, pyrender
-        self._viewport, self._draw_elements = GL_1_0.glViewport, GL_1_1.glDrawElements
-        self._set_matrix, self._bind_mesh = GL_2_0.glUniformMatrix4fv, GL_3_0.glBindVertexArray
         self._context = pyrender.OffscreenRenderer(64, 64)
+        self._viewport = _called("glViewport", *[ctypes.c_int] * 4)
+        address = ctypes.c_size_t  # PyOpenGL asks what pointers point to
+        self._draw_elements = _called("glDrawElements", ctypes.c_uint, ctypes.c_int, ctypes.c_uint, address)
+        self._set_matrix = _called("glUniformMatrix4fv", ctypes.c_int, ctypes.c_int, ctypes.c_ubyte, address)
+        self._bind_mesh = _called("glBindVertexArray", ctypes.c_uint)
+        self._constants = int(GL.GL_TRIANGLES), int(GL.GL_UNSIGNED_INT)
         self._shaders = Renderer(64, 64)
         GL.glDepthFunc(GL.GL_LESS)
         for switch in (GL.GL_CULL_FACE, GL.GL_BLEND, GL.GL_DEPTH_TEST):
@@ -125,52 +131,52 @@ class _Atlas:
     ) -> NDArray[np.uint8]:
         """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid until the next."""
         self._context._platform.make_current()
-        patches, solids = self._uploaded(drawable, views.exposures[0].camera.focal_px * cell[0] / views.size[0])
+        known, samples = self._uploaded(drawable, views.exposures[0].camera.focal_px * cell[0] / views.size[0])
         frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
         frame_buffer.bind()
         reaching = drawable.reaching(views)
-        laid = solids.laid(views, reaching)
+        laid = known.solids.laid(views, reaching)
         reaching[np.flatnonzero(laid.filled), laid.solid[laid.filled]] = False
         places = [((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))]
-        self._clear(np.where(laid.filled, solids.levels[laid.solid], background), places, bool((laid.solid < 0).any()))
+        grounds = known.solids.levels[np.where(laid.ringed < 0, laid.solid, laid.ringed)]
+        self._clear(np.where(laid.filled, grounds, background), places, bool((laid.solid < 0).any()))
         self._program._bind()
-        clip_from_bodies = views.clip_from_bodies().astype(np.float32)
-        per_piece = -(-rows // PIECES) * columns
-        shown: list[list[int]] = [[] for _ in views]
-        for k, p in np.argwhere(reaching).tolist():
-            shown[k].append(p)
-        for k, place in enumerate(places):
+        clip_from_bodies = np.ascontiguousarray(views.clip_from_bodies(), dtype=np.float32)
+        shown = [np.flatnonzero(row).tolist() for row in reaching]
+        per_piece, address, strides = (
+            -(-rows // PIECES) * columns,
+            clip_from_bodies.ctypes.data,
+            clip_from_bodies.strides,
+        )
+        for k, (place, deep, ringed) in enumerate(zip(places, laid.solid < 0, laid.ringed >= 0, strict=True)):
             if k and k % per_piece == 0:
                 self._gl.glFlush()
             self._viewport(*place)
-            (self._draw_by_depth if laid.solid[k] < 0 else self._lay)(drawable, shown[k], patches, clip_from_bodies[k])
-        self._gl.glBindVertexArray(0)
+            matrices = {p: address + k * strides[0] + int(drawable.body_index[p]) * strides[1] for p in shown[k]}
+            if deep:
+                self._draw_by_depth(matrices, known.patches[samples])
+            else:
+                self._lay(matrices, (known.ringed if ringed else known.patches)[samples])
+        self._bind_mesh(0)
         return frame_buffer.read()
 
-    def _draw_by_depth(
-        self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch], clip_from_bodies: NDArray[np.float32]
-    ) -> None:
-        """The patches ``shown`` in a cell, the nearest of which is seen."""
-        gl, body = self._gl, -1
+    def _draw_by_depth(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
+        """The patches shown in a cell, the nearest of which is seen; matrices: addresses of theirs by their numbers."""
+        gl, (triangles, unsigned) = self._gl, self._constants
         gl.glEnable(gl.GL_DEPTH_TEST)
-        for p in shown:
-            if drawable.body_index[p] != body:
-                body = drawable.body_index[p]
-                self._set_matrix(self._matrix_location, 1, gl.GL_TRUE, clip_from_bodies[body])
+        for p, matrix in matrices.items():
+            self._set_matrix(self._matrix_location, 1, True, matrix)
             self._bind_mesh(patches[p].vertex_array)
-            self._draw_elements(gl.GL_TRIANGLES, patches[p].indices, gl.GL_UNSIGNED_INT, None)
+            self._draw_elements(triangles, patches[p].indices, unsigned, 0)
         gl.glDisable(gl.GL_DEPTH_TEST)
 
-    def _lay(
-        self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch], clip_from_bodies: NDArray[np.float32]
-    ) -> None:
-        """The patches ``shown`` in a cell, all of one body, over each other: the solid, then what lies on it."""
-        gl = self._gl
-        if shown:
-            self._set_matrix(self._matrix_location, 1, gl.GL_TRUE, clip_from_bodies[drawable.body_index[shown[0]]])
-        for p in sorted(shown, key=lambda p: isinstance(drawable.patches[p], DiscStack)):
+    def _lay(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
+        """The patches shown in a cell, all of one body, over each other: the solid, then what lies on it."""
+        triangles, unsigned = self._constants
+        for p in sorted(matrices, key=lambda p: not patches[p].solid):
+            self._set_matrix(self._matrix_location, 1, True, matrices[p])
             self._bind_mesh(patches[p].vertex_array)
-            self._draw_elements(gl.GL_TRIANGLES, patches[p].indices, gl.GL_UNSIGNED_INT, patches[p].backwards)
+            self._draw_elements(triangles, patches[p].indices, unsigned, patches[p].backwards)
 
     def _clear(self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool) -> None:
         """Give each cell its ground's level, and the farthest depth where depths are asked for."""
@@ -186,20 +192,26 @@ class _Atlas:
                 gl.glClear(gl.GL_COLOR_BUFFER_BIT)
             gl.glDisable(gl.GL_SCISSOR_TEST)
 
-    def _uploaded(self, drawable: Drawable, samples: float) -> tuple[list[_Patch], LaidSolids]:
-        """The patches in OpenGL's memory, their discs made for ``samples`` drawn pixels a radian."""
+    def _uploaded(self, drawable: Drawable, samples: float) -> tuple[_Uploaded, float]:
+        """The drawable, with its patches in OpenGL's memory, their discs made for ``samples`` drawn pixels a radian."""
         known = self._known.get(drawable)
         if known is None:
-            known = self._known[drawable] = _Uploaded({}, LaidSolids(drawable))
+            known = self._known[drawable] = _Uploaded({}, {}, LaidSolids(drawable))
         if samples not in known.patches:
-            made = [
-                disc_mesh(p, drawable.distance / samples) if isinstance(p, DiscStack) else p for p in drawable.patches
-            ]
-            known.patches[samples] = [
-                _Patch(self._upload(m)._vaid, m.faces.size, ctypes.c_void_p(m.faces.size * np.uint32().itemsize))
-                for m in made
-            ]
-        return known.patches[samples], known.solids
+            sample, solids = drawable.distance / samples, known.solids
+            known.patches[samples], known.ringed[samples] = [], []
+            for k, patch in enumerate(drawable.patches):
+                usual = self._patch(disc_mesh(patch, sample) if isinstance(patch, DiscStack) else patch, patch)
+                known.patches[samples].append(usual)
+                carrier = solids.carrier(k)
+                if isinstance(patch, DiscStack) and carrier is not None:
+                    usual = self._patch(ringed_mesh(patch, sample, float(solids.levels[carrier])), patch)
+                known.ringed[samples].append(usual)
+        return known, samples
+
+    def _patch(self, mesh: Mesh, patch: Patch) -> _Patch:
+        behind = mesh.faces.size * np.uint32().itemsize
+        return _Patch(int(self._upload(mesh)._vaid), mesh.faces.size, behind, isinstance(patch, Mesh))
 
     def _upload(self, mesh: Mesh) -> Any:
         grey = np.repeat(mesh.levels[:, None], 3, axis=1)
@@ -237,6 +249,13 @@ class _Atlas:
             program.set_uniform(name, np.eye(4))
         program.set_uniform("material.base_color_factor", np.ones(4))
         return program
+
+
+def _called(name: str, *arguments: type) -> Any:
+    """A function of OpenGL that takes plain numbers and addresses, and is not asked for errors after each call."""
+    from OpenGL.platform import PLATFORM
+
+    return PLATFORM.constructFunction(name, PLATFORM.GL, None, arguments, error_checker=None)
 
 
 class _FrameBuffer:

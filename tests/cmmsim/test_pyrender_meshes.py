@@ -82,13 +82,14 @@ def test_laid_windows_show_what_is_drawn_by_depths(monkeypatch):
     for _ in range(6):
         views = sticker_views(sensor, camera, rng)
         found = laid(drawable, views)
-        kinds |= {(bool(solid >= 0), bool(filled)) for solid, filled in zip(found.solid, found.filled, strict=True)}
+        kinds |= set(zip((found.solid >= 0).tolist(), found.filled.tolist(), (found.ringed >= 0).tolist(), strict=True))
         without = render.render_windows(drawable, views, SUPERSAMPLING, 0.02)
         with monkeypatch.context() as patched:
-            nowhere = Laid(np.full(len(views), -1), np.zeros(len(views), dtype=bool))
+            none = np.full(len(views), -1)
+            nowhere = Laid(none, np.zeros(len(views), dtype=bool), none)
             patched.setattr(LaidSolids, "laid", lambda *_, nowhere=nowhere: nowhere)
             np.testing.assert_array_equal(without, render.render_windows(drawable, views, SUPERSAMPLING, 0.02))
-    assert kinds == {(True, True), (True, False), (False, False)}
+    assert kinds == {(True, True, True), (True, False, False), (False, False, False)}  # laid, filled, ringed
 
 
 def crossed_by_links(sensor):
