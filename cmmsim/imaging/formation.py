@@ -35,7 +35,7 @@ def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.
 
     Parameters: nodes (n, 3, 3, 2): places (x, y) in the drawn window for the first, middle and last row and column.
     """
-    from cmmsim.imaging.kernels import resample_windows  # compiles, so it is loaded where it is first needed
+    from cmmsim.imaging.window_kernels import resample_windows  # compiles, so it is loaded where it is first needed
 
     coefficients = np.einsum("ar,bc,nrcx->nabx", _QUADRATIC, _QUADRATIC, nodes)
     result = np.empty((len(drawn), size, size), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Compiled: drawing without OpenGL, and what both renderers do with drawn windows."""
+"""Compiled: layers of convex solids and discs, drawn without OpenGL, see ``analytic``."""
 
 from __future__ import annotations
 
@@ -9,109 +9,6 @@ import numpy as np
 
 from cmmsim.compiled import Array, compiled
 from cmmsim.geometry.rim_kernels import cover_window
-
-
-@compiled
-def boxes_reaching(
-    pixels_from_bodies: Array, body_index: Array, boxes: Array, windows: Array, near: float, reaching: Array
-) -> None:
-    """Fill reaching (n, patches) for windows (n,4) of one exposure: lowest x, y and highest x, y, px.
-
-    Projection matrices pixels_from_bodies (b,3,4); corners of each patch's box as columns boxes (patches,4,8), m and 1.
-    A box not wholly farther than ``near`` may show anywhere, one behind the camera nowhere.
-    """
-    box, point = np.empty(4), np.empty(3)
-    for p in range(len(boxes)):
-        move = pixels_from_bodies[body_index[p]]
-        box[:2], box[2:] = np.inf, -np.inf
-        nearest, farthest = np.inf, -np.inf
-        for c in range(8):
-            for i in range(3):
-                point[i] = (
-                    move[i, 0] * boxes[p, 0, c] + move[i, 1] * boxes[p, 1, c] + move[i, 2] * boxes[p, 2, c] + move[i, 3]
-                )
-            nearest, farthest = min(nearest, point[2]), max(farthest, point[2])
-            if point[2] > near:
-                for i in range(2):
-                    box[i], box[2 + i] = min(box[i], point[i] / point[2]), max(box[2 + i], point[i] / point[2])
-        for n in range(len(windows)):
-            if nearest <= near:
-                reaching[n, p] = farthest > 0.0
-            else:
-                reaching[n, p] = (
-                    box[2] >= windows[n, 0]
-                    and box[3] >= windows[n, 1]
-                    and box[0] <= windows[n, 2]
-                    and box[1] <= windows[n, 3]
-                )
-
-
-@compiled
-def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array) -> None:
-    """Fill windows (n, h, w) float32, 0 to 1, with the means of ``supersampling``² drawn pixels, 0 to 255.
-
-    ``drawn`` holds the cell of each window in reading order, ``columns`` of them a row.
-    """
-    count, height, width = windows.shape
-    share, white = np.float32(1.0 / (supersampling * supersampling)), np.float32(255.0)
-    sums = np.empty(width * supersampling, dtype=np.uint32)
-    for n in range(count):
-        top, left = n // columns * height * supersampling, n % columns * width * supersampling
-        for y in range(height):
-            sums[:] = 0
-            for i in range(supersampling):
-                row = drawn[top + y * supersampling + i, left : left + width * supersampling]
-                for x in range(len(row)):
-                    sums[x] += row[x]
-            for x in range(width):
-                total = np.uint32(0)
-                for i in range(supersampling):
-                    total += sums[x * supersampling + i]
-                windows[n, y, x] = np.float32(total) * share / white
-
-
-@compiled
-def keys_weights(share: float) -> tuple:
-    """Weights of the four pixels around a place that lies ``share`` (0 to 1) after the second one."""
-    s = min(max(share, 0.0), 1.0)
-    return (
-        s * (-0.5 + s * (1.0 - 0.5 * s)),
-        1.0 + s * s * (-2.5 + 1.5 * s),
-        s * (0.5 + s * (2.0 - 1.5 * s)),
-        s * s * (-0.5 + 0.5 * s),
-    )
-
-
-@compiled
-def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
-    """Fill windows (n, size, size) from drawn ones (n, h, w) at places given by biquadratic coefficients (n,3,3,2)."""
-    n, height, width = drawn.shape
-    size = result.shape[1]
-    at = np.empty((3, 2))
-    for k in range(n):
-        for row in range(size):
-            t = 2.0 * row / (size - 1) - 1.0
-            for b in range(3):
-                for axis in range(2):
-                    at[b, axis] = (
-                        coefficients[k, 0, b, axis]
-                        + t * coefficients[k, 1, b, axis]
-                        + t * t * coefficients[k, 2, b, axis]
-                    )
-            for column in range(size):
-                s = 2.0 * column / (size - 1) - 1.0
-                x = at[0, 0] + s * (at[1, 0] + s * at[2, 0])
-                y = at[0, 1] + s * (at[1, 1] + s * at[2, 1])
-                first_x = min(max(int(np.floor(x)), 1), width - 3)
-                first_y = min(max(int(np.floor(y)), 1), height - 3)
-                weights_x, weights_y = keys_weights(x - first_x), keys_weights(y - first_y)
-                value = 0.0
-                for i in range(4):
-                    line = 0.0
-                    for j in range(4):
-                        line += weights_x[j] * drawn[k, first_y - 1 + i, first_x - 1 + j]
-                    value += weights_y[i] * line
-                result[k, row, column] = value
 
 
 class Solids(NamedTuple):

@@ -39,7 +39,7 @@ def render_windows(
 
     Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises OpenGLMissingError.
     """
-    from cmmsim.imaging.kernels import mean_of_cells  # compiles, so it is loaded where it is first needed
+    from cmmsim.imaging.window_kernels import mean_of_cells  # compiles, so it is loaded where it is first needed
 
     views = Views.of(views)
     width, height = views.size

@@ -47,7 +47,7 @@ class Drawable:
 
         Parameters: camera_from_bodies (b,4,4); bounds (n,4): lowest x, y and highest x, y, px.
         """
-        from cmmsim.imaging.kernels import boxes_reaching  # compiles, so it is loaded where it is first needed
+        from cmmsim.imaging.window_kernels import boxes_reaching  # compiles, so it is loaded where it is first needed
 
         reaching = np.empty((len(bounds), len(self.patches)), dtype=bool)
         boxes_reaching(camera.matrix @ camera_from_bodies[:, :3], self.body_index, self.boxes, bounds, NEAR, reaching)

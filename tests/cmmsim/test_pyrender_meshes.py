@@ -9,11 +9,11 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import pose_to_transform
 from cmmsim.imaging import pyrender_renderer as render
 from cmmsim.imaging.exposure import SUPERSAMPLING
-from cmmsim.imaging.kernels import mean_of_cells
 from cmmsim.imaging.pyrender_meshes import GROUND_SIDES, LARGEST_SAG, RIM_SAMPLES, Laid, LaidSolids, disc_mesh
 from cmmsim.imaging.renderer import Drawable
 from cmmsim.imaging.scene import Disc, DiscStack, rod, rod_transform, solid_mesh
 from cmmsim.imaging.views import NEAR, View, Views
+from cmmsim.imaging.window_kernels import mean_of_cells
 from cmmsim.sensor import load_sensor
 
 CAMERA = PinholeCamera(1000.0, 500.0, 400.0, 1001, 801)
