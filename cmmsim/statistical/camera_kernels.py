@@ -21,6 +21,12 @@ def pose_transform(pose: Array, transform: Array) -> None:
 
 
 @compiled
+def length_of(x: float, y: float) -> float:
+    """Length of a vector of some pixels: ``math.hypot``, which minds numbers of any size, takes several times longer."""
+    return math.sqrt(x * x + y * y)
+
+
+@compiled
 def multiply(first: Array, second: Array, product: Array) -> None:
     """Product of two transforms (4,4)."""
     for i in range(4):

@@ -77,12 +77,14 @@ def tabulated(
     k = min(max(math.floor(c), 0), table.shape[2] - 2)
     a, b, c = min(max(a - i, 0.0), 1.0), min(max(b - j, 0.0), 1.0), min(max(c - k, 0.0), 1.0)
     found_xx, found_xy, found_yy = 0.0, 0.0, 0.0
-    for corner in range(8):
-        up, across, deep = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = (a if up else 1.0 - a) * (b if across else 1.0 - b) * (c if deep else 1.0 - c)
-        found_xx += weight * table[i + up, j + across, k + deep, 0]
-        found_xy += weight * table[i + up, j + across, k + deep, 1]
-        found_yy += weight * table[i + up, j + across, k + deep, 2]
+    for up in range(2):
+        for across in range(2):
+            entries = table[i + up, j + across]
+            weight = (a if up else 1.0 - a) * (b if across else 1.0 - b)
+            near, far = weight * (1.0 - c), weight * c
+            found_xx += near * entries[k, 0] + far * entries[k + 1, 0]
+            found_xy += near * entries[k, 1] + far * entries[k + 1, 1]
+            found_yy += near * entries[k, 2] + far * entries[k + 1, 2]
     scale = by_light[0] / (light * light) + by_light[1] / light + by_light[2]
     scale /= mean * (found_xx * found_yy - found_xy * found_xy)
     return scale * found_yy, -scale * found_xy, scale * found_xx

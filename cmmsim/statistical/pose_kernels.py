@@ -17,6 +17,7 @@ from cmmsim.statistical.camera_kernels import (
     carry,
     ellipse_of,
     faces,
+    length_of,
     light_at,
     multiply,
     pose_transform,
@@ -116,13 +117,13 @@ def see(side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: A
                 sign = 1.0 if end else -1.0
                 smear_u += sign * other_u
                 smear_v += sign * other_v
-        length = math.hypot(smear_u, smear_v)
+        length = length_of(smear_u, smear_v)
         frame.longest[0] = max(frame.longest[0], length)
-        smallest = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
+        smallest = 0.5 * (xx + yy) - length_of(0.5 * (xx - yy), xy)
         frame.used[n] = (
             smallest > limits.thin_px + limits.thin_std_px * noise[n, 2]
-            and holds(u + along, math.hypot(xx, xy), size)
-            and holds(v + down, math.hypot(xy, yy), size)
+            and holds(u + along, length_of(xx, xy), size)
+            and holds(v + down, length_of(xy, yy), size)
         )
         if not frame.used[n]:
             continue
@@ -147,18 +148,19 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
     bodies (b,4,4): base_from_body of all solids but the platform; noise (2,n,3) unit normal; kept (n,) whether a
     sticker is not left out by chance.
     """
-    moving = False
+    moving, apart = False, False
     for i in range(6):
-        moving = moving or poses[1, i] != poses[2, i]
+        moving, apart = moving or poses[1, i] != poses[2, i], apart or poses[3, i] != poses[0, i]
     frame.longest[0] = 0.0
     for n in range(len(kept)):
         frame.used[n] = kept[n]
     platform, moves, ends = np.empty((4, 4)), np.empty((1 + len(bodies), 4, 4)), np.empty((2, 4, 4))
     for side in range(2):
-        for end in range(2):
+        for end in range(2 if moving else 0):
             pose_transform(poses[3 * side + 1 + end], platform)
             multiply(eyes.looking.moves[side], platform, ends[end])
-        pose_transform(poses[3 * side], platform)
+        if side == 0 or moving or apart:
+            pose_transform(poses[3 * side], platform)
         multiply(eyes.looking.moves[side], platform, moves[0])
         for b in range(len(bodies)):
             multiply(eyes.looking.moves[side], bodies[b], moves[1 + b])

@@ -74,9 +74,9 @@ def pull(
     u, v, a, b, c, d = project(camera, x, y, z)
     r, s = pixel[0] - u, pixel[1] - v
     xx, xy, yy = spread[0, 0] + parted, spread[0, 1], spread[1, 1] + parted
-    det = xx * yy - xy * xy
-    w_xx, w_xy, w_yy = yy / det, -xy / det, xx / det
-    f_x, f_y, t_x, t_y = camera[0] / z, camera[1] / z, x / z, y / z
+    share, near = 1.0 / (xx * yy - xy * xy), 1.0 / z
+    w_xx, w_xy, w_yy = share * yy, -share * xy, share * xx
+    f_x, f_y, t_x, t_y = near * camera[0], near * camera[1], near * x, near * y
     along, down = w_xx * r + w_xy * s, w_xy * r + w_yy * s
     first_0, first_1, first_2 = slope_by(move, a, b, f_x, f_y, t_x, t_y)
     second_0, second_1, second_2 = slope_by(move, c, d, f_x, f_y, t_x, t_y)
@@ -99,10 +99,10 @@ def pull(
 def inverse_of(n: Array, into: Array) -> None:
     """Fill the inverse (6,) of a symmetric (3,3) matrix ``n`` (6,), both as their entries 00, 01, 02, 11, 12, 22."""
     c_00, c_01, c_02 = n[3] * n[5] - n[4] * n[4], n[2] * n[4] - n[1] * n[5], n[1] * n[4] - n[2] * n[3]
-    det = n[0] * c_00 + n[1] * c_01 + n[2] * c_02
-    into[0], into[1], into[2] = c_00 / det, c_01 / det, c_02 / det
-    into[3], into[4] = (n[0] * n[5] - n[2] * n[2]) / det, (n[1] * n[2] - n[0] * n[4]) / det
-    into[5] = (n[0] * n[3] - n[1] * n[1]) / det
+    share = 1.0 / (n[0] * c_00 + n[1] * c_01 + n[2] * c_02)
+    into[0], into[1], into[2] = share * c_00, share * c_01, share * c_02
+    into[3], into[4] = share * (n[0] * n[5] - n[2] * n[2]), share * (n[1] * n[2] - n[0] * n[4])
+    into[5] = share * (n[0] * n[3] - n[1] * n[1])
 
 
 @compiled
