@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from cmmsim.errors import LostError
-from cmmsim.geometry.pose import Array, invert, pose_to_transform
+from cmmsim.geometry.pose import Array, invert, pose_to_transform, transforms_of
 from cmmsim.imaging.analytic import ANALYTIC
 from cmmsim.imaging.exposure import VirtualStereoCamera
 from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement
@@ -47,7 +47,7 @@ def measure_at_rest(
 def expected_at(estimator: PoseEstimator, poses: Array) -> Array:
     """Expected camera_from_platform (N,4,4) at poses (N,6)."""
     camera_from_base = invert(estimator.taught.base_from_camera)
-    return np.array([camera_from_base @ pose_to_transform(pose) for pose in poses]).reshape(-1, 4, 4)
+    return np.asarray(camera_from_base @ transforms_of(poses))
 
 
 def threads_at_most() -> int:

@@ -34,14 +34,19 @@ def checked_pose(pose: ArrayLike) -> Array:
 
 def pose_to_transform(pose: ArrayLike) -> Array:
     """Transform (4,4) of a pose (6,). Raises ShapeError when the pose is not six finite numbers."""
-    values = checked_pose(pose)
-    (ca, cb, cg), (sa, sb, sg) = np.cos(values[3:]), np.sin(values[3:])
-    rotation = [
-        [cb * cg, -cb * sg, sb],
-        [ca * sg + sa * sb * cg, ca * cg - sa * sb * sg, -sa * cb],
-        [sa * sg - ca * sb * cg, sa * cg + ca * sb * sg, ca * cb],
-    ]
-    return rigid(rotation, values[:3])
+    return transforms_of(checked_pose(pose))
+
+
+def transforms_of(poses: Array) -> Array:
+    """Transforms (..., 4, 4) of poses (..., 6)."""
+    (ca, cb, cg), (sa, sb, sg) = (np.moveaxis(f(poses[..., 3:]), -1, 0) for f in (np.cos, np.sin))
+    transforms = np.zeros((*poses.shape[:-1], 4, 4))
+    transforms[..., 0, 0], transforms[..., 0, 1], transforms[..., 0, 2] = cb * cg, -cb * sg, sb
+    transforms[..., 1, 0], transforms[..., 1, 1] = ca * sg + sa * sb * cg, ca * cg - sa * sb * sg
+    transforms[..., 2, 0], transforms[..., 2, 1] = sa * sg - ca * sb * cg, sa * cg + ca * sb * sg
+    transforms[..., 1, 2], transforms[..., 2, 2], transforms[..., 3, 3] = -sa * cb, ca * cb, 1.0
+    transforms[..., :3, 3] = poses[..., :3]
+    return transforms
 
 
 def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:

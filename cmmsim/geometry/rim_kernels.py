@@ -163,7 +163,9 @@ def cover_window(centre_x: float, centre_y: float, shape: Array, shares: Array, 
     height, width = shares.shape
     cover = Cover(shares, np.empty((height, width + 1)), np.empty((height, width), np.bool_), derivatives)
     follow_rim(centre_x, centre_y, shape, cover)
-    for row in range(height):
+    reach = math.hypot(shape[1, 0], shape[1, 1])
+    first, last = max(within(centre_y - reach, height), 0), min(within(centre_y + reach, height), height - 1)
+    for row in range(first, last + 1):
         risen = cover.past[row, width]
         whole = np.rint(risen)
         for column in range(width - 1, -1, -1):

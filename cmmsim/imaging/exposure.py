@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError
-from cmmsim.geometry.pose import Array, apply, pose_to_transform, rigid
+from cmmsim.geometry.pose import Array, apply, pose_to_transform, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.scene import DiscStack
@@ -83,14 +83,13 @@ class VirtualStereoCamera:
         if pose_rate is not None and self.exposure > 0.0:
             poses = sub_frame_poses(pose, pose_rate, self.exposure, self._sticker_pixels)
         lag = np.zeros(6) if pose_rate is None else self.right_later * pose_rate
-        moments = [self._placed(p, p + lag, obstacles or {}) for p in poses]
-        return LiveImages(self, moments, rng, quality or Quality())
+        return LiveImages(self, self._placed(poses, poses + lag, obstacles or {}), rng, quality or Quality())
 
     def look_many(
         self, poses: Array, rngs: Sequence[np.random.Generator], obstacles: Mapping[str, Array]
     ) -> "ManyLiveImages":
         """Exposures of the platform at rest at poses (N,6), each with its own noise, as ``look`` for each of them."""
-        return ManyLiveImages(self, [self._placed(pose, pose, obstacles) for pose in poses], rngs)
+        return ManyLiveImages(self, self._placed(poses, poses, obstacles), rngs)
 
     def moved(self, changes: Array) -> "VirtualStereoCamera":
         """The same cameras with changes (24,) of their rig's parameters; their pixels stay what they are."""
@@ -150,17 +149,17 @@ class VirtualStereoCamera:
         cut = [p.windows(at, size) for p, at in zip(self.patterns, corners, strict=True) if p is not None]
         return FixedPattern(np.stack([c.sensitivity for c in cut]), np.stack([c.offset for c in cut])) if cut else None
 
-    def _placed(self, left: Array, right: Array, obstacles: Mapping[str, Array]) -> list[Array]:
-        """camera_from_body (b,4,4) of all bodies for the left and the right camera, each at its own pose (6,) of the
-        platform."""
+    def _placed(self, left: Array, right: Array, obstacles: Mapping[str, Array]) -> list[tuple[Array, Array]]:
+        """camera_from_body (b,4,4) of all bodies for the left and the right camera, each at its own poses (N,6) of the
+        platform, for each of N moments."""
         absent = rigid(np.eye(3), (0.0, 0.0, -1e3))  # an obstacle without a place stands far behind both cameras
-        return [
-            np.stack(
-                [c @ pose_to_transform(pose), c]
-                + [c @ obstacles[n] if n in obstacles else absent for n in self.obstacle_names]
-            )
-            for c, pose in zip(self._from_base, (left, right), strict=True)
-        ]
+        still = np.stack([np.eye(4), *(obstacles.get(name, absent) for name in self.obstacle_names)])
+        sides = []
+        for camera, poses in zip(self._from_base, (left, right), strict=True):
+            placed = np.empty((len(poses), 1 + len(still), 4, 4))
+            placed[:, 0], placed[:, 1:] = camera @ transforms_of(poses), camera @ still
+            sides.append(list(placed))
+        return list(zip(*sides, strict=True))
 
     def _sticker_pixels(self, pose: Array) -> Array:
         """Pixels (2, n, 2) of the platform's stickers."""

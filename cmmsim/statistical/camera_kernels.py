@@ -22,7 +22,7 @@ def pose_transform(pose: Array, transform: Array) -> None:
 
 @compiled
 def length_of(x: float, y: float) -> float:
-    """Length of a vector of some pixels: ``math.hypot``, which minds numbers of any size, takes several times longer."""
+    """Length of a vector of some pixels; ``math.hypot``, which minds numbers of any size, takes much longer."""
     return math.sqrt(x * x + y * y)
 
 
