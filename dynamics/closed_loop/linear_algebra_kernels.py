@@ -1,40 +1,30 @@
 """Small dense linear algebra, and the rows of derivatives that follow it: one row an unknown, one column a variable."""
 
-import numpy as np
-
 from dynamics.compiled.kernel import Array, kernel, part
 
 
 @part
-def cholesky(matrix: Array, size: int, factor: Array) -> bool:
-    """Factor L (size, size) of a symmetric matrix, with the reciprocals of its diagonal; False if it has none."""
+def factorise(matrix: Array, size: int, factor: Array) -> None:
+    """Factor (size, size) of a symmetric matrix, see `accelerations.factored`."""
     for i in range(size):
         for j in range(i + 1):
             left = matrix[i, j]
             for k in range(j):
-                left -= factor[i, k] * factor[j, k]
-            if i > j:
-                factor[i, j] = left * factor[j, j]
-            elif left > 0:
-                factor[i, i] = 1 / np.sqrt(left)
-            else:
-                return False
-    return True
+                left -= factor[i, k] * factor[k, j]
+            factor[j, i] = left
+            factor[i, j] = left * factor[j, j] if i > j else 1 / left
 
 
 @part
 def solve(factor: Array, size: int, vector: Array) -> None:
-    """Solve L L^T x = vector (size,) in place."""
+    """Solve L D L^T x = vector (size,) in place."""
     for i in range(size):
-        left = vector[i]
         for k in range(i):
-            left -= factor[i, k] * vector[k]
-        vector[i] = left * factor[i, i]
+            vector[i] -= factor[i, k] * vector[k]
     for i in range(size - 1, -1, -1):
-        left = vector[i]
+        vector[i] *= factor[i, i]
         for k in range(i + 1, size):
-            left -= factor[k, i] * vector[k]
-        vector[i] = left * factor[i, i]
+            vector[i] -= factor[k, i] * vector[k]
 
 
 @part
@@ -94,14 +84,12 @@ def add_product(scale: float, matrix: Array, rows: Array, into: Array, width: in
 
 @kernel
 def solve_rows(factor: Array, size: int, rows: Array, width: int) -> None:
-    """Solve L L^T x = rows (size, columns) in place."""
+    """Solve L D L^T x = rows (size, columns) in place."""
     for i in range(size):
         for k in range(i):
             add_row(-factor[i, k], rows[k], rows[i], width)
+    for i in range(size - 1, -1, -1):
         for column in range(width):
             rows[i, column] *= factor[i, i]
-    for i in range(size - 1, -1, -1):
         for k in range(i + 1, size):
             add_row(-factor[k, i], rows[k], rows[i], width)
-        for column in range(width):
-            rows[i, column] *= factor[i, i]

@@ -93,7 +93,7 @@ LAYOUT = {
 }
 """Fields of the records: a name with its dimensions by their letters (see `record_type`), one number without. `!` marks
 integers, `=` another record. Angle and velocity of elastic joints are those of the motors; the mass matrix is kept as
-its Cholesky factor; issued commands stay while they are on their way, the last one is of those of the start."""
+its factor; issued commands stay while they are on their way, the last one is of those of the start."""
 
 
 @lru_cache(maxsize=64)

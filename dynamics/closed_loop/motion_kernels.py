@@ -6,7 +6,7 @@ box-constrained problem in the friction torques. Friction and elastic joints: se
 
 import numpy as np
 
-from dynamics.closed_loop.linear_algebra_kernels import cholesky, copy, dot, fill, solve
+from dynamics.closed_loop.linear_algebra_kernels import copy, dot, factorise, fill, solve
 from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 
 SMOOTHED, STRIBECK = 1, 2  # see `joints.LawName`
@@ -89,7 +89,7 @@ def know_motion(task: Record, known: Record, state: Array) -> int:
     call(task.equation_of_motion, known.inputs, known.mass)
     known.valid = True
     for i in range(size):
-        known.valid = known.valid and 0 <= known.factor[i, i] < np.inf
+        known.valid = known.valid and 0 < known.factor[i, i] < np.inf
     if known.valid:
         return OK
     return SINGULAR_MASS if all_finite(known.mass) else LEFT_REACH
@@ -141,14 +141,14 @@ def follows_law(task: Record, at: Record, joint: int) -> float:
 
 @kernel
 def hold_compliance(task: Record, at: Record, joints: Array) -> None:
-    """M^-1 J^T (n, m) and J M^-1 J^T (n, n) of some joints, in their order, and the Cholesky factor of the latter."""
+    """M^-1 J^T (n, m) and J M^-1 J^T (n, n) of some joints, in their order, and the factor of the latter."""
     for s in range(len(joints)):
         copy(at.jacobian[joints[s]], at.row)
         call(task.response, at.row, at.response[s])
         for r in range(s + 1):
             at.compliance[s, r] = dot(at.jacobian[joints[r]], at.response[s])
             at.compliance[r, s] = at.compliance[s, r]
-    cholesky(at.compliance, len(joints), at.stuck_factor)
+    factorise(at.compliance, len(joints), at.stuck_factor)
 
 
 @kernel

@@ -58,7 +58,7 @@ def compiled_functions(
 ) -> dict[str, MachineFunction]:
     """The functions that `build()` returns, by name; `content` is what they depend on besides this package.
 
-    hot: names of those that inner loops evaluate, to be optimised further.
+    hot: names of those that inner loops evaluate: optimised further, and free to round otherwise than CasADi's.
     Compiled on first use, some seconds, and kept in the cache folder. Raises DynamicsError for an operation that has no
     translation.
     """
@@ -77,7 +77,7 @@ def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     """A line of JSON with the shapes of inputs and outputs of each function, and the code of all.
 
     LLVM's passes find pairs of equal operations; they gain a seventh in speed, for some tenths of a second each."""
-    module = llvm.parse_assembly(llvm_text(functions))
+    module = llvm.parse_assembly(llvm_text(functions, hot))
     module.verify()
     machine = _machine()
     module.triple, module.data_layout = machine.triple, str(machine.target_data)

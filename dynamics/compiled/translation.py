@@ -6,18 +6,24 @@ after the other, row by row. It is `void name(const double *inputs, double *outp
 Parts of a function that are alike are computed in vectors, one lane each (`lanes`): the numbers are the same.
 """
 
+from collections.abc import Callable, Collection
+
 import casadi as ca
 
 from dynamics.compiled.lanes import LEAVES, ColumnFunction, Graph, Group, Node, PartedFunction, graph_of, lane_groups
 from dynamics.compiled.operations import CALLED, MEANING, OF_VECTORS, constant, lanes_for, type_name
+from dynamics.compiled.quick_arithmetic import quickened
 from dynamics.errors import DynamicsError
 
 AnyFunction = ca.Function | PartedFunction | ColumnFunction
 
 
-def llvm_text(functions: list[AnyFunction]) -> str:
-    """The LLVM text of SX functions. Raises DynamicsError, naming it, for an operation that is not known here."""
-    bodies = [_ColumnBody(one) if isinstance(one, ColumnFunction) else _Body(one) for one in functions]
+def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
+    """The LLVM text of SX functions; hot: names of those that may round otherwise where that is quicker, see
+    `quick_arithmetic`. Raises DynamicsError, naming it, for an operation that is not known here."""
+    bodies = [
+        _ColumnBody(one) if isinstance(one, ColumnFunction) else _Body(one, one.name() in hot) for one in functions
+    ]
     declared = sorted({called for body in bodies for called in body.called})
     return "\n".join([*(f"declare {called}" for called in declared), *(body.text() for body in bodies)])
 
@@ -46,18 +52,19 @@ def _inputs(function: AnyFunction) -> int:
 class _Body:
     """The lines of one function, and what they call."""
 
-    def __init__(self, function: AnyFunction) -> None:
+    def __init__(self, function: AnyFunction, quick: bool = False) -> None:
         last = _last(function)
         if not last.is_a("SXFunction"):
             raise DynamicsError(f"only SX functions become machine code: {last.name()} is {last.class_name()}")
         self._name, self._sizes, self.own_inputs = last.name(), shapes(function), _inputs(function)
         self._inputs = _places(self._name, [last.sparsity_in(k) for k in range(self.own_inputs)])
         self._outputs = _places(self._name, [last.sparsity_out(k) for k in range(last.n_out())])
+        self._quickened: Callable[[Graph], Graph] = quickened if quick else lambda graph: graph
         self._count, self._vectors = 0, dict[tuple[str, ...], str]()
         self._lines: list[str] = []
         self.called: set[str] = set()
         parts = self._parts(function) if isinstance(function, PartedFunction) else []
-        self._write(graph_of(last), parts)
+        self._write(self._quickened(graph_of(last)), parts)
 
     def text(self) -> str:
         """The function, and the one that calls it for many rows."""
@@ -76,7 +83,7 @@ class _Body:
 
     def _parts(self, function: PartedFunction) -> list[list[str]]:
         """The columns of all parts, group by group of those that are alike."""
-        graph = graph_of(function.parts, function.constants)
+        graph = self._quickened(graph_of(function.parts, function.constants))
         values, columns = _Values(self, graph, []), [[""] * len(of) for of in graph.outputs]
         for group in lane_groups(graph):
             width = lanes_for(len(group.lanes))

@@ -170,10 +170,10 @@ class RssLeg(Leg):
         torque = crank[0] * lever + crank[3] * motion.crank_acceleration
         pull = link[0] * (motion.tip_acceleration + motion.link_acceleration / 2 - gravity) / 2
         moment = ca.SX.zeros(3)
-        for inertia, direction in zip((link[1], link[2]), _link_xy(leg), strict=True):
+        for inertia, (direction, weight) in zip((link[1], link[2]), _link_xy(leg), strict=True):
             spin = ca.dot(direction, motion.angular_velocity)
             turning = ca.dot(direction, motion.angular_acceleration)
-            moment += inertia * (direction * turning + ca.cross(motion.angular_velocity, direction) * spin)
+            moment += (inertia * weight) * (direction * turning + ca.cross(motion.angular_velocity, direction) * spin)
         turn = ca.cross(moment, leg.link) * (1 / leg.link_length**2)
         return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
 
@@ -185,9 +185,9 @@ class RssLeg(Leg):
         total = reflected * (gradient @ gradient.T) + link[0] / 4 * ca.SX.eye(3) + half + half.T
         # Turning about x moves A along -y and the other way round, less what the crank takes up (eq. 13).
         x, y = _link_xy(leg)
-        for inertia, direction in ((link[1], y), (link[2], x)):
+        for inertia, (direction, weight) in ((link[1], y), (link[2], x)):
             row = direction - gradient * ca.dot(tangent, direction)
-            total += (inertia * (1 / leg.link_length**2)) * (row @ row.T)
+            total += (inertia * weight * (1 / leg.link_length**2)) * (row @ row.T)
         return symmetric_from_lower(total)
 
     def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -260,6 +260,8 @@ def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMoti
     )
 
 
-def _link_xy(leg: LegVectors) -> tuple[ca.SX, ca.SX]:
-    axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
-    return axes[:, 0], axes[:, 1]
+def _link_xy(leg: LegVectors) -> list[tuple[ca.SX, ca.SX]]:
+    """Along the x and y of the link's axes (see `link_axes`) a vector (3,), and 1 over its square."""
+    across = ca.cross(leg.axis, leg.link)
+    weight = 1 / ca.dot(across, across)
+    return [(across, weight), (ca.cross(leg.link, across), weight * (1 / leg.link_length**2))]

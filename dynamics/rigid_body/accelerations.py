@@ -1,7 +1,7 @@
 """From the equation of motion to the acceleration, and to the derivatives of the slope of the state (CasADi).
 
-Both go through the Cholesky factor of the mass matrix. Derivatives are columns, one a variable: parameters, or numbers
-of the start. All of them solve the same equations.
+Both go through a factor of the mass matrix, see `factored`. Derivatives are columns, one a variable: parameters, or
+numbers of the start. All of them solve the same equations.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from dynamics.parameters import LANES, ParameterLayout
 
 
 def free_acceleration(size: int, joints: int) -> ca.Function:
-    """(Cholesky factor (m, m), b (m,), J_theta (n, m), torque (n,)) -> q_ddot (m,) under torques at free joints, of m
+    """(factor of M (m, m), b (m,), J_theta (n, m), torque (n,)) -> q_ddot (m,) under torques at free joints, of m
     coordinates (`size`) and n joints."""
     factor, bias = ca.SX.sym("factor", size, size), ca.SX.sym("bias", size)
     jacobian, torque = ca.SX.sym("jacobian", joints, size), ca.SX.sym("torque", joints)
@@ -23,7 +23,7 @@ def free_acceleration(size: int, joints: int) -> ca.Function:
 
 
 def response(size: int) -> ca.Function:
-    """(row (m,), Cholesky factor (m, m)) -> M^-1 row (m,)."""
+    """(row (m,), factor of M (m, m)) -> M^-1 row (m,)."""
     row, factor = ca.SX.sym("row", size), ca.SX.sym("factor", size, size)
     return function("response", [row, factor], [ca.vertcat(*_solved(factor, ca.vertsplit(row)))])
 
@@ -33,7 +33,7 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     none was stuck.
 
     What all columns share: what `motion_derivatives` returns; J_theta (n, m), and the same with zeros for stuck joints;
-    the Cholesky factor (m, m); by what a joint's torque falls with its velocity (n,), and grows with its error, the
+    the factor of M (m, m); by what a joint's torque falls with its velocity (n,), and grows with its error, the
     integral of that and the command's rate (n,). In each column the
     derivatives of pose and rate (m,), joint integral, command and its rate (n,); of -M q_ddot - b (m,) and of the
     torque (n,) at a fixed state.
@@ -65,18 +65,18 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     return ColumnFunction(found, len(common), layout.derivatives(m), LANES)
 
 
-def cholesky(matrix: ca.SX) -> ca.SX:
-    """Factor L (m, m) of a symmetric matrix, with the reciprocals of its diagonal: these are NaN or infinite where the
-    matrix is not positive definite."""
+def factored(matrix: ca.SX) -> ca.SX:
+    """Factor of a symmetric matrix L D L^T (m, m): L below the diagonal, whose own entries are ones; above it D L^T; on
+    it the reciprocals of D, which are not all positive and finite where the matrix is not positive definite."""
     size = matrix.shape[0]
     factor = ca.SX.zeros(size, size)
     for i in range(size):
         for j in range(i + 1):
             left = matrix[i, j]
             for k in range(j):
-                left -= factor[i, k] * factor[j, k]
-            # CasADi makes divisions, which take long, of products with a reciprocal, unless it is hidden from it.
-            factor[i, j] = left * factor[j, j] if i > j else ca.fabs(1 / ca.sqrt(left))
+                left -= factor[i, k] * factor[k, j]
+            factor[j, i] = left
+            factor[i, j] = left * factor[j, j] if i > j else 1 / left
     return factor
 
 
@@ -86,14 +86,13 @@ def summed(start: ca.SX, row: Sequence[ca.SX], column: Sequence[ca.SX]) -> ca.SX
 
 
 def _solved(factor: ca.SX, right: list[ca.SX]) -> list[ca.SX]:
-    """x of L L^T x = right, in the order of `linear_algebra_kernels.solve`."""
+    """x of L D L^T x = right, in the order of `linear_algebra_kernels.solve`."""
     size, found = len(right), list(right)
     for i in range(size):
         for k in range(i):
             found[i] -= factor[i, k] * found[k]
-        found[i] *= factor[i, i]
     for i in range(size - 1, -1, -1):
+        found[i] *= factor[i, i]
         for k in range(i + 1, size):
             found[i] -= factor[k, i] * found[k]
-        found[i] *= factor[i, i]
     return found

@@ -18,11 +18,11 @@ import numpy as np
 from dynamics.compiled.lanes import ColumnFunction, PartedFunction
 from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import AnyGeometry
-from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
+from dynamics.kinematics.platform import PlatformJointMotion, joint_motion, pose_rate_to_twist, twist_bias
 from dynamics.legs.leg import Leg
 from dynamics.parameters import parameter_layout
-from dynamics.rigid_body.accelerations import cholesky, free_acceleration, response, slope_derivative, summed
-from dynamics.rigid_body.jacobians import freedoms
+from dynamics.rigid_body.accelerations import factored, free_acceleration, response, slope_derivative
+from dynamics.rigid_body.jacobians import freedoms, platform_arms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
@@ -41,32 +41,29 @@ def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction
 
 def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,), its rate (n,),
-    and the Cholesky factor of M (m, m), see `cholesky`."""
+    and the factor of M (m, m), see `factored`."""
     layout, (q, rate) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate")
-    motion, free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
+    (pose, pose_rate, _), free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
+    to_twist, gravity = pose_rate_to_twist(pose), ca.DM(geometry.gravity)
+    twist, twist_dot, freely = to_twist @ pose_rate, twist_bias(pose, pose_rate), to_twist @ free
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
-    joints, (legs, sides), parts = _joints(geometry), _legs(geometry), []
-    for number, leg in enumerate(legs):
-        own, moving, gradient = rigid[layout.leg_rows(number)], joints.of(number), joints.gradient[number]
-        mass = gradient.T @ leg.mass(moving[0], own) @ gradient
-        force = gradient.T @ leg.force(*moving, own, ca.DM(geometry.gravity))
-        row = leg.gradient(moving[0]).T @ gradient @ free
-        joint = [leg.acceleration(*moving), leg.coordinate(moving[0])]
-        parts.append([_of_freedoms(mass, free), free.T @ force, row, *joint])
-    to_twist = pose_rate_to_twist(joints.pose)
-    mass = _of_freedoms(to_twist.T @ platform_mass(joints.pose, rigid[0:4]) @ to_twist, free)
-    bias = free.T @ _platform_columns(geometry, joints) @ rigid[0:4]
+    (legs, sides), parts = _legs(geometry), []
+    for number, (leg, arm) in enumerate(zip(legs, platform_arms(geometry, pose), strict=True)):
+        own, position = rigid[layout.leg_rows(number)], pose[0:3] + arm
+        moving, to_joint = joint_motion(arm, twist, twist_dot), ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
+        mass = symmetric_from_lower(to_joint.T @ leg.mass(position, own) @ to_joint)
+        force = leg.force(position, *moving, own, gravity)
+        row = leg.gradient(position).T @ to_joint @ freely
+        joint = [leg.acceleration(position, *moving), leg.coordinate(position), row @ rate]
+        parts.append([mass, ca.vertcat(force, ca.cross(arm, force)), row, *joint])
+    mass = platform_mass(pose, rigid[0:4])
+    bias = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
 
     def end(masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]) -> list[ca.SX]:
-        jacobian, *of_joints = (ca.vertcat(*row) for row in rows)
-        total = symmetric_from_lower(sum(masses, mass))
-        velocity = ca.vertcat(
-            *(summed(ca.SX(0), ca.horzsplit(row), ca.vertsplit(rate)) for row in ca.vertsplit(jacobian))
-        )
-        return [total, sum(forces, bias), jacobian, *of_joints, velocity, cholesky(total)]
+        total = symmetric_from_lower(freely.T @ symmetric_from_lower(sum(masses, mass)) @ freely)
+        return [total, freely.T @ sum(forces, bias), *(ca.vertcat(*row) for row in rows), factored(total)]
 
-    at = [joints.pose, joints.rate, joints.gain], motion
-    return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides, at)
+    return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides)
 
 
 def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
@@ -141,7 +138,7 @@ def _parted(
     parts: list[list[ca.SX]],
     end: Callable[..., list[ca.SX]],
     sides: tuple[ca.SX, np.ndarray],
-    at: tuple[Sequence[ca.SX], Sequence[ca.SX]],
+    at: tuple[Sequence[ca.SX], Sequence[ca.SX]] = ((), ()),
 ) -> PartedFunction:
     """A function of what each leg has of its own, some expressions a leg, and of what becomes of them: `end` gets the
     first of all legs, the second, and so on; symbols are replaced `at` values."""
