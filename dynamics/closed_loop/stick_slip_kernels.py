@@ -18,6 +18,7 @@ from dynamics.compiled.kernel import Record, entry, invoke, kernel
 
 MAX_EVENTS_PER_SEGMENT = 400
 NO_MARGIN = 1e-12  # rad/s, or share of the breakaway torque
+LITTLE_MARGIN = 1e-13  # as far as rounding lets it be known
 
 
 @kernel
@@ -57,13 +58,36 @@ def breaks_halfway(task: Record, now: Record, at: Record, d: Record, h: float) -
 
 
 @kernel
+def crossing(now: Record, count: int) -> float:
+    """Where steps tried last, `count` of them, have no margin left: the polynomial through step over margin (Neville)."""
+    length, margin, found = now.tried, now.tried_margin, now.tried_crossing
+    for i in range(count):
+        found[i] = length[i]
+    for order in range(1, count):
+        for i in range(count - order):
+            apart = margin[i] - margin[i + order]
+            found[i] = (margin[i] * found[i + 1] - margin[i + order] * found[i]) / apart
+    return found[0]
+
+
+@kernel
+def remember(now: Record, h: float, margin: float) -> None:
+    """Put a step that was tried, and the margin at its end, before the ones before."""
+    for i in range(len(now.tried) - 1, 0, -1):
+        now.tried[i], now.tried_margin[i] = now.tried[i - 1], now.tried_margin[i - 1]
+    now.tried[0], now.tried_margin[0] = h, margin
+
+
+@kernel
 def locate_event(task: Record, now: Record, at: Record, d: Record, h: float, margin: float) -> tuple[int, float, bool]:
-    """The step in (0, h] at which the modes stop holding: regula falsi (Anderson-Bjorck) on the margin, here that at h.
+    """The step in (0, h] at which the modes stop holding: the margin, here that at h, crosses zero. Found by inverse
+    interpolation, and by halving the bracket where that leads out of it; the first time with what the stage at half the
+    step says, which is near.
 
     A joint that has just started from rest has no margin yet: then the bracket is found by halving; the last entry
     returned is False where there is none.
     """
-    low, high, side, tried = 0.0, h, 0, -1.0
+    low, high, halfway = 0.0, h, mode_margin(task, now, at[2])[0]
     at_low, at_high = mode_margin(task, now, at[0])[0], margin
     for _ in range(40):
         if at_low >= NO_MARGIN:
@@ -75,33 +99,27 @@ def locate_event(task: Record, now: Record, at: Record, d: Record, h: float, mar
             low, at_low = high / 2, margin
             break
         high, at_high = high / 2, margin
-    held = at_low > 0
-    for iteration in range(80):
-        if not held or high - low <= 1e-15 + 1e-13 * h:
-            break
-        middle = (low * at_high - high * at_low) / (at_high - at_low)
-        if iteration > 40 or not low < middle < high:
+    if at_low <= 0:
+        return OK, high, False
+    remember(now, h / 2, halfway)
+    remember(now, low, at_low)
+    remember(now, high, at_high)
+    middle, tried = crossing(now, 3 if high - low == h else 2), high
+    for count in range(3, 83):
+        if count > 43 or not low < middle < high:
             middle = 0.5 * (low + high)
         status, margin = try_step(task, now, at, d, middle)
         if status != OK:
             return status, high, False
-        tried = middle
-        if margin <= 0:
-            if side < 0:  # the other end of the bracket, which stayed twice, is weighed down
-                share = 1 - margin / at_high
-                at_low *= share if share > 0 else 0.5
-            high, at_high, side = middle, margin, -1
-            if margin == 0:
-                break
+        if margin > 0:
+            low = middle
         else:
-            if side > 0:
-                share = 1 - margin / at_low
-                at_high *= share if share > 0 else 0.5
-            low, at_low, side = middle, margin, 1
-    status = OK
-    if high != tried:
-        status, margin = try_step(task, now, at, d, high)
-    return status, high, held
+            high = middle
+        remember(now, middle, margin)
+        tried, middle = middle, crossing(now, min(count, len(now.tried)))
+        if abs(margin) <= LITTLE_MARGIN or min(abs(middle - tried), high - low) <= 1e-15 + 1e-13 * h:
+            break
+    return OK, tried, True
 
 
 @entry
