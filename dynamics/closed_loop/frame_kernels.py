@@ -7,7 +7,7 @@ the errors times the frame period. Lost frames leave both alone. A feedforward c
 
 import numpy as np
 
-from dynamics.closed_loop.linear_algebra_kernels import add_product, clear, copy, copy_rows, dot
+from dynamics.closed_loop.linear_algebra_kernels import add_product, add_row, clear, copy, copy_rows, dot, fill
 from dynamics.closed_loop.motion_kernels import MEASURED_OUT_OF_REACH, OK, all_finite
 from dynamics.closed_loop.sensitivity_kernels import velocity_by_pose
 from dynamics.closed_loop.stick_slip_kernels import NO_MARGIN, segment
@@ -41,17 +41,16 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
 def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> None:
     """Write the state at a frame, before it is measured, into the record."""
     size, count = len(now.servo_integral), len(now.mode)
-    for i in range(size):
-        record.pose[k, i] = now.state[i]
-        record.pose_rate[k, i] = now.state[size + i]
-        record.servo_integral[k, i] = now.servo_integral[i]
-    for i in range(count):
-        record.joint_integral[k, i] = now.state[2 * size + i]
-        if task.stiffness > 0:
-            record.motor_angle[k, i] = now.state[len(now.state) - 2 * count + i]
-            record.motor_rate[k, i] = now.state[len(now.state) - count + i]
-        if task.filter_time > 0:
-            record.filtered_rate[k, i] = now.state[2 * size + count + i]
+    copy(now.state[:size], record.pose[k])
+    copy(now.state[size : 2 * size], record.pose_rate[k])
+    copy(now.servo_integral[:], record.servo_integral[k])
+    copy(now.state[2 * size : 2 * size + count], record.joint_integral[k])
+    if task.stiffness > 0:
+        motors = len(now.state) - 2 * count
+        copy(now.state[motors : motors + count], record.motor_angle[k])
+        copy(now.state[motors + count :], record.motor_rate[k])
+    if task.filter_time > 0:
+        copy(now.state[2 * size + count : 2 * size + 2 * count], record.filtered_rate[k])
     if not task.sensitivities:
         return
     keep_rows(now, d.x[:size], record.pose_sensitivity[k], record.start_sensitivity[k])
@@ -72,11 +71,13 @@ def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -
 @kernel
 def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
     """What the ideal sensor says of the pose."""
-    record.measured_ok[k] = len(plan.lost) == 0 or not plan.lost[k]
-    for i in range(len(now.servo_integral)):
-        record.measured[k, i] = now.state[i] if record.measured_ok[k] else np.nan
-        if len(plan.noise) > 0:
-            record.measured[k, i] += plan.noise[k, i]
+    seen, measured = len(plan.lost) == 0 or not plan.lost[k], record.measured[k]
+    record.measured_ok[k] = seen
+    copy(now.state[: len(measured)], measured)
+    if not seen:
+        fill(measured, np.nan)
+    if len(plan.noise) > 0:
+        add_row(1.0, plan.noise[k], measured, len(measured))
 
 
 @kernel
@@ -85,11 +86,12 @@ def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k
     often the one where the motion is known."""
     size, known = len(measured), now.known
     same = known.valid and task.servo_knows
+    reference, reference_rate = plan.reference[k], plan.reference_rate[k]
     for i in range(size):
-        error = plan.reference[k, i] - measured[i]
+        error = reference[i] - measured[i]
         rate = (measured[i] - now.last_measured[i]) / now.elapsed
         now.servo_integral[i] += task.period * error
-        by_rate = task.kd * (plan.reference_rate[k, i] - rate)
+        by_rate = task.kd * (reference_rate[i] - rate)
         now.demand[i] = task.kp * error + by_rate + task.ki * now.servo_integral[i]
         same = same and known.inputs[i] == measured[i]
     jacobian = known.jacobian if same else now.served.jacobian
@@ -133,25 +135,24 @@ def issue_command(task: Record, now: Record, d: Record, plan: Record, record: Re
         serve(task, now, d, plan, record.measured[k], k)
     copy(now.last_command[:], record.command[k])
     if len(plan.feedforward) > 0:
-        for i in range(len(now.mode)):
-            record.command[k, i] += plan.feedforward[k, i]
+        add_row(1.0, plan.feedforward[k], record.command[k], len(now.mode))
     if task.sensitivities:
         copy_rows(d.last_command[:], d.issued[k % (len(d.issued) - 1)], now.width)
     return OK if all_finite(record.command[k : k + 1]) else MEASURED_OUT_OF_REACH
 
 
 @kernel
-def command_number(plan: Record, record: Record, number: int) -> Array:
+def command_number(start: Array, commands: Array, number: int) -> Array:
     """A command by its number: from frame 0 on, and before that those of the start."""
-    if number >= 0:
-        return record.command[number]
-    return plan.start_commands[max(0, len(plan.start_commands) + number)]
+    return commands[number] if number >= 0 else start[max(0, len(start) + number)]
 
 
 @kernel
-def apply_command(task: Record, now: Record, d: Record, plan: Record, record: Record, number: int, ramp: float) -> None:
+def apply_command(
+    task: Record, now: Record, d: Record, start: Array, commands: Array, number: int, ramp: float
+) -> None:
     """Let a command act, when a share of the way from the one before it is done: 1 is all of it."""
-    value, before = command_number(plan, record, number), command_number(plan, record, number - 1)
+    value, before = command_number(start, commands, number), command_number(start, commands, number - 1)
     now.ramping = ramp < 1
     for i in range(len(value)):
         change = value[i] - before[i]
@@ -185,7 +186,7 @@ def run_frames(
         if status != OK:
             return status, k
         for span in range(spans.first[k], spans.first[k + 1]):
-            apply_command(task, now, d, plan, record, spans.command[span], spans.ramp[span])
+            apply_command(task, now, d, plan.start_commands, record.command, spans.command[span], spans.ramp[span])
             if span == spans.first[k]:
                 copy(now.state[:], at[0].state[:])
                 at[0].time = 0.0

@@ -124,7 +124,7 @@ def locate_event(task: Record, now: Record, at: Record, d: Record, h: float, mar
 
 @entry
 def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Take the velocities of the stuck joints out of the state, as an impulse at them would."""
+    """Take the velocities of the stuck joints, whose compliance is known, out of the state, as an impulse would."""
     size, stuck = len(at.bias), stuck_joints(now)
     rate = now.state[size : 2 * size]
     if task.stiffness > 0:
@@ -137,7 +137,6 @@ def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int
         fill(rate, 0.0)
         clear(d.x[size : 2 * size], now.width)
         return OK
-    hold_compliance(task, at, stuck)
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], rate)
     solve(at.stuck_factor, len(stuck), at.force)
@@ -169,6 +168,8 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
         now.mode[joint] = 1 if end.stick_force[joint] > 0 else -1
         return OK
     now.mode[joint] = 0
+    if task.stiffness == 0:
+        hold_compliance(task, end, stuck_joints(now))
     invoke(task.stop_joints, task, now, end, d, 0)
     copy(now.state[:], end.state[:])
     status = invoke(task.evaluate_terms, task, now, end, d, 0)

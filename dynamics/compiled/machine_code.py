@@ -14,6 +14,7 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
+from dynamics.compiled.lanes import ColumnFunction
 from dynamics.compiled.object_files import load_object, save_object
 from dynamics.compiled.translation import AnyFunction, llvm_text, shapes
 
@@ -76,13 +77,15 @@ def compiled_functions(
 def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     """A line of JSON with the shapes of inputs and outputs of each function, and the code of all.
 
-    LLVM's passes find pairs of equal operations; they gain a seventh in speed, for some tenths of a second each."""
+    LLVM's passes find pairs of equal operations; they gain a seventh in speed, for some tenths of a second each. In a
+    loop over columns they lose: what all columns share is taken before it, and registers have no room for that."""
     module = llvm.parse_assembly(llvm_text(functions, hot))
     module.verify()
     machine = _machine()
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
-    for name in hot:
+    columns = [function.name() for function in functions if isinstance(function, ColumnFunction)]
+    for name in [name for name in hot if name not in columns]:
         builder.getFunctionPassManager().run(module.get_function(name), builder)
     shaped = {function.name(): shapes(function) for function in functions}
     return json.dumps(shaped).encode() + b"\n" + bytes(machine.emit_object(module))

@@ -31,8 +31,9 @@ OF_VECTORS = {
     **{name: f"llvm.{name.lower()}" for name in ("SQRT", "FABS", "FLOOR", "CEIL")},
     "FMIN": "llvm.minnum",
     "FMAX": "llvm.maxnum",
+    "FMA": "llvm.fma",
 }
-"""Functions of LLVM that processors have, for vectors, too."""
+"""Functions of LLVM that processors have, for vectors, too; FMA, a product and a sum rounded once, CasADi has not."""
 
 CALLED = {
     **{name: f"{called}.f64" for name, called in OF_VECTORS.items()},

@@ -22,7 +22,7 @@ def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
     """The LLVM text of SX functions; hot: names of those that may round otherwise where that is quicker, see
     `quick_arithmetic`. Raises DynamicsError, naming it, for an operation that is not known here."""
     bodies = [
-        _ColumnBody(one) if isinstance(one, ColumnFunction) else _Body(one, one.name() in hot) for one in functions
+        (_ColumnBody if isinstance(one, ColumnFunction) else _Body)(one, one.name() in hot) for one in functions
     ]
     declared = sorted({called for body in bodies for called in body.called})
     return "\n".join([*(f"declare {called}" for called in declared), *(body.text() for body in bodies)])
@@ -161,9 +161,9 @@ class _Body:
 class _ColumnBody(_Body):
     """The lines of a function of columns: what all share first, then a loop over so many columns at once."""
 
-    def __init__(self, given: ColumnFunction) -> None:
+    def __init__(self, given: ColumnFunction, quick: bool = False) -> None:
         self._given = given
-        super().__init__(given.function)
+        super().__init__(given.function, quick)
 
     def text(self) -> str:
         """The function: `void name(const double *common, const double *rows, double *into, long width)`."""

@@ -48,15 +48,16 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     by_error, by_integral, by_command_rate = gains
     errors, torques = [], []
     for i in range(n):
-        errors.append(summed(command[i], ca.horzsplit(-jacobian[i, :]), pose))
+        errors.append(lessened(command[i], ca.horzsplit(jacobian[i, :]), pose))
         velocity = summed(ca.SX(0), ca.horzsplit(0.5 * joint_by_rate[i, :]), pose)
         velocity = summed(velocity, ca.horzsplit(jacobian[i, :]), rate)
-        felt = [errors[i], command_rate[i], velocity, integral[i], direct[i]]
-        torques.append(summed(ca.SX(0), [by_error[i], by_command_rate[i], -damping[i], by_integral[i], ca.SX(1)], felt))
+        felt = [errors[i], command_rate[i], integral[i]]
+        pushed = summed(direct[i], [by_error[i], by_command_rate[i], by_integral[i]], felt)
+        torques.append(pushed - damping[i] * velocity)
     accelerations = []
     for j in range(m):
-        left = summed(push[j], ca.horzsplit(-by_pose[j, :]), pose)
-        left = summed(left, ca.horzsplit(-by_rate[j, :]), rate)
+        left = lessened(push[j], ca.horzsplit(by_pose[j, :]), pose)
+        left = lessened(left, ca.horzsplit(by_rate[j, :]), rate)
         accelerations.append(summed(left, ca.vertsplit(pushing[:, j]), torques))
     common = [by_pose, by_rate, columns, joint_by_pose, joint_by_rate, jacobian, pushing, factor, damping, *gains]
     rows = [ca.vertcat(*row) for row in (pose, rate, integral, command, command_rate, push, direct)]
@@ -83,6 +84,13 @@ def factored(matrix: ca.SX) -> ca.SX:
 def summed(start: ca.SX, row: Sequence[ca.SX], column: Sequence[ca.SX]) -> ca.SX:
     """A start and products, added in their order."""
     return sum((one * other for one, other in zip(row, column, strict=True)), start)
+
+
+def lessened(start: ca.SX, row: Sequence[ca.SX], column: Sequence[ca.SX]) -> ca.SX:
+    """A start from which products are taken in their order."""
+    for one, other in zip(row, column, strict=True):
+        start -= one * other
+    return start
 
 
 def _solved(factor: ca.SX, right: list[ca.SX]) -> list[ca.SX]:
