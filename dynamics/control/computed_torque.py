@@ -1,32 +1,73 @@
-"""Law `computed_torque`: torques of the inverse dynamics at where the robot is, in pose space, closed by vision.
+"""Law `computed_torque`: torques of the inverse dynamics in pose space, closed by vision.
 
-    torque = ID(q, q_dot, r_ddot + Kd (r_dot - q_dot) + Kp (r - q)),   Kp = bandwidth^2, Kd = 2 damping bandwidth
+    torque = mean over a frame of ID(p, p_dot, p_ddot),   p = r - e,   e_ddot + Kd e_dot + Kp e = 0
+    Kp = bandwidth^2, Kd = 2 damping bandwidth
 
-so that a model that is right leaves r - q as a linear oscillator, each coordinate for itself. A torque acts for one
-frame, which is why the part that the desired motion takes is its mean over that time, and dry friction is that of the
-desired motion: that of the measured velocity chatters. With an observer q and q_dot are those at which the torque
-arrives, and what the observer finds that the model does not know is taken off; without, q is the last measured pose,
-q_dot the difference of the last two, and an integral takes the place of the disturbance.
+with the way back p from where the robot is into the desired motion r. A torque acts for one frame, which is why its
+mean over that time counts. With an observer the way begins where the robot will be as the torque arrives, what the observer
+finds that the model does not know is taken off, and dry friction is that of the way back: near rest its joints often
+turn the other way than those of the desired motion, and a torque for these is wrong by twice the Coulomb torque.
+Without, the way begins at the last measured pose with the difference of the last two, an integral takes the place of
+the disturbance, and dry friction is that of the desired motion: that of a rate half a frame old chatters.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import expm
 
 from dynamics.closed_loop.drives import Drives
 from dynamics.closed_loop.problem import EveryFrame
-from dynamics.control.inverse_dynamics import spans
-from dynamics.control.law import Assignment, LawInLoop
+from dynamics.control.inverse_dynamics import Motion, spans
+from dynamics.control.law import Assignment, Feedback, LawInLoop
 from dynamics.control.observer import Estimate
+from dynamics.kinematics.chart import Chart
 
 INTEGRAL = 0.2
 """Of the gain Ki = INTEGRAL bandwidth^3, without observer."""
 
-FOLLOWED = 0.5
+FOLLOWED = 0.25
 """How fast the disturbance is taken off, over the bandwidth: what dry friction does is over before it is seen."""
 
 Command = Callable[[int, float, np.ndarray | None], np.ndarray]
+
+
+def error_map(feedback: Feedback) -> np.ndarray:
+    """d/dt (2, 2) of the error of a coordinate and its rate on the way back."""
+    w = feedback.bandwidth
+    return np.array([[0.0, 1.0], [-(w**2), -2 * feedback.damping * w]])
+
+
+@dataclass(frozen=True)
+class WayBack:
+    """The motion by which errors (m,), and their rates, at a time, s, die out; with an acceleration (m,) beside."""
+
+    desired: Motion
+    chart: Chart
+    map: np.ndarray
+    begin: float
+    error: np.ndarray
+    rate: np.ndarray
+    beside: np.ndarray | float = 0.0
+
+    def pose(self, t: np.ndarray) -> np.ndarray:
+        """Poses (N, 6), m and rad."""
+        return self.desired.pose(t) - self.chart.lifted(self._errors(t)[:, 0])
+
+    def pose_rate(self, t: np.ndarray) -> np.ndarray:
+        """Their time derivatives (N, 6)."""
+        return self.desired.pose_rate(t) - self.chart.lifted(self._errors(t)[:, 1])
+
+    def pose_acceleration(self, t: np.ndarray) -> np.ndarray:
+        """Their second time derivatives (N, 6)."""
+        back = np.einsum("i,nij->nj", self.map[1], self._errors(t))
+        return self.desired.pose_acceleration(t) - self.chart.lifted(back - self.beside)
+
+    def _errors(self, t: np.ndarray) -> np.ndarray:
+        """Errors and their rates (N, 2, m)."""
+        passed = np.asarray(t) - self.begin
+        return np.asarray(expm(self.map * passed[:, None, None]) @ np.stack([self.error, self.rate]))
 
 
 def computed_torque(assignment: Assignment) -> LawInLoop:
@@ -38,7 +79,7 @@ def computed_torque(assignment: Assignment) -> LawInLoop:
 
 
 def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) -> Command:
-    watched, robot = assignment.watched(drives), assignment.model.robot
+    watched = assignment.watched(drives)
     share = 1 - np.exp(-FOLLOWED * assignment.feedback.bandwidth * assignment.period)
     taken_off = watched.disturbance
 
@@ -47,10 +88,9 @@ def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) 
         expected.append(watched.see(frame, measured))
         at = watched.arrival(frame)
         seen = watched.ahead(at)
-        correction = _correction(assignment, at, seen.coordinates, seen.rates)
         taken_off = taken_off + share * (watched.disturbance - taken_off)
-        turning = robot.coordinate_jacobian(robot.geometry.chart.pose(seen.coordinates)) @ seen.rates
-        torque = np.asarray(_planned(assignment, at) + correction - taken_off + watched.viscous * turning)
+        way = _way_back(assignment, at, seen.coordinates, seen.rates)
+        torque = _torque(assignment, way, way, watched.viscous) - taken_off
         watched.issue(frame, torque)
         return torque
 
@@ -58,40 +98,36 @@ def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) 
 
 
 def _measured(assignment: Assignment) -> Command:
-    chart, period = assignment.model.robot.geometry.chart, assignment.period
+    chart, period, feedback = assignment.model.robot.geometry.chart, assignment.period, assignment.feedback
     pose = assignment.desired(0.0)[0]
     before, elapsed, integral = chart.coordinates(pose), 0.0, np.zeros(len(chart.freedoms))
     at_rest = assignment.holding - assignment.model.robot.static_torque(pose, assignment.model.dynamic)
-    correction = np.zeros(len(at_rest))
+    way = _way_back(assignment, 0.0, before, np.zeros_like(before))
 
     def command(frame: int, time: float, measured: np.ndarray | None) -> np.ndarray:
-        nonlocal before, elapsed, integral, correction
+        nonlocal before, elapsed, integral, way
         elapsed += period
         if measured is not None:
             now = chart.coordinates(measured)
             rates, before, elapsed = (now - before) / elapsed, now, 0.0
             integral = integral + period * (chart.coordinates(assignment.desired(time)[0]) - now)
-            correction = _correction(assignment, time, now, rates, integral)
-        return np.asarray(_planned(assignment, time + assignment.settings.timing.latency_s) + correction + at_rest)
+            way = _way_back(assignment, time, now, rates)
+            way = replace(way, beside=INTEGRAL * feedback.bandwidth**3 * integral)
+        arrival = time + assignment.settings.timing.latency_s
+        return _torque(assignment, replace(way, begin=arrival), assignment.motion) + at_rest
 
     return command
 
 
-def _planned(assignment: Assignment, time: float) -> np.ndarray:
-    """Mean torque (n,) of the desired motion over the frame from a time on."""
-    return spans(assignment.model, assignment.motion, np.array([time]), assignment.period).torque[0]
+def _way_back(assignment: Assignment, time: float, coordinates: np.ndarray, rates: np.ndarray) -> WayBack:
+    """From coordinates and rates (m,) at a time."""
+    chart, (pose, rate, _) = assignment.model.robot.geometry.chart, assignment.desired(time)
+    errors = chart.coordinates(pose) - coordinates, chart.coordinates(rate) - rates
+    return WayBack(assignment.motion, chart, error_map(assignment.feedback), time, *errors)
 
 
-def _correction(
-    assignment: Assignment, time: float, q: np.ndarray, rates: np.ndarray, integral: np.ndarray | float = 0.0
-) -> np.ndarray:
-    """What the torque (n,) at coordinates and rates (m,) has to be beside that of the desired motion at a time;
-    integral (m,): of the error."""
-    chart, feedback, model = assignment.model.robot.geometry.chart, assignment.feedback, assignment.model
-    pose, rate, acceleration = assignment.desired(time)
-    error, error_rate, w = chart.coordinates(pose) - q, chart.coordinates(rate) - rates, feedback.bandwidth
-    wanted = w**2 * error + 2 * feedback.damping * w * error_rate + INTEGRAL * w**3 * integral
-    poses, moving = np.stack([chart.pose(q), pose]), np.stack([chart.lifted(rates), rate])
-    no_dry = np.zeros((2, model.robot.layout.joints))
-    torque = model.torque(poses, moving, np.stack([acceleration + chart.lifted(wanted), acceleration]), no_dry)
-    return np.asarray(torque[0] - torque[1])
+def _torque(assignment: Assignment, way: WayBack, dry: Motion, viscous: np.ndarray | float = 0.0) -> np.ndarray:
+    """Mean (n,) over the first frame of a way back, with the dry friction of a motion; viscous (n,): friction of which
+    the model does not know."""
+    along = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
+    return np.asarray(along.torque[0] + viscous * (along.end[0] - along.begin[0]) / assignment.period)

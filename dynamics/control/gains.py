@@ -14,7 +14,7 @@ from scipy.optimize import brentq, minimize
 
 from dynamics.closed_loop import stability
 from dynamics.closed_loop.problem import LoopSettings, ServoGains
-from dynamics.control.computed_torque import INTEGRAL
+from dynamics.control.computed_torque import INTEGRAL, error_map
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.law import Feedback
 from dynamics.errors import SimulationError
@@ -115,11 +115,12 @@ def _torque_map(
     and the torques on their way."""
     motion, push = stability.torque_motion(model.robot, model.parameters, pose)
     size, joints = len(motion) // 2, push.shape[1]
-    w, one = feedback.bandwidth, np.eye(size)
+    w, one, map_ = feedback.bandwidth, np.eye(size), error_map(feedback)
     stiff, damp = motion[size:, :size], motion[size:, size:]
     inverse = np.linalg.pinv(push)
+    mean = np.linalg.solve(map_, expm(map_ * period) - np.eye(2)) / period  # of the way back, over a frame
     by_place, by_rate = (
-        inverse @ (-factor * k * one - a) for k, a in ((w**2, stiff), (2 * feedback.damping * w, damp))
+        inverse @ (factor * (map_[1] @ along) * one - along[0] * stiff - along[1] * damp) for along in mean.T
     )
     inner = np.zeros((2 * size + joints, 2 * size + joints))
     inner[: 2 * size, : 2 * size], inner[size : 2 * size, 2 * size :] = motion, push

@@ -73,13 +73,17 @@ class Spans:
     torque: np.ndarray
 
 
-def spans(model: Model, motion: Motion, begins: np.ndarray, length: float) -> Spans:
-    """What a motion takes over the spans that begin at times (N,), s. Raises what `Robot.inverse_dynamics` does."""
+def spans(model: Model, motion: Motion, begins: np.ndarray, length: float, dry: Motion | None = None) -> Spans:
+    """What a motion takes over the spans that begin at times (N,), s; dry: the motion whose joints say which way dry
+    friction acts, if not its own. Raises what `Robot.inverse_dynamics` does."""
     share, weight = (NODES + 1) / 2, WEIGHTS / 2
     times = (begins[:, None] + share * length).ravel()
     poses = motion.pose(times)
     joints = model.robot.inverse_kinematics(poses).reshape(len(begins), len(share), -1)
-    torque = model.torque(poses, motion.pose_rate(times), motion.pose_acceleration(times))
+    turning = None
+    if dry is not None:
+        turning = np.einsum("nij,nj->ni", model.robot.pose_jacobian(dry.pose(times)), dry.pose_rate(times))
+    torque = model.torque(poses, motion.pose_rate(times), motion.pose_acceleration(times), turning)
     begin, end = (model.robot.inverse_kinematics(motion.pose(begins + shift)) for shift in (0.0, length))
     return Spans(
         begin,
