@@ -140,6 +140,14 @@ def follows_law(task: Record, at: Record, joint: int) -> float:
 
 
 @kernel
+def winds_up(task: Record, at: Record, joint: int) -> bool:
+    """Whether a drive at its limit would integrate to beyond it; its integrator then holds (conditional integration)."""
+    if task.torques or follows_law(task, at, joint) > 0:
+        return False
+    return bool((task.li * at.error[joint] - task.lx * at.velocity[joint]) * at.torque[joint] > 0)
+
+
+@kernel
 def hold_compliance(task: Record, at: Record, joints: Array) -> None:
     """M^-1 J^T (n, m) and J M^-1 J^T (n, n) of some joints, in their order, and the factor of the latter."""
     for s in range(len(joints)):
@@ -169,7 +177,9 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
         if now.mode[i] != 0:
             at.net_torque[i] -= slip_friction(task, i, at.velocity[i], now.mode[i])
     copy(at.state[size : 2 * size], at.slope[:size])
-    copy(at.error[:], at.slope[2 * size : 2 * size + count])
+    for i in range(count):
+        held = winds_up(task, at, i)
+        at.slope[2 * size + i] = task.lx * at.velocity[i] / task.li if held else at.error[i]
     if task.filter_time > 0:
         for i in range(count):
             unfiltered = task.rate_weight * now.command_rate[i] - at.velocity[i]

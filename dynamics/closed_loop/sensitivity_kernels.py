@@ -23,6 +23,7 @@ from dynamics.closed_loop.motion_kernels import (
     hold_compliance,
     mode_margin,
     stuck_joints,
+    winds_up,
 )
 from dynamics.compiled.kernel import Array, Record, call, call_columns, entry, invoke, kernel
 
@@ -109,6 +110,23 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
         add_row(-1 / task.filter_time, d.filtered[i], slopes[i], width)
 
 
+@kernel
+def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
+    """Derivative of the slopes of integrals that a drive at its limit holds: lx / li times the joint's velocity."""
+    size, width, known = len(at.bias), now.width, now.derivatives
+    lp = len(task.rigid) + 2 * len(now.mode)
+    for i in range(len(now.mode)):
+        if winds_up(task, at, i):
+            row, share = d.k[k, 2 * size + i], task.lx / task.li
+            fill(row, 0.0)
+            for j in range(size):
+                add_row(0.5 * share * known.crank_by_rate[i, j], d.trial[j], row, width)
+                add_row(share * at.jacobian[i, j], d.trial[size + j], row, width)
+            for gain in range(3):
+                row[lp + gain] += task.lx_by[gain] / task.li * at.velocity[i]
+            row[lp + 1] -= share / task.li * at.velocity[i]
+
+
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Derivative of the slope at one state, and behind it of the net torques, into `d.k[k]`: implicitly, for those of
@@ -129,6 +147,8 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     call_columns(task.slope_derivative, known.by_pose, d.trial, d.k[k], width)
     if task.filter_time > 0:
         filtered_tangent(task, now, at, d, k)
+    if task.torque_limit > 0:
+        held_tangent(task, now, at, d, k)
     stuck = stuck_joints(now)
     if len(stuck) == 0:
         return OK

@@ -232,8 +232,11 @@ class Observer:
         pid = not self._drives.torques
         by_error = law.lp * error + li * integral - law.lx * angle[:, 0]
         torque = by_error + ld * (law.rate_weight * command_rate - velocity) if pid else command
-        limit = self._drives.torque_limit
-        torque = torque if limit is None else np.clip(torque, -limit, limit)
+        limit, growing = self._drives.torque_limit, error
+        if limit is not None:
+            further = (np.abs(torque) >= limit) & ((li * error - law.lx * velocity) * torque > 0)
+            growing = np.where(further, law.lx * velocity / (li or 1.0), error)
+            torque = np.clip(torque, -limit, limit)
         net = torque + disturbance - (self._viscous + more) * velocity - self._coulomb * level
         acceleration = np.linalg.solve(mass, jacobian.T @ net - bias[:, 0])
         given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
@@ -250,7 +253,7 @@ class Observer:
         by_state[m : 2 * m, 2 * m + 2 * n :] = -push * velocity
         by_state[2 * m : 2 * m + n, :m] = -pid * jacobian
         until_turned = np.min((np.abs(velocity) - TURNING * width) / np.maximum(np.abs(jacobian @ acceleration), 1e-12))
-        slope = np.concatenate([rate, acceleration, pid * error, np.zeros(2 * n)])
+        slope = np.concatenate([rate, acceleration, pid * growing, np.zeros(2 * n)])
         return slope, by_state, unsure, float(until_turned)
 
     def _expected_friction(

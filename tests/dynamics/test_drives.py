@@ -20,9 +20,10 @@ LAWS = [pytest.param(law, marks=[pytest.mark.thorough] if law == FILTERED else [
 
 
 def drives_of(law):
-    """A law by its name, or the PID at a limit that it meets."""
-    filter_time = 0.008 if law == "pid_filtered" else None
-    return Drives(torque_limit=LIMIT) if law == "limit" else Drives(law=law, filter_time=filter_time)
+    """A law by its name; `limited` before it: at a limit that it meets."""
+    name = law.removeprefix("limited ")
+    filter_time = 0.008 if name == "pid_filtered" else None
+    return Drives(law=name, filter_time=filter_time, torque_limit=LIMIT if name != law else None)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -103,7 +104,7 @@ def test_a_run_from_the_state_of_another_repeats_its_rest(loop):
     assert np.abs(start.filtered_rate).max() > 0
 
 
-CASES = [*LAWS[1:], "limit"]
+CASES = [*LAWS[1:], "limited pid", pytest.param("limited cascade", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("driven", [False, True], ids=["closed loop", "logged commands"])
@@ -120,14 +121,30 @@ def test_sensitivities_are_finite_differences_of_the_run(loop, case, driven):
         return loop.run(reference, settings, values, sensitivities=sensitivities, **given)
 
     base = run(loop.parameters, sensitivities=True)
-    if case == "limit":
+    limited = "limited" in case
+    if limited:
         assert 20 < (np.abs(base.torque) == LIMIT).sum() < 0.5 * base.torque.size
     for index in (0, 2, 12, 52, 58, 64, 65, 66):
         ours = base.pose_sensitivity[:, :, index]
         if index - 64 in np.flatnonzero(settings.drives.joint_law(loop.parameters[64:]).reads == 0):
             assert not ours.any()
             continue
-        _assert_derivative(run, loop.parameters, index, ours, 1e-5 if case == "limit" else 1e-6)
+        _assert_derivative(run, loop.parameters, index, ours, 1e-5 if limited else 1e-6)
+
+
+@pytest.mark.parametrize("law", ["pid", "cascade"])
+def test_the_integrator_of_a_drive_at_its_limit_waits_until_the_error_turns(loop, law):
+    """What it holds, li z - lx theta, stays as long as the torque is at the limit, but for frames within which damping
+    takes it from there for a moment; by the errors of these frames it would have grown."""
+    run = loop.run(loop.reference(45, scale=3.0), loop.settings(drives=drives_of(f"limited {law}")))
+    joint = drives_of(law).joint_law(loop.parameters[64:])
+    angle = loop.robot.inverse_kinematics(run.pose)
+    held, side = joint.li * run.joint_integral - joint.lx * angle, np.sign(run.torque) * (np.abs(run.torque) == LIMIT)
+    grown, error = np.diff(held, axis=0) * side[:-1], (run.command - angle) * side
+    stays = (side[:-1] * side[1:] > 0) & (error[:-1] > 1e-3) & (error[1:] > 1e-3)
+    assert stays.sum() > 10
+    assert np.median(np.abs(grown[stays])) < 1e-9
+    assert grown[stays].sum() < 0.03 * (joint.li / 60 * error[:-1][stays]).sum()
 
 
 def test_sensitivities_of_the_start_are_finite_differences(loop):
