@@ -4,8 +4,8 @@ With U the command of a joint, theta its coordinate and the gains lp, li, ld, th
 
     lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta,
 
-cut at the limit. What z and theta hold there, li z - lx theta, does not grow any further beyond it: the integrator waits
-until the error turns (conditional integration). The laws differ in which gains they read, in c, and in lx:
+cut at the limit. There what z and theta hold, li z - lx theta, does not grow beyond: the integrator waits until the
+error turns (conditional integration). The laws differ in which gains they read, in c, and in lx:
 
     pid       c = 1, lx = 0                   the paper's (eq. 31)
     pd, pi    c = 1, lx = 0, without li; without ld

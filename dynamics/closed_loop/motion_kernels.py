@@ -141,7 +141,7 @@ def follows_law(task: Record, at: Record, joint: int) -> float:
 
 @kernel
 def winds_up(task: Record, at: Record, joint: int) -> bool:
-    """Whether a drive at its limit would integrate to beyond it; its integrator then holds (conditional integration)."""
+    """Whether a drive at its limit would integrate on; its integrator then holds (conditional integration)."""
     if task.torques or follows_law(task, at, joint) > 0:
         return False
     return bool((task.li * at.error[joint] - task.lx * at.velocity[joint]) * at.torque[joint] > 0)

@@ -4,9 +4,9 @@
     Kp = bandwidth^2, Kd = 2 damping bandwidth
 
 with the way back p from where the robot is into the desired motion r. A torque acts for one frame, which is why its
-mean over that time counts. With an observer the way begins where the robot will be as the torque arrives, what the observer
-finds that the model does not know is taken off, and dry friction is that of the way back: near rest its joints often
-turn the other way than those of the desired motion, and a torque for these is wrong by twice the Coulomb torque.
+mean over that time counts. With an observer the way begins where the robot will be as the torque arrives, what the
+observer finds that the model does not know is taken off, and dry friction is that of the way back: near rest its joints
+often turn the other way than those of the desired motion, and a torque for these is wrong by twice the Coulomb torque.
 Without, the way begins at the last measured pose with the difference of the last two, an integral takes the place of
 the disturbance, and dry friction is that of the desired motion: that of a rate half a frame old chatters.
 """

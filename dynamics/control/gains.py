@@ -101,10 +101,12 @@ def check_torque_gains(model: Model, settings: LoopSettings, pose: np.ndarray, f
     """Raise SimulationError, with eigenvalue and limit, where the law computed_torque is unstable near rest."""
     figures = torque_figures(model, settings, pose, feedback)
     if figures.radius >= 1:
+        times = figures.gain_margin
+        mend = f"its gains must be {times:.3g} times as large" if times > 0 else "no factor of its gains makes it so"
         raise SimulationError(
-            f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s is unstable with this model at "
-            f"{settings.timing.frame_rate_hz:g} Hz: its largest eigenvalue from frame to frame is "
-            f"{figures.radius:.4g}, must be below 1; its gains must be {figures.gain_margin:.3g} times as large"
+            f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s and a damping of "
+            f"{feedback.damping:.3g} is unstable with this model at {settings.timing.frame_rate_hz:g} Hz: its largest "
+            f"eigenvalue from frame to frame is {figures.radius:.4g}, must be below 1; {mend}"
         )
 
 

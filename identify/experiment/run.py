@@ -50,6 +50,15 @@ PAYLOAD_RUN = 1_000_000
 
 
 @dataclass(frozen=True)
+class Latencies:
+    """Of the frames of a run (frames,), s: the true ones, and as a law of control knows them, which does not know how
+    far their mean is from the scenario's. None: all are the scenario's."""
+
+    true: Array | None = None
+    known: Array | None = None
+
+
+@dataclass(frozen=True)
 class Experiment:
     """One run: what the experimenter sees, and the truth."""
 
@@ -149,17 +158,17 @@ def run_plant(
     scenario, times = plant.scenario, plant.scenario.timing.frame_times(duration_s)
     check_travel(plant.nominal, trajectory, times, **scenario.excitation.singularity_limits)
     reference = trajectory.reference(times)
-    _part_exposures(sensor, scenario, seed)
+    part_exposures(sensor, scenario, seed)
     watch = _watched(sensor, scenario, len(times))
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
-    latencies = _true_latencies(scenario, len(times), seed, run)
+    latencies = drawn_latencies(scenario, len(times), seed, run)
     true_load = None if load is None else load.true
     in_loop = None
     if law != SERVO:
         motion = NamedMotion("the trajectory", trajectory, duration_s)
         model = model_guess(plant.nominal, scenario).values + (0.0 if load is None else load.stated)
-        in_loop = prepared(plant, law, model, motion, by_images(eye), latencies)
-    done = plant.run(reference, RateSensor(eye.measure), latencies, true_load, in_loop)
+        in_loop = prepared(plant, law, model, motion, by_images(eye), latencies.known)
+    done = plant.run(reference, RateSensor(eye.measure), latencies.true, true_load, in_loop)
     record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
     if in_loop is not None:
         store_law(record, law, in_loop.drives)
@@ -178,7 +187,7 @@ def run_plant(
     return Experiment(record, truth)
 
 
-def _part_exposures(sensor: PoseSensor, scenario: Scenario, seed: int) -> None:
+def part_exposures(sensor: PoseSensor, scenario: Scenario, seed: int) -> None:
     """Have the right camera expose later than the left by what is not known of it, one draw for all runs of a seed."""
     rig = scenario.rig
     if isinstance(sensor, cmmsim.Sensor) and rig.right_later_s is None and rig.right_later_std_s:
@@ -197,15 +206,15 @@ def _watched(sensor: PoseSensor, scenario: Scenario, frames: int) -> DriftWatch 
     return sensor.watch_drift(base=scenario.rig.watch == "both")
 
 
-def _true_latencies(scenario: Scenario, frames: int, seed: int, run: int) -> Array | None:
-    """Latency of each frame (frames,) [s] of a run; None where all have the known mean. What is not known of the mean
-    is one draw for all runs of a seed."""
+def drawn_latencies(scenario: Scenario, frames: int, seed: int, run: int) -> Latencies:
+    """Latencies of the frames of a run. What is not known of their mean is one draw for all runs of a seed."""
     timing = scenario.timing
-    drawn = timing.drawn_latencies(frames, np.random.default_rng(stream_seed(seed, LATENCY, run)))
+    known = timing.drawn_latencies(frames, np.random.default_rng(stream_seed(seed, LATENCY, run)))
     if not timing.latency_std_s:
-        return drawn
+        return Latencies(known, known)
     off = timing.latency_std_s * np.random.default_rng(stream_seed(seed, MEAN_LATENCY)).standard_normal()
-    return np.maximum((timing.latency_s if drawn is None else drawn) + np.full(frames, off), 0.0)
+    true = np.maximum((timing.latency_s if known is None else known) + np.full(frames, off), 0.0)
+    return Latencies(true, known)
 
 
 def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorInLoop, seed: int) -> xr.Dataset:

@@ -10,6 +10,9 @@ from dynamics.closed_loop import ClosedLoopRun, DriveName, RateSensor, Reference
 from identify.arrays import Array
 from identify.experiment.law_in_loop import NamedMotion, Seen, prepared
 from identify.experiment.plant import Plant
+from identify.experiment.run import Latencies
+
+USUAL = Latencies()
 
 
 @dataclass(frozen=True)
@@ -62,18 +65,18 @@ def follow(
     parameters: Array,
     motion: NamedMotion,
     seen: Seen,
-    latencies: Array | None = None,
+    latencies: Latencies = USUAL,
     drive: DriveName | None = None,
 ) -> Followed:
-    """Follow a motion under a law with a model of these parameters (p,); latencies (N,), s, where they vary; drive: the
-    law of its drives, where that is not the scenario's model's.
+    """Follow a motion under a law with a model of these parameters (p,); latencies: where they are not the scenario's;
+    drive: the law of its drives, where that is not the scenario's model's.
 
     Raises what `prepared` does, and LoopFailure: a loop that is lost.
     """
-    in_loop = prepared(plant, law, parameters, motion, seen, latencies, drive)
+    in_loop = prepared(plant, law, parameters, motion, seen, latencies.known, drive)
     times = plant.scenario.timing.frame_times(motion.duration_s)
     reference = Reference(motion.motion.pose(times), motion.motion.pose_rate(times))
-    run = plant.run(reference, RateSensor(seen.measure), latencies, law=in_loop)
+    run = plant.run(reference, RateSensor(seen.measure), latencies.true, law=in_loop)
     expected = None
     if in_loop.expected:
         means = np.array([estimate.coordinates for estimate in in_loop.expected])

@@ -18,13 +18,13 @@ from identify.estimation.prior import starting_guess
 from identify.excitation.design import design_trajectories
 from identify.experiment.law_in_loop import NamedMotion, Seen, by_images, prepared
 from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import excitation_run, taught_sensor
+from identify.experiment.run import Latencies, drawn_latencies, excitation_run, part_exposures, taught_sensor
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, with_renderer
 from identify.files.run_folder import RunFolder, load_result, rms_figures
 from identify.files.versions import versions
 from identify.loop_parameters import parameter_column, settled_drive
 from identify.progress import Advance, Progress
-from identify.random_streams import LATENCY, NOISE, TRACKED, child, stream_seed
+from identify.random_streams import NOISE, TRACKED, child, stream_seed
 from identify.scenario import Scenario, load_scenario
 from identify.tracking.following import Followed, by_drawing, follow
 from identify.tracking.motions import motions
@@ -151,7 +151,8 @@ def follow_by_images(
     advance: Advance = lambda n=1: None,
 ) -> tuple[Followed, Seen]:
     """A motion followed under a law with a model, and by what the loop saw; noise and latencies are those of a seed and
-    of the motion's number. Raises as `follow`."""
+    of the motion's number, the mean latency and how far exposures are apart those of the seed. Raises as `follow`."""
+    part_exposures(sensor, plant.scenario, seed)
     seen = by_images(SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, FIRST_RUN + number), advance))
     latencies = _latencies(plant, motion, seed, number)
     return follow(plant, law, model.parameters, motion, seen, latencies, model.drive), seen
@@ -222,7 +223,8 @@ def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact
     """Mean squared errors (6,) over all motions, with one thing exact."""
     plant = task.plant
     if exact == "latency":
-        still = {"timing.latency_s": 0.0, "timing.latency_jitter_s": 0.0, "timing.dropout": 0.0}
+        still = dict.fromkeys(("latency_s", "latency_jitter_s", "latency_std_s", "dropout"), 0.0)
+        still = {f"timing.{name}": value for name, value in still.items()}
         plant = build_plant(plant.scenario.with_overrides(still), plant.nominal)
     dropout, squares = plant.scenario.timing.dropout, []
     for number, motion in enumerate(task.motions):
@@ -230,7 +232,7 @@ def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact
         lost = rng.random(plant.scenario.timing.frames(motion.duration_s)) < dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")
         known = known_model(plant, "true", None) if exact == "model" else model
-        latencies = None if exact == "latency" else _latencies(task.plant, motion, task.seed, number)
+        latencies = Latencies() if exact == "latency" else _latencies(task.plant, motion, task.seed, number)
         try:
             done = follow(plant, law, known.parameters, motion, seen, latencies, known.drive)
             squares.append(done.errors**2)
@@ -239,7 +241,6 @@ def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact
     return np.asarray(np.concatenate(squares).mean(axis=0))
 
 
-def _latencies(plant: Plant, motion: NamedMotion, seed: int, number: int) -> Array | None:
-    timing = plant.scenario.timing
-    rng = np.random.default_rng(stream_seed(seed, LATENCY, FIRST_RUN + number))
-    return timing.drawn_latencies(timing.frames(motion.duration_s), rng)
+def _latencies(plant: Plant, motion: NamedMotion, seed: int, number: int) -> Latencies:
+    scenario = plant.scenario
+    return drawn_latencies(scenario, scenario.timing.frames(motion.duration_s), seed, FIRST_RUN + number)

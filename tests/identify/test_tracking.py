@@ -11,6 +11,7 @@ from dynamics.errors import SimulationError
 from identify.errors import RecordError, ScenarioError, TrajectoryError
 from identify.experiment.law_in_loop import NamedMotion, prepared
 from identify.experiment.plant import build_plant
+from identify.experiment.run import drawn_latencies
 from identify.files.run_folder import RunFolder, save_result
 from identify.scenario import load_scenario
 from identify.studies.rows.sensor import DrawnSensor
@@ -117,7 +118,7 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
     ("law", "changes", "error", "said"),
     [
         ("computed_torque", {"control.torque_access": False}, ScenarioError, "control.torque_access = false"),
-        ("computed_torque", {"control.bandwidth_rad_s": 120.0}, SimulationError, "largest eigenvalue"),
+        ("computed_torque", {"control.observer": False, "control.bandwidth_rad_s": 120.0}, SimulationError, "largest eigenvalue"),
         ("sliding_mode", {}, ScenarioError, "unknown law 'sliding_mode'; valid: pid, feedforward, computed_torque"),
         ("builtins:repr", {}, ScenarioError, "must return a LawInLoop, returned str"),
     ],
@@ -150,6 +151,32 @@ def test_a_law_of_ones_own_is_a_function():
     done = follow(chosen, "tests.identify.test_tracking:holding", chosen.parameters, swing(), seen())
     alone = follow(chosen, "pid", chosen.parameters, swing(), seen())
     assert np.abs(done.errors).max() < np.abs(alone.errors).max()
+
+
+KNOWN_LATENCIES = []
+
+
+def noting(assignment):
+    """The servo, which notes what latencies it is told."""
+    KNOWN_LATENCIES.append(assignment.latencies)
+    return LawInLoop(drives=assignment.settings.drives)
+
+
+def test_what_is_not_known_of_the_mean_latency_is_drawn_for_a_seed_and_no_law_knows_it():
+    """The run is that with the drawn latency; the same for all motions of a seed."""
+    stated = {"timing.latency_s": 0.006, "timing.latency_std_s": 0.002}
+    vague, model = plant(**stated), tracking.known_model(plant(), "true", None)
+    drawn = [drawn_latencies(vague.scenario, 120, seed, run) for seed, run in ((3, 0), (3, 7), (4, 0))]
+    first, other, another = (float(one.true[0]) for one in drawn)
+    assert first == other != another
+    assert abs(first - 0.006) > 1e-4
+    exact = plant(**{"timing.latency_s": first})
+    name = "tests.identify.test_tracking:noting"
+    runs = [
+        tracking.follow_by_images(one, DrawnSensor(NOISE), name, model, swing(), 3)[0].run.pose for one in (vague, exact)
+    ]
+    assert np.array_equal(*runs)
+    assert (np.array(KNOWN_LATENCIES[0]) == 0.006).all()
 
 
 def test_the_scale_of_all_parameters_makes_no_difference_to_feedforward():

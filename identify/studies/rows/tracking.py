@@ -34,6 +34,10 @@ COLUMNS = {
     "position_share_percent": Column("%", "position's deviation over that under the law pid", main=True),
     "orientation_share_percent": Column("%", "orientation's deviation over that under the law pid", main=True),
     "observer_normalised_error": Column("1", "mean squared error of the observer over the stated one"),
+    "starting_position_excess_um": Column("um", "that with the starting model less this, of the position", main=True),
+    "starting_orientation_excess_urad": Column("urad", "and of the orientation", main=True),
+    "true_position_ratio": Column("1", "this over that with the true model, of the position", main=True),
+    "true_orientation_ratio": Column("1", "and of the orientation", main=True),
     "effort_rms": Column("N m or N", "torque or force of the actuators, rms"),
     "lost_frames": Column("1", "frames that the sensor lost"),
 }
@@ -49,6 +53,9 @@ class TrackingOptions(Section):
     )
     off: float = Field(
         0.0, ge=0, lt=1, description="share by which each parameter is too large or too small, at random"
+    )
+    compared: bool = Field(
+        False, description="whether the same motions are followed with the starting and the true model, too"
     )
     trajectory_seed: int = Field(0, ge=0, description="seed of the trajectory from which the model is identified")
 
@@ -73,14 +80,19 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
     model = _model(plant, sensor, number, options)
     model = replace(model, parameters=model.parameters * (1.0 + options.off * signs))
     unseen = motions(robot, scenario, number)[: scenario.validation.count]
-    done, beside = (
-        [follow_by_images(plant, sensor, law, model, motion, number + k)[0] for k, motion in enumerate(unseen)]
-        for law in (options.law, "pid")
-    )
+
+    def followed(law: str, known: KnownModel) -> list[Followed]:
+        return [follow_by_images(plant, sensor, law, known, motion, number, k)[0] for k, motion in enumerate(unseen)]
+
+    done, beside = followed(options.law, model), followed("pid", model)
     common = sensor.taught.calibration_covariance(robot.home_pose)
     normalised = [one.normalised_squared_error(robot, common) for one in done]
     known = [value for value in normalised if value is not None]
-    return _figures(done, beside) | ({"observer_normalised_error": float(np.mean(known))} if known else {})
+    row = _figures(done, beside)
+    if options.compared:
+        start, truth = (followed(options.law, known_model(plant, name, None)) for name in ("initial", "true"))
+        row |= _against(done, start, truth)
+    return row | ({"observer_normalised_error": float(np.mean(known))} if known else {})
 
 
 def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptions) -> KnownModel:
@@ -96,10 +108,26 @@ def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptio
     return identified_model(plant, record, SilentProgress())
 
 
+AXES = (("position", slice(0, 3), "um"), ("orientation", slice(3, 6), "urad"))
+
+
+def _rms(runs: list[Followed], axes: slice) -> float:
+    return rms_um(np.concatenate([one.errors for one in runs])[:, axes])
+
+
+def _against(done: list[Followed], start: list[Followed], truth: list[Followed]) -> Row:
+    row: Row = {}
+    for name, axes, unit in AXES:
+        own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
+        row[f"starting_{name}_excess_{unit}"] = with_start - own
+        row |= {f"true_{name}_ratio": own / with_truth} if with_truth else {}
+    return row
+
+
 def _figures(done: list[Followed], beside: list[Followed]) -> Row:
     row: Row = {}
-    for name, axes, unit in (("position", slice(0, 3), "um"), ("orientation", slice(3, 6), "urad")):
-        own, pid = (rms_um(np.concatenate([one.errors for one in runs])[:, axes]) for runs in (done, beside))
+    for name, axes, unit in AXES:
+        own, pid = (_rms(runs, axes) for runs in (done, beside))
         row |= {f"{name}_rms_{unit}": own, f"pid_{name}_rms_{unit}": pid}
         row |= {f"{name}_share_percent": 100.0 * own / pid} if pid else {}
     torque = np.concatenate([one.run.torque for one in done])
