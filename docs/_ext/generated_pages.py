@@ -24,13 +24,28 @@ PAGES: dict[str, Callable[[], str]] = {
     "api_dynamics.md": lambda: api_pages.package("dynamics"),
     "api_identify.md": lambda: api_pages.package("identify"),
 }
-FOLLOWED = {
-    "position_rms_um": "position, µm",
-    "orientation_rms_urad": "orientation, µrad",
+SHARES = {
     "position_share_percent": "position over that of `pid`, %",
     "orientation_share_percent": "orientation over that of `pid`, %",
 }
+FOLLOWED = {"position_rms_um": "position, µm", "orientation_rms_urad": "orientation, µrad"} | SHARES
 """Figures of a motion that is followed."""
+
+COMPARED = SHARES | {
+    "true_position_ratio": "position over that with the true model",
+    "true_orientation_ratio": "orientation",
+    "starting_position_excess_um": "with the starting model more by, µm",
+    "starting_orientation_excess_urad": "µrad",
+}
+"""And beside it with other models."""
+
+TIMING = ("timing",)
+
+
+def at_both_rates(name: str) -> dict[str, tuple[str, ...]]:
+    """Kept answers of a study of tracking, at both timings."""
+    return {name: ("60 Hz",), f"{name}_29hz": ("29 Hz, latency of a frame",)}
+
 
 COVERED = {
     "intervals": "quantities identified",
@@ -99,10 +114,20 @@ FIGURES: dict[str, Callable[[Path], str]] = {
         {"options.law": "law", "options.model_error": "error of the model, starting model 1"},
         FOLLOWED,
     ),
-    "answer_control_laws.md": kept_figures.answer(
-        "control_laws",
-        {"options.law": "law", "options.model": "model"},
-        FOLLOWED,
+    "answer_control_laws.md": kept_figures.answers(
+        at_both_rates("control_laws"), TIMING, {"options.law": "law"}, COMPARED
+    ),
+    "answer_control_robots.md": kept_figures.answers(
+        at_both_rates("control_robots"), TIMING, {"scenario.robot": "robot", "options.law": "law"}, COMPARED
+    ),
+    "answer_model_off.md": kept_figures.answers(
+        at_both_rates("model_off"), TIMING, {"scenario.robot": "robot", "options.law": "law"}, SHARES
+    ),
+    "answer_observer.md": kept_figures.answers(
+        at_both_rates("observer"),
+        TIMING,
+        {"scenario.robot": "robot", "options.law": "law"},
+        {"observer_normalised_error": "mean squared error of the observer over the stated one"},
     ),
 }
 

@@ -142,16 +142,26 @@ def laws(folder: Path) -> str:
 def answer(name: str, factors: dict[str, str], shown: dict[str, str]) -> Callable[[Path], str]:
     """The table of a built-in study that asks a question, of its kept summary: factors and figures with their heads."""
 
+    return answers({name: ()}, (), factors, shown)
+
+
+def answers(
+    kept_as: dict[str, tuple[str, ...]], heads: tuple[str, ...], factors: dict[str, str], shown: dict[str, str]
+) -> Callable[[Path], str]:
+    """The same of several kept summaries, each with what its rows have in common, under these heads."""
+
     def table(folder: Path) -> str:
-        content = kept(folder / "answers", name)
+        contents = {name: kept(folder / "answers", name) for name in kept_as}
         rows = [
             (
+                *kept_as[name],
                 *(str(point["factors"][path]) for path in factors),
                 *(_average(figure, point["figures"]) for figure in shown),
             )
+            for name, content in contents.items()
             for point in content["points"]
         ]
-        return _table((*factors.values(), *shown.values()), rows) + _kept_rows(content)
+        return _table((*heads, *factors.values(), *shown.values()), rows) + _kept_rows(list(contents.values()))
 
     return table
 
@@ -164,22 +174,23 @@ def leaderboard(folder: Path) -> str:
     names = [name.removesuffix("_position_um") for name in point["figures"] if name.endswith("_position_um")]
     rows = [(f"`{name}`", *(_average(f"{name}_{end}", point["figures"]) for end in ends)) for name in names]
     heads = ("estimator", "groups, %", "gains, %", "position, µm", "orientation, µrad", "time, s")
-    return _table(heads, rows) + _kept_rows(content)
+    return _table(heads, rows) + _kept_rows([content])
 
 
 def _average(name: str, figures: dict[str, Any]) -> str:
-    """Mean of shares and counts, rms of all else, with its 95 % band."""
+    """Mean of shares, counts, ratios and differences, rms of all else, with its 95 % band."""
     if name not in figures:
         return "none"
-    kind = "mean" if "covered" in name or name.endswith(("intervals", "groups")) else "rms"
+    ends = ("intervals", "groups", "ratio", "normalised_error")
+    kind = "mean" if "covered" in name or "excess" in name or name.endswith(ends) else "rms"
     middle, band = figures[name][kind], figures[name][f"{kind}_band"]
     return f"{middle:.3g}" if band is None else f"{middle:.3g} ({band[0]:.3g} to {band[1]:.3g})"
 
 
-def _kept_rows(content: dict[str, Any]) -> str:
-    rows = content["rows"]
-    lost = f"; {rows['failed']} failed" if rows["failed"] else ""
-    return f"\n\n{rows['done']} experiments{lost}, seed {content['seed']}; `cmmsim study {content['name']}`.\n"
+def _kept_rows(contents: list[dict[str, Any]]) -> str:
+    done, failed = (sum(content["rows"][what] for content in contents) for what in ("done", "failed"))
+    lost = f"; {failed} failed" if failed else ""
+    return f"\n\n{done} experiments{lost}, seed {contents[0]['seed']}; `cmmsim study {contents[0]['name']}`.\n"
 
 
 def _faster(value: float) -> str:

@@ -40,7 +40,7 @@ def rows_of(name, repeats=None):
 
 
 ANSWERS = {"control_laws", "control_value", "estimators", "excitation_methods", "friction_timing", "inexact"}
-ANSWERS |= {"interval_coverage", "parameter_groups"}
+ANSWERS |= {"interval_coverage", "parameter_groups", "control_robots", "model_off", "observer"}
 """Studies that ask what no law says; what came out is in the documentation."""
 
 

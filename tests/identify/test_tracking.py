@@ -118,7 +118,12 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
     ("law", "changes", "error", "said"),
     [
         ("computed_torque", {"control.torque_access": False}, ScenarioError, "control.torque_access = false"),
-        ("computed_torque", {"control.observer": False, "control.bandwidth_rad_s": 120.0}, SimulationError, "largest eigenvalue"),
+        (
+            "computed_torque",
+            {"control.observer": False, "control.bandwidth_rad_s": 120.0},
+            SimulationError,
+            "largest eigenvalue",
+        ),
         ("sliding_mode", {}, ScenarioError, "unknown law 'sliding_mode'; valid: pid, feedforward, computed_torque"),
         ("builtins:repr", {}, ScenarioError, "must return a LawInLoop, returned str"),
     ],
@@ -173,7 +178,8 @@ def test_what_is_not_known_of_the_mean_latency_is_drawn_for_a_seed_and_no_law_kn
     exact = plant(**{"timing.latency_s": first})
     name = "tests.identify.test_tracking:noting"
     runs = [
-        tracking.follow_by_images(one, DrawnSensor(NOISE), name, model, swing(), 3)[0].run.pose for one in (vague, exact)
+        tracking.follow_by_images(one, DrawnSensor(NOISE), name, model, swing(), 3)[0].run.pose
+        for one in (vague, exact)
     ]
     assert np.array_equal(*runs)
     assert (np.array(KNOWN_LATENCIES[0]) == 0.006).all()

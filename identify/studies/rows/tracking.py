@@ -119,8 +119,8 @@ def _against(done: list[Followed], start: list[Followed], truth: list[Followed])
     row: Row = {}
     for name, axes, unit in AXES:
         own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
-        row[f"starting_{name}_excess_{unit}"] = with_start - own
-        row |= {f"true_{name}_ratio": own / with_truth} if with_truth else {}
+        if with_truth:  # not of coordinates that the platform does not have
+            row |= {f"starting_{name}_excess_{unit}": with_start - own, f"true_{name}_ratio": own / with_truth}
     return row
 
 
