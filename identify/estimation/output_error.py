@@ -47,9 +47,10 @@ class OutputErrorProblem:
         return any(run.common.latency_std or (run.common.names and not run.driven) for run in self.runs if run.marginal)
 
     def has(self, errors: Sequence[Array], within: float) -> bool:
-        """Whether the model of each run has these common errors (k,), but for so many standard deviations."""
+        """Whether the model of each run has these common errors (k,), as far as it can, but for so many standard
+        deviations."""
         pairs = zip(self.runs, errors, strict=True)
-        return all(np.abs(run.errors_had - own).max(initial=0.0) <= within for run, own in pairs)
+        return all(np.abs(run.errors_had - run.having(own).errors_had).max(initial=0.0) <= within for run, own in pairs)
 
     def having(self, errors: Sequence[Array]) -> "OutputErrorProblem":
         """The same problem, the model of each run with these common errors (k,)."""

@@ -13,8 +13,9 @@ That is the PID. In other laws of the drives the torque is in proportion to the 
 derivatives by these, times these; those of a cascade depend on ratios of the gains, for which the latest fit stands.
 
 What all poses of a run have in common, or a geometry that is known only so well, moves theta by e d, with d of standard
-deviation one. That stands in the equation with lp and with li: as errors of the rows that go on along a run, lp0 e and
-li0 integral(e) with the gains of the starting guess, they are marginalised (`record.common_errors`).
+deviation one; an error of the latency moves U by the way that it makes in that time. That stands in the equation with
+lp and with li: as errors of the rows that go on along a run, lp0 e and li0 integral(e) with the gains of the starting
+guess, they are marginalised (`record.common_errors`).
 """
 
 import numpy as np
@@ -96,12 +97,14 @@ def _stacked(problem: OutputErrorProblem, scenario: Scenario, law: JointLaw) -> 
 
 
 def _common_torques(run: RecordedRun, guess: StartingGuess, scenario: Scenario) -> Array:
-    """What common errors of the poses and errors of the geometry, each of one standard deviation, add to the balance of
-    every joint (N, n, k), N m or N, with the gains of the starting guess."""
+    """What common errors of the poses and errors of geometry and latency, each of one standard deviation, add to the
+    balance of every joint (N, n, k), N m or N, with the gains of the starting guess."""
     poses, (lp, li, _) = run.without_gaps(), guess.values[guess.layout.joint_pid]
     by_pose = run.robot.pose_jacobian(run.reference.poses) @ run.common.modes if run.common.names else None
     by_geometry = run.common.geometry.joints(poses) if run.common.geometry else None
-    moved = [part for part in (by_pose, by_geometry) if part is not None]
+    latency_std = run.common.latency_std
+    by_latency = latency_std * effective_command(run.logged, scenario)[1][:, :, None] if latency_std else None
+    moved = [part for part in (by_pose, by_geometry, by_latency) if part is not None]
     if not moved:
         return np.zeros((*run.logged.shape, 0))
     angle = np.concatenate(moved, axis=2)

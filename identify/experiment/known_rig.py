@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import cmmsim
 from cmmsim.calibration import PairView, board_poses, calibrate, default_board, render_pairs
@@ -28,6 +29,8 @@ from identify.scenario import Scenario
 
 LARGEST_RATIO = 1.5
 """Of the focal lengths and baselines of two rigs, one over the other, of which one may be calibrated for the other."""
+ANGLE, SHARE = np.deg2rad(10.0), 0.1
+"""By which the directions of such may differ, and their principal points, of the image's size."""
 
 
 def known_rig(
@@ -95,20 +98,40 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
         )
     if size != [rig.left.width, rig.left.height]:
         raise ScenarioError(
-            f"rig.known = {str(path)!r} is of cameras with {size[0]} x {size[1]} px, the sensor's have "
-            f"{rig.left.width} x {rig.left.height}"
+            f"rig.known = {str(path)!r} is of cameras with {size} px, the sensor's have "
+            f"{[rig.left.width, rig.left.height]}"
         )
-    for name, there, here in _sizes(estimates, rig.parameters):
+    if not np.isfinite(matrix).all():
+        raise ScenarioError(f"rig.known = {str(path)!r}: its covariance is not finite")
+    if other := _other_rig(estimates, rig):
+        raise ScenarioError(f"rig.known = {str(path)!r} is of another rig: {other}")
+    try:
+        return KnownRig(rig, matrix).covariance
+    except cmmsim.CmmError as error:
+        raise ScenarioError(f"rig.known = {str(path)!r}: {error}") from None
+
+
+def _other_rig(estimates: Array, rig: StereoRig) -> str:
+    """In what calibrated parameters (24,) are not those of a rig like this one; empty where they are."""
+
+    def both(name: str) -> tuple[float, float]:
+        index = PARAMETER_NAMES.index(name)
+        return float(estimates[index]), float(rig.parameters[index])
+
+    places = [(Rotation.from_rotvec(one[21:]), one[18:21]) for one in (estimates, rig.parameters)]
+    turned = (places[0][0].inv() * places[1][0]).magnitude()
+    lengths = [float(np.linalg.norm(place)) for _, place in places]
+    ratios = {f"{side}.fx_px": both(f"{side}.fx_px") for side in ("left", "right")} | {"baseline [m]": tuple(lengths)}
+    for name, (there, here) in ratios.items():
         if not 1.0 / LARGEST_RATIO < there / here < LARGEST_RATIO:
-            raise ScenarioError(
-                f"rig.known = {str(path)!r} is of another rig: {name} {there:.4g} there, {here:.4g} of the sensor"
-            )
-    return matrix
-
-
-def _sizes(*rigs: Array) -> list[tuple[str, float, float]]:
-    """Focal lengths and baseline of two rigs (24,), by name."""
-    pairs = [
-        (f"{name} [px]", *(rig[PARAMETER_NAMES.index(name)] for rig in rigs)) for name in ("left.fx_px", "right.fx_px")
-    ]
-    return [*pairs, ("baseline [m]", *(float(np.linalg.norm(rig[18:21])) for rig in rigs))]
+            return f"{name} is {there:.4g} there, {here:.4g} of the sensor"
+    for camera in ("left", "right"):
+        for name, size in ((f"{camera}.cx_px", rig.left.width), (f"{camera}.cy_px", rig.left.height)):
+            there, here = both(name)
+            if not abs(there - here) < SHARE * size:
+                return f"{name} is {there:.5g} there, {here:.5g} of the sensor"
+    along = np.arccos(np.clip(places[0][1] @ places[1][1] / np.prod(lengths), -1.0, 1.0))
+    for what, angle in (("the right camera looks", turned), ("the right camera stands", along)):
+        if not angle < ANGLE:
+            return f"{what} {np.rad2deg(angle):.0f} degrees beside where that of the sensor does, from the left one"
+    return ""

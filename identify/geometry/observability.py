@@ -76,8 +76,9 @@ def check_enough(robot: Robot, poses: int, information: Array, scale: Array, pri
     worst = np.argsort(-np.sqrt(np.diagonal(covariance)) / prior_std, kind="stable")
     unseen = [names[k] for k in worst if covariance[k, k] <= (OBSERVABLE * prior_std[k]) ** 2][: told - poses * rows]
     shown = ", ".join(unseen[:6]) + (f" and {len(unseen) - 6} more" if len(unseen) > 6 else "")
+    needed, missing = -(-told // rows), told - poses * rows
     raise EstimationError(
-        f"{poses} poses give {poses * rows} equations for {told} combinations of the {len(names)} geometric numbers of "
-        f"{robot.name} that poses can tell: at least {-(-told // rows)} are needed; missing: {told - poses * rows}, "
+        f"{poses} poses that differ give {poses * rows} equations for {told} combinations of the {len(names)} "
+        f"geometric numbers of {robot.name} that poses can tell: at least {needed} are needed; missing: {missing}, "
         f"hardest to tell: {shown}"
     )

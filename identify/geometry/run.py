@@ -48,7 +48,7 @@ def run_geometry(
         sensor = taught_sensor(scenario, robot, seed, progress)
         data, lost = stand_at(robot, scenario, sensor, true, chosen.joints, chosen.poses, seed, progress)
         check_encoders(robot, data)
-    _require_enough(designer, among, len(data))
+    _require_enough(designer, among, data.different)
     with progress.stage("calibrate", 1) as advance:
         found = calibrate(robot, data, tolerance)
         advance()

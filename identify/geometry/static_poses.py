@@ -14,6 +14,9 @@ from identify.files.run_folder import load_result
 UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
 """Standard deviation (6,) of a frame of which nothing is known, m and rad: more than where any robot is put."""
 
+APART, ROUNDING = 10.0, 1e-9
+"""Standard deviations of the encoders, and rad or m, by which different poses differ in some joint."""
+
 
 @dataclass(frozen=True)
 class FrameKnowledge:
@@ -60,6 +63,15 @@ class StaticPoses:
         """As `common`, with k = 0 where there is nothing."""
         return np.zeros((len(self), 6, 0)) if self.common is None else self.common
 
+    @property
+    def different(self) -> int:
+        """How many of the poses differ in what the encoders read, by more than their noise makes."""
+        apart, kept = np.maximum(APART * self.joint_std, ROUNDING), self.joints[:0]
+        for joints in self.joints:
+            if not (np.abs(kept - joints) <= apart).all(axis=1).any():
+                kept = np.vstack([kept, joints])
+        return len(kept)
+
     def entry(self, robot: Robot) -> dict[str, Any]:
         """What `read_static_poses` reads, as JSON holds it."""
         return {
@@ -84,6 +96,8 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
     content = load_result(path)
     if not isinstance(content.get("joints"), list):
         raise RecordError(f"{path} holds no poses: it needs joints, joint_std, poses and covariances")
+    if not content["joints"]:
+        raise RecordError(f"{path} holds no poses: joints is empty")
     unit, count, joints = content.get("joint_unit"), len(content["joints"]), robot.layout.joints
     if unit not in (None, robot.layout.joint_unit):
         raise RecordError(f"{path}: joint_unit is {unit!r}, joints of {robot.name} are in {robot.layout.joint_unit}")
@@ -111,8 +125,16 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
         raise RecordError(f"{path}: joint_std of joint {int(np.argmin(std)) + 1} is {std.min():g}, must be >= 0")
     common = None
     if content.get("common") is not None:
-        common = array("common", count, 6, np.shape(content["common"])[-1] if np.ndim(content["common"]) == 3 else 1)
+        common = array("common", count, 6, _columns(content["common"]))
     return StaticPoses(array("joints", count, joints), std, array("poses", count, 6), covariances, frames, common)
+
+
+def _columns(rows: Any) -> int:
+    """Length of the first of the innermost of nested lists; one where there is none."""
+    try:
+        return len(rows[0][0])
+    except (TypeError, LookupError):
+        return 1
 
 
 def _check_covariances(name: str, matrices: Array, strictly: bool) -> None:

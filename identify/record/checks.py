@@ -3,6 +3,8 @@
 Each check raises EstimationError with what it found, in frames counted from 0.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -129,11 +131,12 @@ def check_length(frames: int, scenario: Scenario, what: str = "the record has") 
         )
 
 
-def check_good_share(ok: NDArray[np.bool_]) -> None:
-    """Enough frames (N,) that were measured; else TooFewFramesError."""
+def check_good_share(ok: NDArray[np.bool_], seen: Sequence[str] = ()) -> None:
+    """Enough frames (N,) that were measured; else TooFewFramesError, with what a watch saw of the cameras."""
     if ok.mean() < MINIMUM_GOOD_SHARE:
+        why = "".join(f": {warning}" for warning in seen)
         raise TooFewFramesError(
-            f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} are needed"
+            f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} are needed{why}"
         )
 
 

@@ -25,6 +25,7 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.common_errors import NONE, CommonErrors, Marginal, read_common_errors
+from identify.record.drift import drift_warnings
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
 from identify.record.law import takes_torques
 from identify.record.payload import recorded_payload
@@ -67,8 +68,8 @@ class RecordedRun:
         return replace(self, driven=True, marginal=None)
 
     def having(self, drawn: Array) -> "RecordedRun":
-        """The same run, whose model has these common errors (k,), in standard deviations."""
-        return replace(self, drawn=drawn if len(drawn) else None, marginal=None)
+        """The same run, whose model has these common errors (k,), in standard deviations, as far as it can."""
+        return replace(self, drawn=np.maximum(drawn, self._lowest) if len(drawn) else None, marginal=None)
 
     def with_common_errors(self, parameters: Array) -> "RecordedRun":
         """The same run, whose residuals are whitened by what its poses have in common, too, as a model with these
@@ -104,15 +105,12 @@ class RecordedRun:
         """What a run shows (N, 6) with a standard deviation more of each common error, less that without; beside (N, 6,
         k): of those that are in the measured poses, where the loop does not see them."""
         drawn = self.errors_had
-        lowest = np.full(len(drawn), -np.inf)
-        if self.common.latency_std:
-            lowest[-1] = -self.settings.timing.latency_s / self.common.latency_std  # no latency is negative
         modes, count = np.zeros((*self.measured.shape, len(drawn))), len(self.common.names)
         if beside is not None:
             modes[:, :, :count] = beside
         moving = [] if beside is not None else list(range(count))[: self.common.noticed]
         moving += range(count, len(drawn))
-        ends = [np.maximum(drawn + sign * np.eye(len(drawn))[k], lowest) for k in moving for sign in (1.0, -1.0)]
+        ends = [np.maximum(drawn + sign * np.eye(len(drawn))[k], self._lowest) for k in moving for sign in (1.0, -1.0)]
         with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
             found = list(pool.map(lambda end: shown(self.having(end).simulate(parameters)), ends))
         for place, k in enumerate(moving):
@@ -129,6 +127,14 @@ class RecordedRun:
         if self.drawn is None or not self.common.latency_std:
             return None
         return max(self.settings.timing.latency_s + self.common.latency_std * float(self.drawn[-1]), 0.0)
+
+    @property
+    def _lowest(self) -> Array:
+        """The least that a model can have (k,) of each common error that its loop can have: no latency is negative."""
+        lowest = np.full(len(self.common.names) + bool(self.common.latency_std), -np.inf)
+        if self.common.latency_std:
+            lowest[-1] = -self.settings.timing.latency_s / self.common.latency_std
+        return lowest
 
     @property
     def errors_had(self) -> Array:
@@ -270,7 +276,7 @@ def recorded_reference(record: xr.Dataset) -> Reference:
 def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
     """What a record holds, and what the scenario says of the model."""
     ok = record["measured_ok"].values.astype(bool)
-    check_good_share(ok)
+    check_good_share(ok, drift_warnings([record]))
     load, load_std = recorded_payload(record, robot.layout)
     run = RecordedRun(
         robot=robot,

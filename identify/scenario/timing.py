@@ -18,6 +18,9 @@ from identify.scenario.settings_file import one_line
 if TYPE_CHECKING:
     from cmmsim.files import Timing as SensorTiming
 
+LATENCY_STDS = 5.0
+"""Standard deviations by which the mean latency may be longer than stated."""
+
 IN_FILE = {
     "frame_rate_hz": "frame_rate",
     "exposure_s": "exposure",
@@ -76,12 +79,13 @@ class Timing(Section):
         """
         from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
 
-        longest = self.of_sensor().largest_latency
+        longest = self.of_sensor().largest_latency + LATENCY_STDS * self.latency_std_s
         if longest * self.frame_rate_hz > MAX_DELAY_FRAMES:
             raise ValueError(
                 f"timing.latency_s = {self.latency_s:g} s with timing.latency_jitter_s = {self.latency_jitter_s:g} s "
-                f"reaches {longest:.4g} s, {longest * self.frame_rate_hz:.1f} frames of {self.frame_rate_hz:g} Hz; at "
-                f"most {MAX_DELAY_FRAMES} frames are possible"
+                f"and timing.latency_std_s = {self.latency_std_s:g} s reaches {longest:.4g} s, "
+                f"{longest * self.frame_rate_hz:.1f} frames of {self.frame_rate_hz:g} Hz; at most {MAX_DELAY_FRAMES} "
+                "frames are possible"
             )
 
 

@@ -5,6 +5,7 @@ turns that couple into positions, of some deviations of the noise. What a real r
 `tests/cmmsim/test_common_errors.py`.
 """
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,13 +13,15 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
-from identify.errors import RecordError
+from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
+from identify.errors import RecordError, ScenarioError
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
+from identify.experiment.known_rig import stated_covariance
 from identify.progress import SilentProgress
 from identify.record.common_errors import CommonErrors, Marginal, read_common_errors, store_common_errors
-from identify.record.recorded_run import recorded_reference
+from identify.record.recorded_run import recorded_reference, recorded_run
 from identify.record.recording import poses
 from identify.reporting.tables import common_error_table
 from identify.validation.unseen import model_run, predicted_runs
@@ -186,6 +189,48 @@ def test_eliminated_errors_are_those_that_would_be_estimated_beside_the_paramete
     np.testing.assert_allclose(
         np.linalg.inv((w := marginal.whiten(jacobian)).T @ w), np.linalg.inv(both.T @ both)[:3, :3], rtol=1e-9
     )
+
+
+@pytest.mark.parametrize("stated_s", [0.0, 0.006])
+def test_a_model_takes_no_latency_below_zero_and_says_how_poses_change_with_it(stated_s):
+    scenario = quick(**{"timing.latency_s": stated_s, "timing.latency_std_s": 0.002})
+    record, _ = run_plant(scenario, 2, duration_s=5.0)
+    run = recorded_run(record, rss6(), scenario).having(np.array([-9.0]))
+    assert run.latency_s == 0.0
+    (later,) = (run.having(run.errors_had + 1.0).simulate(truth()).pose - run.simulate(truth()).pose,)
+    np.testing.assert_allclose(run.modes(truth())[:, :, 0], later, atol=1e-12)
+
+
+def calibration(path, rig, **changes):
+    """A calibration.json of a rig, as far as an experiment reads it."""
+    estimates = rig.moved(rig_changes({name: value for name, value in changes.items() if "." in name})).parameters
+    content = {
+        "image_size_px": [rig.left.width, rig.left.height],
+        "parameters": {name: {"estimate": value} for name, value in zip(PARAMETER_NAMES, estimates, strict=True)},
+        "covariance": {"names": list(PARAMETER_NAMES), "matrix": PHOTOGRAPHED.tolist()},
+    }
+    path.write_text(json.dumps(content | {name: value for name, value in changes.items() if "." not in name}))
+    return path
+
+
+def test_a_calibration_of_another_rig_or_one_that_is_none_is_refused_in_one_line(tmp_path):
+    rig, path = cmmsim.load_sensor("ctrack780").rig, tmp_path / "calibration.json"
+    np.testing.assert_array_equal(stated_covariance(calibration(path, rig), rig), PHOTOGRAPHED)
+    negative = {"names": list(PARAMETER_NAMES), "matrix": (-PHOTOGRAPHED).tolist()}
+    for changes, words in (
+        ({"left.fx_px": 5000.0}, "left.fx_px is"),
+        ({"left.cx_px": -900.0}, "left.cx_px is"),
+        ({"right_from_left.ry_rad": -1.2}, "the right camera looks 68 degrees beside"),
+        ({"right_from_left.tz_m": 0.5}, "the right camera stands"),
+        ({"image_size_px": 3}, "cameras with 3 px"),
+        ({"covariance": negative}, "left.fx_px is negative"),
+        ({"covariance": {"names": [], "matrix": []}}, "not of the 24 parameters"),
+        ({"covariance": None}, "nor the calibration.json"),
+    ):
+        with pytest.raises(ScenarioError, match=r"^rig\.known = ") as refused:
+            stated_covariance(calibration(path, rig, **changes), rig)
+        assert words in str(refused.value), refused.value
+        assert "\n" not in str(refused.value)
 
 
 def test_records_that_share_a_draw_do_not_average_it():

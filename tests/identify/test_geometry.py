@@ -247,9 +247,16 @@ def test_too_few_poses_are_refused_with_how_many_are_needed():
 
     enough(11)
     said = refusal(EstimationError, enough, 10)
-    assert "10 poses give 60 equations for 66" in said
+    assert "10 poses that differ give 60 equations for 66" in said
     assert "at least 11 are needed; missing: 6" in said
     assert "leg" in said
+
+
+def test_a_pose_that_is_measured_again_is_no_other_pose(rss6):
+    again = np.repeat(np.arange(len(rss6.data)), 2)[:60]
+    noise = np.random.default_rng(0).standard_normal((60, 6)) * rss6.data.joint_std
+    assert rss6.data.different == 60
+    assert replace(rss6.data, joints=rss6.data.joints[again] + noise).different == 30
 
 
 def test_loops_that_do_not_close_are_refused_by_the_number_of_the_pose():
@@ -280,6 +287,8 @@ def test_poses_survive_their_file_and_a_damaged_one_is_refused(tmp_path, rss6):
         ({"joint_unit": "deg"}, "joint_unit is 'deg', joints of rss6 are in rad"),
         ({"covariances": bent.tolist()}, "covariances, number 4"),
         ({"joint_std": [-1.0] * 6}, "must be >= 0"),
+        ({"common": [[1.0], 2.0]}, "common must be numbers of shape (60, 6, 1)"),
+        ({"joints": []}, "holds no poses"),
     ):
         path.write_text(json.dumps(whole | entries))
         assert said in refusal(RecordError, read_static_poses, path, robot)
