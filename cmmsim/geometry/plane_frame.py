@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from cmmsim.errors import LostError
-from cmmsim.geometry.pose import Array, rigid, rotation_log
+from cmmsim.geometry.pose import Array, rigid
 from cmmsim.geometry.registration import SMALLEST_SPREAD
 
 PLANE_NAMES = ("A", "B", "C")
@@ -84,11 +85,8 @@ def frame_of_points(
     normals = np.stack([p.normal for p in planes])
     offsets = np.array([p.offset for p in planes])
     frame = frame_from_planes(normals, offsets)
-    covariance = np.zeros((6, 6))
-    for k, plane in enumerate(planes):
-        sensitivity = _frame_sensitivity(normals, offsets, k, plane.tangents)
-        covariance += sensitivity @ plane.covariance @ sensitivity.T
-    return frame, covariance
+    sensitivity = _frame_sensitivity(frame, normals, np.stack([p.tangents for p in planes]))
+    return frame, sensitivity @ block_diag(*[p.covariance for p in planes]) @ sensitivity.T
 
 
 def _tangents(normal: Array) -> Array:
@@ -98,20 +96,19 @@ def _tangents(normal: Array) -> Array:
     return np.column_stack([first, np.cross(normal, first)])
 
 
-def _frame_sensitivity(normals: Array, offsets: Array, plane: int, tangents: Array) -> Array:
-    """Change (6,3) of [t, phi] by [turns, offset] of one plane, by central differences of the closed form."""
-    step = 1e-6
-    columns = []
-    for k in range(3):
-        moved = []
-        for sign in (1.0, -1.0):
-            n, d = normals.copy(), offsets.copy()
-            if k < 2:
-                n[plane] = n[plane] + sign * step * tangents[:, k]
-                n[plane] /= np.linalg.norm(n[plane])
-            else:
-                d[plane] += sign * step
-            moved.append(frame_from_planes(n, d))
-        turn = rotation_log(moved[0][:3, :3] @ moved[1][:3, :3].T)
-        columns.append(np.concatenate([moved[0][:3, 3] - moved[1][:3, 3], turn]) / (2.0 * step))
-    return np.column_stack(columns)
+def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:
+    """Change (6, 9) of [t, phi] of a frame by two turns and the offset of plane A, of B, and of C, whose tangents are
+    (3, 3, 2): the derivative of `frame_from_planes`."""
+    x, y, z, origin = frame[:3].T
+    turned = np.zeros((3, 3, 3, 3))  # plane moved, by which parameter, normal of which plane, its change
+    shifted = np.zeros((3, 3, 3))
+    for plane in range(3):
+        turned[plane, :2, plane] = tangents[plane].T
+        shifted[plane, 2, plane] = 1.0
+    turned, shifted = turned.reshape(9, 3, 3), shifted.reshape(9, 3)
+    by_origin = np.linalg.solve(normals, (shifted - turned @ origin).T)
+    along = np.cross(turned[:, 0], normals[1]) + np.cross(normals[0], turned[:, 1])
+    by_z = turned[:, 0]
+    by_x = (along - np.outer(along @ x, x)) / np.linalg.norm(np.cross(normals[0], normals[1]))
+    by_y = np.cross(by_z, x) + np.cross(z, by_x)
+    return np.vstack([by_origin, 0.5 * (np.cross(x, by_x) + np.cross(y, by_y) + np.cross(z, by_z)).T])

@@ -59,7 +59,7 @@ def breaks_halfway(task: Record, now: Record, at: Record, d: Record, h: float) -
 
 @kernel
 def crossing(now: Record, count: int) -> float:
-    """Where steps tried last, `count` of them, have no margin left: the polynomial through step over margin (Neville)."""
+    """Where the last `count` steps that were tried would have no margin left: the polynomial of step over margin."""
     length, margin, found = now.tried, now.tried_margin, now.tried_crossing
     for i in range(count):
         found[i] = length[i]

@@ -209,7 +209,7 @@ def _noise(
             "its servo cannot bear the sensor's noise, and no interval can be given"
         )
     misfit = Misfit(white.found, float(np.mean(squares)), float(np.std(squares, ddof=1)))
-    return np.cov(np.array(scores).T), misfit, unstable
+    return np.cov(scores.T), misfit, unstable
 
 
 def _repeated_scores(
@@ -218,9 +218,9 @@ def _repeated_scores(
     found: list[_Linear],
     rng: np.random.Generator,
     advance: Advance,
-) -> tuple[list[Array], list[float]]:
-    """Scores J^T r of noise and mean squared residuals of noise and common errors, of the repeated experiments whose
-    loop is stable."""
+) -> tuple[Array, list[float]]:
+    """Scores J^T r (draws, q) of noise and mean squared residuals of noise and common errors, of the repeated
+    experiments whose loop is stable."""
 
     def repeat(draws: np.random.Generator) -> tuple[Array, float] | None:
         try:
@@ -235,15 +235,16 @@ def _repeated_scores(
             run.without_common(residual + one.modes @ draws.standard_normal(one.modes.shape[2]))
             for run, one, residual in zip(problem.runs, found, noise, strict=True)
         ]
-        score = np.asarray(sum(np.tensordot(r, one.rows, 2) for r, one in zip(noise, found, strict=True)))
-        return score, float(np.mean(np.concatenate(drawn) ** 2))
+        return np.concatenate(noise), float(np.mean(np.concatenate(drawn) ** 2))
 
     results = []
     with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
         for result in pool.map(repeat, rng.spawn(DRAWS)):
             results += [result] if result else []
             advance()
-    return [score for score, _ in results], [square for _, square in results]
+    rows = np.concatenate([one.rows.reshape(-1, one.rows.shape[2]) for one in found])
+    drawn = np.array([noise.ravel() for noise, _ in results]).reshape(len(results), len(rows))
+    return drawn @ rows, [square for _, square in results]  # scores of all at once: each reads the rows otherwise
 
 
 def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> ClosedLoopRun:
