@@ -18,7 +18,7 @@ from dynamics.compiled.kernel import Record, entry, invoke, kernel
 
 MAX_EVENTS_PER_SEGMENT = 400
 NO_MARGIN = 1e-12  # rad/s, or share of the breakaway torque
-LITTLE_MARGIN = 1e-13  # as far as rounding lets it be known
+LITTLE_SHARE = 1e-13  # of the breakaway torque: as far as rounding lets it be known
 
 
 @kernel
@@ -117,7 +117,9 @@ def locate_event(task: Record, now: Record, at: Record, d: Record, h: float, mar
             high = middle
         remember(now, middle, margin)
         tried, middle = middle, crossing(now, min(count, len(now.tried)))
-        if abs(margin) <= LITTLE_MARGIN or min(abs(middle - tried), high - low) <= 1e-15 + 1e-13 * h:
+        holds = now.mode[mode_margin(task, now, at[END])[1]] == 0
+        little = LITTLE_SHARE if holds else 0.0
+        if abs(margin) <= little or min(abs(middle - tried), high - low) <= 1e-15 + 1e-13 * h:
             break
     return OK, tried, True
 
