@@ -100,12 +100,10 @@ def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:
     """Change (6, 9) of [t, phi] of a frame by two turns and the offset of plane A, of B, and of C, whose tangents are
     (3, 3, 2): the derivative of `frame_from_planes`."""
     x, y, z, origin = frame[:3].T
-    turned = np.zeros((3, 3, 3, 3))  # plane moved, by which parameter, normal of which plane, its change
-    shifted = np.zeros((3, 3, 3))
+    turned, shifted = np.zeros((9, 3, 3)), np.zeros((9, 3))  # changes of all normals and offsets
     for plane in range(3):
-        turned[plane, :2, plane] = tangents[plane].T
-        shifted[plane, 2, plane] = 1.0
-    turned, shifted = turned.reshape(9, 3, 3), shifted.reshape(9, 3)
+        turned[3 * plane : 3 * plane + 2, plane] = tangents[plane].T
+        shifted[3 * plane + 2, plane] = 1.0
     by_origin = np.linalg.solve(normals, (shifted - turned @ origin).T)
     along = np.cross(turned[:, 0], normals[1]) + np.cross(normals[0], turned[:, 1])
     by_z = turned[:, 0]

@@ -26,6 +26,10 @@ def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
     return "\n".join([*(f"declare {called}" for called in declared), *(body.text() for body in bodies)])
 
 
+def _body(function: AnyFunction, quick: bool) -> "_Body":
+    return _ColumnBody(function, quick) if isinstance(function, ColumnFunction) else _Body(function, quick)
+
+
 def shapes(function: AnyFunction) -> tuple[list[int], list[tuple[int, int]]]:
     """Sizes of the inputs of a function, and shapes of its outputs."""
     last = _last(function)

@@ -66,6 +66,31 @@ def test_plane_frame_of_exact_points():
     np.testing.assert_allclose(frame, moved @ own, atol=1e-12)
 
 
+def test_covariance_of_a_plane_frame_is_what_errors_of_its_points_make():
+    """To first order, by differences of the whole fit: each coordinate of each point moved forth and back."""
+    rng, step, std = np.random.default_rng(7), 1e-6, 2e-5
+    normals = np.array([[0.0, 0.1, 1.0], [0.8, 0.5, 0.3], [0.7, -0.6, 0.2]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    plane, spread = np.repeat(np.arange(3), 4), rng.uniform(-0.1, 0.1, (12, 3))
+    points = (
+        np.array([0.2, -0.1, 1.5]) + spread - np.einsum("ni,ni->n", spread, normals[plane])[:, None] * normals[plane]
+    )
+    covariances = np.tile(std**2 * np.eye(3), (12, 1, 1))
+
+    def frame(moved):
+        return frame_of_points(moved, covariances, plane, normals)
+
+    changes = []
+    for k in range(points.size):
+        by = step * np.eye(1, points.size, k).reshape(points.shape)
+        more, less = frame(points + by)[0], frame(points - by)[0]
+        turn = Rotation.from_matrix(more[:3, :3] @ less[:3, :3].T).as_rotvec()
+        changes.append(np.concatenate([more[:3, 3] - less[:3, 3], turn]) / (2 * step))
+    expected = std**2 * np.transpose(changes) @ changes
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(frame(points)[1] / scale, expected / scale, atol=1e-6)
+
+
 @settings(max_examples=50, deadline=None)  # the first one may compile
 @given(st.integers(0, 10_000), st.integers(3, 18))
 def test_registration_finds_a_known_transform(seed, count):
