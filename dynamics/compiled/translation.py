@@ -21,7 +21,7 @@ AnyFunction = ca.Function | PartedFunction | ColumnFunction
 def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
     """The LLVM text of SX functions; hot: names of those that may round otherwise where that is quicker, see
     `quick_arithmetic`. Raises DynamicsError, naming it, for an operation that is not known here."""
-    bodies = [(_ColumnBody if isinstance(one, ColumnFunction) else _Body)(one, one.name() in hot) for one in functions]
+    bodies = [_body(one, one.name() in hot) for one in functions]
     declared = sorted({called for body in bodies for called in body.called})
     return "\n".join([*(f"declare {called}" for called in declared), *(body.text() for body in bodies)])
 
