@@ -113,13 +113,19 @@ class VirtualStereoCamera:
         size: int,
         supersampling: int,
     ) -> list[NDArray[np.float32]]:
-        """As ``radiance`` for each of several exposures, whose windows are drawn together."""
+        """As ``radiance`` for each of several exposures. They are drawn together where nothing finer than their pixels
+        is drawn: finer windows of many exposures would not fit into the processor's caches."""
         sides = [
             Side(*side)
             for at, first in zip(placed, corners, strict=True)
             for side in zip(self.rig.cameras, at, first, strict=True)
         ]
-        windows = self.formation.windows(sides, size, supersampling)
+        together = max(len(sides), 2) if self.formation.draws_pixels(self.rig.cameras) else 2
+        windows = [
+            window
+            for start in range(0, len(sides), together)
+            for window in self.formation.windows(sides[start : start + together], size, supersampling)
+        ]
         return [np.stack(pair) for pair in zip(windows[::2], windows[1::2], strict=True)]
 
     def whole_exposure(self, side: int, moments: Sequence[Array], supersampling: int) -> NDArray[np.float32]:
