@@ -29,6 +29,7 @@ BAND_REACH = 5.0  # radii of a ring to which a band around it reaches
 RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
 CLEARANCE = 1e-6  # m by which a disc must lie over its solid
 FLATTEST = 1e-6  # volume of a solid over that of a cube as long; a flatter one fills no window
+SMALLEST_SLOPE = 1e-3  # of a ray across a disc's plane, below which it runs along it
 OUTWARDS = frozen([-1.0, -1.0, 1.0, 1.0])
 CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # of bounds: lowest x, y and highest x, y
 
@@ -138,7 +139,10 @@ class LaidSolids:
                 for k, p in enumerate(patches)
             ]
         )
-        self._lowest = {k: p.discs[0] for k, p in enumerate(patches) if isinstance(p, DiscStack) and len(p.discs) > 1}
+        lowest = [p.discs[0] if isinstance(p, DiscStack) and len(p.discs) > 1 else None for p in patches]
+        self._ring_centres = np.array([np.zeros(3) if ring is None else ring.centre for ring in lowest])
+        inside = BAND_REACH * np.cos(np.pi / GROUND_SIDES)
+        self._ring_reach = np.array([0.0 if ring is None else inside * ring.radius for ring in lowest])
         self._normals = np.array([p.discs[-1].normal if isinstance(p, DiscStack) else np.zeros(3) for p in patches])
         self._heights = np.array(
             [p.discs[-1].centre @ p.discs[-1].normal if isinstance(p, DiscStack) else 0.0 for p in patches]
@@ -169,14 +173,16 @@ class LaidSolids:
                     corners = (bounds[alone] + RIM_PX * OUTWARDS)[:, CORNERS]
                     rays[..., :2] = (corners - shown.camera.centre) / shown.camera.focal_lengths
                     laid.filled[alone] = self._fills(k, shown, rays)
-                    stacks = np.where(np.arange(reaching.shape[1]) == k, False, reaching[alone])
-                    own = np.where(laid.filled[alone] & stacks.any(axis=1), stacks.argmax(axis=1), -1)
-                    laid.ringed[alone] = np.where(self._banded(own, k, shown, rays), own, -1)
+                    others = reaching[alone]
+                    others[:, k] = False
+                    stack = others.argmax(axis=1)
+                    banded = laid.filled[alone] & others.any(axis=1) & self._banded(stack, k, shown, rays)
+                    laid.ringed[alone[banded]] = stack[banded]
         return laid
 
     def carrier(self, stack: int) -> int | None:
         """The solid on which a stack with a lowest disc lies, or None."""
-        return next((k for k in self._solids if stack in self._lowest and self._lying[k][stack]), None)
+        return next((k for k in self._solids if self._ring_reach[stack] > 0.0 and self._lying[k][stack]), None)
 
     def _seen_over(self, solid: int, view: Exposure) -> NDArray[np.bool_]:
         """The solid itself, and the stacks of discs on it that show their upper side (patches,)."""
@@ -195,21 +201,16 @@ class LaidSolids:
         return np.asarray(self._solids[solid].hides(move, FAR * rays).all(axis=1))
 
     def _banded(self, stacks: NDArray[np.int_], solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
-        """Whether a band around the lowest disc of each stack (n,), on the solid, covers the corners of its window."""
-        banded = np.array([k in self._lowest for k in stacks], dtype=bool)
-        if banded.any():
-            discs = [self._lowest[k] for k in stacks[banded]]
-            centres, normals = np.array([disc.centre for disc in discs]), np.array([disc.normal for disc in discs])
-            reach = BAND_REACH * np.cos(np.pi / GROUND_SIDES) * np.array([disc.radius for disc in discs])
-            move = view.camera_from_bodies[self._body_index[solid]]
-            eye, along = -move[:3, 3] @ move[:3, :3], rays[banded] @ move[:3, :3]
-            slopes = np.einsum("nci,ni->nc", along, normals)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = np.einsum("ni,ni->n", normals, centres - eye)[:, None] / slopes
-                gaps = eye + share[..., None] * along - centres[:, None]
-                covered = (slopes < 0.0) & (np.einsum("nci,nci->nc", gaps, gaps) < reach[:, None] ** 2)
-            banded[banded] = covered.all(axis=1)
-        return banded
+        """Whether a band around the lowest disc of each stack (n,) on the solid covers the corners of its window, along
+        ``rays`` (n,4,3)."""
+        move = view.camera_from_bodies[self._body_index[solid]]
+        gaps = self._ring_centres[stacks] + move[:3, 3] @ move[:3, :3]  # from the camera, in the axes of the body
+        along, normals = rays @ move[:3, :3], self._normals[stacks]
+        slopes = np.einsum("nci,ni->nc", along, normals)
+        share = np.einsum("ni,ni->n", normals, gaps)[:, None] / np.minimum(slopes, -SMALLEST_SLOPE)
+        beside = share[..., None] * along - gaps[:, None]
+        within = np.einsum("nci,nci->nc", beside, beside) < self._ring_reach[stacks, None] ** 2
+        return np.asarray((within & (slopes < -SMALLEST_SLOPE)).all(axis=1))
 
 
 def _is_plain_convex(mesh: Mesh) -> bool:

@@ -172,9 +172,11 @@ def cut(start, end):
 
 @pytest.mark.parametrize("radii", [(3.8, 2.4), (0.2, 0.1), (0.5, 9.0), (1.0, 1.0), (30.0, 30.0)])
 def test_coverage_is_that_of_plain_numpy(radii):
-    """In all cases of a side: within, outside, crossed once or twice; centres on pixel corners are among them."""
+    """In all cases of a side: within, outside, crossed once or twice; centres on pixel corners are among them, and
+    ellipses that a window shows in part."""
     centres, shapes = random_ellipses(np.random.default_rng(0), 50, 16, radii)
     centres[:10] = np.round(2.0 * centres[:10]) / 2.0
+    centres[10:30] += np.random.default_rng(1).uniform(-10.0, 10.0, (20, 2))
     for found, expected in zip(coverage(centres, shapes, 16), plain_coverage(centres, shapes, 16), strict=True):
         np.testing.assert_allclose(found, expected, atol=2e-12)
 

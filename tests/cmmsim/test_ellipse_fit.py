@@ -10,7 +10,7 @@ from cmmsim.detection import ellipse_fit, fit_kernels
 from cmmsim.detection.cramer_rao import cramer_rao_bound, grey_value_information
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import RING_REACH, fit_ellipses
-from cmmsim.detection.fit_kernels import CORE_SHARE, SMALLEST_START_PX
+from cmmsim.detection.fit_kernels import CORE_SHARE, SMALLEST_START_PX, two_of_rank
 from cmmsim.geometry.disc_image import SHAPE_BASIS, coverage
 from tests.cmmsim.sensors import NOISE, random_ellipses
 
@@ -72,6 +72,16 @@ def test_the_fit_takes_the_steps_of_plain_numpy(monkeypatch, radii):
     np.testing.assert_allclose(np.stack([fits.contrast, fits.ground, fits.misfits]), [*p[:, 5:].T, misfits], **close)
     np.testing.assert_allclose(fits.covariances, covariances[:, :2, :2], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(fits.shape_covariances, covariances[:, 2:5, 2:5], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("values", [np.arange(3.0), np.array([7.0]), 4096.0 * np.random.default_rng(0).random(300)])
+def test_ranks_are_those_of_sorted_values(values):
+    """Few and many different ones, of any size, that fall into one step or many."""
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        window = rng.choice(values, (12, 12)) + rng.choice([0.0, 1e6]) * (rng.random((12, 12)) < 0.1)
+        low, high = np.sort(window.ravel())[[48, 138]]
+        assert two_of_rank(window, 48, 138) == (low, high)
 
 
 def test_the_fit_stops_no_earlier_than_the_noise_allows():
