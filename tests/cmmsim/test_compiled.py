@@ -58,4 +58,4 @@ def test_kernels_compile_where_the_package_cannot_be_written(copied, tmp_path):
     for place in (tmp_path / "home", tmp_path / "nowhere"):
         users = {"HOME": str(place), "XDG_CACHE_HOME": str(place)}
         assert run_copy(copied, users) == pytest.approx(9.0 * np.pi)
-    assert list((tmp_path / "home").rglob("disc_kernels*.nbi"))
+    assert list((tmp_path / "home").rglob("rim_kernels*.nbi"))
