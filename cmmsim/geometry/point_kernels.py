@@ -171,3 +171,70 @@ def rigid_fits(
         for _ in range(steps if starts[f + 1] > starts[f] else 0):
             rigid_step(source[own], target[own], weights[own], transforms[f], covariances[f], change)
             move_by(transforms[f], change)
+
+
+@compiled
+def inverse_of(n: Array, into: Array) -> None:
+    """Fill the inverse (6,) of a symmetric (3,3) matrix ``n`` (6,), both as their entries 00, 01, 02, 11, 12, 22."""
+    c_00, c_01, c_02 = n[3] * n[5] - n[4] * n[4], n[2] * n[4] - n[1] * n[5], n[1] * n[4] - n[2] * n[3]
+    share = 1.0 / (n[0] * c_00 + n[1] * c_01 + n[2] * c_02)
+    into[0], into[1], into[2] = share * c_00, share * c_01, share * c_02
+    into[3], into[4] = share * (n[0] * n[5] - n[2] * n[2]), share * (n[1] * n[2] - n[0] * n[4])
+    into[5] = share * (n[0] * n[3] - n[1] * n[1])
+
+
+@compiled
+def left_noise(arm: Array, noise: Array, covariance: Array, half: Array, entries: Array) -> None:
+    """Fill the entries (6,) of the covariance of a sticker's residual: its noise (3,3) less what it pulls the pose by.
+
+    arm (3,) from the platform's origin; covariance (6,6) of the pose; half (3,6) is overwritten.
+    """
+    x, y, z = arm[0], arm[1], arm[2]
+    for b in range(6):
+        half[0, b] = covariance[0, b] + z * covariance[4, b] - y * covariance[5, b]
+        half[1, b] = covariance[1, b] - z * covariance[3, b] + x * covariance[5, b]
+        half[2, b] = covariance[2, b] + y * covariance[3, b] - x * covariance[4, b]
+    entries[0] = noise[0, 0] - (half[0, 0] + z * half[0, 4] - y * half[0, 5])
+    entries[1] = noise[0, 1] - (half[0, 1] - z * half[0, 3] + x * half[0, 5])
+    entries[2] = noise[0, 2] - (half[0, 2] + y * half[0, 3] - x * half[0, 4])
+    entries[3] = noise[1, 1] - (half[1, 1] - z * half[1, 3] + x * half[1, 5])
+    entries[4] = noise[1, 2] - (half[1, 2] + y * half[1, 3] - x * half[1, 4])
+    entries[5] = noise[2, 2] - (half[2, 2] + y * half[2, 3] - x * half[2, 4])
+
+
+@compiled
+def residual_misfits(
+    transforms: Array, spreads: Array, of: Array, places: Array, points: Array, covariances: Array, smallest: float,
+    misfits: Array,
+) -> None:  # fmt: skip
+    """Fill squared residuals (n,) of rigid fits, each in units of its own covariance.
+
+    transforms (f,4,4) with covariances ``spreads`` (f,6,6); of (n,): to which of them each point belongs; places and
+    points (n,3) with covariances (n,3,3). NaN where in any direction less than the share ``smallest`` of a point's
+    noise is left in its residual.
+    """
+    arm, gap, half, left, inverse = np.empty(3), np.empty(3), np.empty((3, 6)), np.empty(6), np.empty(6)
+    for n in range(len(points)):
+        move, noise = transforms[of[n]], covariances[n]
+        for i in range(3):
+            arm[i] = move[i, 0] * places[n, 0] + move[i, 1] * places[n, 1] + move[i, 2] * places[n, 2]
+            gap[i] = points[n, i] - arm[i] - move[i, 3]
+        left_noise(arm, noise, spreads[of[n]], half, left)
+        xx, xy, xz = (
+            left[0] - smallest * noise[0, 0],
+            left[1] - smallest * noise[0, 1],
+            left[2] - smallest * noise[0, 2],
+        )
+        yy, yz, zz = (
+            left[3] - smallest * noise[1, 1],
+            left[4] - smallest * noise[1, 2],
+            left[5] - smallest * noise[2, 2],
+        )
+        minor = xx * yy - xy * xy
+        whole = zz * minor - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
+        misfits[n] = np.nan
+        if xx > 0.0 and minor > 0.0 and whole > 0.0:
+            inverse_of(left, inverse)
+            x, y, z = gap
+            misfits[n] = inverse[0] * x * x + inverse[3] * y * y + inverse[5] * z * z
+            misfits[n] += 2.0 * (inverse[1] * x * y + inverse[2] * x * z + inverse[4] * y * z)

@@ -100,20 +100,32 @@ def place_misfits(
     Parameters: points (n,3) measured with covariances (n,3,3), and places (n,3) known; of (n,): to which of several
     registrations each belongs. Directions in which a sticker alone determines the pose are left out.
     """
-    transform, covariance = (result.transform, result.covariance) if of is None else _of(result, of)
-    turned = np.einsum("...ij,...j->...i", transform[..., :3, :3], places)
+    from cmmsim.geometry.point_kernels import residual_misfits  # compiles, so it is loaded where it is first needed
+
+    own = np.zeros(len(points), dtype=int) if of is None else of
+    transforms, spread = result.transform.reshape(-1, 4, 4), result.covariance.reshape(-1, 6, 6)
+    misfits = np.empty(len(points))
+    places, points, covariances = (np.ascontiguousarray(v, dtype=float) for v in (places, points, covariances))
+    residual_misfits(transforms, spread, own, places, points, covariances, SMALLEST_REDUNDANCY, misfits)
+    few = np.isnan(misfits)
+    if few.any():
+        each = transforms[own[few]], spread[own[few]]
+        misfits[few] = _shown_misfits(*each, points[few], places[few], covariances[few])
+    return misfits
+
+
+def _shown_misfits(transforms: Array, spreads: Array, points: Array, places: Array, covariances: Array) -> Array:
+    """Squared residuals (n,) as of ``place_misfits`` without the directions in which a sticker alone determines the
+    pose: each has its transform (n,4,4) and covariance (n,6,6)."""
+    turned = np.einsum("nij,nj->ni", transforms[:, :3, :3], places)
     jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -skew(turned)], axis=2)
     # in the axes in which the noise is the unit matrix
     whiten = np.linalg.inv(np.linalg.cholesky(covariances))
     pulled = whiten @ jacobian
-    redundancy, axes = np.linalg.eigh(np.eye(3) - pulled @ covariance @ pulled.swapaxes(1, 2))
-    residuals = np.einsum("nji,njk,nk->ni", axes, whiten, points - turned - transform[..., :3, 3])
+    redundancy, axes = np.linalg.eigh(np.eye(3) - pulled @ spreads @ pulled.swapaxes(1, 2))
+    residuals = np.einsum("nji,njk,nk->ni", axes, whiten, points - turned - transforms[:, :3, 3])
     shown = redundancy > SMALLEST_REDUNDANCY
     return np.asarray((residuals**2 / np.where(shown, redundancy, np.inf)).sum(axis=1))
-
-
-def _of(result: Registration, which: NDArray[np.int_]) -> tuple[Array, Array]:
-    return result.transform[which], result.covariance[which]
 
 
 def outline_misfits(observation: StickerObservation, shapes: Array) -> Array:

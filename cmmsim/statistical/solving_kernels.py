@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
-from cmmsim.geometry.point_kernels import factor, invert_factored, solve_factored
+from cmmsim.geometry.point_kernels import factor, inverse_of, invert_factored, left_noise, solve_factored
 from cmmsim.statistical.camera_kernels import project
 
 LONG_PX = 0.2  # difference between found and expected pixels beyond which slopes are taken anew
@@ -93,16 +93,6 @@ def pull(
     normal[4] += pushed_1 * first_2 + pulled_1 * second_2
     normal[5] += pushed_2 * first_2 + pulled_2 * second_2
     return r * along + s * down, max(abs(r), abs(s))
-
-
-@compiled
-def inverse_of(n: Array, into: Array) -> None:
-    """Fill the inverse (6,) of a symmetric (3,3) matrix ``n`` (6,), both as their entries 00, 01, 02, 11, 12, 22."""
-    c_00, c_01, c_02 = n[3] * n[5] - n[4] * n[4], n[2] * n[4] - n[1] * n[5], n[1] * n[4] - n[2] * n[3]
-    share = 1.0 / (n[0] * c_00 + n[1] * c_01 + n[2] * c_02)
-    into[0], into[1], into[2] = share * c_00, share * c_01, share * c_02
-    into[3], into[4] = share * (n[0] * n[5] - n[2] * n[2]), share * (n[1] * n[2] - n[0] * n[4])
-    into[5] = share * (n[0] * n[3] - n[1] * n[1])
 
 
 @compiled
@@ -201,25 +191,6 @@ def register(frame: Frame, scratch: Array, change: Array, covariance: Array) -> 
     for a in range(6):
         squared -= before[a] * change[a]
     return squared
-
-
-@compiled
-def left_noise(arm: Array, noise: Array, covariance: Array, half: Array, entries: Array) -> None:
-    """Fill the entries (6,) of the covariance of a sticker's residual: its noise (3,3) less what it pulls the pose by.
-
-    arm (3,) from the platform's origin; covariance (6,6) of the pose; half (3,6) is overwritten.
-    """
-    x, y, z = arm[0], arm[1], arm[2]
-    for b in range(6):
-        half[0, b] = covariance[0, b] + z * covariance[4, b] - y * covariance[5, b]
-        half[1, b] = covariance[1, b] - z * covariance[3, b] + x * covariance[5, b]
-        half[2, b] = covariance[2, b] + y * covariance[3, b] - x * covariance[4, b]
-    entries[0] = noise[0, 0] - (half[0, 0] + z * half[0, 4] - y * half[0, 5])
-    entries[1] = noise[0, 1] - (half[0, 1] - z * half[0, 3] + x * half[0, 5])
-    entries[2] = noise[0, 2] - (half[0, 2] + y * half[0, 3] - x * half[0, 4])
-    entries[3] = noise[1, 1] - (half[1, 1] - z * half[1, 3] + x * half[1, 5])
-    entries[4] = noise[1, 2] - (half[1, 2] + y * half[1, 3] - x * half[1, 4])
-    entries[5] = noise[2, 2] - (half[2, 2] + y * half[2, 3] - x * half[2, 4])
 
 
 @compiled

@@ -112,6 +112,31 @@ def test_place_misfits_are_chi_square(stickers):
         assert kstest(np.array(found)[:, k], "chi2", args=(3,)).pvalue > 1e-4
 
 
+def test_place_misfits_are_those_of_plain_numpy():
+    """By the whole covariance S - J C J' of each residual, of one registration and of two at once."""
+    rng, seen = np.random.default_rng(4), [seen_from_home(np.random.default_rng(k), ALL) for k in range(2)]
+    places = BODY.nominal[seen[0].index]
+    fits = [register(places, one.points, one.covariances) for one in seen]
+    plain = []
+    for one, fit in zip(seen, fits, strict=True):
+        turned = places @ fit.transform[:3, :3].T
+        residuals = one.points - turned - fit.transform[:3, 3]
+        turns = np.cross(np.eye(3), turned[:, None]).swapaxes(1, 2)
+        slopes = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), turns], axis=2)
+        left = one.covariances - slopes @ fit.covariance @ slopes.swapaxes(1, 2)
+        plain.append(np.einsum("ni,nij,nj->n", residuals, np.linalg.inv(left), residuals))
+        found = place_misfits(fit, one.points, places, one.covariances)
+        np.testing.assert_allclose(found, plain[-1], rtol=1e-8)
+    both = replace(
+        fits[0], transform=np.stack([f.transform for f in fits]), covariance=np.stack([f.covariance for f in fits])
+    )
+    order = rng.permutation(2 * len(places))
+    points, spread = (np.concatenate([getattr(o, n) for o in seen])[order] for n in ("points", "covariances"))
+    of, sticker = np.divmod(order, len(places))
+    found = place_misfits(both, points, places[sticker], spread, of)
+    np.testing.assert_allclose(found, np.concatenate(plain)[order], rtol=1e-8)
+
+
 @pytest.mark.parametrize(("seed", "wrong"), [(2, {"shift_px": 0.5}), (3, {"shrink_px": 0.1})])
 def test_displaced_or_misshapen_sticker_is_left_out(seed, wrong):
     seen = seen_from_home(np.random.default_rng(seed), ALL, **wrong)
