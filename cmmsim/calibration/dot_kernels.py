@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
-from cmmsim.detection.fit_kernels import nth_smallest
+from cmmsim.detection.start_kernels import nth_smallest
 
 
 @compiled

@@ -153,10 +153,8 @@ class _Atlas:
                 self._gl.glFlush()
             self._viewport(*place)
             matrices = {p: address + k * strides[0] + int(drawable.body_index[p]) * strides[1] for p in shown[k]}
-            if deep:
-                self._draw_by_depth(matrices, known.patches[samples])
-            else:
-                self._lay(matrices, (known.ringed if ringed else known.patches)[samples])
+            draw = self._draw_by_depth if deep else self._lay
+            draw(matrices, (known.ringed if ringed else known.patches)[samples])
         self._bind_mesh(0)
         return frame_buffer.read()
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from cmmsim.detection import ellipse_fit, fit_kernels
+from cmmsim.detection import ellipse_fit
 from cmmsim.detection.cramer_rao import cramer_rao_bound, grey_value_information
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import RING_REACH, fit_ellipses
-from cmmsim.detection.fit_kernels import CORE_SHARE, SMALLEST_START_PX, two_of_rank
+from cmmsim.detection.start_kernels import CORE_SHARE, SMALLEST_START_PX, bound_radii, two_of_rank
 from cmmsim.geometry.disc_image import SHAPE_BASIS, coverage
 from tests.cmmsim.sensors import NOISE, random_ellipses
 
@@ -118,7 +118,7 @@ def test_windows_without_a_whole_ellipse_are_not_good_and_give_finite_numbers():
 
 def test_radii_are_kept_between_their_bounds():
     matrix = np.array([[4.0, 1.5], [1.5, 0.9]])
-    xx, xy, yy = fit_kernels.bound_radii(4.0, 1.5, 0.9, 0.5, 3.0)
+    xx, xy, yy = bound_radii(4.0, 1.5, 0.9, 0.5, 3.0)
     values, vectors = np.linalg.eigh(matrix)
     np.testing.assert_allclose([[xx, xy], [xy, yy]], vectors @ np.diag(np.clip(values, 0.5, 3.0)) @ vectors.T)
 
