@@ -6,7 +6,9 @@ the same for every px of it; so the information of a sticker's centre is the int
 camera sees it. Its inverse goes through the triangulation of both cameras' pixels.
 """
 
+import json
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,6 +54,36 @@ def test_study_can_be_run_and_says_why_its_laws_hold(name):
     assert bool(study.theory) == (name not in ANSWERS)
     assert all(law.why for law in study.theory)
     assert all(law.order in (None, study.factors.get(law.factor)) for law in study.theory)
+
+
+LARGEST_SHARE = {"feedforward": 25.0, "computed_torque": 12.5}
+"""Of the error under the law pid, %, that a law with the identified model may leave."""
+
+
+def kept_points(name):
+    """Law and figures of each point of a kept answer, whose 95 % bands are of their means."""
+    content = json.loads((Path(__file__).parents[2] / ".readme" / "answers" / f"{name}.json").read_text())
+    assert not content["rows"]["failed"]
+    return [(point["factors"]["options.law"], point["figures"]) for point in content["points"]]
+
+
+@pytest.mark.parametrize("timing", ["", "_29hz"], ids=["60 Hz", "29 Hz"])
+def test_kept_answers_say_that_identified_models_follow_nearly_as_true_ones_and_better_than_starting_ones(timing):
+    """Of three robots: by bands, for the share of pid's error, the ratio to the true model, and the difference."""
+    for law, figures in kept_points(f"control_laws{timing}") + kept_points(f"control_robots{timing}"):
+        for what, unit in (("position", "um"), ("orientation", "urad")):
+            if f"true_{what}_ratio" in figures:  # a delta does not turn
+                assert figures[f"{what}_share_percent"]["mean_band"][1] < LARGEST_SHARE[law]
+                assert figures[f"true_{what}_ratio"]["mean_band"][1] < 1.5
+                assert figures[f"starting_{what}_excess_{unit}"]["mean_band"][0] > 0
+
+
+@pytest.mark.parametrize("timing", ["", "_29hz"], ids=["60 Hz", "29 Hz"])
+def test_kept_answers_say_that_a_model_that_is_off_is_no_worse_than_none(timing):
+    for _, figures in kept_points(f"model_off{timing}"):
+        for what in ("position", "orientation"):
+            if f"{what}_share_percent" in figures:
+                assert figures[f"{what}_share_percent"]["mean_band"][1] < 100
 
 
 @pytest.mark.parametrize("name", SLOW)
