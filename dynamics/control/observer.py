@@ -40,7 +40,7 @@ PLACE_DOUBT, RATE_DOUBT, TORQUE_DOUBT = 1e-4, 1e-5, 1e-3
 VISCOUS_DOUBT = 5.0
 """Standard deviation of the viscous friction that the model does not know of, over the inertia at the joint, 1/s."""
 
-MEMORY = 1.0
+MEMORY = 2.0
 """Time, s, over which what innovations said of the scales fades: what was learnt far from the truth, of a slope that is
 another there, would hold them back."""
 
