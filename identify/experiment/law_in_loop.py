@@ -22,7 +22,7 @@ from identify.scenario.plant_sections import FILTERED
 
 FASTEST = 1.0
 """Bandwidth of computed_torque with an observer, times the time between two frames: its gains may then double before
-the loop is lost. Noise gives no other limit: a slower loop is further from the motion, whatever the noise."""
+the loop is lost. At the noise of the sensors here a slower loop is further from the motion."""
 
 FASTEST_UNSEEN = 0.5
 """The same without, times the delay from the motion to its torque: the latency, half a frame of hold, one frame of
