@@ -324,5 +324,5 @@ def test_own_poses_are_calibrated_into_a_robot_file_by_the_command(tmp_path, rss
     assert not (tmp_path / "no").exists()
     few = "--set", "geometry.poses=5"
     assert command("geometry", "--out", tmp_path / "no", *few, *settings) == 1
-    assert "5 poses give 30 equations for 66" in one_line(capsys.readouterr().err)
+    assert "5 poses that differ give 30 equations for 66" in one_line(capsys.readouterr().err)
     assert not (tmp_path / "no").exists()
