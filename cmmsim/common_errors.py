@@ -27,6 +27,7 @@ from cmmsim.geometry.pose import (
     pose_to_transform,
     rotation_log,
     skew,
+    transforms_of,
 )
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig, triangulate
 from cmmsim.pose_estimation.estimator import by_planes
@@ -100,7 +101,7 @@ class MeasuringGeometry:
             rig_covariance, self.taught.base_covariance, self.taught.platform_covariance, exposure_std**2
         )
         kept = np.flatnonzero(np.diag(covariance) > 0.0)
-        view = _view(self, np.stack([pose_to_transform(pose) for pose in poses]))
+        view = _view(self, transforms_of(poses))
         small = np.concatenate([self._by_rig(view), view.by_taught_frames(), view.by_delay(poses, rates)], axis=2)
         changes = np.stack([pose_jacobian(pose) for pose in poses]) @ small[:, :, kept]
         return CommonErrors(tuple(NAMES[k] for k in kept), changes, covariance[np.ix_(kept, kept)])

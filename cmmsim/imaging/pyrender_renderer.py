@@ -131,7 +131,8 @@ class _Atlas:
     ) -> NDArray[np.uint8]:
         """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid until the next."""
         self._context._platform.make_current()
-        known, samples = self._uploaded(drawable, views.exposures[0].camera.focal_px * cell[0] / views.size[0])
+        samples = views.exposures[0].camera.focal_px * cell[0] / views.size[0]  # drawn pixels a radian
+        known = self._uploaded(drawable, samples)
         frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
         frame_buffer.bind()
         reaching = drawable.reaching(views)
@@ -190,7 +191,7 @@ class _Atlas:
                 gl.glClear(gl.GL_COLOR_BUFFER_BIT)
             gl.glDisable(gl.GL_SCISSOR_TEST)
 
-    def _uploaded(self, drawable: Drawable, samples: float) -> tuple[_Uploaded, float]:
+    def _uploaded(self, drawable: Drawable, samples: float) -> _Uploaded:
         """The drawable, with its patches in OpenGL's memory, their discs made for ``samples`` drawn pixels a radian."""
         known = self._known.get(drawable)
         if known is None:
@@ -199,13 +200,13 @@ class _Atlas:
             sample, solids = drawable.distance / samples, known.solids
             known.patches[samples], known.ringed[samples] = [], []
             for k, patch in enumerate(drawable.patches):
-                usual = self._patch(disc_mesh(patch, sample) if isinstance(patch, DiscStack) else patch, patch)
-                known.patches[samples].append(usual)
+                drawn = self._patch(disc_mesh(patch, sample) if isinstance(patch, DiscStack) else patch, patch)
+                known.patches[samples].append(drawn)
                 carrier = solids.carrier(k)
                 if isinstance(patch, DiscStack) and carrier is not None:
-                    usual = self._patch(ringed_mesh(patch, sample, float(solids.levels[carrier])), patch)
-                known.ringed[samples].append(usual)
-        return known, samples
+                    drawn = self._patch(ringed_mesh(patch, sample, float(solids.levels[carrier])), patch)
+                known.ringed[samples].append(drawn)
+        return known
 
     def _patch(self, mesh: Mesh, patch: Patch) -> _Patch:
         behind = mesh.faces.size * np.uint32().itemsize

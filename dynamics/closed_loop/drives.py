@@ -120,11 +120,6 @@ class Drives:
         """The law with the gains lp, li, ld (3,)."""
         return joint_law(self.law, gains, self.filter_time)
 
-    @property
-    def holds_by_integral(self) -> bool:
-        """Whether the commands of a robot at rest are where its joints are."""
-        return "li" in READS[self.law]
-
 
 PID = Drives()
 """The paper's, without a limit."""

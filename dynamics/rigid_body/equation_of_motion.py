@@ -158,11 +158,6 @@ def _shaped(column: ca.SX, like: list[ca.SX]) -> list[ca.SX]:
     return [ca.reshape(own, *one.shape) for own, one in zip(ca.vertsplit(column, ends), like, strict=True)]
 
 
-def _of_freedoms(matrix: ca.SX, free: ca.DM) -> ca.SX:
-    """What of a symmetric matrix (6, 6) the platform's freedoms see (m, m)."""
-    return free.T @ symmetric_from_lower(matrix) @ free
-
-
 def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
     """The legs with symbols for the branches that they are on, so that legs which differ in a sign are alike; and these
     with their values."""

@@ -31,6 +31,11 @@ class CommonErrorEstimates:
         """Standard deviations (k,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
+    @property
+    def learned(self) -> dict[str, float]:
+        """The estimate of each by its name."""
+        return dict(zip(self.names, self.estimate.tolist(), strict=True))
+
 
 def most_likely(run: RecordedRun, parameters: Array) -> Array:
     """The common errors (k,) of a run `with_common_errors` at the optimum (p,), in standard deviations beforehand."""

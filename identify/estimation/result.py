@@ -136,7 +136,7 @@ class IdentificationResult:
             "strongest_correlations": pairs,
             "warnings": list(self.warnings),
             "nuisances": dict(zip(common.names, common.std.tolist(), strict=True)),
-            "nuisance_estimates": dict(zip(common.names, common.estimate.tolist(), strict=True)),
+            "nuisance_estimates": common.learned,
             "nuisance_prior_std": dict(zip(common.names, common.prior_std.tolist(), strict=True)),
             "base_rank": self.base_rank,
             "drive": self._drive(),

@@ -107,9 +107,8 @@ def test_poses_of_unseen_motion_are_predicted_with_what_the_record_taught(method
     record, _, _ = experiment(1, scenario)
     result = identify(record, robot, scenario)
     unseen, run, _ = experiment(1, scenario, trajectory_seed=1)
-    learned = dict(zip(result.common_errors.names, result.common_errors.estimate, strict=True))
     model = robot, scenario, [unseen], result.estimate
-    (taught,) = predicted_runs(*model, result.whole_covariance, 0, SilentProgress(), learned)
+    (taught,) = predicted_runs(*model, result.whole_covariance, 0, SilentProgress(), result.common_errors.learned)
     (before,) = predicted_runs(*model, result.covariance, 0, SilentProgress())
     np.testing.assert_array_equal(before.poses, model_run(robot, scenario, result.estimate, recorded_reference(unseen)))
     sizes = [np.sqrt(np.mean(((one.poses - run.pose) / SIGMA) ** 2)) for one in (taught, before)]

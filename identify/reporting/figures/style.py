@@ -64,7 +64,6 @@ STYLE: Any = {
 }
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")
-LETTERS = ("(a)", "(b)", "(c)", "(d)", "(e)", "(f)")
 UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
 LINES: tuple[dict[str, Any], ...] = (
     {"color": BLUE, "linestyle": "-"},

@@ -37,9 +37,10 @@ def _predicted(
     """Errors of predicted poses (frames, 6) on all unseen trajectories, and the covariance stated of them (frames, 6,
     6)."""
     records = [one.record for one in unseen]
-    learned = dict(zip(result.common_errors.names, result.common_errors.estimate.tolist(), strict=True))
     estimated = result.estimate, result.whole_covariance
-    predicted = predicted_runs(plant.nominal, plant.scenario, records, *estimated, seed, SilentProgress(), learned)
+    predicted = predicted_runs(
+        plant.nominal, plant.scenario, records, *estimated, seed, SilentProgress(), result.common_errors.learned
+    )
     errors = [true_poses(one.truth) - of_one.poses for one, of_one in zip(unseen, predicted, strict=True)]
     return np.concatenate(errors), np.concatenate([one.covariance for one in predicted])
 

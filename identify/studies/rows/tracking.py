@@ -25,6 +25,7 @@ from identify.tracking.motions import motions
 from identify.tracking.track import KnownModel, follow_by_images, identified_model, known_model
 
 EXPERIMENT, SIGNS = 0, 1
+AXES = (("position", slice(0, 3), "um"), ("orientation", slice(3, 6), "urad"))
 
 COLUMNS = {
     "position_rms_um": Column("um", "deviation of the true from the desired position, rms", main=True),
@@ -106,9 +107,6 @@ def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptio
     trajectory = designed_trajectories(plant.scenario, options.trajectory_seed).excitation
     record = excitation_run(plant, sensor, trajectory, number).record
     return identified_model(plant, record, SilentProgress())
-
-
-AXES = (("position", slice(0, 3), "um"), ("orientation", slice(3, 6), "urad"))
 
 
 def _rms(runs: list[Followed], axes: slice) -> float:
