@@ -223,7 +223,7 @@ def test_a_controller_of_every_frame_is_asked_where_the_measurement_is_lost(robo
 @pytest.mark.thorough
 @pytest.mark.parametrize("law", [feedforward, computed_torque])
 @pytest.mark.parametrize("timing", [FrameTiming(60.0, 1 / 60), SLOW], ids=["60 Hz", "29 Hz"])
-def test_the_observer_knows_how_well_it_predicts_over_jitter_and_lost_frames(law, timing):
+def test_the_observer_knows_how_well_it_predicts_over_jitter_and_lost_frames(law, timing, record_property):
     """Mean normalised error of what it expects, over three robots: a fifth of the frames lost, jitter of half one."""
     ratios = []
     for name in ("rss6", "ups6", "delta3"):
@@ -233,6 +233,7 @@ def test_the_observer_knows_how_well_it_predicts_over_jitter_and_lost_frames(law
         weighted = np.linalg.solve(np.array([one.covariance for one in expected]), off[..., None])[..., 0]
         ratios.append(np.mean(np.sum(off * weighted, axis=1)) / off.shape[1])
         assert size(errors) < 3e-4  # m: it has not been lost
+    record_property("normalised error", float(np.mean(ratios)))
     assert 0.85 < np.mean(ratios) < 1.15, ratios
 
 
