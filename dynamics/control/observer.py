@@ -37,7 +37,9 @@ TURNING = 4.0
 """Standard deviations of a joint's velocity from rest within which it may turn back."""
 
 WALK = 0.003
-"""What the disturbance walks in a second before anything has been learnt, relative to the torques at rest."""
+"""What the disturbance walks in a second before anything has been learnt, relative to the torques at rest. Three times
+as much states the errors with a model that is far off better (1.4 instead of 1.9), and makes those with a true one a
+fifth larger."""
 
 PLACE_DOUBT, RATE_DOUBT, TORQUE_DOUBT = 1e-4, 1e-5, 1e-3
 """Standard deviations at the start, where the robot rests: m and rad, m/s and rad/s, and of torques at rest."""
