@@ -9,6 +9,7 @@ wrong frames and sticker places, and much of its error cancels there: only what 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +22,7 @@ from cmmsim.files.setup import MarkedBody
 from cmmsim.geometry.pose import (
     Array,
     apply,
+    apply_each,
     euler_rates_matrix,
     invert,
     pose_jacobian,
@@ -30,10 +32,10 @@ from cmmsim.geometry.pose import (
     transforms_of,
 )
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig, triangulate
-from cmmsim.pose_estimation.estimator import by_planes
-from cmmsim.pose_estimation.observation import StickerObservation, faces_camera
+from cmmsim.pose_estimation.estimator import frames_by_planes
+from cmmsim.pose_estimation.observation import faces_camera
 from cmmsim.pose_estimation.taught import Taught
-from cmmsim.teaching import platform_frame, teaching_path
+from cmmsim.teaching import platform_places, teaching_path
 
 NAMES = (
     *PARAMETER_NAMES,
@@ -115,30 +117,33 @@ class MeasuringGeometry:
     def taught_by_rig(self) -> tuple[Array, Array]:
         """Small error (6, 24) of base_from_camera as it was taught, and changes (24, n, 3) of the places of the
         platform's stickers, by each parameter of the rig."""
-        changes = [(self._teach(self.rig.moved(step)), self._teach(self.rig.moved(-step))) for step in STEPS]
+        moved = [self.rig.moved(sign * step) for sign in (1.0, -1.0) for step in STEPS]
+        frames, places = (values.reshape(2, len(STEPS), *values.shape[1:]) for values in self._teach(moved))
         twice = 2.0 * np.diag(STEPS)
-        frames = np.stack([_small_error(more[0], less[0]) for more, less in changes], axis=1) / twice
-        return frames, np.stack([more[1] - less[1] for more, less in changes]) / twice[:, None, None]
+        errors = np.stack([_small_error(more, less) for more, less in zip(*frames, strict=True)], axis=1) / twice
+        return errors, (places[0] - places[1]) / twice[:, None, None]
 
-    def _teach(self, true: StereoRig) -> tuple[Array, Array]:
-        """base_from_camera (4,4) and places (n,3) of the platform's stickers as the known rig teaches them, without
-        noise, where the cameras are those of another rig; the places per step of STEPS."""
-        seen = self._observed(true, apply(self.camera_from_base, self.taught.base_places))
-        camera_from_base = by_planes(seen, self.base, self.base.normals @ self.camera_from_base[:3, :3].T)[0]
-        views = [
-            self._observed(true, apply(self.camera_from_base @ pose_to_transform(pose), self.taught.platform_places))
-            for pose in teaching_path(self.home, TEACHING_POSES)
-        ]
-        return invert(camera_from_base), platform_frame(self.platform, views)[0]
-
-    def _observed(self, true: StereoRig, points: Array) -> StickerObservation:
-        """Points (n,3) in the camera frame, seen by the cameras of one rig and triangulated with the known one."""
-        pixels, unit = true.project(points)[0], np.tile(np.eye(2), (2, len(points), 1, 1))
-        ideal, spread, _ = self.rig.undistort(pixels, unit)
-        found = triangulate(self.rig, ideal[0], ideal[1], spread[0], spread[1])
-        return StickerObservation(
-            np.arange(len(points)), pixels[0], pixels[1], found.points, found.covariances, np.ones(len(points))
+    def _teach(self, true: Sequence[StereoRig]) -> tuple[Array, Array]:
+        """base_from_camera (r,4,4) and places (r,n,3) of the platform's stickers as the known rig teaches them, without
+        noise, where the cameras are those of other rigs: of each for itself."""
+        path = transforms_of(teaching_path(self.home, TEACHING_POSES))
+        places, base = self.taught.platform_places, apply(self.camera_from_base, self.taught.base_places)
+        views = apply_each(self.camera_from_base @ path, places)
+        points, covariances = self._observed(true, np.concatenate([base, views.reshape(-1, 3)]))
+        split, of_views = len(base), (len(true), *views.shape)
+        towards = self.base.normals @ self.camera_from_base[:3, :3].T
+        camera_from_base = frames_by_planes(self.base, points[:, :split], covariances[:, :split], towards)
+        return invert(camera_from_base), platform_places(
+            self.platform, points[:, split:].reshape(of_views), covariances[:, split:].reshape(*of_views, 3)
         )
+
+    def _observed(self, true: Sequence[StereoRig], points: Array) -> tuple[Array, Array]:
+        """Points (r,n,3), and their covariances (r,n,3,3) per px² of noise, as triangulated with the known rig, where
+        points (n,3) in the camera frame are seen by the cameras of other rigs."""
+        pixels = np.stack([rig.project(points)[0] for rig in true], axis=1).reshape(2, -1, 2)
+        ideal, spread, _ = self.rig.undistort(pixels, np.tile(np.eye(2), (*pixels.shape[:2], 1, 1)))
+        found, shape = triangulate(self.rig, *ideal, *spread), (len(true), *points.shape)
+        return found.points.reshape(shape), found.covariances.reshape(*shape, 3)
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,13 @@ from cmmsim.errors import LostError, TeachingError
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
 from cmmsim.geometry.disc_image import sticker_outlines
-from cmmsim.geometry.pose import Array, apply, compose_covariance, invert
-from cmmsim.geometry.registration import register
+from cmmsim.geometry.pose import Array, apply, apply_each, compose_covariance, invert
+from cmmsim.geometry.registration import register, register_sets
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.exposure import Quality
 from cmmsim.imaging.scene import placed_stickers
 from cmmsim.plugins import DEFAULT_DETECTOR
-from cmmsim.pose_estimation.estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, by_planes
+from cmmsim.pose_estimation.estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, by_planes, frames_by_planes
 from cmmsim.pose_estimation.observation import Observer, StickerExposure, StickerObservation, faces_camera
 from cmmsim.pose_estimation.search import bright_ellipses, candidate_points, find_layout
 from cmmsim.pose_estimation.taught import Taught, setup_of
@@ -188,9 +188,8 @@ class Teacher:
 def platform_frame(platform: MarkedBody, seen: list[StickerObservation]) -> tuple[Array, Array, Array]:
     """Sticker places (n,3) on the platform, their covariances (n,3,3) and the covariance (6,6) of the platform frame,
     from observations of all its stickers."""
-    mean, covariances = seen[0].points, seen[0].covariances
-    for _ in range(3):
-        mean, covariances = _mean_constellation(mean, seen)
+    views = np.stack([one.points for one in seen]), np.stack([one.covariances for one in seen])
+    mean, covariances = mean_constellation(*views)
     towards = _towards(platform, register(platform.nominal, mean, covariances).transform)
     whole = replace(seen[0], points=mean, covariances=covariances)
     mean_from_body, frame_covariance, _ = by_planes(whole, platform, towards)
@@ -203,6 +202,14 @@ def platform_frame(platform: MarkedBody, seen: list[StickerObservation]) -> tupl
     )
 
 
+def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> Array:
+    """Sticker places (c,n,3) as of ``platform_frame`` that each of c teachings finds, in whose views the stickers are
+    at points (c,v,n,3) with covariances (c,v,n,3,3)."""
+    mean, covariances = mean_constellation(points, covariances)
+    towards = _towards(platform, register_sets(platform.nominal, mean, covariances).transform)
+    return apply_each(invert(frames_by_planes(platform, mean, covariances, towards)), mean)
+
+
 def teaching_path(home: Array, count: int) -> Array:
     """Smooth closed path of poses (count, 6) that starts near ``home`` and visits many sub-pixel positions."""
     angle = 2.0 * np.pi * np.arange(count)[:, None] / count * CYCLES + PHASES
@@ -210,21 +217,25 @@ def teaching_path(home: Array, count: int) -> Array:
 
 
 def _towards(body: MarkedBody, camera_from_body: Array) -> Array:
-    """Normals (3,3) of the planes in the camera frame."""
-    return body.normals @ camera_from_body[:3, :3].T
+    """Normals (..., 3, 3) of the planes in the camera frame, where camera_from_body is (..., 4, 4)."""
+    return np.asarray(body.normals @ camera_from_body[..., :3, :3].swapaxes(-1, -2))
 
 
-def _mean_constellation(reference: Array, seen: list[StickerObservation]) -> tuple[Array, Array]:
-    """Weighted mean (n,3) of all observations laid onto ``reference`` (n,3), and its covariances (n,3,3)."""
-    information, weighted = np.zeros((len(reference), 3, 3)), np.zeros((len(reference), 3))
-    for observation in seen:
-        to_reference = invert(register(reference, observation.points, observation.covariances).transform)
-        turn = to_reference[:3, :3]
-        weight = np.linalg.inv(turn @ observation.covariances @ turn.T)
-        information += weight
-        weighted += np.einsum("nij,nj->ni", weight, apply(to_reference, observation.points))
-    covariances = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    return np.einsum("nij,nj->ni", covariances, weighted), covariances
+def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
+    """Weighted mean (..., n, 3) of views (..., v, n, 3) of the same stickers laid onto each other, near the first of
+    them, and its covariances (..., n, 3, 3), from those of the points (..., v, n, 3, 3)."""
+    weights = np.linalg.inv(covariances)
+    mean, spread = points[..., 0, :, :], covariances[..., 0, :, :, :]
+    for _ in range(3):
+        sets = np.broadcast_to(mean[..., None, :, :], points.shape).reshape(-1, *points.shape[-2:])
+        found = register_sets(sets, points.reshape(sets.shape), covariances.reshape(*sets.shape, 3)).transform
+        to_mean = invert(found).reshape(*points.shape[:-2], 4, 4)
+        turn = to_mean[..., None, :3, :3]
+        turned = turn @ weights @ turn.swapaxes(-1, -2)
+        weighted = (turned @ apply_each(to_mean, points)[..., None]).sum(axis=-4)
+        spread = np.linalg.inv(turned.sum(axis=-4))
+        mean = (spread @ weighted)[..., 0]
+    return mean, spread
 
 
 @dataclass(frozen=True)

@@ -20,55 +20,63 @@ FEWEST_STICKERS = 3
 
 @dataclass(frozen=True)
 class FittedPlane:
-    """normal (3,) unit; offset d, m; tangents (3,2); covariance (3,3) of [turn about each tangent..., d]: the normal
-    moves by tangents @ parameters[:2]."""
+    """A plane, or several of them (...): normal (..., 3) unit; offset (...) d, m; tangents (..., 3, 2); covariance (...,
+    3, 3) of [turn about each tangent..., d]: the normal moves by tangents @ parameters[:2]."""
 
     normal: Array
-    offset: float
+    offset: Array
     tangents: Array
     covariance: Array
 
 
 def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "") -> FittedPlane:
-    """Weighted least-squares plane through ``points`` (n,3) with covariances (n,3,3).
+    """Weighted least-squares plane through ``points`` (n,3) with covariances (n,3,3), or planes through several sets
+    (..., n, 3) of them.
 
-    ``towards`` (3,) is a rough normal that fixes the sign. Raises LostError with fewer than three points off one line.
+    ``towards`` (..., 3) is a rough normal that fixes the sign. Raises LostError with fewer than three points off one
+    line.
     """
-    if len(points) < FEWEST_STICKERS:
-        raise LostError(f"plane {name}: {len(points)} visible stickers, at least {FEWEST_STICKERS} needed")
-    middle = points.mean(axis=0)
-    _, spread, axes = np.linalg.svd(points - middle)
-    if spread[1] < SMALLEST_SPREAD:
+    count = points.shape[-2]
+    if count < FEWEST_STICKERS:
+        raise LostError(f"plane {name}: {count} visible stickers, at least {FEWEST_STICKERS} needed")
+    middle = points.mean(axis=-2)
+    arms = points - middle[..., None, :]
+    _, spread, axes = np.linalg.svd(arms)
+    if (width := float(spread[..., 1].min())) < SMALLEST_SPREAD:
         raise LostError(
-            f"plane {name}: its {len(points)} visible stickers lie on one line "
-            f"to {spread[1] * 1e3:.1f} mm, at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
+            f"plane {name}: its {count} visible stickers lie on one line "
+            f"to {width * 1e3:.1f} mm, at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
         )
-    normal = axes[2] * (1.0 if axes[2] @ towards > 0.0 else -1.0)
-    offset = float(normal @ middle)
+    normal = axes[..., 2, :]
+    normal = normal * np.where(_dot(normal, towards) > 0.0, 1.0, -1.0)[..., None]
+    shift = np.zeros(normal.shape[:-1])  # of the plane from the middle, along the normal
     for _ in range(2):
         tangents = _tangents(normal)
-        jacobian = np.column_stack([(points - middle) @ tangents, -np.ones(len(points))])
-        weights = 1.0 / np.einsum("i,nij,j->n", normal, covariances, normal)
-        covariance = np.linalg.inv(jacobian.T @ (weights[:, None] * jacobian))
-        residuals = (points - middle) @ normal - (offset - normal @ middle)
-        change = -covariance @ (jacobian.T @ (weights * residuals))
-        shift = offset - normal @ middle + change[2]
-        normal = normal + tangents @ change[:2]
-        normal /= np.linalg.norm(normal)
-        offset = float(shift + normal @ middle)
+        jacobian = np.concatenate([arms @ tangents, np.full((*arms.shape[:-1], 1), -1.0)], axis=-1)
+        weights = 1.0 / np.einsum("...i,...nij,...j->...n", normal, covariances, normal)
+        covariance = np.linalg.inv(jacobian.swapaxes(-1, -2) @ (weights[..., None] * jacobian))
+        residuals = (arms @ normal[..., None])[..., 0] - shift[..., None]
+        change = -(covariance @ (jacobian.swapaxes(-1, -2) @ (weights * residuals)[..., None]))[..., 0]
+        shift = shift + change[..., 2]
+        normal = normal + (tangents @ change[..., :2, None])[..., 0]
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     tangents = _tangents(normal)
     # parameters were [turn, shift about the middle]; the offset is shift + n . middle
-    to_offset = np.eye(3)
-    to_offset[2, :2] = middle @ tangents
-    return FittedPlane(normal, offset, tangents, to_offset @ covariance @ to_offset.T)
+    to_offset = np.zeros((*shift.shape, 3, 3)) + np.eye(3)
+    to_offset[..., 2, :2] = (middle[..., None, :] @ tangents)[..., 0, :]
+    spread = to_offset @ covariance @ to_offset.swapaxes(-1, -2)
+    return FittedPlane(normal, shift + _dot(normal, middle), tangents, spread)
 
 
 def frame_from_planes(normals: Array, offsets: Array) -> Array:
-    """camera_from_planes (4,4): the frame of planes A, B, C given as unit normals (3,3) by row and offsets (3,)."""
-    z = normals[0] / np.linalg.norm(normals[0])
-    x = np.cross(normals[0], normals[1])
-    x /= np.linalg.norm(x)
-    return rigid(np.column_stack([x, np.cross(z, x), z]), np.linalg.solve(normals, offsets))
+    """camera_from_planes (..., 4, 4): the frame of planes A, B, C given as unit normals (..., 3, 3) by row and offsets
+    (..., 3)."""
+    first = normals[..., 0, :]
+    z = first / np.linalg.norm(first, axis=-1, keepdims=True)
+    x = np.cross(first, normals[..., 1, :])
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    corner = np.linalg.solve(normals, offsets[..., None])[..., 0]
+    return rigid(np.stack([x, np.cross(z, x), z], axis=-1), corner)
 
 
 def frame_of_points(
@@ -79,21 +87,35 @@ def frame_of_points(
     Parameters: points (n,3) and covariances (n,3,3); plane_index (n,) 0, 1, 2 for A, B, C; towards (3,3) rough normals
     by row. Raises LostError that names the plane, the count and the limit.
     """
-    planes = [
-        fit_plane(points[plane_index == k], covariances[plane_index == k], towards[k], PLANE_NAMES[k]) for k in range(3)
-    ]
-    normals = np.stack([p.normal for p in planes])
-    offsets = np.array([p.offset for p in planes])
-    frame = frame_from_planes(normals, offsets)
-    sensitivity = _frame_sensitivity(frame, normals, np.stack([p.tangents for p in planes]))
+    frame, planes = frames_of_points(points, covariances, plane_index, towards)
+    sensitivity = _frame_sensitivity(
+        frame, np.stack([p.normal for p in planes]), np.stack([p.tangents for p in planes])
+    )
     return frame, sensitivity @ block_diag(*[p.covariance for p in planes]) @ sensitivity.T
 
 
+def frames_of_points(
+    points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
+) -> tuple[Array, list[FittedPlane]]:
+    """As ``frame_of_points`` for sets of points (..., n, 3): their frames (..., 4, 4), and planes A, B and C."""
+    planes = []
+    for k, name in enumerate(PLANE_NAMES):
+        own = plane_index == k
+        planes.append(fit_plane(points[..., own, :], covariances[..., own, :, :], towards[..., k, :], name))
+    normals = np.stack([plane.normal for plane in planes], axis=-2)
+    return frame_from_planes(normals, np.stack([plane.offset for plane in planes], axis=-1)), planes
+
+
+def _dot(first: Array, second: Array) -> Array:
+    """Inner products (...) of vectors (..., 3)."""
+    return np.einsum("...i,...i->...", first, second)
+
+
 def _tangents(normal: Array) -> Array:
-    """Two unit vectors (3,2) that span the plane of ``normal``."""
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    return np.column_stack([first, np.cross(normal, first)])
+    """Two unit vectors (..., 3, 2) that span the plane of ``normal`` (..., 3)."""
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=-1)])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(normal, first)], axis=-1)
 
 
 def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:

@@ -90,15 +90,16 @@ def poses_of(transforms: Array) -> Array:
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """Transform (4,4) of a rotation (3,3) and a translation (3,)."""
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, translation
+    """Transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    transform = np.zeros((*np.shape(rotation)[:-2], 4, 4))
+    transform[..., :3, :3], transform[..., :3, 3], transform[..., 3, 3] = rotation, translation, 1.0
     return transform
 
 
 def invert(transform: Array) -> Array:
-    """Inverse (4,4) of a rigid transform."""
-    return rigid(transform[:3, :3].T, -transform[:3, :3].T @ transform[:3, 3])
+    """Inverses (..., 4, 4) of rigid transforms."""
+    back = transform[..., :3, :3].swapaxes(-1, -2)
+    return rigid(back, -(back @ transform[..., :3, 3:])[..., 0])
 
 
 def apply(transform: Array, points: Array) -> Array:
@@ -107,7 +108,7 @@ def apply(transform: Array, points: Array) -> Array:
 
 
 def apply_each(transforms: Array, points: Array) -> Array:
-    """Points (n,3) carried by each of the transforms (..., 4,4): (..., n, 3)."""
+    """Points (n,3), or a set of them for each (..., n, 3), carried by each of the transforms (..., 4,4): (..., n, 3)."""
     return np.asarray(points @ transforms[..., :3, :3].swapaxes(-1, -2) + transforms[..., None, :3, 3])
 
 

@@ -80,6 +80,16 @@ def register(source: Array, target: Array, covariances: Array) -> Registration:
     return Registration(fit.transform[0], fit.covariance[0], fit.misfit)
 
 
+def register_sets(source: Array, targets: Array, covariances: Array) -> Registration:
+    """``register`` of all points of a ``source``, (n,3) or one each (c,n,3), onto each of the targets (c,n,3) with
+    covariances (c,n,3,3). Of the result transform is (c,4,4), covariance (c,6,6), misfit (c n,)."""
+    sets, count = targets.shape[:2]
+    starts = rigid_starts(source, targets, np.ones((sets, count)))
+    of_each = np.broadcast_to(source, targets.shape).reshape(-1, 3)
+    flat = targets.reshape(-1, 3), covariances.reshape(-1, 3, 3)
+    return register_each(of_each, *flat, count * np.arange(sets + 1), starts)
+
+
 def register_each(
     source: Array, target: Array, covariances: Array, starts: NDArray[np.int_], transforms: Array
 ) -> Registration:

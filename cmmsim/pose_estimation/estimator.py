@@ -14,7 +14,7 @@ from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError, ShapeError, UnknownOptionError
 from cmmsim.files.setup import MarkedBody
-from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points
+from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points, frames_of_points
 from cmmsim.geometry.pose import Array, compose_covariance, invert, pose_covariance, skew, transform_to_pose
 from cmmsim.geometry.registration import register
 from cmmsim.pose_estimation.consistency import consistent
@@ -125,8 +125,19 @@ def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array)
     frame, covariance = frame_of_points(
         observation.points, observation.covariances, body.plane_index[observation.index], towards
     )
-    planes_from_body = invert(frame_from_planes(body.normals, body.offsets))
+    planes_from_body = _planes_from(body)
     return frame @ planes_from_body, move_origin(frame, covariance, planes_from_body[:3, 3]), observation
+
+
+def frames_by_planes(body: MarkedBody, points: Array, covariances: Array, towards: Array) -> Array:
+    """camera_from_body (...,4,4) as of ``by_planes`` where all stickers of a body are at points (..., n, 3) with
+    covariances (..., n, 3, 3); ``towards`` (..., 3, 3)."""
+    return frames_of_points(points, covariances, body.plane_index, towards)[0] @ _planes_from(body)
+
+
+def _planes_from(body: MarkedBody) -> Array:
+    """planes_from_body (4,4)."""
+    return invert(frame_from_planes(body.normals, body.offsets))
 
 
 def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:

@@ -37,7 +37,7 @@ def seen_by_both(geometry):
 def measured(geometry, true, poses, later=None):
     """Poses (N, 6) that the known rig measures through another one, taught by it as well; `later` (N, 6): the poses at
     which the right camera exposes."""
-    base_from_camera, places = geometry._teach(true)
+    base_from_camera, places = (one[0] for one in geometry._teach([true]))
     keep, found = seen_by_both(geometry), []
     for each in zip(poses, poses if later is None else later, strict=True):
         points = [
