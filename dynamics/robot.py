@@ -211,13 +211,12 @@ class Robot:
         For a crank, sin^2 of the angle between it and its direction of reach. It falls without limit as the leg's
         target moves away, and is -inf where squares overflow.
         """
-        margin = self._call("inverse_kinematics", self.charted(pose), output=1)[..., 0]
-        return np.where(np.isnan(margin), -np.inf, margin)
+        return self._margins(self.charted(pose))
 
     def check_reach(self, pose: ArrayLike, name: str = "pose", row: str = "row") -> None:
         """Raise UnreachablePoseError, naming leg and pose, where a leg cannot reach; `name` and `row` are its words."""
         poses = np.atleast_2d(self.charted(pose, name))
-        margin = self.reach_margin(poses)
+        margin = self._margins(poses)
         if (margin > 0).all():
             return
         index, leg = (int(value) for value in np.argwhere(~(margin > 0))[0])
@@ -241,6 +240,11 @@ class Robot:
         """
         geometry = self.geometry.moved(floats("deviations", deviations, (len(self.geometry.number_names),)))
         return Robot(RobotDescription(self.name, geometry, self.parameter_sets), self.functions_of)
+
+    def _margins(self, poses: np.ndarray) -> np.ndarray:
+        """`reach_margin` of poses that the platform can have."""
+        margin = self._call("inverse_kinematics", poses, output=1)[..., 0]
+        return np.where(np.isnan(margin), -np.inf, margin)
 
     def _poses(self, pose: ArrayLike) -> np.ndarray:
         poses = rows("pose", pose, 6)

@@ -2,21 +2,22 @@
 
 A body's stickers are expected where their taught places and its measured pose put them. The pose itself is not known
 otherwise, so what six numbers explain is taken out: what is left is the pattern's misfit and the gaps of the rays.
-With n stickers, 4 n - 6 numbers of unit variance. The base stands still, and its pose was taught: of that nothing is
-taken out, and it shows how the whole rig stands against it as well.
+With n stickers, 4 n numbers, of unit variance in the 4 n - 6 directions that no pose explains, and zero in the others.
+The base stands still, and its pose was taught: of that nothing is taken out, and it shows how the whole rig stands
+against it as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.common_errors import MeasuringGeometry
-from cmmsim.geometry.pose import Array, apply, skew
-from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES
+from cmmsim.geometry.pose import Array, apply, apply_each, skew
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 
 PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
 """A movement of both cameras together: by so much points of the base move in the camera frame, about its origin."""
@@ -27,9 +28,10 @@ RIG = len(PARAMETER_NAMES)
 
 @dataclass(frozen=True)
 class Rows:
-    """residuals (m,) of unit variance, and their derivatives: by a drift since teaching (m, 30) of the rig's parameters
-    and its place, by errors (m, 24) that the rig had at teaching already, by the time (m, 1) [s] by which the right
-    camera exposes later, and by offsets (m, o) [px] of single centres."""
+    """Of b blocks of frames: residuals (b, m), of unit variance or zero in any direction, and their derivatives: by a
+    drift since teaching (b, m, 30) of the rig's parameters and its place, by errors (b, m, 24) that the rig had at
+    teaching already, by the time (b, m, 1) [s] by which the right camera exposes later, and by offsets (b, m, o) [px]
+    of single centres."""
 
     residuals: Array
     by_drift: Array
@@ -38,106 +40,131 @@ class Rows:
     by_offsets: Array
 
 
-NOT_OFFSETS = ("residuals", "by_drift", "by_start", "by_delay")
-
-
 @dataclass
 class Sightings:
-    """The same stickers of a body in some frames: index (k,); camera_from_body (4,4) and time s of each frame; weights
-    (k,) px^-2, and weighted residuals (2, k, 2), of all of them."""
+    """The same stickers of a body in some frames, a block: index (k,) of them, and their places (k, 3) in body axes; of
+    each frame its time s, camera_from_body (4,4), pixels (2, k, 2) and their variances (k,) px²."""
 
     index: NDArray[np.int_]
-    places: list[Array] = field(default_factory=list)
+    places: Array
     times: list[float] = field(default_factory=list)
-    weights: Array = field(default_factory=lambda: np.zeros(()))
-    weighted: Array = field(default_factory=lambda: np.zeros(()))
+    moves: list[Array] = field(default_factory=list)
+    pixels: list[Array] = field(default_factory=list)
+    variances: list[Array] = field(default_factory=list)
 
-    def add(self, time: float, camera_from_body: Array, residuals: Array, variances: Array) -> None:
-        """One more frame: residuals (2, k, 2) px with variances (k,) px²."""
-        weights = 1.0 / (variances + SMALLEST_STD_PX**2)
-        self.places.append(camera_from_body)
+    def add(self, time: float, camera_from_body: Array, pixels: tuple[Array, Array], variances: Array) -> None:
+        """One more frame."""
         self.times.append(time)
-        self.weights = self.weights + weights
-        self.weighted = self.weighted + weights[:, None] * residuals
+        self.moves.append(camera_from_body)
+        self.pixels.append(np.array(pixels))
+        self.variances.append(variances)
 
     @property
     def middle(self) -> Array:
         """camera_from_body (4,4) half way."""
-        return self.places[len(self.places) // 2]
+        return self.moves[len(self.moves) // 2]
 
     @property
-    def whitened(self) -> Array:
-        """Mean residuals (4k,) in units of their standard deviations."""
-        return np.asarray((self.weighted / np.sqrt(self.weights)[:, None]).ravel())
-
-    def whiten(self, slopes: Array) -> Array:
-        """Derivatives (4k, p) of the same from those of pixels (2, k, 2, p)."""
-        return np.asarray((np.sqrt(self.weights)[:, None, None] * slopes).reshape(4 * len(self.index), -1))
-
-    def velocities(self, points: Array) -> Array:
-        """Of points (k, 3) in body axes, in the camera frame, m/s; zero where only one frame was seen."""
+    def velocities(self) -> Array:
+        """Of the stickers (k, 3) in the camera frame, m/s; zero where only one frame was seen."""
         span = self.times[-1] - self.times[0]
         if span == 0.0:
-            return np.zeros(points.shape)
-        return (apply(self.places[-1], points) - apply(self.places[0], points)) / span
+            return np.zeros(self.places.shape)
+        return (apply(self.moves[-1], self.places) - apply(self.moves[0], self.places)) / span
 
 
-def platform_rows(geometry: MeasuringGeometry, seen: Sightings) -> Rows:
-    """What frames say in which the platform was measured."""
-    places = geometry.taught.platform_places[seen.index]
-    move = seen.middle
-    arms = places @ move[:3, :3].T
-    slopes, by_rig = geometry.rig.derivatives(arms + move[:3, 3])
-    taught = np.einsum("ij,pkj->kip", move[:3, :3], geometry.taught_by_rig[1][:, seen.index])
-    by_pose = seen.whiten(slopes @ _small_movement(arms))
-    told = np.linalg.qr(by_pose, mode="complete")[0][:, by_pose.shape[1] :].T  # what no pose explains
-    by_delay = np.zeros((*by_rig.shape[:3], 1))
-    by_delay[1, ..., 0] = np.einsum("kij,kj->ki", slopes[1], seen.velocities(places))
+def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
+    """What blocks of frames with the same stickers say, in which the platform was measured."""
+    index, moves = blocks[0].index, np.array([seen.middle for seen in blocks])
+    arms = blocks[0].places @ moves[:, :3, :3].swapaxes(1, 2)
+    slopes, by_rig = _derivatives(geometry.rig, arms + moves[:, None, :3, 3])
+    taught = np.einsum("bij,pkj->bkip", moves[:, :3, :3], geometry.taught_by_rig[1][:, index])
+    by_delay = np.zeros((*by_rig.shape[:-1], 1))
+    by_delay[1, ..., 0] = np.einsum("bkij,bkj->bki", slopes[1], np.array([seen.velocities for seen in blocks]))
+    residuals, roots = _whitened(geometry.rig, blocks)
+    by_pose = np.linalg.qr(_whiten(roots, slopes @ _small_movement(arms)))[0]
 
-    def rows(derivatives: Array) -> Array:
-        return np.asarray(told @ seen.whiten(derivatives))
+    def left(values: Array) -> Array:
+        """What no pose explains of values (b, 4k, ...)."""
+        return np.asarray(values - by_pose @ (by_pose.swapaxes(1, 2) @ values))
 
-    count = len(geometry.taught.platform_places)
-    by_drift = np.pad(rows(by_rig), ((0, 0), (0, len(PLACES_OF_RIG))))
-    offsets = _offsets(rows, seen.index, count)
-    return Rows(told @ seen.whitened, by_drift, rows(by_rig - slopes @ taught), rows(by_delay), offsets)
+    drift = left(_whiten(roots, by_rig))
+    return Rows(
+        left(residuals[..., None])[..., 0],
+        np.pad(drift, ((0, 0), (0, 0), (0, len(PLACES_OF_RIG)))),
+        drift - left(_whiten(roots, slopes @ taught)),
+        left(_whiten(roots, by_delay)),
+        _offsets(left, roots, index, len(geometry.taught.platform_places)),
+    )
 
 
-def base_rows(geometry: MeasuringGeometry, seen: Sightings) -> Rows:
-    """What frames say in which the base was looked at."""
-    move, count = geometry.camera_from_base, len(geometry.taught.base_places)
-    arms = geometry.taught.base_places[seen.index] @ move[:3, :3].T
+def base_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
+    """What blocks of frames with the same stickers say, in which the base was looked at: it stands still."""
+    index, move = blocks[0].index, geometry.camera_from_base
+    arms = blocks[0].places @ move[:3, :3].T
     slopes, by_rig = geometry.rig.derivatives(arms + move[:3, 3])
     across = slopes.transpose(1, 0, 2, 3).reshape(len(arms), 4, 3)
     rig_first = by_rig.transpose(1, 0, 2, 3).reshape(len(arms), 4, RIG)
     taught = np.linalg.solve(across.swapaxes(1, 2) @ across, across.swapaxes(1, 2) @ rig_first)  # where they were seen
+    by_drift = np.concatenate([by_rig, slopes @ _small_movement(arms)], axis=-1)
+    residuals, roots = _whitened(geometry.rig, blocks)
     return Rows(
-        seen.whitened,
-        seen.whiten(np.concatenate([by_rig, slopes @ _small_movement(arms)], axis=-1)),
-        seen.whiten(by_rig - slopes @ taught),
-        np.zeros((4 * len(arms), 1)),
-        _offsets(seen.whiten, seen.index, count),
+        residuals,
+        _whiten(roots, by_drift[:, None]),
+        _whiten(roots, (by_rig - slopes @ taught)[:, None]),
+        np.zeros((*residuals.shape, 1)),
+        _offsets(np.asarray, roots, index, len(geometry.taught.base_places)),
     )
 
 
 def stacked(rows: list[Rows], centres: tuple[int, ...]) -> Rows:
     """Rows of several bodies as one; the stickers of all bodies, so many each, have offsets of their own."""
-    every, first, before = np.zeros((sum(len(one.residuals) for one in rows), 4 * sum(centres))), 0, 0
-    for one, count in zip(rows, centres, strict=False):
-        every[first : first + len(one.residuals), 4 * before : 4 * (before + count)] = one.by_offsets
-        first, before = first + len(one.residuals), before + count
-    parts = {name: np.concatenate([getattr(one, name) for one in rows]) for name in NOT_OFFSETS}
+    sizes, first, before = [one.residuals.shape for one in rows], 0, 0
+    every = np.zeros((sizes[0][0], sum(size for _, size in sizes), 4 * sum(centres)))
+    for one, (_, size), count in zip(rows, sizes, centres, strict=False):
+        every[:, first : first + size, 4 * before : 4 * (before + count)] = one.by_offsets
+        first, before = first + size, before + count
+    parts = {name: np.concatenate([getattr(one, name) for one in rows], axis=1) for name in NOT_OFFSETS}
     return Rows(**parts, by_offsets=every)
 
 
+NOT_OFFSETS = ("residuals", "by_drift", "by_start", "by_delay")
+
+
+def _derivatives(rig: StereoRig, points: Array) -> tuple[Array, Array]:
+    """Derivatives (2, b, k, 2, 3) of pixels by points (b, k, 3) in the camera frame; (2, b, k, 2, 24) by the rig."""
+    slopes, by_rig = rig.derivatives(points.reshape(-1, 3))
+    return slopes.reshape(2, *points.shape[:2], 2, 3), by_rig.reshape(2, *points.shape[:2], 2, RIG)
+
+
+def _whitened(rig: StereoRig, blocks: Sequence[Sightings]) -> tuple[Array, Array]:
+    """Means (b, 4k) of pixels less those expected, in units of their standard deviations; and the roots (b, k) of their
+    weights."""
+    weights = 1.0 / (np.array([each for seen in blocks for each in seen.variances]) + SMALLEST_STD_PX**2)
+    moves = np.array([move for seen in blocks for move in seen.moves])
+    pixels = np.array([each for seen in blocks for each in seen.pixels]).swapaxes(0, 1)
+    residuals = pixels - rig.project(apply_each(moves, blocks[0].places))[0]
+    starts = np.cumsum([0, *(len(seen.times) for seen in blocks)])[:-1]
+    roots = np.sqrt(np.add.reduceat(weights, starts))
+    summed = np.add.reduceat(weights[..., None] * residuals, starts, axis=1)
+    return (summed / roots[..., None]).swapaxes(0, 1).reshape(len(blocks), -1), roots
+
+
+def _whiten(roots: Array, slopes: Array) -> Array:
+    """Derivatives (b, 4k, p) of whitened residuals from those of pixels (2, b, k, 2, p), or (2, 1, k, 2, p)."""
+    weighted = (roots[..., None, None] * slopes).swapaxes(0, 1)
+    return weighted.reshape(len(roots), 4 * roots.shape[1], -1)
+
+
 def _small_movement(arms: Array) -> Array:
-    """Derivatives (k, 3, 6) of points by a small movement [dt, dphi] of their body, arms (k, 3) about its origin."""
-    return np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)
+    """Derivatives (..., 3, 6) of points, arms (..., 3) from their body's origin, by its small movement [dt, dphi]."""
+    return np.concatenate([np.broadcast_to(np.eye(3), (*arms.shape, 3)), -skew(arms)], axis=-1)
 
 
-def _offsets(rows: Callable[[Array], Array], index: NDArray[np.int_], count: int) -> Array:
-    """Derivatives (m, 4 count) by the offsets of all centres of a body, of which those of an index (k,) are seen."""
-    seen = rows(np.eye(4 * len(index)).reshape(2, len(index), 2, -1)).reshape(-1, 2, len(index), 2)
-    every = np.zeros((len(seen), 2, count, 2))
-    every[:, :, index] = seen
-    return every.reshape(len(seen), -1)
+def _offsets(left: Callable[[Array], Array], roots: Array, index: NDArray[np.int_], count: int) -> Array:
+    """Derivatives (b, 4k, 4 count) by the offsets of all centres of a body, of which an index (k,) is seen."""
+    blocks, k = roots.shape
+    every = np.zeros((blocks, 4 * k, 2, count, 2))
+    seen = left(np.repeat(np.tile(roots, 2), 2, axis=1)[..., None] * np.eye(4 * k))
+    every[:, :, :, index] = seen.reshape(blocks, 4 * k, 2, k, 2)
+    return every.reshape(blocks, 4 * k, -1)

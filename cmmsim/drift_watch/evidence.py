@@ -15,7 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from cmmsim.drift_watch.blocks import PLACES_OF_RIG, RIG, Rows
 from cmmsim.geometry.pose import Array
@@ -30,22 +31,64 @@ WALK_FRAMES = 1000
 
 
 class Filter:
-    """Kalman filter of unknowns (n,) that walk at random: mean, covariance, and log likelihood of all that it saw."""
+    """Kalman filter of unknowns (n,), of which the first w walk at random and are zero before the first step: in its
+    information form, since one product of the derivatives serves all models, and few unknowns walk.
+
+    What was seen makes the density of the unknowns x proportional to exp(constant + right x - x precision x / 2).
+    Source: B. D. O. Anderson and J. B. Moore, Optimal Filtering (1979), section 6.3.
+    """
 
     def __init__(self, prior_std: Array, walk_std: Array) -> None:
-        self.mean, self.covariance = np.zeros(len(prior_std)), np.diag(prior_std**2)
-        self._walk, self.log_likelihood = np.diag(walk_std**2), 0.0
+        self._walk = walk_std**2
+        self.precision = np.diag(np.concatenate([np.zeros(len(walk_std)), prior_std**-2]))
+        self.right, self._constant = np.zeros(len(self.precision)), -float(np.log(prior_std).sum())
 
-    def step(self, residuals: Array, columns: Array, frames: int) -> None:
-        """See residuals (m,) of unit variance, with derivatives (m, n), so many frames after those before."""
-        self.covariance += frames * self._walk
-        gain = columns @ self.covariance
-        lower = np.linalg.cholesky(gain @ columns.T + np.eye(len(residuals)))
-        white = solve_triangular(lower, residuals - columns @ self.mean, lower=True)
-        gain = solve_triangular(lower, gain, lower=True)
-        self.log_likelihood -= 0.5 * float(white @ white) + float(np.log(np.diag(lower)).sum())
-        self.mean = self.mean + gain.T @ white
-        self.covariance = self.covariance - gain.T @ gain
+    def step(self, gram: Array, right: Array, squared: float, frames: int) -> None:
+        """See residuals r of unit variance with derivatives D (m, n), so many frames after those before: D'D (n, n),
+        D'r (n,) and r'r."""
+        if len(self._walk):
+            self._walk_on(frames)
+        self.precision += gram
+        self.right += right
+        self._constant -= 0.5 * squared
+
+    def _walk_on(self, frames: int) -> None:
+        w, walked = len(self._walk), frames * self._walk
+        if not self.precision[0, 0]:
+            self.precision[range(w), range(w)] = 1.0 / walked
+            self._constant -= 0.5 * float(np.log(walked).sum())
+            return
+        both = np.column_stack([self.precision[:w], self.right[:w]])
+        lower, part = _factored(self.precision[:w, :w] + np.diag(1.0 / walked), both)
+        self.precision -= part[:, :-1].T @ part[:, :-1]
+        self.right -= part[:, :-1].T @ part[:, -1]
+        logarithms = float(np.log(np.diag(lower)).sum() + 0.5 * np.log(walked).sum())
+        self._constant += 0.5 * float(part[:, -1] @ part[:, -1]) - logarithms
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of all residuals that it saw."""
+        if not self.precision[0, 0]:  # nothing was seen
+            return 0.0
+        lower, part = _factored(self.precision, self.right)
+        return self._constant + 0.5 * float(part @ part) - float(np.log(np.diag(lower)).sum())
+
+    def told_of(self, first: int) -> tuple[Array, Array]:
+        """Information (d, d) about the first d unknowns, and score (d,), whatever the others are."""
+        others = np.linalg.solve(self.precision[first:, first:], self.precision[first:, :first])
+        return (
+            self.precision[:first, :first] - self.precision[:first, first:] @ others,
+            self.right[:first] - others.T @ self.right[first:],
+        )
+
+
+def _factored(matrix: Array, right: Array) -> tuple[Array, Array]:
+    """Lower Cholesky factor L of a matrix (n, n), its upper part left as it was, and L^-1 right (n,) or (n, p); plain
+    LAPACK, whose callers in SciPy take longer than the work."""
+    lower, failed = dpotrf(matrix, lower=True, clean=False)
+    if failed:
+        raise np.linalg.LinAlgError(f"no positive definite matrix: minor {failed} of {len(matrix)}")
+    return lower, dtrtrs(lower, right, lower=True)[0]
 
 
 @dataclass(frozen=True)
@@ -69,16 +112,9 @@ class Evidence:
         self._calibration, self._delay_std = calibration, delay_std
         self._size = len(SIZES) if place_shows else RIG
         known = np.concatenate([np.ones(calibration.shape[1]), np.ones(1), offset_std])
-        still = np.zeros(len(known))
-        self._fitting = Filter(known, still)
-        self._walking = {
-            rate: Filter(
-                np.concatenate([np.zeros(self._size), known]),
-                np.concatenate([np.full(self._size, rate / np.sqrt(WALK_FRAMES)), still]),
-            )
-            for rate in RATES
-        }
-        self._wrong = Filter(np.concatenate([np.ones(RIG), known]), np.zeros(RIG + len(known)))
+        self._fitting = Filter(known, np.zeros(0))
+        self._walking = {rate: Filter(known, np.full(self._size, rate / np.sqrt(WALK_FRAMES))) for rate in RATES}
+        self._wrong = Filter(np.concatenate([np.ones(RIG), known]), np.zeros(0))
         self._frames = 0
 
     @property
@@ -88,16 +124,26 @@ class Evidence:
         others = np.array([one.log_likelihood for one in (*self._walking.values(), self._wrong)])
         return float(np.logaddexp.reduce(others) - np.log(len(others)) - self._fitting.log_likelihood)
 
-    def step(self, rows: Rows, frames: int) -> None:
-        """See rows, so many frames after those before."""
-        self._frames += frames
+    def products(self, rows: Rows) -> Array:
+        """What ``step`` takes of b blocks: products (b, n, n) of their residuals and derivatives with each other."""
         by_start = rows.by_start * SIZES[:RIG]
-        known = np.hstack([by_start @ self._calibration, self._delay_std * rows.by_delay, rows.by_offsets])
-        by_drift = (rows.by_drift * SIZES)[:, : self._size]
-        self._fitting.step(rows.residuals, known, frames)
+        known = [by_start @ self._calibration, self._delay_std * rows.by_delay, rows.by_offsets]
+        by_drift = (rows.by_drift * SIZES)[..., : self._size]
+        every = np.concatenate([by_drift, by_start, *known, rows.residuals[..., None]], axis=-1)
+        return np.asarray(every.swapaxes(1, 2) @ every)
+
+    def step(self, products: Array, frames: int) -> None:
+        """See a block by its products (n, n), so many frames after those before."""
+        self._frames += frames
+        size, drifted = self._size, np.delete(np.arange(len(products) - 1), slice(self._size, self._size + RIG))
+
+        def see(one: Filter, columns: slice | NDArray[np.int_]) -> None:
+            one.step(products[columns][:, columns], products[columns, -1], float(products[-1, -1]), frames)
+
+        see(self._fitting, slice(size + RIG, -1))
+        see(self._wrong, slice(size, -1))
         for one in self._walking.values():
-            one.step(rows.residuals, np.hstack([by_drift, known]), frames)
-        self._wrong.step(rows.residuals, np.hstack([by_start, known]), frames)
+            see(one, drifted)
 
     @property
     def sensitivity(self) -> Array:
@@ -120,8 +166,8 @@ class Evidence:
 
 
 def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[Array, Array]:
-    """Information (d, d) and score (d,) that residuals gave about the first d unknowns, from what they are after it."""
-    if not filtered.covariance[:size, :size].any():  # nothing has been seen, and nothing has walked
-        return np.zeros((size, size)), np.zeros(size)
-    precise = np.linalg.inv(filtered.covariance[:size, :size])
-    return precise - np.eye(size) / prior_variance, precise @ filtered.mean[:size]
+    """Information (d, d) and score (d,) that residuals gave about the first d unknowns, beyond that of a prior."""
+    information, score = filtered.told_of(size)
+    if not information.any():  # nothing has been seen, and nothing has walked
+        return information, score
+    return information - np.eye(size) / prior_variance, score

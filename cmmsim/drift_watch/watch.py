@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from cmmsim.common_errors import MeasuringGeometry
@@ -12,7 +13,7 @@ from cmmsim.drift_watch.evidence import SIZES, Evidence
 from cmmsim.drift_watch.finding import Finding, movements, unseen_directions
 from cmmsim.errors import CmmError, LostError
 from cmmsim.geometry.known_rig import KnownRig
-from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.geometry.pose import Array, transforms_of
 from cmmsim.pose_estimation.consistency import consistent
 from cmmsim.pose_estimation.estimator import Measurement
 from cmmsim.pose_estimation.observation import Observer, StickerObservation
@@ -20,6 +21,7 @@ from cmmsim.radiometry.images import StereoImages
 
 CHANCE = 0.01  # of a false alarm in a run
 BLOCK = 6  # frames at most whose residuals are averaged before they count
+TOGETHER = 64  # blocks that are counted at once, so that a long run takes no more memory than a short one
 FEWEST = 4  # stickers of a frame that can say something
 TAUGHT_OFFSET_PX = 3e-4
 """What teaching and the image of a sticker leave of a centre, the same while it stands still."""
@@ -64,6 +66,7 @@ class DriftWatch:
         self._frames = self._counted = self._judged = 0
         self._platform: Sightings | None = None
         self._base: Sightings | None = None
+        self._blocks: list[_Block] = []
         self._largest = 0.0
         self._noticed: int | None = None
 
@@ -90,20 +93,16 @@ class DriftWatch:
         if not measurement.ok or len(measurement.target_ids) < FEWEST:
             return
         self._judged += 1
-        index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
-        if not self._goes_on(index, base):
+        if not self._goes_on(measurement, base):
             self._close()
-            self._platform = Sightings(index)
-            self._base = None if base is None or not self.watches_base else Sightings(base.index)
+            self._begin(measurement, base)
         assert self._platform is not None
-        move = self.geometry.camera_from_base @ pose_to_transform(measurement.pose)
-        pixels = np.stack([measurement.left_pixels, measurement.right_pixels])
-        places = self.geometry.taught.platform_places[index]
-        self._platform.add(time, move, self._residuals(pixels, move, places), measurement.pixel_variances)
+        move = self.geometry.camera_from_base @ transforms_of(measurement.pose)
+        pixels = measurement.left_pixels, measurement.right_pixels
+        self._platform.add(time, move, pixels, measurement.pixel_variances)
         if self._base is not None and base is not None:
-            pixels, at = np.stack([base.left_pixels, base.right_pixels]), self.geometry.camera_from_base
-            residuals = self._residuals(pixels, at, self.geometry.taught.base_places[base.index])
-            self._base.add(time, at, residuals, base.pixel_variances)
+            pixels = base.left_pixels, base.right_pixels
+            self._base.add(time, self.geometry.camera_from_base, pixels, base.pixel_variances)
         if len(self._platform.times) == BLOCK:
             self._close()
 
@@ -111,6 +110,7 @@ class DriftWatch:
     def finding(self) -> Finding:
         """What the frames since the last ``restart`` say."""
         self._close()
+        self._count()
         told = self._evidence.told
         moved, share = movements(told) if self._noticed is not None else ((), 0.0)
         return Finding(
@@ -127,35 +127,71 @@ class DriftWatch:
             unseen_directions(self._evidence.sensitivity),
         )
 
-    def _residuals(self, pixels: Array, camera_from_body: Array, places: Array) -> Array:
-        """Pixels (2, k, 2) less those that are expected of places (k, 3) in body axes."""
-        return np.asarray(pixels - self.geometry.rig.project(apply(camera_from_body, places))[0])
-
-    def _goes_on(self, index: NDArray[np.int_], base: StickerObservation | None) -> bool:
+    def _goes_on(self, measurement: Measurement, base: StickerObservation | None) -> bool:
         """Whether the same stickers are seen as in the frames that wait to be counted."""
-        if self._platform is None or not np.array_equal(self._platform.index, index):
+        if self._platform is None or not np.array_equal(self._platform_ids, measurement.target_ids):
             return False
         seen = None if base is None or not self.watches_base else base.index
         if self._base is None or seen is None:
             return self._base is None and seen is None
         return np.array_equal(self._base.index, seen)
 
+    def _begin(self, measurement: Measurement, base: StickerObservation | None) -> None:
+        """Have frames with these stickers wait to be counted."""
+        taught, self._platform_ids = self.geometry.taught, measurement.target_ids
+        index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
+        self._platform = Sightings(index, taught.platform_places[index])
+        watched = base is not None and self.watches_base
+        self._base = Sightings(base.index, taught.base_places[base.index]) if base is not None and watched else None
+
     def _close(self) -> None:
-        """Count the frames that wait. Matrices are small: a second thread of the BLAS takes ten times as long."""
+        """Have the frames that wait be a block."""
         if self._platform is None:
             return
-        with self._threads.limit(limits=1, user_api="blas"):
-            self._count(self._platform)
+        self._blocks.append(_Block(self._platform, self._base, self._frames))
         self._platform = self._base = None
-        self._counted = self._frames
-        ratio = self._evidence.log_ratio
-        self._largest = max(self._largest, ratio)
-        if self._noticed is None and ratio > -np.log(self.chance):
-            self._noticed = self._frames - 1
+        if len(self._blocks) == TOGETHER:
+            self._count()
 
-    def _count(self, platform: Sightings) -> None:
-        rows = [platform_rows(self.geometry, platform)]
-        if self._base is not None:
-            rows.append(base_rows(self.geometry, self._base))
-        stickers = len(self.geometry.taught.platform_places), len(self.geometry.taught.base_places)
-        self._evidence.step(stacked(rows, stickers[: 1 + self.watches_base]), self._frames - self._counted)
+    def _count(self) -> None:
+        """Count the blocks. Matrices are small: a second thread of the BLAS takes ten times as long."""
+        with self._threads.limit(limits=1, user_api="blas"):
+            for block, products in zip(self._blocks, self._products(), strict=True):
+                self._evidence.step(products, block.end - self._counted)
+                self._counted, ratio = block.end, self._evidence.log_ratio
+                self._largest = max(self._largest, ratio)
+                if self._noticed is None and ratio > -np.log(self.chance):
+                    self._noticed = block.end - 1
+        self._blocks.clear()
+
+    def _products(self) -> list[Array]:
+        """Of each block, as the evidence takes them; those with the same stickers together."""
+        alike: dict[tuple[bytes, bytes | None], list[int]] = {}
+        for number, block in enumerate(self._blocks):
+            alike.setdefault(block.stickers, []).append(number)
+        found: dict[int, Array] = {}
+        taught = self.geometry.taught
+        centres = len(taught.platform_places), len(taught.base_places)
+        for numbers in alike.values():
+            rows = [platform_rows(self.geometry, [self._blocks[number].platform for number in numbers])]
+            bases = [base for number in numbers if (base := self._blocks[number].base) is not None]
+            if bases:
+                rows.append(base_rows(self.geometry, bases))
+            products = self._evidence.products(stacked(rows, centres[: 1 + self.watches_base]))
+            found |= dict(zip(numbers, products, strict=True))
+        return [found[number] for number in range(len(self._blocks))]
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Frames with the same stickers: what was seen of the platform, and of the base where somebody watched it; end: how
+    many frames of the run had passed."""
+
+    platform: Sightings
+    base: Sightings | None
+    end: int
+
+    @property
+    def stickers(self) -> tuple[bytes, bytes | None]:
+        """Says which they are."""
+        return self.platform.index.tobytes(), None if self.base is None else self.base.index.tobytes()

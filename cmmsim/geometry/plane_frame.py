@@ -20,8 +20,8 @@ FEWEST_STICKERS = 3
 
 @dataclass(frozen=True)
 class FittedPlane:
-    """A plane, or several of them (...): normal (..., 3) unit; offset (...) d, m; tangents (..., 3, 2); covariance (...,
-    3, 3) of [turn about each tangent..., d]: the normal moves by tangents @ parameters[:2]."""
+    """A plane, or several (...): normal (..., 3) unit; offset (...) d, m; tangents (..., 3, 2); covariance (..., 3, 3)
+    of [turn about each tangent..., d]: the normal moves by tangents @ parameters[:2]."""
 
     normal: Array
     offset: Array

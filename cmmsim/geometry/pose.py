@@ -39,7 +39,9 @@ def pose_to_transform(pose: ArrayLike) -> Array:
 
 def transforms_of(poses: Array) -> Array:
     """Transforms (..., 4, 4) of poses (..., 6)."""
-    (ca, cb, cg), (sa, sb, sg) = (np.moveaxis(f(poses[..., 3:]), -1, 0) for f in (np.cos, np.sin))
+    cosines, sines = np.cos(poses[..., 3:]), np.sin(poses[..., 3:])
+    ca, cb, cg = cosines[..., 0], cosines[..., 1], cosines[..., 2]
+    sa, sb, sg = sines[..., 0], sines[..., 1], sines[..., 2]
     transforms = np.zeros((*poses.shape[:-1], 4, 4))
     transforms[..., 0, 0], transforms[..., 0, 1], transforms[..., 0, 2] = cb * cg, -cb * sg, sb
     transforms[..., 1, 0], transforms[..., 1, 1] = ca * sg + sa * sb * cg, ca * cg - sa * sb * sg
@@ -70,9 +72,10 @@ def all_rigid(transforms: Array) -> bool:
     turns = transforms[:, :3, :3]
     errors = np.abs(turns.swapaxes(1, 2) @ turns - np.eye(3)).max(initial=0.0)
     last = np.abs(transforms[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
-    return bool(
-        errors <= RIGID and last <= RIGID and np.isfinite(transforms).all() and (np.linalg.det(turns) > 0.0).all()
-    )
+    if not (errors <= RIGID and last <= RIGID and np.isfinite(transforms).all()):
+        return False
+    (a, b, c), (d, e, f), (g, h, i) = turns.transpose(1, 2, 0)
+    return bool((a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)).min(initial=1.0) > 0.0)
 
 
 def transform_to_pose(transform: ArrayLike) -> Array:
@@ -108,14 +111,15 @@ def apply(transform: Array, points: Array) -> Array:
 
 
 def apply_each(transforms: Array, points: Array) -> Array:
-    """Points (n,3), or a set of them for each (..., n, 3), carried by each of the transforms (..., 4,4): (..., n, 3)."""
+    """Points (..., n, 3): points (n,3), or a set of them for each (..., n, 3), carried by each of the transforms (...,
+    4, 4)."""
     return np.asarray(points @ transforms[..., :3, :3].swapaxes(-1, -2) + transforms[..., None, :3, 3])
 
 
 def skew(vectors: Array) -> Array:
     """Cross product matrices (..., 3, 3) of vectors (..., 3)."""
     result = np.zeros((*vectors.shape, 3))
-    x, y, z = np.moveaxis(vectors, -1, 0)
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
     result[..., 1, 0], result[..., 2, 0], result[..., 2, 1] = z, -y, x
     return result

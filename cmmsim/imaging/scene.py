@@ -166,8 +166,8 @@ def rod_transforms(starts: Array, ends: Array) -> Array:
 
 def _crossed(first: Array, second: Array) -> Array:
     """Cross products (k,3) of vectors (k,3); numpy.cross takes ten times as long for a dozen."""
-    after, before = [1, 2, 0], [2, 0, 1]
-    return first[:, after] * second[:, before] - first[:, before] * second[:, after]
+    (a, b, c), (x, y, z) = first.T, second.T
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
 
 
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:

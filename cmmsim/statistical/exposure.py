@@ -18,7 +18,7 @@ from cmmsim.detection.ellipse_fit import EllipseFits, fit_settings, lies_inside
 from cmmsim.errors import CmmError
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import SHAPE_BASIS, bending, project_discs, symmetric_root
-from cmmsim.geometry.pose import Array, pose_to_transform, rigid
+from cmmsim.geometry.pose import Array, frozen, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.exposure import Quality
 from cmmsim.imaging.renderer import Renderer
@@ -40,6 +40,8 @@ def refuse_images(*_: object, **__: object) -> NoReturn:
 
 
 STATISTICAL = Renderer(NAME, refuse_images)
+HERE, ABSENT = frozen(np.eye(4)), frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
+"""base_from_body (4,4) of the base itself, and of a body without a place: far below."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +81,15 @@ class StatisticalStereoCamera:
         the end of the left camera's exposure, then of the right one's."""
         rates = np.zeros_like(poses) if rates is None else rates
         half, lag = 0.5 * self.exposure * rates, self.right_later * rates
-        return np.stack([poses + later + share for later in (0.0, lag) for share in (0.0, -half, half)], axis=1)
+        found = np.empty((len(poses), 6, 6))
+        for side, middle in enumerate((poses, poses + lag)):
+            for k, share in enumerate((0.0, -half, half)):
+                found[:, 3 * side + k] = middle + share
+        return found
 
     def placed(self, obstacles: Mapping[str, Array]) -> Array:
         """base_from_body (b,4,4) of the base and of all obstacles; those without a place lie far below."""
-        absent = rigid(np.eye(3), (0.0, 0.0, -1e3))
-        return np.stack([np.eye(4), *(obstacles.get(name, absent) for name in self.obstacle_names)])
+        return np.array([HERE, *(obstacles.get(name, ABSENT) for name in self.obstacle_names)])
 
     def centre_error_px(self, quality: Quality) -> float:
         """What drawing leaves in a sticker's centre: nothing is drawn."""
@@ -151,15 +156,18 @@ class DrawnStickers:
         shapes: list[Array] = []
         smears: list[Array] = []
         seen: list[NDArray[np.bool_]] = []
+        places = transforms_of(self.exposed)
         for side, (lens, from_base) in enumerate(zip(camera.rig.cameras, camera.from_base, strict=True)):
             middle, first, last = (
-                from_base @ np.stack([pose_to_transform(pose), *self.bodies])
-                for pose in self.exposed[3 * side : 3 * side + 3]
+                from_base @ np.concatenate([place[None], self.bodies]) for place in places[3 * side : 3 * side + 3]
             )
             at, shape, whole = camera.side(lens, middle)
             centres.append(at)
             shapes.append(shape)
             seen.append(whole)
+            if np.array_equal(first, last):
+                smears.append(np.zeros(at.shape))
+                continue
             ends = (lens.project(camera.scene.placed(moves)[0])[0] for moves in (last, first))
             smears.append(np.asarray(np.subtract(*ends)))
         require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))

@@ -49,6 +49,7 @@ class StatisticalTracker:
             raise CmmError(f"poses are measured without images by registration only, not by {estimator.method}")
         self._estimator = estimator
         self._camera: StatisticalStereoCamera | None = None
+        self._one = self._frame()  # what is found in a frame, overwritten by the next
 
     def forget(self) -> None:
         """There is nothing to be forgotten."""
@@ -60,7 +61,7 @@ class StatisticalTracker:
         """Measure one frame, such as ``sensor.look`` returns; raises CmmError for images."""
         if not isinstance(exposure, DrawnStickers):
             raise CmmError("a sensor without images measures what its own look() returns; images go to measure_frame")
-        frame, found, spread = self._frame(), np.empty(6), np.empty((6, 6))
+        frame, found, spread = self._one, np.empty(6), np.empty((6, 6))
         noise, kept = self._draws(exposure.rng, 1)
         eyes = self._eyes_of(exposure.camera)
         state = measure_frame(eyes, exposure.exposed, exposure.bodies, noise[0], kept[0], frame, found, spread)

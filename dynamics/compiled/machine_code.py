@@ -35,16 +35,19 @@ class MachineFunction:
     def __call__(self, *batches: np.ndarray) -> list[np.ndarray]:
         """All outputs (N, rows, columns) over batches (N or 1, columns) of the arguments, NaN included."""
         count = max((len(batch) for batch in batches if len(batch) != 1), default=1)
-        given = np.empty((count, sum(self.inputs)))
         if len(self.constants):
             batches = (*batches, self.constants[None])
-        for batch, size, end in zip(batches, self.inputs, np.cumsum(self.inputs), strict=True):
-            given[:, end - size : end] = batch
-        sizes = [rows * columns for rows, columns in self.outputs]
-        found = np.empty((count, sum(sizes)))
+        given, end = np.empty((count, sum(self.inputs))), 0
+        for batch, size in zip(batches, self.inputs, strict=True):
+            given[:, end : end + size] = batch
+            end += size
+        found = np.empty((count, sum(rows * columns for rows, columns in self.outputs)))
         self.over_rows(count, given.ctypes.data, found.ctypes.data)
-        parts = np.split(found, np.cumsum(sizes)[:-1], axis=1)
-        return [part.reshape(count, *shape) for part, shape in zip(parts, self.outputs, strict=True)]
+        parts, end = [], 0
+        for rows, columns in self.outputs:
+            parts.append(found[:, end : end + rows * columns].reshape(count, rows, columns))
+            end += rows * columns
+        return parts
 
     def bound_to(self, inputs: np.ndarray, outputs: np.ndarray) -> Callable[[], None]:
         """The code for one set of inputs, with the constants, and outputs as a function without arguments; the caller

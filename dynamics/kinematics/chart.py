@@ -66,4 +66,6 @@ class Chart:
     def forbidden(self, pose: ArrayLike) -> np.ndarray:
         """How far poses (N, 6) are from those that the platform can take, in each entry, m and rad."""
         values = np.asarray(pose, dtype=float)
+        if len(self.freedoms) == len(POSE_NAMES):
+            return np.zeros(values.shape)
         return values - self.pose(self.coordinates(values))
