@@ -30,6 +30,10 @@ class Part(NamedTuple):
     last: bool
 
 
+BASE = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
+"""Where the base itself is: origin, axes, spin."""
+
+
 @dataclass(frozen=True)
 class Frames:
     """Where parts are: origin (parts, 3), the joint to the part before, m; axes (parts, 3, 3) as columns and angular
@@ -70,11 +74,11 @@ class Parts:
         """
         robot.check_reach(pose)
         moving = np.zeros(6) if twist is None else twist
-        found = robot.functions["placements"](pose[None], moving[None])[0][0][self._rows]
-        axes, spin = found[:, 3:12].reshape(-1, 3, 3), found[:, 12:]
-        axes, spin = np.concatenate([axes, np.eye(3)[None]]), np.concatenate([spin, np.zeros((1, 3))])
-        shift = (axes[self._before] @ self._offset[..., None] - axes[:-1] @ self._centre[..., None])[..., 0]
-        return Frames(np.concatenate([found[:, :3] + shift, np.zeros((1, 3))]), axes, spin)
+        found = np.empty((len(self.all) + 1, 15))
+        found[:-1], found[-1] = robot.functions["placements"](pose[None], moving[None])[0][0][self._rows], BASE
+        axes, origin = found[:, 3:12].reshape(-1, 3, 3), found[:, :3]
+        origin[:-1] += (axes[self._before] @ self._offset[..., None] - axes[:-1] @ self._centre[..., None])[..., 0]
+        return Frames(origin, axes, found[:, 12:])
 
     def rods(self, robot: Robot, pose: np.ndarray) -> np.ndarray:
         """Ends (parts, 2, 3) of what is drawn of each part, base axes, m. Raises as `frames`."""

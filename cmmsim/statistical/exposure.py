@@ -83,8 +83,8 @@ class StatisticalStereoCamera:
         half, lag = 0.5 * self.exposure * rates, self.right_later * rates
         found = np.empty((len(poses), 6, 6))
         for side, middle in enumerate((poses, poses + lag)):
-            for k, share in enumerate((0.0, -half, half)):
-                found[:, 3 * side + k] = middle + share
+            for k, sign in enumerate((0.0, -1.0, 1.0)):
+                found[:, 3 * side + k] = middle + sign * half
         return found
 
     def placed(self, obstacles: Mapping[str, Array]) -> Array:
