@@ -19,17 +19,18 @@ def floats(name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeEr
 
     Raises `error`, which names the array with what was got, or with the place of an entry that is not finite.
     """
-    wanted = " or ".join(_shape_text(shape) for shape in shapes)
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
-        raise error(f"{name} must be numbers of shape {wanted}, got {shown(value)}") from None
+        raise error(f"{name} must be numbers of shape {_shapes_text(shapes)}, got {shown(value)}") from None
     if np.ma.is_masked(value):
-        raise error(f"{name} must be numbers of shape {wanted}, got masked entries")
+        raise error(f"{name} must be numbers of shape {_shapes_text(shapes)}, got masked entries")
     if array.dtype.kind not in "iuf":
-        raise error(f"{name} must be numbers of shape {wanted}, got {shown(value)} (dtype {array.dtype})")
+        raise error(
+            f"{name} must be numbers of shape {_shapes_text(shapes)}, got {shown(value)} (dtype {array.dtype})"
+        )
     if not any(_fits(array.shape, shape) for shape in shapes):
-        raise error(f"{name} must have shape {wanted}, got {array.shape}")
+        raise error(f"{name} must have shape {_shapes_text(shapes)}, got {array.shape}")
     array = array.astype(float, copy=False)
     if finite and not np.isfinite(array).all():
         place = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
@@ -120,5 +121,5 @@ def _fits(shape: tuple[int, ...], wanted: Shape) -> bool:
     return len(shape) == len(wanted) and all(want in ("N", got) for got, want in pairs)
 
 
-def _shape_text(shape: Shape) -> str:
-    return f"({shape[0]},)" if len(shape) == 1 else f"({', '.join(map(str, shape))})"
+def _shapes_text(shapes: Sequence[Shape]) -> str:
+    return " or ".join(f"({one[0]},)" if len(one) == 1 else f"({', '.join(map(str, one))})" for one in shapes)
