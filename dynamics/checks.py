@@ -26,9 +26,7 @@ def floats(name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeEr
     if np.ma.is_masked(value):
         raise error(f"{name} must be numbers of shape {_shapes_text(shapes)}, got masked entries")
     if array.dtype.kind not in "iuf":
-        raise error(
-            f"{name} must be numbers of shape {_shapes_text(shapes)}, got {shown(value)} (dtype {array.dtype})"
-        )
+        raise error(f"{name} must be numbers of shape {_shapes_text(shapes)}, got {shown(value)} (dtype {array.dtype})")
     if not any(_fits(array.shape, shape) for shape in shapes):
         raise error(f"{name} must have shape {_shapes_text(shapes)}, got {array.shape}")
     array = array.astype(float, copy=False)

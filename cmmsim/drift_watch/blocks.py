@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.common_errors import MeasuringGeometry
-from cmmsim.geometry.pose import Array, apply, apply_each, skew
+from cmmsim.geometry.pose import Array, apply, apply_each, skew, transforms_of
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 
 PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
@@ -42,27 +43,34 @@ class Rows:
 
 @dataclass
 class Sightings:
-    """The same stickers of a body in some frames, a block: index (k,) of them, and their places (k, 3) in body axes; of
-    each frame its time s, camera_from_body (4,4), pixels (2, k, 2) and their variances (k,) px²."""
+    """The same stickers of a body in some frames, a block: index (k,) of them, their places (k, 3) in body axes;
+    camera_from_base (4,4); of each frame its time s, base_from_body as a pose (6,), pixels (2, k, 2) and their
+    variances (k,) px²."""
 
     index: NDArray[np.int_]
     places: Array
+    camera_from_base: Array
     times: list[float] = field(default_factory=list)
-    moves: list[Array] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
     pixels: list[Array] = field(default_factory=list)
     variances: list[Array] = field(default_factory=list)
 
-    def add(self, time: float, camera_from_body: Array, pixels: tuple[Array, Array], variances: Array) -> None:
+    def add(self, time: float, pose: Array, pixels: tuple[Array, Array], variances: Array) -> None:
         """One more frame."""
         self.times.append(time)
-        self.moves.append(camera_from_body)
+        self.poses.append(pose)
         self.pixels.append(np.array(pixels))
         self.variances.append(variances)
+
+    @cached_property
+    def moves(self) -> Array:
+        """camera_from_body (f,4,4) of all frames, once there are no more."""
+        return np.asarray(self.camera_from_base @ transforms_of(np.array(self.poses)))
 
     @property
     def middle(self) -> Array:
         """camera_from_body (4,4) half way."""
-        return self.moves[len(self.moves) // 2]
+        return np.asarray(self.moves[len(self.moves) // 2])
 
     @property
     def velocities(self) -> Array:
@@ -141,7 +149,7 @@ def _whitened(rig: StereoRig, blocks: Sequence[Sightings]) -> tuple[Array, Array
     """Means (b, 4k) of pixels less those expected, in units of their standard deviations; and the roots (b, k) of their
     weights."""
     weights = 1.0 / (np.array([each for seen in blocks for each in seen.variances]) + SMALLEST_STD_PX**2)
-    moves = np.array([move for seen in blocks for move in seen.moves])
+    moves = np.concatenate([seen.moves for seen in blocks])
     pixels = np.array([each for seen in blocks for each in seen.pixels]).swapaxes(0, 1)
     residuals = pixels - rig.project(apply_each(moves, blocks[0].places))[0]
     starts = np.cumsum([0, *(len(seen.times) for seen in blocks)])[:-1]

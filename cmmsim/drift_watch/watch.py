@@ -13,7 +13,7 @@ from cmmsim.drift_watch.evidence import SIZES, Evidence
 from cmmsim.drift_watch.finding import Finding, movements, unseen_directions
 from cmmsim.errors import CmmError, LostError
 from cmmsim.geometry.known_rig import KnownRig
-from cmmsim.geometry.pose import Array, transforms_of
+from cmmsim.geometry.pose import Array
 from cmmsim.pose_estimation.consistency import consistent
 from cmmsim.pose_estimation.estimator import Measurement
 from cmmsim.pose_estimation.observation import Observer, StickerObservation
@@ -97,12 +97,11 @@ class DriftWatch:
             self._close()
             self._begin(measurement, base)
         assert self._platform is not None
-        move = self.geometry.camera_from_base @ transforms_of(measurement.pose)
         pixels = measurement.left_pixels, measurement.right_pixels
-        self._platform.add(time, move, pixels, measurement.pixel_variances)
+        self._platform.add(time, measurement.pose, pixels, measurement.pixel_variances)
         if self._base is not None and base is not None:
             pixels = base.left_pixels, base.right_pixels
-            self._base.add(time, self.geometry.camera_from_base, pixels, base.pixel_variances)
+            self._base.add(time, np.zeros(6), pixels, base.pixel_variances)
         if len(self._platform.times) == BLOCK:
             self._close()
 
@@ -140,9 +139,10 @@ class DriftWatch:
         """Have frames with these stickers wait to be counted."""
         taught, self._platform_ids = self.geometry.taught, measurement.target_ids
         index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
-        self._platform = Sightings(index, taught.platform_places[index])
-        watched = base is not None and self.watches_base
-        self._base = Sightings(base.index, taught.base_places[base.index]) if base is not None and watched else None
+        camera_from_base = self.geometry.camera_from_base
+        self._platform, self._base = Sightings(index, taught.platform_places[index], camera_from_base), None
+        if base is not None and self.watches_base:
+            self._base = Sightings(base.index, taught.base_places[base.index], camera_from_base)
 
     def _close(self) -> None:
         """Have the frames that wait be a block."""
