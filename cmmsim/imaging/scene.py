@@ -146,32 +146,17 @@ def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
 
 def rod_transforms(starts: Array, ends: Array) -> Array:
     """As ``rod_transform`` of k rods at once: (k,4,4) of starts and ends (k,3). Raises CmmError for one too short."""
-    along = ends - starts
-    lengths = np.sqrt(_squares(along))
+    from cmmsim.imaging.view_kernels import place_rods  # compiles, so it is loaded where it is first needed
+
+    transforms, lengths = np.zeros((len(starts), 4, 4)), np.empty(len(starts))
+    place_rods(np.ascontiguousarray(starts), np.ascontiguousarray(ends), transforms, lengths)
     if not lengths.min(initial=np.inf) >= SHORTEST_ROD:
         k = np.flatnonzero(~(lengths >= SHORTEST_ROD))[0]
         raise CmmError(
             f"a rod of {lengths[k]:g} m from {starts[k].tolist()} m points nowhere, at least {SHORTEST_ROD:g} m is "
             "needed"
         )
-    z = along / lengths[:, None]
-    aside = _crossed(z, np.eye(3)[np.abs(z).argmin(axis=1)])
-    x = aside / np.sqrt(_squares(aside))[:, None]
-    transforms = np.zeros((len(z), 4, 4))
-    transforms[:, :3, 0], transforms[:, :3, 1], transforms[:, :3, 2] = x, _crossed(z, x), z
-    transforms[:, :3, 3], transforms[:, 3, 3] = starts, 1.0
     return transforms
-
-
-def _squares(vectors: Array) -> Array:
-    """Squared lengths (k,) of vectors (k,3)."""
-    return np.asarray(np.einsum("ki,ki->k", vectors, vectors))
-
-
-def _crossed(first: Array, second: Array) -> Array:
-    """Cross products (k,3) of vectors (k,3); numpy.cross takes ten times as long for a dozen."""
-    (a, b, c), (x, y, z) = first.T, second.T
-    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
 
 
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,29 @@ class Scene(NamedTuple):
     face_normals: Array
     face_offsets: Array
     face_starts: Array
+
+
+@compiled
+def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) -> None:
+    """Fill base_from_body (k,4,4), zero before, of rods from starts (k,3) to ends (k,3) along their z axes, and their
+    lengths (k,); x is across z and the axis that is farthest from it."""
+    for k in range(len(starts)):
+        move, squared, aside = transforms[k], 0.0, 0
+        for i in range(3):
+            move[i, 2] = ends[k, i] - starts[k, i]
+            move[i, 3] = starts[k, i]
+            squared += move[i, 2] ** 2
+        lengths[k] = math.sqrt(squared)
+        for i in range(3):
+            move[i, 2] /= lengths[k]
+            aside = i if abs(move[i, 2]) < abs(move[aside, 2]) else aside
+        after, before = (aside + 1) % 3, (aside + 2) % 3
+        across = math.sqrt(move[after, 2] ** 2 + move[before, 2] ** 2)
+        move[after, 0], move[before, 0] = move[before, 2] / across, -move[after, 2] / across
+        for i in range(3):
+            j, m = (i + 1) % 3, (i + 2) % 3
+            move[i, 1] = move[j, 2] * move[m, 0] - move[m, 2] * move[j, 0]
+        move[3, 3] = 1.0
 
 
 @compiled
