@@ -42,8 +42,13 @@ class SilentProgress:
         yield lambda n=1: None
 
 
+LINE_S = 60.0
+"""How often a stage with a rate says where it is when not on a terminal, seconds."""
+
+
 class RichProgress:
-    """Bars with elapsed time and time left; a plain line for each finished stage when not on a terminal."""
+    """Bars with elapsed time and time left; when not on a terminal, a plain line for each finished stage, and for one
+    with a rate also once a minute while it lasts."""
 
     def __init__(self, console: Console | None = None, rate: str = "") -> None:
         """``rate``: unit of the steps' rate, such as rows/s; empty shows none."""
@@ -70,17 +75,23 @@ class RichProgress:
 
     @contextmanager
     def _line(self, name: str, total: int) -> Iterator[Advance]:
-        done = 0
+        done, start = 0, time.perf_counter()
+        said = start
+
+        def say() -> None:
+            seconds = time.perf_counter() - start
+            rate = f", {done / seconds:.3g} {self._rate}" if self._rate else ""
+            self._console.print(f"{name}: {done} of {total} in {seconds:.1f} s{rate}", highlight=False, soft_wrap=True)
 
         def advance(n: int = 1) -> None:
-            nonlocal done
+            nonlocal done, said
             done += n
+            if self._rate and done < total and time.perf_counter() > said + LINE_S:
+                said = time.perf_counter()
+                say()
 
-        start = time.perf_counter()
         yield advance
-        seconds = time.perf_counter() - start
-        rate = f", {done / seconds:.3g} {self._rate}" if self._rate else ""
-        self._console.print(f"{name}: {done} of {total} in {seconds:.1f} s{rate}", highlight=False, soft_wrap=True)
+        say()
 
 
 def terminal_progress(quiet: bool, rate: str = "") -> Progress:

@@ -135,7 +135,7 @@ def study(
     count = cores() if workers is None else workers
     if scheduler is None:
         check_memory(chosen, max(count, 1))
-    others = [rows_beside(chosen, other) for other in beside or ()]
+    others = rows_beside(chosen, beside or ())
     folder = out or Path("runs") / f"study-{chosen.name}"
     try:
         progress, so_far = terminal_progress(quiet, rate="rows/s"), partial(_summary, chosen, folder, figures=False)
@@ -173,7 +173,8 @@ def _say(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
         typer.echo(_law_line(law))
     again = f", {outcome.found} of them from before" if outcome.found else ""
     again += f" ({outcome.beyond} more, of further repeats, are kept)" if outcome.beyond else ""
-    typer.echo(f"{outcome.rows} rows{again}; summary.md, figures and study.parquet: {folder}")
+    figures = ", figures" if (folder / "figures").is_dir() else ""
+    typer.echo(f"{outcome.rows} rows{again}; summary.md{figures} and study.parquet: {folder}")
 
 
 def _judge(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:

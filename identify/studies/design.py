@@ -17,9 +17,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
+from cmmsim import CmmError, Sensor
 from cmmsim.files import SensorFile
 from identify.errors import ScenarioError, StudyError
-from identify.experiment.sensor_in_loop import with_renderer
+from identify.experiment.sensor_in_loop import sensor_file, with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
 from identify.studies.rows import KINDS, find_kind
@@ -142,7 +143,8 @@ def prepare(study: Study) -> Setup:
     The first row is checked as a whole. Values that contradict each other only in other rows are errors of these.
 
     Raises StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid ones; a wrong value; a
-    key that the kind's rows do not read. Raises ScenarioError: no such scenario, or changes that contradict it.
+    key that the kind's rows do not read; a sensor that the statistical renderer was not proved for. Raises
+    ScenarioError: no such scenario, or changes that contradict it.
     """
     kind = find_kind(study.kind)
     kind.checked(study.options)
@@ -156,6 +158,8 @@ def prepare(study: Study) -> Setup:
     row_scenario, row_options = setup.row_scenario(first), kind.checked(setup.row_options(first))
     if kind.reads is not None:
         check_read(study, kind.reads, row_scenario, row_options)
+    if getattr(row_options, "sensor", "images") == "images":
+        _check_proved(row_scenario)
     for name in study.figures or [] if kind.columns else []:
         if name not in kind.columns:
             raise StudyError(f"figures has {name!r}, no figure of {study.kind}; {_nearest(name, kind.columns)}")
@@ -165,6 +169,16 @@ def prepare(study: Study) -> Setup:
         except StudyError as error:
             raise StudyError(f"[[theory]] {place}: {error}") from error
     return setup
+
+
+def _check_proved(scenario: Scenario) -> None:
+    """Refuse a sensor for which frames without images were not proved, where the scenario's have none."""
+    if scenario.renderer != "statistical":
+        return
+    try:
+        _ = Sensor(sensor_file(scenario), renderer=scenario.renderer).camera
+    except CmmError as error:
+        raise StudyError(f"the first row's sensor: {error}") from error
 
 
 def _check_keys(study: Study, kind: Kind) -> None:

@@ -76,11 +76,13 @@ def draw(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdi
 
 
 def draw_side_by_side(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], others: Others) -> None:
-    """Write the figures against each factor with the finished rows of other studies, by their names, beside them."""
+    """Write the figures against each factor, or against the studies where they vary nothing, with the finished rows of
+    other studies, by their names, beside them."""
     names, tables = zip((study.name, done), *others, strict=True)
     together = pd.concat([table.assign(study=name) for name, table in zip(names, tables, strict=True)])
     named = study.model_copy(update={"factors": study.factors | {"study": list(names)}})
-    _write(folder, ((f"side_by_side_{path}", factor_figure(named, together, path, shown)) for path in study.factors))
+    paths = list(study.factors) or ["study"]
+    _write(folder, ((f"side_by_side_{path}", factor_figure(named, together, path, shown)) for path in paths))
 
 
 def _write(folder: Path, figures: Iterable[tuple[str, Figure]]) -> None:

@@ -98,17 +98,31 @@ def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
     return pd.read_parquet(path), Study.model_validate(entry["study"])
 
 
-def rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
-    """Name and finished rows of another study, of its folder, to be shown beside those of a study.
+def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.DataFrame]]:
+    """Names and finished rows of other studies, of their folders, to be shown beside those of a study.
 
-    Raises StudyError: no table there, or rows of another kind or with other factors.
+    A name that is taken gives way to that of the folder, and that to its path. Raises StudyError: no table there, rows
+    of another kind or with other factors, or a folder named twice.
     """
+    found: dict[str, pd.DataFrame] = {}
+    for folder in folders:
+        own, rows = _rows_beside(study, folder)
+        names = [name for name in (own, folder.name, str(folder.resolve())) if name not in (study.name, *found)]
+        if not names:
+            raise StudyError(f"{folder} is to stand beside this study twice")
+        found[names[0]] = rows
+    return list(found.items())
+
+
+def _rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
+    """Name and finished rows of one."""
     frame, other = read_table(folder / TABLE)
     if other.kind != study.kind or set(other.factors) != set(study.factors):
-        ours, theirs = (f"rows of kind {one.kind!r} by {', '.join(one.factors)}" for one in (study, other))
+        ours, theirs = (
+            f"rows of kind {one.kind!r} by {', '.join(one.factors) or 'no factor'}" for one in (study, other)
+        )
         raise StudyError(f"{folder} has {theirs}, and this study {ours}: they cannot stand side by side")
-    label = other.name if other.name != study.name else folder.name
-    return label, frame[frame["error"] == ""]
+    return other.name, frame[frame["error"] == ""]
 
 
 def study_in(path: Path) -> dict[str, Any] | None:

@@ -166,6 +166,11 @@ def test_another_study_is_drawn_beside_one_and_refused_where_it_has_other_factor
     drawn = Path("runs/study-mine/figures/side_by_side_sensor.camera.dark_noise.svg").read_text()
     assert "study mine" in drawn
     assert "study other" in drawn
+    plain = ("--set", "sensor.camera.dark_noise=8.0", "--workers", 0, "--quiet", "--out")
+    for folder, beside in (("mine", ()), ("one", ()), ("two", ("--beside", "one", "--beside", "mine"))):
+        assert command("study", mine, *plain, folder, *beside) == 0
+    drawn = Path("two/figures/side_by_side_study.svg").read_text()  # against the studies: they vary nothing
+    assert all(name in drawn for name in (">mine<", ">one<", "/mine<"))  # three studies of one name
     capsys.readouterr()
     levels = "sensor.rig.baseline=[0.5,1.0]"
     assert command("study", mine, "--workers", 0, "--set", levels, "--out", "new", "--beside", "other") == 1

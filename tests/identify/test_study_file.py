@@ -140,6 +140,10 @@ def test_study_files_that_contradict_themselves_are_refused(text, evidence):
         ({"kind": "static_pose", "options": {"capturs": 4}}, ["unknown key 'capturs'; valid names: poses, captures"]),
         ({"kind": "static_pose", "factors": {"options.captures": ["many"]}}, ["options.captures = 'many'"]),
         ({"kind": "path_pose", "factors": {"options.zz": [4]}}, ["'options.zz'", "stretch_s, options.teaching"]),
+        (
+            {"kind": "static_pose", "changes": {"scenario.renderer": "statistical", "sensor.lens.psf_px": 2.0}},
+            ["first row", "not proved for lens.psf_px 2", "at most 1", "analytic or pyrender"],
+        ),
         ({"kind": f"{__name__}:wrong_row"}, ["wrong_row' takes (scenario);", "(scenario, seed) or (scenario, seed, "]),
         ({"kind": f"{__name__}:plain_row", "options": {"odd": 1}}, ["plain_row' takes no options, got odd"]),
     ],
