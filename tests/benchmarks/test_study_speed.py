@@ -32,6 +32,7 @@ pytestmark = pytest.mark.thorough
 SECOND_CORE = 1.8
 OVERHEAD = 0.4  # of the time of `plain_work`
 SENSOR_ROWS = 10_000
+IDENTIFICATIONS = 30
 
 FLAT_EMPTY_ROWS, FLAT_SENSOR_ROWS, FLAT_MB = 10_000, 600, 20.0
 """Of sensor rows fewer will do: one that kept its pictures, or its sensor, would keep a megabyte or more."""
@@ -94,6 +95,14 @@ def rows_of_five_poses(rows):
     return study.model_copy(update={"options": {**study.options, "poses": 5}})
 
 
+def identifications(rows):
+    """Whole experiments with the scenario `quick`: teaching, record, identification with intervals, unseen motions."""
+    changes, options = {"scenario.renderer": "statistical"}, {"sensor": "images"}
+    return Study(
+        name="identifications", kind="identification", scenario="quick", changes=changes, options=options, repeats=rows
+    )
+
+
 def test_second_core(one_core, two_cores, run, record_property):
     """The fastest of up to three rounds, which end where the goal is reached or the second core is not whole."""
     study = rows_of_five_poses(100)
@@ -137,9 +146,29 @@ def test_rate_of_sensor_rows(two_cores, run, record_property):
 
 
 @pytest.mark.parametrize(
+    ("study", "rows", "minutes"),
+    [(identifications(IDENTIFICATIONS), 1000, 20.0), (load_study("estimators"), 200, 15.0)],
+    ids=["identifications", "leaderboard"],
+)
+def test_a_study_of_whole_experiments_is_done_before_lunch(two_cores, run, record_property, study, rows, minutes):
+    """A thousand identifications, and nine estimators on two hundred records, by the rate of some of their rows."""
+    run(two_cores, study.model_copy(update={"repeats": 6}))
+    some = study.model_copy(update={"repeats": IDENTIFICATIONS})
+    with OtherLoad() as load:
+        taken = seconds(lambda: run(two_cores, some)) / some.rows * rows / 60.0
+    record_property("rows_per_second", rows / (60.0 * taken))
+    record_property("minutes", taken)
+    judge(taken <= minutes, f"{rows} rows of {study.kind} in {taken:.1f} minutes, goal {minutes:g}", load)
+
+
+@pytest.mark.parametrize(
     ("study", "warm"),
-    [(empty_rows(FLAT_EMPTY_ROWS), empty_rows(40)), (rows_of_many_sensors(FLAT_SENSOR_ROWS), rows_of_many_sensors(80))],
-    ids=["empty", "sensors"],
+    [
+        (empty_rows(FLAT_EMPTY_ROWS), empty_rows(40)),
+        (rows_of_many_sensors(FLAT_SENSOR_ROWS), rows_of_many_sensors(80)),
+        (identifications(2 * IDENTIFICATIONS), identifications(10)),
+    ],
+    ids=["empty", "sensors", "identifications"],
 )
 def test_memory_is_flat(two_cores, run, record_property, study, warm):
     """From the first fifth of the rows to the last: of this process, and of the largest worker."""
