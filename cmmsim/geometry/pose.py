@@ -27,6 +27,9 @@ def frozen(values: ArrayLike) -> Array:
     return array
 
 
+IDENTITY = frozen(np.eye(4))
+
+
 def checked_pose(pose: ArrayLike) -> Array:
     """The pose (6,) as an array of its own. Raises ShapeError when it is not six finite numbers."""
     return finite_array(pose, (6,), "a pose is six finite numbers [x y z alpha beta gamma]")
@@ -70,8 +73,8 @@ def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
 def all_rigid(transforms: Array) -> bool:
     """Whether ``checked_transform`` passes all of the transforms (k,4,4): asked at once, without naming a wrong one."""
     turns = transforms[:, :3, :3]
-    errors = np.abs(turns.swapaxes(1, 2) @ turns - np.eye(3)).max(initial=0.0)
-    last = np.abs(transforms[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
+    errors = np.abs(turns.swapaxes(1, 2) @ turns - IDENTITY[:3, :3]).max(initial=0.0)
+    last = np.abs(transforms[:, 3] - IDENTITY[3]).max(initial=0.0)
     if not (errors <= RIGID and last <= RIGID and np.isfinite(transforms).all()):
         return False
     (a, b, c), (d, e, f), (g, h, i) = turns.transpose(1, 2, 0)

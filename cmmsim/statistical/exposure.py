@@ -18,7 +18,7 @@ from cmmsim.detection.ellipse_fit import EllipseFits, fit_settings, lies_inside
 from cmmsim.errors import CmmError
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import SHAPE_BASIS, bending, project_discs, symmetric_root
-from cmmsim.geometry.pose import Array, frozen, rigid, transforms_of
+from cmmsim.geometry.pose import IDENTITY, Array, frozen, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.exposure import Quality
 from cmmsim.imaging.renderer import Renderer
@@ -40,8 +40,8 @@ def refuse_images(*_: object, **__: object) -> NoReturn:
 
 
 STATISTICAL = Renderer(NAME, refuse_images)
-HERE, ABSENT = frozen(np.eye(4)), frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
-"""base_from_body (4,4) of the base itself, and of a body without a place: far below."""
+ABSENT = frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
+"""base_from_body (4,4) of a body without a place: far below."""
 
 
 @dataclass(frozen=True)
@@ -79,17 +79,15 @@ class StatisticalStereoCamera:
     def exposed(self, poses: Array, rates: Array | None) -> Array:
         """Poses (N,6,6) of the platform at poses (N,6) in motion at rates (N,6): in the middle, at the beginning and at
         the end of the left camera's exposure, then of the right one's."""
-        rates = np.zeros_like(poses) if rates is None else rates
-        half, lag = 0.5 * self.exposure * rates, self.right_later * rates
-        found = np.empty((len(poses), 6, 6))
-        for side, middle in enumerate((poses, poses + lag)):
-            for k, sign in enumerate((0.0, -1.0, 1.0)):
-                found[:, 3 * side + k] = middle + sign * half
-        return found
+        if rates is None:
+            return np.repeat(poses[:, None], 6, axis=1)
+        half, lag = 0.5 * self.exposure, self.right_later
+        later = np.array([0.0, -half, half, lag, lag - half, lag + half])
+        return np.asarray(poses[:, None] + later[:, None] * rates[:, None])
 
     def placed(self, obstacles: Mapping[str, Array]) -> Array:
         """base_from_body (b,4,4) of the base and of all obstacles; those without a place lie far below."""
-        return np.array([HERE, *(obstacles.get(name, ABSENT) for name in self.obstacle_names)])
+        return np.array([IDENTITY, *(obstacles.get(name, ABSENT) for name in self.obstacle_names)])
 
     def centre_error_px(self, quality: Quality) -> float:
         """What drawing leaves in a sticker's centre: nothing is drawn."""
