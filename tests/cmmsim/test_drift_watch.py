@@ -8,10 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.linalg import block_diag
+from scipy.stats import binom, multivariate_normal
 
 from cmmsim.common_errors import MeasuringGeometry
 from cmmsim.drift_watch import DriftWatch
+from cmmsim.drift_watch.evidence import Filter
 from cmmsim.errors import CmmError
 from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
@@ -98,6 +100,26 @@ def cost(sensor, drift, pose):
     eye.rng = type("Silent", (), {"standard_normal": staticmethod(np.zeros)})
     moved = eye.measured(sensor.rig.moved(drift), pose).pose - eye.measured(sensor.rig, pose).pose
     return moved / np.sqrt(np.diag(sensor.measure(pose).covariance))
+
+
+def test_a_filter_finds_what_one_gaussian_of_all_residuals_says():
+    """Two unknowns that walk and three that stand still, seen in four blocks of five residuals."""
+    rng, walk, prior, frames = np.random.default_rng(0), np.array([0.3, 0.8]), np.array([0.5, 1.0, 2.0]), [3, 1, 6, 2]
+    slopes, seen = rng.normal(size=(4, 5, 5)), rng.normal(size=(4, 5))
+    found = Filter(prior, walk)
+    for one, residuals, passed in zip(slopes, seen, frames, strict=True):
+        found.step(one.T @ one, one.T @ residuals, residuals @ residuals, passed)
+    passed = np.cumsum(frames)
+    states = np.kron(np.minimum.outer(passed, passed), np.diag(np.append(walk, np.zeros(3)) ** 2))
+    states += np.kron(np.ones((4, 4)), np.diag(np.append(np.zeros(2), prior) ** 2))
+    whole = block_diag(*slopes)
+    covariance, last = whole @ states @ whole.T + np.eye(20), states[15:17] @ whole.T
+    expected = multivariate_normal(np.zeros(20), covariance).logpdf(seen.ravel()) + 10.0 * np.log(2.0 * np.pi)
+    assert found.log_likelihood == pytest.approx(expected, rel=1e-10)
+    spread = states[15:17, 15:17] - last @ np.linalg.solve(covariance, last.T)
+    information, score = found.told_of(2)
+    np.testing.assert_allclose(information, np.linalg.inv(spread), rtol=1e-9)
+    np.testing.assert_allclose(score, information @ last @ np.linalg.solve(covariance, seen.ravel()), rtol=1e-9)
 
 
 @pytest.mark.parametrize("base", [False, True])

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from cmmsim.errors import LostError
 from cmmsim.geometry import pose as p
 from cmmsim.geometry.camera import Distortion, PinholeCamera
-from cmmsim.geometry.plane_frame import fit_plane, frame_from_planes, frame_of_points
-from cmmsim.geometry.registration import register
+from cmmsim.geometry.plane_frame import fit_plane, frame_from_planes, frame_of_points, frames_of_points
+from cmmsim.geometry.registration import register, register_sets
 from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
 from tests.cmmsim.sensors import CAMERA
 
@@ -152,6 +152,28 @@ def test_transform_explains_the_points_best(seen):
 
 LINE, EACH = np.outer(np.arange(5.0), [0.1, 0.05, 0.0]), np.tile(np.eye(3), (5, 1, 1))
 UP = np.array([0.0, 0.0, 1.0])
+
+
+def test_several_sets_of_points_are_fitted_as_each_alone():
+    rng, plane = np.random.default_rng(5), np.repeat(np.arange(3), 5)
+    normals = np.array([[0.0, 0.0, 1.0], [0.8, 0.5, 0.3], [0.8, -0.5, 0.2]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    source = rng.uniform(-0.1, 0.1, (15, 3))
+    source -= np.einsum("ni,ni->n", source, normals[plane])[:, None] * normals[plane]
+    moves = p.transforms_of(rng.uniform(-1.0, 1.0, (4, 6)))
+    points = p.apply_each(moves, source) + 1e-5 * rng.normal(size=(4, 15, 3))
+    roots = 1e-5 * (np.eye(3) + 0.3 * rng.normal(size=(4, 15, 3, 3)))
+    covariances = roots @ roots.swapaxes(-1, -2)
+    towards = normals @ moves[:, :3, :3].swapaxes(1, 2)
+    frames, laid = (
+        frames_of_points(points, covariances, plane, towards)[0],
+        register_sets(source, points, covariances).transform,
+    )
+    for k in range(4):
+        own = points[k], covariances[k]
+        np.testing.assert_allclose(frames[k], frame_of_points(*own, plane, towards[k])[0], atol=1e-12)
+        np.testing.assert_allclose(laid[k], register(source, *own).transform, atol=1e-12)
+    np.testing.assert_allclose(frames, moves @ frame_from_planes(normals, np.zeros(3)), atol=1e-3)
 
 
 @pytest.mark.parametrize(
