@@ -10,7 +10,7 @@ import numpy as np
 from dynamics.closed_loop.linear_algebra_kernels import add_product, add_row, clear, copy, copy_rows, dot, fill
 from dynamics.closed_loop.motion_kernels import MEASURED_OUT_OF_REACH, OK, all_finite
 from dynamics.closed_loop.sensitivity_kernels import velocity_by_pose
-from dynamics.closed_loop.stick_slip_kernels import NO_MARGIN, segment
+from dynamics.closed_loop.stick_slip_kernels import NO_MARGIN, begin_span, judge, next_step, try_step
 from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 
 
@@ -19,6 +19,7 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
     """Modes and derivatives at frame 0. Joints slower than NO_MARGIN are at rest."""
     size, count = len(at[0].bias), len(now.mode)
     copy(now.state[:], at[0].state[:])
+    now.span = -1
     status = invoke(task.evaluate_terms, task, now, at[0], d, 0)  # where it fails, the first frame does and says so
     for i in range(count):
         velocity = at[0].velocity[i]
@@ -172,28 +173,45 @@ def apply_command(
             d.command_slope[i, k] = d.command_rate[i, k] if now.ramping else 0.0
 
 
+@kernel
+def next_span(task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record) -> int:
+    """Go on to the next span of a frame, or to the next frame, which is measured first."""
+    spans, k = plan.spans, now.frame
+    if now.span == spans.first[k + 1]:
+        now.frame, now.span = k + 1, -1
+        return OK
+    if now.span < 0:
+        keep_state(task, now, d, record, k)
+        status = issue_command(task, now, d, plan, record, k)
+        if status != OK:
+            return status
+        now.span = spans.first[k]
+    span = now.span
+    now.span, now.grid, now.steps, now.target = span + 1, 0, 0, 0.0
+    apply_command(task, now, d, plan.start_commands, record.command, spans.command[span], spans.ramp[span])
+    if span == spans.first[k]:
+        copy(now.state[:], at[0].state[:])
+        at[0].time = 0.0
+        status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
+        copy(at[0].torque[:], record.torque[k])
+        if status != OK:
+            return status
+    return begin_span(task, now, at, d, spans.duration[span], spans.steps[span]) if k + 1 < len(record.pose) else OK
+
+
 @entry
 def run_frames(
     task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record, first: int, last: int
 ) -> tuple[int, int]:
     """Frames `first` to `last`, without it; the status, and the frame that it is of."""
-    frames, spans = len(record.pose), plan.spans
     if first == 0:
         begin(task, now, at, d, plan)
-    for k in range(first, last):
-        keep_state(task, now, d, record, k)
-        status = issue_command(task, now, d, plan, record, k)
-        if status != OK:
-            return status, k
-        for span in range(spans.first[k], spans.first[k + 1]):
-            apply_command(task, now, d, plan.start_commands, record.command, spans.command[span], spans.ramp[span])
-            if span == spans.first[k]:
-                copy(now.state[:], at[0].state[:])
-                at[0].time = 0.0
-                status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
-                copy(at[0].torque[:], record.torque[k])
-            if status == OK and k + 1 < frames:
-                status = segment(task, now, at, d, spans.duration[span], spans.steps[span])
-            if status != OK:
-                return status, k
-    return OK, last
+    status = OK
+    while status == OK and now.frame < last:
+        if next_step(now, at):
+            status = try_step(task, now, at, d)
+            if status == OK:
+                status = judge(task, now, at, d)
+        else:
+            status = next_span(task, now, at, d, plan, record)
+    return status, now.frame

@@ -76,7 +76,8 @@ LAYOUT = {
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
-    "pose_and_rate:M rate_map:nm tried:4 tried_margin:4 tried_crossing:4",
+    "pose_and_rate:M rate_map:nm frame! span! steps! grid! duration target purpose! length "
+    "trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
     # first what `equation_of_motion` and `motion_derivatives` return, in their order
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
     # and what else the columns of `slope_derivative` share

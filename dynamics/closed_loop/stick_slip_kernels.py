@@ -21,40 +21,45 @@ NO_MARGIN = 1e-12  # rad/s, or share of the breakaway torque
 LITTLE_SHARE = 1e-13  # of the breakaway torque: as far as rounding lets it be known
 
 
+TAKEN, WHOLE, HALF, AGAIN, BRACKET, CROSSING = range(6)
+"""What the step that is tried is for: none is, the last one was taken; the one to be taken; half of it, to see whether
+modes are broken in between, and the whole again where they are not; one that begins where an event's bracket does; and
+one that ends at the event."""
+
+
 @kernel
-def try_step(task: Record, now: Record, at: Record, d: Record, h: float) -> tuple[int, float]:
-    """A Runge-Kutta step of h s with fixed modes from the evaluation `at[0]`: its stages, its end, the margin there."""
-    start, end = at[0], at[END]
-    for k in range(1, 4):
+def ask(now: Record, purpose: int, length: float) -> None:
+    """Ask for a step of a length, s, to be tried."""
+    now.purpose, now.length = purpose, length
+
+
+@kernel
+def set_stage(now: Record, at: Record, k: int) -> None:
+    """State and time of stage `k` of the step that is tried, or of its end."""
+    start, stage, h = at[0], at[k], now.length
+    if k < END:
+        before = at[k - 1]
         for i in range(len(now.state)):
-            at[k].state[i] = start.state[i] + FRACTION[k] * h * at[k - 1].slope[i]
-        at[k].time = start.time + FRACTION[k] * h
+            stage.state[i] = start.state[i] + FRACTION[k] * h * before.slope[i]
+        stage.time = start.time + FRACTION[k] * h
+        return
+    for i in range(len(now.state)):
+        reached = start.state[i]
+        for stage_before in range(END):
+            reached += WEIGHT[stage_before] * h * at[stage_before].slope[i]
+        stage.state[i] = reached
+    stage.time = start.time + h
+
+
+@kernel
+def try_step(task: Record, now: Record, at: Record, d: Record) -> int:
+    """The Runge-Kutta step that is asked for, with fixed modes, from the evaluation `at[0]`: its stages and its end."""
+    for k in range(1, END + 1):
+        set_stage(now, at, k)
         status = invoke(task.evaluate, task, now, at[k], d, 0)
         if status != OK:
-            return status, 0.0
-    copy(start.state[:], end.state[:])
-    for k in range(4):
-        for i in range(len(now.state)):
-            end.state[i] += WEIGHT[k] * h * at[k].slope[i]
-    end.time = start.time + h
-    status = invoke(task.evaluate, task, now, end, d, 0)
-    return status, mode_margin(task, now, end)[0]
-
-
-@kernel
-def breaks_halfway(task: Record, now: Record, at: Record, d: Record, h: float) -> tuple[int, bool, float]:
-    """Whether modes that hold at both ends of a step are broken in between (a joint reversing twice); and the margin.
-
-    The stages give a hint, which a step of half the length confirms: that is then the step tried. After a false alarm
-    it is the whole step again.
-    """
-    if mode_margin(task, now, at[1])[0] >= 0 and mode_margin(task, now, at[2])[0] >= 0:
-        return OK, False, 0.0
-    status, margin = try_step(task, now, at, d, h / 2)
-    if status != OK or margin < 0:
-        return status, True, margin
-    status, margin = try_step(task, now, at, d, h)
-    return status, False, margin
+            return status
+    return OK
 
 
 @kernel
@@ -79,49 +84,99 @@ def remember(now: Record, h: float, margin: float) -> None:
 
 
 @kernel
-def locate_event(task: Record, now: Record, at: Record, d: Record, h: float, margin: float) -> tuple[int, float, bool]:
-    """The step in (0, h] at which the modes stop holding: the margin, here that at h, crosses zero. Found by inverse
-    interpolation, and by halving the bracket where that leads out of it; the first time with what the stage at half the
-    step says, which is near.
+def locate_event(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
+    """Look for the step, not longer than the last one tried, at which the modes stop holding: the margin, here that of
+    the last one, crosses zero. By inverse interpolation, and by halving the bracket where that leads out of it; the
+    first time with what the stage at half the step says, which is near.
 
-    A joint that has just started from rest has no margin yet: then the bracket is found by halving; the last entry
-    returned is False where there is none.
+    A joint that has just started from rest has no margin yet: then the bracket is found by halving.
     """
-    low, high, halfway = 0.0, h, mode_margin(task, now, at[2])[0]
-    at_low, at_high = mode_margin(task, now, at[0])[0], margin
-    for _ in range(40):
-        if at_low >= NO_MARGIN:
-            break
-        status, margin = try_step(task, now, at, d, high / 2)
-        if status != OK:
-            return status, high, False
-        if margin > 0:
-            low, at_low = high / 2, margin
-            break
-        high, at_high = high / 2, margin
-    if at_low <= 0:
-        return OK, high, False
-    remember(now, h / 2, halfway)
-    remember(now, low, at_low)
-    remember(now, high, at_high)
-    middle, tried = crossing(now, 3 if high - low == h else 2), high
-    for count in range(3, 83):
-        if count > 43 or not low < middle < high:
-            middle = 0.5 * (low + high)
-        status, margin = try_step(task, now, at, d, middle)
-        if status != OK:
-            return status, high, False
-        if margin > 0:
-            low = middle
-        else:
-            high = middle
-        remember(now, middle, margin)
-        tried, middle = middle, crossing(now, min(count, len(now.tried)))
-        holds = now.mode[mode_margin(task, now, at[END])[1]] == 0
-        little = LITTLE_SHARE if holds else 0.0
-        if abs(margin) <= little or min(abs(middle - tried), high - low) <= 1e-15 + 1e-13 * h:
-            break
-    return OK, tried, True
+    now.events_left -= 1
+    if now.events_left < 0:
+        return TOO_MANY_EVENTS
+    now.cut, now.low, now.high, now.trials = now.length, 0.0, now.length, 0
+    now.low_margin, now.high_margin = mode_margin(task, now, at[0])[0], margin
+    now.half_margin = mode_margin(task, now, at[2])[0]
+    return narrow(task, now, at, d)
+
+
+@kernel
+def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
+    """Ask for the next step of an event's search, once its bracket begins with a margin; take the last one tried where
+    40 halvings have not found that."""
+    if now.low_margin < NO_MARGIN and now.trials < 40:
+        ask(now, BRACKET, now.high / 2)
+        return OK
+    if now.low_margin <= 0:
+        return take_step(task, now, at, d, True, False)
+    remember(now, now.cut / 2, now.half_margin)
+    remember(now, now.low, now.low_margin)
+    remember(now, now.high, now.high_margin)
+    now.trials = 3
+    ask_between(now, crossing(now, 3 if now.high - now.low == now.cut else 2))
+    return OK
+
+
+@kernel
+def ask_between(now: Record, length: float) -> None:
+    """Ask for a step where the event seems to be; half way of the bracket where that is outside, or slow."""
+    if now.trials > 43 or not now.low < length < now.high:
+        length = 0.5 * (now.low + now.high)
+    ask(now, CROSSING, length)
+
+
+@kernel
+def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
+    """A step of half the bracket was tried: it begins there, or it ends there."""
+    now.trials += 1
+    if margin > 0:
+        now.low, now.low_margin, now.trials = now.length, margin, 40
+    else:
+        now.high, now.high_margin = now.length, margin
+    return narrow(task, now, at, d)
+
+
+@kernel
+def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
+    """A step to where an event seems to be was tried: it is taken once no better one is known."""
+    tried = now.length
+    if margin > 0:
+        now.low = tried
+    else:
+        now.high = tried
+    remember(now, tried, margin)
+    better = crossing(now, min(now.trials, len(now.tried)))
+    holds = now.mode[mode_margin(task, now, at[END])[1]] == 0
+    little = LITTLE_SHARE if holds else 0.0
+    near = min(abs(better - tried), now.high - now.low) <= 1e-15 + 1e-13 * now.cut
+    now.trials += 1
+    if abs(margin) <= little or near or now.trials == 83:
+        return take_step(task, now, at, d, True, True)
+    ask_between(now, better)
+    return OK
+
+
+@kernel
+def judge(task: Record, now: Record, at: Record, d: Record) -> int:
+    """What follows from a step that was tried: it is taken, or another one is asked for.
+
+    Modes that hold at both ends of a step may be broken in between (a joint reversing twice): the stages give a hint,
+    which a step of half the length confirms.
+    """
+    margin = mode_margin(task, now, at[END])[0]
+    if now.purpose == BRACKET:
+        return judge_bracket(task, now, at, d, margin)
+    if now.purpose == CROSSING:
+        return judge_crossing(task, now, at, d, margin)
+    if now.purpose != AGAIN and margin < 0:
+        return locate_event(task, now, at, d, margin)
+    if now.purpose == HALF:
+        ask(now, AGAIN, 2 * now.length)
+    elif now.purpose == AGAIN or (mode_margin(task, now, at[1])[0] >= 0 and mode_margin(task, now, at[2])[0] >= 0):
+        return take_step(task, now, at, d, False, True)
+    else:
+        ask(now, HALF, now.length / 2)
+    return OK
 
 
 @entry
@@ -181,44 +236,28 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
 
 
 @kernel
-def step(task: Record, now: Record, at: Record, d: Record, target: float) -> int:
-    """One step to the time `target`, s, or to where the first mode before it ends."""
-    h, held = target - at[0].time, True
-    status, margin = try_step(task, now, at, d, h)
-    if status != OK:
-        return status
-    event = margin < 0
-    if not event:
-        status, event, halfway = breaks_halfway(task, now, at, d, h)
-        if status != OK:
-            return status
-        if event:
-            h, margin = h / 2, halfway
-    if event:
-        now.events_left -= 1
-        if now.events_left < 0:
-            return TOO_MANY_EVENTS
-        status, h, held = locate_event(task, now, at, d, h, margin)
-        if status != OK:
-            return status
-        now.events += 1
+def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, held: bool) -> int:
+    """Take the step that was tried, which ends at its target, or where an event cuts it. held: not where a joint that
+    has just started from rest turns back at once."""
+    now.purpose, time = TAKEN, now.target
     if task.sensitivities:
-        step_tangent(task, now, at, d, h, event, event and held)
+        step_tangent(task, now, at, d, now.length, event, event and held)
     copy(at[END].state[:], now.state[:])
     if event:
-        target = at[END].time
+        now.events += 1
+        time = at[END].time
         status = after_event(task, now, at, d, held)
         if status != OK:
             return status
     else:
         invoke(task.stop_joints, task, now, at[END], d, 0)
         follow_frictionless(task, now, at[END])
-    return evaluate_anew(task, now, at, d, target)
+    return evaluate_anew(task, now, at, d, time)
 
 
 @kernel
-def segment(task: Record, now: Record, at: Record, d: Record, duration: float, steps: int) -> int:
-    """Integrate over a time, s, with one command. Modes are decided anew at its start, where the torque jumps."""
+def begin_span(task: Record, now: Record, at: Record, d: Record, duration: float, steps: int) -> int:
+    """Begin a time, s, with one command. Modes are decided anew at its start, where the torque jumps."""
     start = at[0]
     copy(now.state[:], start.state[:])
     start.time = 0.0
@@ -232,8 +271,19 @@ def segment(task: Record, now: Record, at: Record, d: Record, duration: float, s
         rest_tangent(task, now, start, d)
     now.start_moves = 0
     now.events_left = MAX_EVENTS_PER_SEGMENT
-    for n in range(1, steps + 1):
-        target = duration * n / steps
-        while status == OK and start.time < target:
-            status = step(task, now, at, d, target)
+    now.duration, now.steps = duration, steps
     return status
+
+
+@kernel
+def next_step(now: Record, at: Record) -> bool:
+    """Ask for the next step of the span, unless one is being tried; False where the span's end is reached."""
+    if now.purpose != TAKEN:
+        return True
+    while at[0].time >= now.target:
+        if now.grid == now.steps:
+            return False
+        now.grid += 1
+        now.target = now.duration * now.grid / now.steps
+    ask(now, WHOLE, now.target - at[0].time)
+    return True
