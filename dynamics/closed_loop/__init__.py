@@ -23,7 +23,7 @@ from dynamics.closed_loop.problem import (
     equilibrium,
 )
 from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
-from dynamics.closed_loop.simulate import prepare, simulate, simulate_batch
+from dynamics.closed_loop.simulate import prepare, simulate, simulate_batch, simulate_repeats
 
 __all__ = [
     "ClosedLoopRun",
@@ -45,4 +45,5 @@ __all__ = [
     "prepare",
     "simulate",
     "simulate_batch",
+    "simulate_repeats",
 ]

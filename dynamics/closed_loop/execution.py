@@ -4,6 +4,7 @@ The same lines run compiled and, as the oracle of that, plain. Sensors and contr
 kernels then do one frame at a time.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 from dynamics.checks import floats
 from dynamics.closed_loop.command_schedule import command_schedule
 from dynamics.closed_loop.frame_kernels import measure_ideally, run_frames
-from dynamics.closed_loop.memory import Memory, Plan, empty_memory, empty_record
+from dynamics.closed_loop.lane_kernels import run_lanes
+from dynamics.closed_loop.memory import Memory, Plan, empty_memory, empty_record, record_type
 from dynamics.closed_loop.motion_kernels import (
     LEFT_REACH,
     MEASURED_OUT_OF_REACH,
@@ -29,6 +31,7 @@ from dynamics.closed_loop.stick_slip_kernels import stop_joints
 from dynamics.compiled.kernel import address, chosen, plain
 from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import SimulationError
+from dynamics.parameters import LANES
 
 FAILURES = {
     LEFT_REACH: "the robot left the reachable set (the loop is unstable):",
@@ -37,8 +40,8 @@ FAILURES = {
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; there",
 }
 MACHINE_CODE = (
-    *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
-    "slope_derivative",
+    *("equation_of_motion", "motion_in_lanes", "free_acceleration", "response", "motion_derivatives"),
+    *("rate_map_derivative", "slope_derivative"),
 )
 """Functions of a robot that kernels call, by their names."""
 
@@ -65,10 +68,47 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
                 raise
         status, frame = do(*memory, plan, record, first, last)
         if status:
-            raise _failure(problem, status, frame, memory, record)
+            raise _failure(problem, status, frame, memory.now, record)
+    return _result(problem, record, measured, memory.now)
+
+
+def run_repeats(problem: LoopProblem, noises: np.ndarray, compiled: bool = True) -> list[ClosedLoopRun | LoopFailure]:
+    """A run for each noise (runs, frames, 6); see `closed_loop.simulate_repeats`."""
+    found: list[ClosedLoopRun | LoopFailure] = []
+    for some in np.split(noises, range(LANES, len(noises), LANES)):
+        found += _run_together(problem, some, compiled)
+    return found
+
+
+def _run_together(problem: LoopProblem, noises: np.ndarray, compiled: bool) -> list[ClosedLoopRun | LoopFailure]:
+    """Runs that differ in their noise (runs, frames, 6), a lane each."""
+    sizes, frames, runs = problem.sizes, problem.frames, len(noises)
+    memory, record = empty_memory(sizes), empty_record(problem, runs)
+    plan = _plan(replace(problem, noise=noises.reshape(-1, 6)), np.zeros((0, sizes.joints)))
+    own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
+    _fill(memory, problem, own, known["equation_of_motion"], _addresses(sizes, compiled))
+    lanes, at = np.zeros(1, record_type("lanes", sizes))[0], np.zeros((runs, 5), memory.evaluations.dtype)
+    now = np.repeat(memory.now.reshape(1), runs).view(np.recarray)
+    now["first_row"] = frames * np.arange(runs)
+    lanes.shared = memory.now.known.inputs[2 * sizes.coordinates :]
+    lanes.states = np.tile(memory.now.state[: 2 * sizes.coordinates], (LANES, 1)).T
+    chosen(run_lanes, compiled)(memory.task, now, at, memory.tangent, plan, record, lanes)
+    found: list[ClosedLoopRun | LoopFailure] = []
+    for lane, noise in enumerate(noises):
+        rows = slice(lane * frames, (lane + 1) * frames)
+        one = type(record)(*[array[rows] for array in record])
+        if status := int(now[lane].status):
+            found.append(_failure(problem, status, int(now[lane].frame), now[lane], one))
+        else:
+            found.append(_result(replace(problem, noise=noise), one, np.full((frames, 6), np.nan), now[lane]))
+    return found
+
+
+def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -> ClosedLoopRun:
+    """What a run that came to its end has recorded."""
     found: dict[str, Any] = {name: array if array.size else None for name, array in record._asdict().items()}
     found |= _poses(problem, found, measured)
-    time, events = np.arange(frames) * problem.period, int(memory.now.events)
+    time, events = np.arange(problem.frames) * problem.period, int(now.events)
     return ClosedLoopRun(time=time, **found, events=events, start=problem.start)
 
 
@@ -125,11 +165,11 @@ def _consult(
     commands[frame] = floats(what, command, (problem.sizes.joints,), error=SimulationError)
 
 
-def _failure(problem: LoopProblem, status: int, frame: int, memory: Memory, record: Any) -> LoopFailure:
+def _failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any) -> LoopFailure:
     """The error of a run that ended early, with the leg to blame for a pose out of reach."""
     said = f"closed loop stopped at frame {frame} (t = {frame * problem.period:.3f} s): {FAILURES[status]}"
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
-        stopped = memory.now.known.inputs[: problem.sizes.coordinates]
+        stopped = now.known.inputs[: problem.sizes.coordinates]
         at = problem.robot.pose(stopped if status == LEFT_REACH else record.measured[frame])
         margin = problem.robot.reach_margin(at)
         leg = int(np.argmin(margin))

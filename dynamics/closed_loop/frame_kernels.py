@@ -42,16 +42,17 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
 def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> None:
     """Write the state at a frame, before it is measured, into the record."""
     size, count = len(now.servo_integral), len(now.mode)
-    copy(now.state[:size], record.pose[k])
-    copy(now.state[size : 2 * size], record.pose_rate[k])
-    copy(now.servo_integral[:], record.servo_integral[k])
-    copy(now.state[2 * size : 2 * size + count], record.joint_integral[k])
+    row = now.first_row + k
+    copy(now.state[:size], record.pose[row])
+    copy(now.state[size : 2 * size], record.pose_rate[row])
+    copy(now.servo_integral[:], record.servo_integral[row])
+    copy(now.state[2 * size : 2 * size + count], record.joint_integral[row])
     if task.stiffness > 0:
         motors = len(now.state) - 2 * count
-        copy(now.state[motors : motors + count], record.motor_angle[k])
-        copy(now.state[motors + count :], record.motor_rate[k])
+        copy(now.state[motors : motors + count], record.motor_angle[row])
+        copy(now.state[motors + count :], record.motor_rate[row])
     if task.filter_time > 0:
-        copy(now.state[2 * size + count : 2 * size + 2 * count], record.filtered_rate[k])
+        copy(now.state[2 * size + count : 2 * size + 2 * count], record.filtered_rate[row])
     if not task.sensitivities:
         return
     keep_rows(now, d.x[:size], record.pose_sensitivity[k], record.start_sensitivity[k])
@@ -72,13 +73,14 @@ def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -
 @kernel
 def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
     """What the ideal sensor says of the pose."""
-    seen, measured = len(plan.lost) == 0 or not plan.lost[k], record.measured[k]
-    record.measured_ok[k] = seen
+    row = now.first_row + k
+    seen, measured = len(plan.lost) == 0 or not plan.lost[k], record.measured[row]
+    record.measured_ok[row] = seen
     copy(now.state[: len(measured)], measured)
     if not seen:
         fill(measured, np.nan)
     if len(plan.noise) > 0:
-        add_row(1.0, plan.noise[k], measured, len(measured))
+        add_row(1.0, plan.noise[row], measured, len(measured))
 
 
 @kernel
@@ -130,16 +132,17 @@ def issue_command(task: Record, now: Record, d: Record, plan: Record, record: Re
     if not task.measured:
         measure_ideally(now, plan, record, k)
     now.elapsed += task.period
+    row = now.first_row + k
     if len(plan.commands) > 0:
         copy(plan.commands[k], now.last_command[:])
-    elif record.measured_ok[k]:
-        serve(task, now, d, plan, record.measured[k], k)
-    copy(now.last_command[:], record.command[k])
+    elif record.measured_ok[row]:
+        serve(task, now, d, plan, record.measured[row], k)
+    copy(now.last_command[:], record.command[row])
     if len(plan.feedforward) > 0:
-        add_row(1.0, plan.feedforward[k], record.command[k], len(now.mode))
+        add_row(1.0, plan.feedforward[k], record.command[row], len(now.mode))
     if task.sensitivities:
         copy_rows(d.last_command[:], d.issued[k % (len(d.issued) - 1)], now.width)
-    return OK if all_finite(record.command[k : k + 1]) else MEASURED_OUT_OF_REACH
+    return OK if all_finite(record.command[row : row + 1]) else MEASURED_OUT_OF_REACH
 
 
 @kernel
@@ -176,7 +179,8 @@ def apply_command(
 @kernel
 def next_span(task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record) -> int:
     """Go on to the next span of a frame, or to the next frame, which is measured first."""
-    spans, k = plan.spans, now.frame
+    spans, k, last = plan.spans, now.frame, now.frame + 2 == len(plan.spans.first)
+    commands = record.command[now.first_row :]
     if now.span == spans.first[k + 1]:
         now.frame, now.span = k + 1, -1
         return OK
@@ -188,15 +192,15 @@ def next_span(task: Record, now: Record, at: Record, d: Record, plan: Record, re
         now.span = spans.first[k]
     span = now.span
     now.span, now.grid, now.steps, now.target = span + 1, 0, 0, 0.0
-    apply_command(task, now, d, plan.start_commands, record.command, spans.command[span], spans.ramp[span])
+    apply_command(task, now, d, plan.start_commands, commands, spans.command[span], spans.ramp[span])
     if span == spans.first[k]:
         copy(now.state[:], at[0].state[:])
         at[0].time = 0.0
         status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
-        copy(at[0].torque[:], record.torque[k])
+        copy(at[0].torque[:], record.torque[now.first_row + k])
         if status != OK:
             return status
-    return begin_span(task, now, at, d, spans.duration[span], spans.steps[span]) if k + 1 < len(record.pose) else OK
+    return OK if last else begin_span(task, now, at, d, spans.duration[span], spans.steps[span])
 
 
 @entry

@@ -12,7 +12,7 @@ import numpy as np
 from dynamics.closed_loop.command_schedule import CommandSchedule
 from dynamics.closed_loop.joints import FRICTION
 from dynamics.closed_loop.problem import MAX_DELAY_FRAMES, LoopProblem, Sizes
-from dynamics.parameters import room_for_derivatives
+from dynamics.parameters import LANES, room_for_derivatives
 
 
 class Plan(NamedTuple):
@@ -41,9 +41,9 @@ RECORDED = (
 Record: Any = namedtuple("Record", re.findall(r"(\w+):", RECORDED))  # type: ignore[misc]
 
 
-def empty_record(problem: LoopProblem) -> Any:
-    """Room for what a run writes; what it is not asked for has no rows or no columns."""
-    sizes, frames = problem.sizes, problem.frames
+def empty_record(problem: LoopProblem, runs: int = 1) -> Any:
+    """Room for what runs write, one after the other; what is not asked for has no rows or no columns."""
+    sizes, frames = problem.sizes, runs * problem.frames
     length = {"f": frames, "n": sizes.joints, "m": sizes.coordinates, "S": sizes.start}
     length["p"] = sizes.parameters if problem.sensitivities else 0
     length["s"] = sizes.start if problem.start_sensitivities else 0
@@ -70,13 +70,13 @@ class Memory(NamedTuple):
 
 LAYOUT = {
     "task": "equation_of_motion! free_acceleration! response! motion_derivatives! rate_map_derivative! "
-    "slope_derivative! servo_motion! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! "
+    "slope_derivative! motion_in_lanes! servo_motion! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! "
     "sensitivities! servo_knows! measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping "
     "motor_inertia period torques! torque_limit filter_time rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
-    "pose_and_rate:M rate_map:nm frame! span! steps! grid! duration target purpose! length "
+    "pose_and_rate:M rate_map:nm first_row! status! frame! span! steps! grid! duration target purpose! length "
     "trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
     # first what `equation_of_motion` and `motion_derivatives` return, in their order
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
@@ -88,6 +88,8 @@ LAYOUT = {
     "velocity:n spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
     # first the rows of `slope_derivative`; k: what it returns of each stage,
     # and before the torques the slopes of filtered rates, whose trials are `filtered`
+    # first what `motion_in_lanes` takes, then what it returns, in their order
+    "lanes": "shared:q states:BL factor:mmL bias:mL jacobian:nmL bias_acceleration:nL angle:nL velocity:nL asked:L!",
     "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w length:w "
     "stage_time:w margin:w command:nw command_slope:nw last_command:nw force:nw last_measured:mw integral:mw "
     "demand:mw moved:mw",
@@ -105,7 +107,10 @@ def record_type(name: str, sizes: Sizes) -> np.dtype:
     length |= {"b": 2 * m + n, "f": max(f, 1), "y": 2 * m + 2 * n + f}
     g = sizes.geometry
     length |= {
+        "B": 2 * m,
+        "L": LANES,
         "M": 2 * m + g,
+        "q": r + g,
         "i": 2 * m + r + g,
         "d": 3 * m + n + r + g,
         "w": room_for_derivatives(sizes.parameters, sizes.start),

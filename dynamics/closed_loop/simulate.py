@@ -27,7 +27,7 @@ from dynamics.closed_loop.problem import (
     checked_loop_parameters,
     equilibrium,
 )
-from dynamics.closed_loop.run import ClosedLoopRun
+from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
 from dynamics.errors import SimulationError
 from dynamics.robot import Robot
 
@@ -73,54 +73,52 @@ def simulate(
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
     UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
     """
-    check_type("robot", robot, Robot, SimulationError)
-    check_type("reference", reference, Reference, SimulationError)
-    check_type("settings", settings, LoopSettings, SimulationError)
-    if servo_robot is not None:
-        check_type("servo_robot", servo_robot, Robot, SimulationError)
-    if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
-        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
-    if controller is not None and not callable(controller) and not isinstance(controller, EveryFrame):
-        raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
-    start_sensitivities = flag("start_sensitivities", start_sensitivities, SimulationError)
-    sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
-    compiled = flag("compiled", compiled, SimulationError)
-    _check_reach(robot, reference)
-    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters, settings.drives.law)
-    feedforward = _checked_rows("feedforward", feedforward, (frames, robot.layout.joints))
-    if start is None:
-        known, at = (parameters.tobytes(), reference.poses[0].tobytes()), (servo_robot, feedforward is not None)
-        start = _at_rest(robot, *known, settings, *at)
-    else:
-        check_type("start", start, StartState, SimulationError)
-        start.check_sizes(robot)
-        check_start_pose(robot, parameters, start.pose)
-    if latencies is not None:
-        latencies = floats("latencies", latencies, (frames,), error=SimulationError)
-        for frame, latency in enumerate(latencies.tolist()):
-            settings.timing.check_latency(f"latency of frame {frame}", latency)
-    problem = LoopProblem(
+    problem = _checked(
         robot,
         parameters,
         reference,
         settings,
-        start,
         sensor,
-        sensitivities,
-        start_sensitivities,
-        commands=_checked_rows("commands", commands, (frames, robot.layout.joints)),
+        start=start,
+        sensitivities=sensitivities,
+        start_sensitivities=start_sensitivities,
+        commands=commands,
         feedforward=feedforward,
-        lost=None if lost is None else mask("lost", lost, frames, SimulationError),
-        noise=_checked_rows("noise", noise, (frames, 6)),
+        lost=lost,
+        noise=noise,
         latencies=latencies,
-        servo_robot=servo_robot or robot,
+        servo_robot=servo_robot,
         controller=controller,
     )
-    _check_together(problem, servo_robot)
-    _check_elasticity(problem)
+    compiled = flag("compiled", compiled, SimulationError)
     from dynamics.closed_loop.execution import run  # imports numba, which takes its time
 
     return run(problem, compiled)
+
+
+def simulate_repeats(
+    robot: Robot,
+    parameters: np.ndarray,
+    reference: Reference,
+    settings: LoopSettings,
+    noises: np.ndarray,
+    *,
+    lost: np.ndarray | None = None,
+    latencies: np.ndarray | None = None,
+    compiled: bool = True,
+) -> list[ClosedLoopRun | LoopFailure]:
+    """`simulate` with each noise of noises (N, frames, 6), m and rad, in the poses that the ideal sensor measures.
+
+    All runs are those of `simulate` up to rounding, and take about half its time: the equation of motion is computed
+    for eight of them at once. A run that leaves the reachable set gives its LoopFailure; raises what else `simulate`
+    raises.
+    """
+    problem = _checked(robot, parameters, reference, settings, lost=lost, latencies=latencies)
+    noises = floats("noises", noises, ("N", problem.frames, 6), error=SimulationError)
+    compiled = flag("compiled", compiled, SimulationError)
+    from dynamics.closed_loop.execution import run_repeats
+
+    return run_repeats(problem, noises, compiled)
 
 
 def simulate_batch(
@@ -173,6 +171,72 @@ def prepare(robot: Robot) -> None:
     reference = Reference(np.tile(robot.home_pose, (2, 1)), np.zeros((2, 6)))
     settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), FrameTiming(60.0))
     simulate(robot, next(iter(robot.parameter_sets.values())).vector, reference, settings)
+
+
+def _checked(
+    robot: Robot,
+    parameters: np.ndarray,
+    reference: Reference,
+    settings: LoopSettings,
+    sensor: PoseSensor | RateSensor | None = None,
+    *,
+    start: StartState | None = None,
+    sensitivities: bool = False,
+    start_sensitivities: bool = False,
+    commands: np.ndarray | None = None,
+    feedforward: np.ndarray | None = None,
+    lost: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
+    latencies: np.ndarray | None = None,
+    servo_robot: Robot | None = None,
+    controller: Controller | EveryFrame | None = None,
+) -> LoopProblem:
+    """What `simulate` was asked, checked; it raises what that raises before the run."""
+    check_type("robot", robot, Robot, SimulationError)
+    check_type("reference", reference, Reference, SimulationError)
+    check_type("settings", settings, LoopSettings, SimulationError)
+    if servo_robot is not None:
+        check_type("servo_robot", servo_robot, Robot, SimulationError)
+    if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
+        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
+    if controller is not None and not callable(controller) and not isinstance(controller, EveryFrame):
+        raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
+    start_sensitivities = flag("start_sensitivities", start_sensitivities, SimulationError)
+    sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
+    _check_reach(robot, reference)
+    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters, settings.drives.law)
+    feedforward = _checked_rows("feedforward", feedforward, (frames, robot.layout.joints))
+    if start is None:
+        known, at = (parameters.tobytes(), reference.poses[0].tobytes()), (servo_robot, feedforward is not None)
+        start = _at_rest(robot, *known, settings, *at)
+    else:
+        check_type("start", start, StartState, SimulationError)
+        start.check_sizes(robot)
+        check_start_pose(robot, parameters, start.pose)
+    if latencies is not None:
+        latencies = floats("latencies", latencies, (frames,), error=SimulationError)
+        for frame, latency in enumerate(latencies.tolist()):
+            settings.timing.check_latency(f"latency of frame {frame}", latency)
+    problem = LoopProblem(
+        robot,
+        parameters,
+        reference,
+        settings,
+        start,
+        sensor,
+        sensitivities,
+        start_sensitivities,
+        commands=_checked_rows("commands", commands, (frames, robot.layout.joints)),
+        feedforward=feedforward,
+        lost=None if lost is None else mask("lost", lost, frames, SimulationError),
+        noise=_checked_rows("noise", noise, (frames, 6)),
+        latencies=latencies,
+        servo_robot=servo_robot or robot,
+        controller=controller,
+    )
+    _check_together(problem, servo_robot)
+    _check_elasticity(problem)
+    return problem
 
 
 @lru_cache(maxsize=16)

@@ -20,7 +20,7 @@ from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import PlatformJointMotion, joint_motion, pose_rate_to_twist, twist_bias
 from dynamics.legs.leg import Leg
-from dynamics.parameters import parameter_layout
+from dynamics.parameters import LANES, parameter_layout
 from dynamics.rigid_body.accelerations import factored, free_acceleration, response, slope_derivative
 from dynamics.rigid_body.jacobians import freedoms, platform_arms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
@@ -29,8 +29,10 @@ from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:
     """What the closed loop integrates."""
     size, layout = len(geometry.chart.freedoms), parameter_layout(geometry.legs)
+    motion = equation_of_motion(geometry)
     return [
-        equation_of_motion(geometry),
+        motion,
+        motion_in_lanes(motion),
         free_acceleration(size, layout.joints),
         motion_derivatives(geometry),
         rate_map_derivative(geometry),
@@ -64,6 +66,16 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
         return [total, freely.T @ sum(forces, bias), *(ca.vertcat(*row) for row in rows), factored(total)]
 
     return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides)
+
+
+def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
+    """The equation of motion of several states at once, of one robot with the same parameters: in each column pose and
+    rate (m,); then the factor of M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,), its rate (n,)."""
+    whole = motion.whole
+    inputs = whole.sx_in()
+    (q, rate, *shared), (_, bias, *joints, factor) = inputs, whole.call(inputs)
+    found = ca.Function("motion_in_lanes", [*shared, q, rate], [factor, bias, *joints])
+    return ColumnFunction(found, len(shared), LANES, LANES)
 
 
 def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
