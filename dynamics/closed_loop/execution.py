@@ -84,7 +84,8 @@ def _run_together(problem: LoopProblem, noises: np.ndarray, compiled: bool) -> l
     """Runs that differ in their noise (runs, frames, 6), a lane each."""
     sizes, frames, runs = problem.sizes, problem.frames, len(noises)
     memory, record = empty_memory(sizes), empty_record(problem, runs)
-    plan = _plan(replace(problem, noise=noises.reshape(-1, 6)), np.zeros((0, sizes.joints)))
+    commands = np.zeros((0, sizes.joints)) if problem.commands is None else problem.commands
+    plan = _plan(replace(problem, noise=noises.reshape(-1, 6)), commands)
     own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
     _fill(memory, problem, own, known["equation_of_motion"], _addresses(sizes, compiled))
     lanes, at = np.zeros(1, record_type("lanes", sizes))[0], np.zeros((runs, 5), memory.evaluations.dtype)

@@ -113,7 +113,7 @@ def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k
 def serve_tangent(task: Record, now: Record, d: Record, measured: Array, jacobian: Array) -> None:
     """Derivative of the command, given that of the measured pose."""
     width = now.width
-    by_pose = velocity_by_pose(task, now, measured, now.demand[:])
+    velocity_by_pose(task, now, measured, now.demand[:])
     for i in range(len(now.demand)):
         for k in range(width):
             moved = d.x[i, k]
@@ -123,7 +123,7 @@ def serve_tangent(task: Record, now: Record, d: Record, measured: Array, jacobia
             d.last_measured[i, k] = moved
     clear(d.last_command[:], width)
     add_product(1.0, jacobian, d.demand[:], d.last_command[:], width)
-    add_product(1.0, by_pose, d.last_measured[:], d.last_command[:], width)
+    add_product(1.0, now.rate_map, d.last_measured[:], d.last_command[:], width)
 
 
 @kernel
@@ -146,9 +146,9 @@ def issue_command(task: Record, now: Record, d: Record, plan: Record, record: Re
 
 
 @kernel
-def command_number(start: Array, commands: Array, number: int) -> Array:
-    """A command by its number: from frame 0 on, and before that those of the start."""
-    return commands[number] if number >= 0 else start[max(0, len(start) + number)]
+def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
+    """A joint's command by its number: from frame 0 on, and before that those of the start."""
+    return commands[number, joint] if number >= 0 else start[max(0, len(start) + number), joint]
 
 
 @kernel
@@ -156,19 +156,19 @@ def apply_command(
     task: Record, now: Record, d: Record, start: Array, commands: Array, number: int, ramp: float
 ) -> None:
     """Let a command act, when a share of the way from the one before it is done: 1 is all of it."""
-    value, before = command_number(start, commands, number), command_number(start, commands, number - 1)
     now.ramping = ramp < 1
-    for i in range(len(value)):
-        change = value[i] - before[i]
+    for i in range(len(now.command)):
+        value, before = command_of(start, commands, number, i), command_of(start, commands, number - 1, i)
+        change = value - before
         now.command_rate[i] = change / task.period
-        now.command[i] = before[i] + ramp * change if now.ramping else value[i]
+        now.command[i] = before + ramp * change if now.ramping else value
         now.command_slope[i] = now.command_rate[i] if now.ramping else 0.0
     if not task.sensitivities:
         return
     rows = len(d.issued) - 1  # the last one is of the commands of the start
     newer = d.issued[number % rows if number >= 0 else rows]
     older = d.issued[(number - 1) % rows if number > 0 else rows]
-    for i in range(len(value)):
+    for i in range(len(now.command)):
         for k in range(now.width):
             change = newer[i, k] - older[i, k]
             d.command_rate[i, k] = change / task.period

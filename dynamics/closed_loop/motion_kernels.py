@@ -56,14 +56,14 @@ def slip_friction(task: Record, joint: int, velocity: float, mode: int) -> float
 
 
 @kernel
-def stuck_joints(now: Record) -> Array:
-    """The joints that stick."""
+def count_stuck(now: Record) -> int:
+    """How many joints stick; they are the first in `now.stuck`."""
     count = 0
     for i in range(len(now.mode)):
         if now.mode[i] == 0:
             now.stuck[count] = i
             count += 1
-    return now.stuck[:count]
+    return count
 
 
 @kernel
@@ -196,7 +196,7 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
         accelerate_freely(task, at, at.spring, acceleration)
         return
     accelerate_freely(task, at, at.net_torque, acceleration)
-    stuck = stuck_joints(now)
+    stuck = now.stuck[: count_stuck(now)]
     if len(stuck) == 0:
         return
     hold_compliance(task, at, stuck)
@@ -222,17 +222,20 @@ def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
 
 
 @kernel
-def follow_frictionless(task: Record, now: Record, at: Record) -> None:
-    """Joints without dry friction have no modes to break: they slip the way they move."""
+def follow_frictionless(task: Record, now: Record, at: Record) -> bool:
+    """Joints without dry friction have no modes to break: they slip the way they move; whether one turns."""
+    turns = False
     for i in range(len(now.mode)):
-        if not has_events(task, i):
-            now.mode[i] = -1 if at.velocity[i] < 0 else 1
+        mode = -1 if at.velocity[i] < 0 else 1
+        if not has_events(task, i) and now.mode[i] != mode:
+            now.mode[i], turns = mode, True
+    return turns
 
 
 @entry
 def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Which of the joints in mode 0, at rest, stick, and how the others start: projected Gauss-Seidel on friction."""
-    joints = stuck_joints(now)
+    joints = now.stuck[: count_stuck(now)]
     if task.stiffness > 0:  # motors at rest do not feel each other
         for i in joints:
             left = at.torque[i] - at.spring[i]

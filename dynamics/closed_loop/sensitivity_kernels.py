@@ -22,7 +22,7 @@ from dynamics.closed_loop.motion_kernels import (
     follows_law,
     hold_compliance,
     mode_margin,
-    stuck_joints,
+    count_stuck,
     winds_up,
 )
 from dynamics.compiled.kernel import Array, Record, call, call_columns, entry, invoke, kernel
@@ -149,7 +149,7 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
         filtered_tangent(task, now, at, d, k)
     if task.torque_limit > 0:
         held_tangent(task, now, at, d, k)
-    stuck = stuck_joints(now)
+    stuck = now.stuck[: count_stuck(now)]
     if len(stuck) == 0:
         return OK
     clear(d.force[:], width)
@@ -193,12 +193,11 @@ def try_tangent(now: Record, d: Record) -> None:
 
 
 @kernel
-def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> Array:
-    """d(J_theta rate)/d(pose) (n, m)."""
+def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> None:
+    """d(J_theta rate)/d(pose) (n, m), into `now.rate_map`."""
     copy(pose, now.pose_and_rate[: len(pose)])
     copy(rate, now.pose_and_rate[len(pose) :])
     call(task.rate_map_derivative, now.pose_and_rate, now.rate_map)
-    return now.rate_map
 
 
 @kernel
@@ -208,9 +207,9 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
     size, width, column, joint = len(end.bias), now.width, now.step_column, mode_margin(task, now, end)[1]
     fill(d.margin[:], 0.0)
     if now.mode[joint] != 0:
-        by_pose = velocity_by_pose(task, now, end.state[:size], end.state[size : 2 * size])
+        velocity_by_pose(task, now, end.state[:size], end.state[size : 2 * size])
         for j in range(size):
-            add_row(by_pose[joint, j], d.x[j], d.margin[:], width)
+            add_row(now.rate_map[joint, j], d.x[j], d.margin[:], width)
             add_row(end.jacobian[joint, j], d.x[size + j], d.margin[:], width)
     else:
         copy(d.time[:], d.stage_time[:])
@@ -263,7 +262,8 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
     M change = -J^T impulse (`at.force`) and J rate = 0 in these joints, differentiated implicitly.
     """
-    size, width, known, stuck = len(at.bias), now.width, now.derivatives, stuck_joints(now)
+    size, width, known = len(at.bias), now.width, now.derivatives
+    stuck = now.stuck[: count_stuck(now)]
     pose, rate = d.x[:size], d.x[size : 2 * size]
     fill(now.rest[:], 0.0)
     fill(now.impulse[:], 0.0)
@@ -280,11 +280,11 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
     solve_rows(at.factor, size, d.moved[:], width)
     for j in range(size):
         add_row(1.0, d.moved[j], rate[j], width)
-    by_pose = velocity_by_pose(task, now, now.state[:size], now.state[size : 2 * size])
+    velocity_by_pose(task, now, now.state[:size], now.state[size : 2 * size])
     clear(d.force[:], width)
     for s in range(len(stuck)):
         for j in range(size):
-            add_row(by_pose[stuck[s], j], pose[j], d.force[s], width)
+            add_row(now.rate_map[stuck[s], j], pose[j], d.force[s], width)
             add_row(at.jacobian[stuck[s], j], rate[j], d.force[s], width)
     give_back(at, d, len(stuck), rate, width)
     return OK
@@ -293,7 +293,7 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 @kernel
 def rest_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
     """A start state moved at joints that stick: their velocities are lost at once, without a path."""
-    size, stuck = len(at.bias), stuck_joints(now)
+    size, stuck = len(at.bias), now.stuck[: count_stuck(now)]
     if len(stuck) == size:
         clear(d.x[size : 2 * size], now.width)
     elif len(stuck) > 0:

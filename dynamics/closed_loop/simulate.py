@@ -103,6 +103,7 @@ def simulate_repeats(
     settings: LoopSettings,
     noises: np.ndarray,
     *,
+    commands: np.ndarray | None = None,
     lost: np.ndarray | None = None,
     latencies: np.ndarray | None = None,
     compiled: bool = True,
@@ -113,7 +114,8 @@ def simulate_repeats(
     for eight of them at once. A run that leaves the reachable set gives its LoopFailure; raises what else `simulate`
     raises.
     """
-    problem = _checked(robot, parameters, reference, settings, lost=lost, latencies=latencies)
+    options = {"commands": commands, "lost": lost, "latencies": latencies}
+    problem = _checked(robot, parameters, reference, settings, **options)
     noises = floats("noises", noises, ("N", problem.frames, 6), error=SimulationError)
     compiled = flag("compiled", compiled, SimulationError)
     from dynamics.closed_loop.execution import run_repeats

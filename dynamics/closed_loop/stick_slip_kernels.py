@@ -11,7 +11,7 @@ from dynamics.closed_loop.motion_kernels import (
     follow_frictionless,
     hold_compliance,
     mode_margin,
-    stuck_joints,
+    count_stuck,
 )
 from dynamics.closed_loop.sensitivity_kernels import END, FRACTION, WEIGHT, rest_tangent, step_tangent
 from dynamics.compiled.kernel import Record, entry, invoke, kernel
@@ -182,7 +182,7 @@ def judge(task: Record, now: Record, at: Record, d: Record) -> int:
 @entry
 def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Take the velocities of the stuck joints, whose compliance is known, out of the state, as an impulse would."""
-    size, stuck = len(at.bias), stuck_joints(now)
+    size, stuck = len(at.bias), now.stuck[: count_stuck(now)]
     rate = now.state[size : 2 * size]
     if task.stiffness > 0:
         for i in stuck:
@@ -226,7 +226,7 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
         return OK
     now.mode[joint] = 0
     if task.stiffness == 0:
-        hold_compliance(task, end, stuck_joints(now))
+        hold_compliance(task, end, now.stuck[: count_stuck(now)])
     invoke(task.stop_joints, task, now, end, d, 0)
     copy(now.state[:], end.state[:])
     status = invoke(task.evaluate_terms, task, now, end, d, 0)
@@ -251,7 +251,11 @@ def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, hel
             return status
     else:
         invoke(task.stop_joints, task, now, at[END], d, 0)
-        follow_frictionless(task, now, at[END])
+        same_modes = not follow_frictionless(task, now, at[END])
+        if same_modes and count_stuck(now) == 0:
+            at[0] = at[END]
+            at[0].time = time
+            return OK
     return evaluate_anew(task, now, at, d, time)
 
 

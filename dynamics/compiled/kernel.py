@@ -40,13 +40,13 @@ types.Record.mangling_args = property(_record_symbol)  # type: ignore[method-ass
 def kernel(function: Callable[..., Any]) -> Any:
     """A kernel that only kernels call: compiled with each of them, without a door for Python."""
     function.kernel = True  # type: ignore[attr-defined]
-    return njit(nogil=True, error_model="numpy", **_ONLY_KERNELS)(function)
+    return njit(nogil=True, error_model="numpy", _nrt=False, **_ONLY_KERNELS)(function)
 
 
 def part(function: Callable[..., Any]) -> Any:
     """A kernel of a few operations, which becomes a part of those that call it: a call would cost as much."""
     function.kernel = True  # type: ignore[attr-defined]
-    return njit(nogil=True, error_model="numpy", forceinline=True, **_ONLY_KERNELS)(function)
+    return njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True, **_ONLY_KERNELS)(function)
 
 
 _ONLY_KERNELS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # unknown to numba's stubs
@@ -55,7 +55,7 @@ _ONLY_KERNELS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper":
 def entry(function: Callable[..., Any]) -> Any:
     """A kernel that Python calls, or kernels by its address: kept in the user's cache with all that it calls."""
     function.kernel = True  # type: ignore[attr-defined]
-    compiled: Any = njit(nogil=True, error_model="numpy")(function)
+    compiled: Any = njit(nogil=True, error_model="numpy", _nrt=False)(function)
     if isinstance(compiled, Dispatcher):  # NUMBA_DISABLE_JIT leaves the function as it is
         compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
     return compiled

@@ -30,6 +30,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
 from dynamics.closed_loop import ClosedLoopRun, LoopFailure
+from dynamics.parameters import LANES
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.common_errors import covariance_by_kind, most_likely_of, shared_draws
@@ -222,14 +223,10 @@ def _repeated_scores(
     """Scores J^T r (draws, q) of noise and mean squared residuals of noise and common errors, of the repeated
     experiments whose loop is stable."""
 
-    def repeat(draws: np.random.Generator) -> tuple[Array, float] | None:
-        try:
-            repeated = [repeated_experiment(run, parameters, draws).measured for run in problem.runs]
-        except LoopFailure:
-            return None
+    def judged(repeated: Sequence[ClosedLoopRun], draws: np.random.Generator) -> tuple[Array, float]:
         noise = [
-            one.missed + run.whiten(run.measured - poses)
-            for run, one, poses in zip(problem.runs, found, repeated, strict=True)
+            one.missed + run.whiten(run.measured - made.measured)
+            for run, one, made in zip(problem.runs, found, repeated, strict=True)
         ]
         drawn = [
             run.without_common(residual + one.modes @ draws.standard_normal(one.modes.shape[2]))
@@ -237,24 +234,30 @@ def _repeated_scores(
         ]
         return np.concatenate(noise), float(np.mean(np.concatenate(drawn) ** 2))
 
-    results = []
+    def repeat(draws: Sequence[np.random.Generator]) -> list[tuple[Array, float] | None]:
+        runs = [repeated_experiments(run, parameters, draws) for run in problem.runs]
+        return [
+            None if any(isinstance(one, LoopFailure) for one in repeated) else judged(repeated, own)
+            for own, *repeated in zip(draws, *runs, strict=True)
+        ]
+
+    results, each = [], rng.spawn(DRAWS)
     with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
-        for result in pool.map(repeat, rng.spawn(DRAWS)):
-            results += [result] if result else []
-            advance()
+        for some in pool.map(repeat, [each[k : k + LANES] for k in range(0, DRAWS, LANES)]):
+            results += [result for result in some if result]
+            advance(len(some))
     rows = np.concatenate([one.rows.reshape(-1, one.rows.shape[2]) for one in found])
     drawn = np.array([noise.ravel() for noise, _ in results]).reshape(len(results), len(rows))
     return drawn @ rows, [square for _, square in results]  # scores of all at once: each reads the rows otherwise
 
 
-def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> ClosedLoopRun:
-    """A repeated experiment whose plant is the identified model and whose sensor has drawn noise; NaN where lost.
-
-    Raises LoopFailure where the loop is unstable.
-    """
-    return run.simulate(
-        parameters, noise=rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
-    )
+def repeated_experiments(
+    run: RecordedRun, parameters: Array, draws: Sequence[np.random.Generator]
+) -> list[ClosedLoopRun | LoopFailure]:
+    """Repeated experiments, one for each generator, whose plant is the identified model and whose sensor has drawn
+    noise; NaN where lost. In place of one whose loop is unstable its LoopFailure."""
+    root = np.linalg.cholesky(run.covariance).T
+    return run.simulate_repeats(parameters, np.stack([rng.standard_normal(run.measured.shape) @ root for rng in draws]))
 
 
 def correlation_matrix(covariance: Array) -> Array:

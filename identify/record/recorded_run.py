@@ -6,13 +6,14 @@ A record that cannot carry an identification is refused, see `identify.record.ch
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import Robot
-from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulate
+from dynamics.closed_loop import ClosedLoopRun, LoopFailure, LoopSettings, Reference, simulate, simulate_repeats
 from identify.arrays import Array
 from identify.filtering import without_gaps
 from identify.loop_parameters import model_settings
@@ -151,22 +152,40 @@ class RecordedRun:
     ) -> ClosedLoopRun:
         """The model's run with the common errors that it has; of another robot than the servo knows, or with noise (N,
         6) in what that measures, where they are given. Raises LoopFailure where it is unstable."""
-        error = noise
-        if self.drawn is not None and self.common.names and not self.driven:
-            error = self.common.modes @ self.drawn[: len(self.common.names)] + (0.0 if noise is None else noise)
-        latency_s = self.latency_s
         return simulate(
             robot or self.robot,
             parameters + self.payload,
             self.reference,
             self.settings,
             sensitivities=sensitivities,
-            commands=self.logged if self.driven else None,
-            lost=None if self.driven else ~self.ok,
-            latencies=None if latency_s is None else np.full(len(self.ok), latency_s),
-            noise=error,
+            noise=self._sensed(noise),
             servo_robot=self.robot if robot else None,
+            **self._as_recorded,
         )
+
+    def simulate_repeats(self, parameters: Array, noises: Array) -> list[ClosedLoopRun | LoopFailure]:
+        """The model's run with each noise of noises (runs, N, 6) in what that measures, or why it is unstable."""
+        sensed = np.asarray(self._sensed(noises))
+        return simulate_repeats(
+            self.robot, parameters + self.payload, self.reference, self.settings, sensed, **self._as_recorded
+        )
+
+    @property
+    def _as_recorded(self) -> dict[str, Any]:
+        """What a model's run has in common with the recorded one: commands, lost frames, latencies."""
+        latency_s = self.latency_s
+        return {
+            "commands": self.logged if self.driven else None,
+            "lost": None if self.driven else ~self.ok,
+            "latencies": None if latency_s is None else np.full(len(self.ok), latency_s),
+        }
+
+    def _sensed(self, noise: Array | None) -> Array | None:
+        """What is added to the poses (N, 6) that a model's servo measures: its common errors, and noise (..., N, 6)."""
+        if self.drawn is None or not self.common.names or self.driven:
+            return noise
+        error: Array = self.common.modes @ self.drawn[: len(self.common.names)]
+        return error if noise is None else error + noise
 
     def model_poses(self, parameters: Array) -> Array:
         """Poses (N, 6) of the model. Raises LoopFailure where it is unstable."""

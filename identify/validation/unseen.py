@@ -21,7 +21,7 @@ from dynamics.closed_loop import LoopFailure, Reference, simulate
 from dynamics.closed_loop.problem import checked_loop_parameters
 from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
-from identify.estimation.covariance import repeated_experiment
+from identify.estimation.covariance import repeated_experiments
 from identify.excitation.design import unseen_trajectories
 from identify.experiment.plant import build_plant
 from identify.experiment.run import Experiment, run_plant
@@ -152,7 +152,11 @@ def predict_poses(
     run = run.having(likely[:inside])
     model = run.simulate(parameters, sensitivities=True)
     assert model.pose_sensitivity is not None
-    drawn = [repeated_experiment(run, parameters, rng).pose - model.pose for _ in range(REPETITIONS)]
+    drawn = []
+    for repeated in repeated_experiments(run, parameters, [rng] * REPETITIONS):
+        if isinstance(repeated, LoopFailure):
+            raise repeated
+        drawn.append(repeated.pose - model.pose)
     noise = np.concatenate(drawn)
     common = run.pose_modes(parameters)
     slopes = np.concatenate([model.pose_sensitivity, common @ root], axis=2)
