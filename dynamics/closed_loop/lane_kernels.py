@@ -8,41 +8,74 @@ import numpy as np
 
 from dynamics.closed_loop.frame_kernels import begin, next_span
 from dynamics.closed_loop.linear_algebra_kernels import copy
-from dynamics.closed_loop.motion_kernels import OK
+from dynamics.closed_loop.motion_kernels import OK, count_stuck, drive, hold_stuck, push, take_known
 from dynamics.closed_loop.sensitivity_kernels import END
 from dynamics.closed_loop.stick_slip_kernels import judge, next_step, set_stage
 from dynamics.compiled.kernel import Array, Record, call_columns, entry, invoke, kernel
+from dynamics.parameters import LANES
 
 
 @kernel
-def know_motions(task: Record, now: Record, at: Record, lanes: Record, asked: Array, k: int) -> None:
-    """The equation of motion at stage `k` of the lanes that ask for it."""
-    size = len(at[0, 0].bias)
+def evaluate_lanes(task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array, k: int) -> None:
+    """What `evaluate` finds at stage `k` of the lanes that ask for it, and the status of each. Of a stage within a step
+    on which no joint sticks only the slope counts; what is known at the end of a step is needed again."""
+    size, count = len(at[0, 0].bias), len(at[0, 0].angle)
     for lane in asked:
         for j in range(2 * size):
             lanes.states[j, lane] = at[lane, k].state[j]
-    call_columns(task.motion_in_lanes, lanes.shared, lanes.states, lanes.factor, lanes.states.shape[1])
+    call_columns(task.motion_in_lanes, lanes.shared, lanes.states, lanes.bias_acceleration, LANES)
     for lane in asked:
-        known = now[lane].known
-        copy(at[lane, k].state[: 2 * size], known.inputs[: 2 * size])
-        take_lane(lanes, lane, known)
+        own, stage = now[lane], at[lane, k]
+        if own.status != OK:
+            continue
+        if k == END:
+            copy(stage.state[: 2 * size], own.known.inputs[: 2 * size])
+            take_lane(lanes, lane, own.known)
+            take_known(own.known, stage)
+        elif task.stiffness == 0 and count_stuck(own) > 0:
+            take_lane(lanes, lane, stage)
+        for i in range(count):
+            stage.angle[i], stage.velocity[i] = lanes.angle[i, lane], lanes.velocity[i, lane]
+        drive(task, own, stage)
+        push(task, own, stage)
+        for i in range(count):
+            lanes.push[i, lane] = stage.spring[i] if task.stiffness > 0 else stage.net_torque[i]
+    call_columns(task.acceleration_in_lanes, lanes.shared, lanes.factor, lanes.acceleration, LANES)
+    for lane in asked:
+        own, stage = now[lane], at[lane, k]
+        if own.status != OK:
+            continue
+        if has_factor(lanes, lane):
+            for j in range(size):
+                stage.slope[size + j] = lanes.acceleration[j, lane]
+            hold_stuck(task, own, stage)
+        else:
+            own.known.valid = False
+            own.status = invoke(task.evaluate, task, own, stage, d, 0)  # says what is wrong
 
 
 @kernel
-def take_lane(lanes: Record, lane: int, known: Record) -> None:
-    """What is known of one lane. Where it has no factor it counts as unknown, and is asked for again alone."""
-    count, size = known.jacobian.shape
-    known.valid = True
+def has_factor(lanes: Record, lane: int) -> bool:
+    """Whether the mass matrix of a lane is positive definite, and finite."""
+    has = True
+    for i in range(lanes.factor.shape[0]):
+        has = has and 0 < lanes.factor[i, i, lane] < np.inf
+    return has
+
+
+@kernel
+def take_lane(lanes: Record, lane: int, into: Record) -> None:
+    """What is known of the platform in one lane."""
+    count, size = into.jacobian.shape
     for i in range(size):
-        known.bias[i] = lanes.bias[i, lane]
+        into.bias[i] = lanes.bias[i, lane]
         for j in range(size):
-            known.factor[i, j] = lanes.factor[i, j, lane]
-        known.valid = known.valid and 0 < known.factor[i, i] < np.inf
+            into.factor[i, j] = lanes.factor[i, j, lane]
     for i in range(count):
-        known.bias_acceleration[i] = lanes.bias_acceleration[i, lane]
-        known.angle[i], known.velocity[i] = lanes.angle[i, lane], lanes.velocity[i, lane]
+        into.bias_acceleration[i] = lanes.bias_acceleration[i, lane]
+        into.angle[i], into.velocity[i] = lanes.angle[i, lane], lanes.velocity[i, lane]
         for j in range(size):
-            known.jacobian[i, j] = lanes.jacobian[i, j, lane]
+            into.jacobian[i, j] = lanes.jacobian[i, j, lane]
 
 
 @kernel
@@ -51,10 +84,7 @@ def try_steps(task: Record, now: Record, at: Record, d: Record, lanes: Record, a
     for k in range(1, END + 1):
         for lane in asked:
             set_stage(now[lane], at[lane], k)
-        know_motions(task, now, at, lanes, asked, k)
-        for lane in asked:
-            if now[lane].status == OK:
-                now[lane].status = invoke(task.evaluate, task, now[lane], at[lane, k], d, 0)
+        evaluate_lanes(task, now, at, d, lanes, asked, k)
 
 
 @entry

@@ -69,7 +69,7 @@ class Memory(NamedTuple):
 
 
 LAYOUT = {
-    "task": "equation_of_motion! free_acceleration! response! motion_derivatives! rate_map_derivative! "
+    "task": "equation_of_motion! free_acceleration! acceleration_in_lanes! response! motion_derivatives! rate_map_derivative! "
     "slope_derivative! motion_in_lanes! servo_motion! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! "
     "sensitivities! servo_knows! measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping "
     "motor_inertia period torques! torque_limit filter_time rigid:r coulomb:n viscous:n friction=friction",
@@ -88,8 +88,9 @@ LAYOUT = {
     "velocity:n spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
     # first the rows of `slope_derivative`; k: what it returns of each stage,
     # and before the torques the slopes of filtered rates, whose trials are `filtered`
-    # first what `motion_in_lanes` takes, then what it returns, in their order
-    "lanes": "shared:q states:BL factor:mmL bias:mL jacobian:nmL bias_acceleration:nL angle:nL velocity:nL asked:L!",
+    # first what `motion_in_lanes` takes, then what it returns, and from the factor on what `acceleration_in_lanes` does
+    "lanes": "shared:q states:BL bias_acceleration:nL angle:nL velocity:nL factor:mmL bias:mL jacobian:nmL push:nL "
+    "acceleration:mL asked:L!",
     "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w length:w "
     "stage_time:w margin:w command:nw command_slope:nw last_command:nw force:nw last_measured:mw integral:mw "
     "demand:mw moved:mw",

@@ -98,12 +98,17 @@ def know_motion(task: Record, known: Record, state: Array) -> int:
 @entry
 def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Everything at the state and time of an evaluation that does not depend on the modes."""
-    known, state = now.known, at.state
-    status = know_motion(task, known, at.state[:])
-    if status != OK:
-        return status
+    status = know_motion(task, now.known, at.state[:])
+    if status == OK:
+        take_known(now.known, at)
+        drive(task, now, at)
+    return status
+
+
+@kernel
+def take_known(known: Record, at: Record) -> None:
+    """What an evaluation says of the platform, from where it is known."""
     count, size = known.jacobian.shape
-    first = 2 * size
     for i in range(size):
         at.bias[i] = known.bias[i]
         copy(known.factor[i], at.factor[i])
@@ -111,6 +116,12 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
         at.angle[i], at.velocity[i] = known.angle[i], known.velocity[i]
         at.bias_acceleration[i] = known.bias_acceleration[i]
         copy(known.jacobian[i], at.jacobian[i])
+
+
+@kernel
+def drive(task: Record, now: Record, at: Record) -> None:
+    """Torques of the drives, whose angles and velocities are known."""
+    state, count, first = at.state, len(at.angle), 2 * len(at.bias)
     for i in range(count):
         if task.stiffness > 0:  # from here on the motors stand for the cranks in what joint PID and friction feel
             motor, motor_rate = state[len(state) - 2 * count + i], state[len(state) - count + i]
@@ -128,7 +139,6 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
             at.torque[i], at.error[i] = now.command[i] + now.command_slope[i] * at.time, 0.0
         if task.torque_limit > 0:
             at.torque[i] = min(max(at.torque[i], -task.torque_limit), task.torque_limit)
-    return OK
 
 
 @kernel
@@ -167,10 +177,10 @@ def accelerate_freely(task: Record, at: Record, torque: Array, acceleration: Arr
 
 
 @kernel
-def accelerate(task: Record, now: Record, at: Record) -> None:
-    """The slope of the state in the present modes; stuck joints get the torque that keeps them at rest."""
+def push(task: Record, now: Record, at: Record) -> None:
+    """Net torques in the present modes, without what holds stuck joints, and the slope of the state but for what these
+    torques accelerate."""
     size, count = len(at.bias), len(at.angle)
-    acceleration = at.slope[size : 2 * size]
     for i in range(count):
         at.stick_force[i] = 0.0
         at.net_torque[i] = at.torque[i]
@@ -193,12 +203,15 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
             if now.mode[i] == 0:
                 at.stick_force[i] = left
                 at.net_torque[i] -= left
-        accelerate_freely(task, at, at.spring, acceleration)
+
+
+@kernel
+def hold_stuck(task: Record, now: Record, at: Record) -> None:
+    """Give rigid joints that are stuck the torque that keeps them at rest; the slope knows the free acceleration."""
+    size, stuck = len(at.bias), now.stuck[: count_stuck(now)]
+    if task.stiffness > 0 or len(stuck) == 0:
         return
-    accelerate_freely(task, at, at.net_torque, acceleration)
-    stuck = now.stuck[: count_stuck(now)]
-    if len(stuck) == 0:
-        return
+    acceleration = at.slope[size : 2 * size]
     hold_compliance(task, at, stuck)
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], acceleration) + at.bias_acceleration[stuck[s]]
@@ -216,9 +229,13 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
 def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """The whole evaluation at its state and time, in the present modes."""
     status = invoke(task.evaluate_terms, task, now, at, d, 0)
-    if status == OK:
-        accelerate(task, now, at)
-    return status
+    if status != OK:
+        return status
+    push(task, now, at)
+    size = len(at.bias)
+    accelerate_freely(task, at, at.spring if task.stiffness > 0 else at.net_torque, at.slope[size : 2 * size])
+    hold_stuck(task, now, at)
+    return OK
 
 
 @kernel

@@ -29,11 +29,12 @@ from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:
     """What the closed loop integrates."""
     size, layout = len(geometry.chart.freedoms), parameter_layout(geometry.legs)
-    motion = equation_of_motion(geometry)
+    motion, free = equation_of_motion(geometry), free_acceleration(size, layout.joints)
     return [
         motion,
         motion_in_lanes(motion),
-        free_acceleration(size, layout.joints),
+        free,
+        ColumnFunction(ca.Function("acceleration_in_lanes", free.sx_in(), free.call(free.sx_in())), 0, LANES, LANES),
         motion_derivatives(geometry),
         rate_map_derivative(geometry),
         response(size),
@@ -70,11 +71,11 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
 
 def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
     """The equation of motion of several states at once, of one robot with the same parameters: in each column pose and
-    rate (m,); then the factor of M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,), its rate (n,)."""
+    rate (m,); then J_theta_dot rate (n,), theta (n,), its rate (n,), the factor of M (m, m), b (m,), J_theta (n, m)."""
     whole = motion.whole
     inputs = whole.sx_in()
-    (q, rate, *shared), (_, bias, *joints, factor) = inputs, whole.call(inputs)
-    found = ca.Function("motion_in_lanes", [*shared, q, rate], [factor, bias, *joints])
+    (q, rate, *shared), (_, bias, jacobian, *joints, factor) = inputs, whole.call(inputs)
+    found = ca.Function("motion_in_lanes", [*shared, q, rate], [*joints, factor, bias, jacobian])
     return ColumnFunction(found, len(shared), LANES, LANES)
 
 
