@@ -27,6 +27,20 @@ def room_for_derivatives(parameters: int, start: int) -> int:
     return -(-(parameters + 1 + start) // LANES) * LANES
 
 
+@dataclass(frozen=True, eq=False)
+class RigidGroups:
+    """Through which combinations (k, r) alone the r inertial parameters of a robot act; pivots (k,): a parameter of
+    each, ascending, that has the coefficient 1 there and is in no other."""
+
+    pivots: np.ndarray
+    combinations: np.ndarray
+
+    def of_all(self, by_pivots: np.ndarray) -> np.ndarray:
+        """Derivatives (..., p) by all parameters, of those by the pivots and the parameters behind the inertial ones."""
+        count = len(self.pivots)
+        return np.concatenate([by_pivots[..., :count] @ self.combinations, by_pivots[..., count:]], axis=-1)
+
+
 @dataclass(frozen=True)
 class ParameterLayout:
     """Which parameters a robot has: those of its bodies, dry and viscous friction of its joints, and the joint PID.

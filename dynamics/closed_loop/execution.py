@@ -122,6 +122,9 @@ def _poses(problem: LoopProblem, found: dict[str, Any], measured: np.ndarray) ->
         poses["measured"][~found["measured_ok"]] = np.nan
         if problem.noise is not None:
             poses["measured"] += chart.forbidden(chart.pose(np.zeros(problem.sizes.coordinates)) + problem.noise)
+    for name in ("pose_sensitivity", "end_sensitivity"):
+        if problem.groups is not None and found[name] is not None:
+            found[name] = poses[name] = problem.groups.of_all(found[name])
     for name in ("pose_sensitivity", "start_sensitivity"):
         if found[name] is not None:
             poses[name] = chart.lifted(found[name], axis=1)
@@ -190,9 +193,9 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "lost": np.zeros(0, bool) if problem.lost is None else np.ascontiguousarray(problem.lost),
         "noise": np.zeros((0, 0)) if problem.noise is None else chart.coordinates(problem.noise),
         "start_commands": start.commands,
-        "start_integral_sensitivity": still if slope is None else slope,
-        "start_servo_sensitivity": _servo_sensitivity(problem, by_command),
-        "start_command_sensitivity": by_command,
+        "start_integral_sensitivity": (still if slope is None else slope)[:, problem.columns],
+        "start_servo_sensitivity": _servo_sensitivity(problem, by_command)[:, problem.columns],
+        "start_command_sensitivity": by_command[:, problem.columns],
     }
     views = {name: np.ascontiguousarray(array).view() for name, array in given.items()}
     for view in views.values():  # kernels are compiled for each kind of array that they are given, so all are of one
@@ -238,6 +241,8 @@ def _fill(
         task.stiffness, task.damping = settings.elasticity.stiffness, settings.elasticity.damping
         task.motor_inertia = settings.elasticity.motor_inertia
     task.rigid = rigid
+    columns, shown = problem.columns, len(problem.columns) - 2 * sizes.joints - len(gains)
+    task.shown, task.pivots[:shown] = shown, columns[:shown]
     rest = np.zeros(sizes.joints)
     filtered = rest[: sizes.filters] if start.filtered_rate is None else start.filtered_rate[: sizes.filters]
     motor = [rest if part is None else part for part in (start.motor_angle, start.motor_rate)]
@@ -257,8 +262,8 @@ def _fill(
         last = np.concatenate([fixed, function.constants])
         end = sum(function.inputs)
         inputs[end - len(last) : end] = last
-    now.step_column, now.start_moves = sizes.parameters, problem.start_sensitivities
-    now.width = sizes.parameters + 1 + (sizes.start if problem.start_sensitivities else 0)
+    now.step_column, now.start_moves = len(columns), problem.start_sensitivities
+    now.width = len(columns) + 1 + (sizes.start if problem.start_sensitivities else 0)
 
 
 @lru_cache(maxsize=16)

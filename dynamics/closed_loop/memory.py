@@ -45,7 +45,7 @@ def empty_record(problem: LoopProblem, runs: int = 1) -> Any:
     """Room for what runs write, one after the other; what is not asked for has no rows or no columns."""
     sizes, frames = problem.sizes, runs * problem.frames
     length = {"f": frames, "n": sizes.joints, "m": sizes.coordinates, "S": sizes.start}
-    length["p"] = sizes.parameters if problem.sensitivities else 0
+    length["p"] = len(problem.columns) if problem.sensitivities else 0
     length["s"] = sizes.start if problem.start_sensitivities else 0
     length["e"] = frames if problem.settings.elasticity else 0
     length["F"] = frames if sizes.filters else 0
@@ -72,7 +72,7 @@ LAYOUT = {
     "task": "equation_of_motion! free_acceleration! acceleration_in_lanes! response! motion_derivatives! rate_map_derivative! "
     "slope_derivative! motion_in_lanes! servo_motion! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! "
     "sensitivities! servo_knows! measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping "
-    "motor_inertia period torques! torque_limit filter_time rigid:r coulomb:n viscous:n friction=friction",
+    "motor_inertia period torques! torque_limit filter_time shown! pivots:r! rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "

@@ -12,6 +12,7 @@ from dynamics.closed_loop.drives import ABOVE_ZERO, PID, READS, DriveName, Drive
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
 from dynamics.legs.numbers import MOST_NUMBERS
+from dynamics.parameters import RigidGroups
 from dynamics.robot import Robot
 
 MAX_DELAY_FRAMES = 60
@@ -221,6 +222,13 @@ class LoopProblem:
     servo_robot: Robot
     controller: Controller | EveryFrame | None = None
     feedforward: np.ndarray | None = None
+    groups: RigidGroups | None = None
+
+    @property
+    def columns(self) -> np.ndarray:
+        """The parameters (k,) whose derivatives stand for those of all."""
+        rigid = np.arange(self.sizes.rigid) if self.groups is None else self.groups.pivots
+        return np.concatenate([rigid, np.arange(self.sizes.rigid, self.sizes.parameters)])
 
     @property
     def frames(self) -> int:

@@ -1,6 +1,6 @@
 """Sensitivities over the steps of the integrator, the exact derivative of what it computes.
 
-Derivatives are rows over columns: the parameters, the length of the present step, and the start state if wanted. A
+Derivatives are rows over columns: the parameters (of rigid bodies those that stand for all), the length of the present step, and the start state if wanted. A
 Runge-Kutta step is differentiated stage by stage, the equation of motion at each implicitly. A step that an event cuts
 has the length at which a margin vanishes at its end; the margin's derivative gives that of the length, and the step
 that follows is shorter by it. Stopping joints by an impulse is differentiated implicitly too.
@@ -44,6 +44,10 @@ def differentiate_motion(
     copy(acceleration, known.inputs[2 * size : 3 * size])
     copy(torque, known.inputs[3 * size :])
     call(task.motion_derivatives, known.inputs, known.by_pose)
+    if task.shown < len(task.rigid):
+        for row in known.columns:
+            for k in range(task.shown):
+                row[k] = row[task.pivots[k]]
 
 
 @kernel
@@ -69,7 +73,7 @@ def share_with_columns(task: Record, now: Record, at: Record) -> None:
 def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
     """What the parameters do at a fixed state: to -M q_ddot - b (`d.push`), and to the torque of each joint without the
     friction that holds it (`d.direct`)."""
-    count, first, rigid = len(now.mode), 2 * len(at.bias), len(task.rigid)
+    count, first, rigid = len(now.mode), 2 * len(at.bias), task.shown
     lp = rigid + 2 * count
     for i in range(len(at.bias)):
         for k in range(rigid):
@@ -114,7 +118,7 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
 def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
     """Derivative of the slopes of integrals that a drive at its limit holds: lx / li times the joint's velocity."""
     size, width, known = len(at.bias), now.width, now.derivatives
-    lp = len(task.rigid) + 2 * len(now.mode)
+    lp = task.shown + 2 * len(now.mode)
     for i in range(len(now.mode)):
         if winds_up(task, at, i):
             row, share = d.k[k, 2 * size + i], task.lx / task.li
@@ -218,7 +222,7 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
         invoke(task.slope_tangent, task, now, end, d, 0)
         torque = d.k[0, len(d.k[0]) - len(now.mode) + joint]
         add_row(1.0 if end.stick_force[joint] > 0 else -1.0, torque, d.margin[:], width)
-        d.margin[len(task.rigid) + joint] -= task.friction.static_level
+        d.margin[task.shown + joint] -= task.friction.static_level
     approach = d.margin[column]
     fill(d.length[:], 0.0)
     if abs(approach) > NO_APPROACH:
@@ -269,13 +273,13 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
     fill(now.impulse[:], 0.0)
     clear(d.moved[:], width)
     differentiate_motion(task, now, now.state[:size], now.rest[:], now.rest[:], now.impulse[:])
-    copy_rows(known.columns, d.moved[:], len(task.rigid))
+    copy_rows(known.columns, d.moved[:], task.shown)
     add_product(1.0, known.by_pose, pose, d.moved[:], width)
     for s in range(len(stuck)):
         now.impulse[stuck[s]] = -at.force[s]
     differentiate_motion(task, now, now.state[:size], now.rest[:], now.change[:], now.impulse[:])
     for i in range(size):
-        add_row(-1.0, known.columns[i], d.moved[i], len(task.rigid))  # the difference leaves out gravity
+        add_row(-1.0, known.columns[i], d.moved[i], task.shown)  # the difference leaves out gravity
     add_product(-1.0, known.by_pose, pose, d.moved[:], width)
     solve_rows(at.factor, size, d.moved[:], width)
     for j in range(size):

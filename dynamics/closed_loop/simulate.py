@@ -29,6 +29,7 @@ from dynamics.closed_loop.problem import (
 )
 from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
 from dynamics.errors import SimulationError
+from dynamics.parameters import RigidGroups
 from dynamics.robot import Robot
 
 Item = TypeVar("Item", Reference, StartState)
@@ -51,6 +52,7 @@ def simulate(
     latencies: np.ndarray | None = None,
     servo_robot: Robot | None = None,
     controller: Controller | EveryFrame | None = None,
+    groups: RigidGroups | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
     """Run the closed loop for all parameters of a robot: the dynamic ones, then lp, li, ld.
@@ -69,6 +71,8 @@ def simulate(
     Where the settings' drives take torques, commands, those of a controller and those of the start are torques.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     noise (frames, 6), m and rad: added to the poses that the ideal sensor measures elsewhere.
+    groups: combinations through which alone the inertial parameters act, where they are known: sensitivities are then
+    computed by these, in less time; a start that is given has those of its own, and all are computed.
     compiled: False runs the same lines in plain Python, thousands of times slower.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
     UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
@@ -89,6 +93,7 @@ def simulate(
         latencies=latencies,
         servo_robot=servo_robot,
         controller=controller,
+        groups=groups if start is None else None,
     )
     compiled = flag("compiled", compiled, SimulationError)
     from dynamics.closed_loop.execution import run  # imports numba, which takes its time
@@ -192,6 +197,7 @@ def _checked(
     latencies: np.ndarray | None = None,
     servo_robot: Robot | None = None,
     controller: Controller | EveryFrame | None = None,
+    groups: RigidGroups | None = None,
 ) -> LoopProblem:
     """What `simulate` was asked, checked; it raises what that raises before the run."""
     check_type("robot", robot, Robot, SimulationError)
@@ -235,6 +241,7 @@ def _checked(
         latencies=latencies,
         servo_robot=servo_robot or robot,
         controller=controller,
+        groups=groups,
     )
     _check_together(problem, servo_robot)
     _check_elasticity(problem)

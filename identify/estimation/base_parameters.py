@@ -8,7 +8,7 @@ the same whatever motion shows them.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from scipy.linalg import orth, qr, subspace_angles
 from dynamics import Robot
 from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
-from dynamics.parameters import ParameterLayout
+from dynamics.legs.leg import INERTIAL
+from dynamics.parameters import ParameterLayout, RigidGroups
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
@@ -57,6 +58,13 @@ class BaseParameters:
     def rank(self) -> int:
         """Number of base parameters."""
         return len(self.pivots)
+
+    @cached_property
+    def rigid_groups(self) -> RigidGroups:
+        """Those of the inertial parameters, which stand first, without friction: that is in no group with others."""
+        inertial = [k for k, name in enumerate(self.names) if name.split(".")[1] in INERTIAL]
+        rows = np.flatnonzero(np.isin(self.pivots, inertial))
+        return RigidGroups(np.array(self.pivots)[rows], self.combinations[np.ix_(rows, inertial)])
 
     def group_names(self) -> tuple[str, ...]:
         """Name of each group: its pivot's, with a plus where other parameters belong to it."""

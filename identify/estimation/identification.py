@@ -6,12 +6,14 @@ settings or the truth.
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import xarray as xr
 
 from dynamics import DynamicsError, Robot
 from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
+from identify.estimation.base_parameters import structure
 from identify.estimation.common_errors import common_error_estimates
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.drive_choice import choose_drive
@@ -122,7 +124,8 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
             raise EstimationError(f"{given!r} is no {kind.__name__}: {loader}(name or path) gives one")
     if not records:
         raise EstimationError("no record to identify from")
-    runs = tuple(recorded_run(record, robot, scenario) for record in records)
+    found = [recorded_run(record, robot, scenario) for record in records]
+    runs = tuple(replace(run, groups=structure(robot).rigid_groups) for run in found)
     anchor = read_anchor(records[0], robot.layout)
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopFailure, LoopSettings, Reference, simulate, simulate_repeats
+from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
 from identify.loop_parameters import model_settings
@@ -47,7 +48,8 @@ class RecordedRun:
     commands (N, n) as they were given; driven: whether the model's joints get these, or its own servo acts; payload
     (p,): what a known load on the platform adds to the parameters, with standard deviations payload_std (p,); common:
     errors that all measured poses have in common; drawn: those that a model's loop can have (k,), as it has them, in
-    their standard deviations, None: none; marginal: what whitens residuals by them (`with_common_errors`).
+    their standard deviations, None: none; marginal: what whitens residuals by them (`with_common_errors`); groups:
+    through which alone the inertial parameters act, where that is known: it makes sensitivities quicker.
     """
 
     robot: Robot
@@ -63,6 +65,7 @@ class RecordedRun:
     driven: bool = False
     drawn: Array | None = None
     marginal: Marginal | None = None
+    groups: RigidGroups | None = None
 
     def driven_by_commands(self) -> "RecordedRun":
         """The same run with the model's joints driven by the logged commands."""
@@ -160,6 +163,7 @@ class RecordedRun:
             sensitivities=sensitivities,
             noise=self._sensed(noise),
             servo_robot=self.robot if robot else None,
+            groups=self.groups if sensitivities else None,
             **self._as_recorded,
         )
 
