@@ -57,7 +57,7 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
         commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
     plan, measured = _plan(problem, commands), np.full((frames, 6), np.nan)
     own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
-    _fill(memory, problem, own, known["equation_of_motion"], _addresses(problem.sizes, compiled))
+    _fill(memory, problem, own, known["servo_jacobian"], _addresses(problem.sizes, compiled))
     do = chosen(run_frames, compiled)
     for first, last in [(k, k + 1) for k in range(frames)] if problem.asked else [(0, frames)]:
         if problem.asked:
@@ -87,7 +87,7 @@ def _run_together(problem: LoopProblem, noises: np.ndarray, compiled: bool) -> l
     commands = np.zeros((0, sizes.joints)) if problem.commands is None else problem.commands
     plan = _plan(replace(problem, noise=noises.reshape(-1, 6)), commands)
     own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
-    _fill(memory, problem, own, known["equation_of_motion"], _addresses(sizes, compiled))
+    _fill(memory, problem, own, known["servo_jacobian"], _addresses(sizes, compiled))
     lanes, at = np.zeros(1, record_type("lanes", sizes))[0], np.zeros((runs, 5), memory.evaluations.dtype)
     now = np.repeat(memory.now.reshape(1), runs).view(np.recarray)
     now["first_row"] = frames * np.arange(runs)
@@ -215,7 +215,7 @@ def _fill(
     memory: Memory,
     problem: LoopProblem,
     own: dict[str, MachineFunction],
-    servo_motion: MachineFunction,
+    servo_jacobian: MachineFunction,
     addresses: dict[str, int],
 ) -> None:
     """Machine code, laws, parameters and gains, and the state at the first frame."""
@@ -225,7 +225,7 @@ def _fill(
         task[name] = own[name].address
     for name, found in addresses.items():
         task[name] = found
-    task.servo_motion = servo_motion.address
+    task.servo_jacobian = servo_jacobian.address
     rigid, task.coulomb, task.viscous, gains = problem.robot.layout.split(problem.parameters)
     law = settings.drives.joint_law(gains)
     for name, value in law._asdict().items():
@@ -255,7 +255,7 @@ def _fill(
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
     for inputs, function, fixed in (
         (now.known.inputs, own["equation_of_motion"], rigid),
-        (now.served.inputs, servo_motion, rigid),
+        (now.served.inputs, servo_jacobian, rigid[:0]),
         (now.derivatives.inputs, own["motion_derivatives"], rigid),
         (now.pose_and_rate, own["rate_map_derivative"], rigid[:0]),
     ):

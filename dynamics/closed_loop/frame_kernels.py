@@ -100,7 +100,7 @@ def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k
     jacobian = known.jacobian if same else now.served.jacobian
     if not same:
         copy(measured, now.served.inputs[:size])
-        call(task.servo_motion, now.served.inputs, now.served.mass)
+        call(task.servo_jacobian, now.served.inputs, now.served.jacobian)
     for i in range(len(now.mode)):
         now.last_command[i] = dot(jacobian[i], now.demand[:])
     if task.sensitivities:

@@ -38,6 +38,7 @@ def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction
         motion_derivatives(geometry),
         rate_map_derivative(geometry),
         response(size),
+        servo_jacobian(geometry),
         slope_derivative(layout, size),
     ]
 
@@ -67,6 +68,18 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
         return [total, freely.T @ sum(forces, bias), *(ca.vertcat(*row) for row in rows), factored(total)]
 
     return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides)
+
+
+def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
+    """q (m,) -> J_theta (n, m), all that the servo asks for at a pose that is measured."""
+    (q,), (legs, sides) = _coordinates(geometry, "q"), _legs(geometry)
+    pose = _poses(geometry, q, 0 * q, 0 * q)[0]
+    freely, parts = pose_rate_to_twist(pose) @ freedoms(geometry), []
+    for leg, arm in zip(legs, platform_arms(geometry, pose), strict=True):
+        parts.append([leg.gradient(pose[0:3] + arm).T @ ca.horzcat(ca.SX.eye(3), -ca.skew(arm)) @ freely])
+    return _parted(
+        "servo_jacobian", [q, *geometry.symbols], parts, lambda rows: [ca.vertcat(*rows)], sides
+    )
 
 
 def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:

@@ -19,7 +19,7 @@ from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
 from dynamics.legs.leg import INERTIAL
 from dynamics.parameters import ParameterLayout, RigidGroups
-from identify.arrays import Array
+from identify.arrays import Array, triangular_factor
 from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
 
@@ -157,7 +157,7 @@ def rank_by_threshold(matrix: Array, threshold: float) -> int:
     The entries have the regressor's units (N, N m per unit of a parameter) and grow with the root of the number of
     samples, so the count depends on both; where it exceeds the rank, the threshold lies below rounding.
     """
-    return int(np.sum(np.abs(np.diag(qr(matrix, mode="r", pivoting=True)[0])) > threshold))
+    return int(np.sum(np.abs(np.diag(qr(triangular_factor(matrix), mode="r", pivoting=True)[0])) > threshold))
 
 
 def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> Array:

@@ -31,7 +31,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from dynamics.closed_loop import ClosedLoopRun, LoopFailure
 from dynamics.parameters import LANES
-from identify.arrays import Array
+from identify.arrays import Array, triangular_factor
 from identify.errors import EstimationError
 from identify.estimation.common_errors import covariance_by_kind, most_likely_of, shared_draws
 from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
@@ -175,7 +175,7 @@ def _units(rows: list[Array]) -> Array:
     From the rows themselves: W has the square of their condition number, beyond what its inverse can bear where a
     record contradicts the model.
     """
-    triangle: Array = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
+    triangle = triangular_factor(np.vstack(rows))
     return np.asarray(solve_triangular(triangle, np.eye(triangle.shape[1])))
 
 

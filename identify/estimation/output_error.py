@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynamics import DynamicsError
-from identify.arrays import Array
+from identify.arrays import Array, triangular_factor
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
 from identify.estimation.prior import StartingGuess, prior_residuals
 from identify.estimation.scale_anchor import ScaleAnchor
@@ -81,7 +81,7 @@ class OutputErrorProblem:
             residual, jacobian = run.residuals(parameters)
             cost += float(np.sum(residual**2))
             rows = np.column_stack([jacobian.reshape(-1, size), residual.ravel()])
-            triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows]), mode="r"))
+            triangle = triangular_factor(np.vstack([triangle, triangular_factor(rows)]))
         return cost, triangle[:size, :size], triangle[:size, size]
 
     def known_information(self) -> Array:

@@ -26,7 +26,7 @@ from scipy.signal import lfilter
 
 from dynamics import Robot
 from dynamics.closed_loop.drives import JointLaw
-from identify.arrays import Array
+from identify.arrays import Array, triangular_factor
 from identify.estimation.bounds import SMALLEST_SHARE
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import StartingGuess
@@ -182,7 +182,7 @@ def bounded_fit(matrix: Array, right: Array, guess: StartingGuess, anchor: Scale
     """
     size, known_size = matrix.shape[1], len(guess.values)
     extra = size - known_size
-    triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))[:size]
+    triangle = triangular_factor(np.column_stack([matrix, right]))[:size]
     prior = np.eye(known_size, size) / guess.std[:, None]
     place, measured = anchor.row(guess.layout)
     known = np.vstack([triangle[:, :size], prior, np.pad(place, ((0, 0), (0, extra)))])
