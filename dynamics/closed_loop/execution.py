@@ -262,6 +262,8 @@ def _fill(
         last = np.concatenate([fixed, function.constants])
         end = sum(function.inputs)
         inputs[end - len(last) : end] = last
+    elastic = settings.elasticity is not None
+    now.unknowns = len(now.state) - (0 if elastic else 2 * sizes.joints)  # motors come last
     now.step_column, now.start_moves = len(columns), problem.start_sensitivities
     now.width = len(columns) + 1 + (sizes.start if problem.start_sensitivities else 0)
 

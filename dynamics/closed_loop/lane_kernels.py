@@ -32,7 +32,7 @@ def evaluate_lanes(task: Record, now: Record, at: Record, d: Record, lanes: Reco
             copy(stage.state[: 2 * size], own.known.inputs[: 2 * size])
             take_lane(lanes, lane, own.known)
             take_known(own.known, stage)
-        elif task.stiffness == 0 and count_stuck(own) > 0:
+        elif task.stiffness == 0 and count_stuck(own) > 1:
             take_lane(lanes, lane, stage)
         for i in range(count):
             stage.angle[i], stage.velocity[i] = lanes.angle[i, lane], lanes.velocity[i, lane]
@@ -40,6 +40,11 @@ def evaluate_lanes(task: Record, now: Record, at: Record, d: Record, lanes: Reco
         push(task, own, stage)
         for i in range(count):
             lanes.push[i, lane] = stage.spring[i] if task.stiffness > 0 else stage.net_torque[i]
+        if count_stuck(own) > 0:
+            joint = own.stuck[0]
+            stage.bias_acceleration[joint] = lanes.bias_acceleration[joint, lane]
+            for j in range(size):
+                stage.jacobian[joint, j] = lanes.row[j, lane] = lanes.jacobian[joint, j, lane]
     call_columns(task.acceleration_in_lanes, lanes.shared, lanes.factor, lanes.acceleration, LANES)
     for lane in asked:
         own, stage = now[lane], at[lane, k]
@@ -47,8 +52,8 @@ def evaluate_lanes(task: Record, now: Record, at: Record, d: Record, lanes: Reco
             continue
         if has_factor(lanes, lane):
             for j in range(size):
-                stage.slope[size + j] = lanes.acceleration[j, lane]
-            hold_stuck(task, own, stage)
+                stage.slope[size + j], stage.response[0, j] = lanes.acceleration[j, lane], lanes.response[j, lane]
+            hold_stuck(task, own, stage, 1)
         else:
             own.known.valid = False
             own.status = invoke(task.evaluate, task, own, stage, d, 0)  # says what is wrong

@@ -76,7 +76,7 @@ LAYOUT = {
     "now": "known=known served=served derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
-    "pose_and_rate:M rate_map:nm first_row! status! frame! span! steps! grid! duration target purpose! length "
+    "pose_and_rate:M rate_map:nm first_row! status! unknowns! frame! span! steps! grid! duration target purpose! length "
     "trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
     # first what `equation_of_motion` and `motion_derivatives` return, in their order
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
@@ -91,7 +91,7 @@ LAYOUT = {
     # and before the torques the slopes of filtered rates, whose trials are `filtered`
     # first what `motion_in_lanes` takes, then what it returns, and from the factor on what `acceleration_in_lanes` does
     "lanes": "shared:q states:BL bias_acceleration:nL angle:nL velocity:nL factor:mmL bias:mL jacobian:nmL push:nL "
-    "acceleration:mL asked:L!",
+    "row:mL acceleration:mL response:mL asked:L!",
     "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w length:w "
     "stage_time:w margin:w command:nw command_slope:nw last_command:nw force:nw last_measured:mw integral:mw "
     "demand:mw moved:mw",

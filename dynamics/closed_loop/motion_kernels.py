@@ -122,21 +122,23 @@ def take_known(known: Record, at: Record) -> None:
 def drive(task: Record, now: Record, at: Record) -> None:
     """Torques of the drives, whose angles and velocities are known."""
     state, count, first = at.state, len(at.angle), 2 * len(at.bias)
+    time, lp, li, ld, rate_weight = at.time, task.lp, task.li, task.ld, task.rate_weight  # read once, not at every joint
     for i in range(count):
         if task.stiffness > 0:  # from here on the motors stand for the cranks in what joint PID and friction feel
             motor, motor_rate = state[len(state) - 2 * count + i], state[len(state) - count + i]
             wound, winding = motor - at.angle[i], motor_rate - at.velocity[i]
             at.spring[i] = task.stiffness * wound + task.damping * winding
             at.angle[i], at.velocity[i] = motor, motor_rate
-        at.error[i] = now.command[i] + now.command_slope[i] * at.time - at.angle[i]
-        damped = task.ld * (task.rate_weight * now.command_rate[i] - at.velocity[i])
+        error = now.command[i] + now.command_slope[i] * time - at.angle[i]
+        damped = ld * (rate_weight * now.command_rate[i] - at.velocity[i])
         if task.filter_time > 0:
-            damped = task.ld * state[first + count + i]
-        at.torque[i] = task.lp * at.error[i] + damped + task.li * state[first + i]
+            damped = ld * state[first + count + i]
+        at.error[i] = error
+        at.torque[i] = lp * error + damped + li * state[first + i]
         if task.lx > 0:
             at.torque[i] -= task.lx * at.angle[i]
         if task.torques:
-            at.torque[i], at.error[i] = now.command[i] + now.command_slope[i] * at.time, 0.0
+            at.torque[i], at.error[i] = now.command[i] + now.command_slope[i] * time, 0.0
         if task.torque_limit > 0:
             at.torque[i] = min(max(at.torque[i], -task.torque_limit), task.torque_limit)
 
@@ -158,11 +160,13 @@ def winds_up(task: Record, at: Record, joint: int) -> bool:
 
 
 @kernel
-def hold_compliance(task: Record, at: Record, joints: Array) -> None:
-    """M^-1 J^T (n, m) and J M^-1 J^T (n, n) of some joints, in their order, and the factor of the latter."""
+def hold_compliance(task: Record, at: Record, joints: Array, known: int) -> None:
+    """M^-1 J^T (n, m), the first `known` rows of which are known, and J M^-1 J^T (n, n) of some joints, in their order,
+    and the factor of the latter."""
     for s in range(len(joints)):
-        copy(at.jacobian[joints[s]], at.row)
-        call(task.response, at.row, at.response[s])
+        if s >= known:
+            copy(at.jacobian[joints[s]], at.row)
+            call(task.response, at.row, at.response[s])
         for r in range(s + 1):
             at.compliance[s, r] = dot(at.jacobian[joints[r]], at.response[s])
             at.compliance[r, s] = at.compliance[s, r]
@@ -206,13 +210,14 @@ def push(task: Record, now: Record, at: Record) -> None:
 
 
 @kernel
-def hold_stuck(task: Record, now: Record, at: Record) -> None:
-    """Give rigid joints that are stuck the torque that keeps them at rest; the slope knows the free acceleration."""
+def hold_stuck(task: Record, now: Record, at: Record, known: int) -> None:
+    """Give rigid joints that are stuck the torque that keeps them at rest; the slope knows the free acceleration, and
+    `known` joints' response to it is known (see `hold_compliance`)."""
     size, stuck = len(at.bias), now.stuck[: count_stuck(now)]
     if task.stiffness > 0 or len(stuck) == 0:
         return
     acceleration = at.slope[size : 2 * size]
-    hold_compliance(task, at, stuck)
+    hold_compliance(task, at, stuck, known)
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], acceleration) + at.bias_acceleration[stuck[s]]
     solve(at.stuck_factor, len(stuck), at.force)
@@ -234,7 +239,7 @@ def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     push(task, now, at)
     size = len(at.bias)
     accelerate_freely(task, at, at.spring if task.stiffness > 0 else at.net_torque, at.slope[size : 2 * size])
-    hold_stuck(task, now, at)
+    hold_stuck(task, now, at, 0)
     return OK
 
 
@@ -259,7 +264,7 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
             now.mode[i] = 0 if abs(left) < breakaway(task, i) else 1 if left >= 0 else -1
     if task.stiffness > 0 or len(joints) == 0:
         return OK
-    hold_compliance(task, at, joints)
+    hold_compliance(task, at, joints, 0)
     for i in range(len(now.mode)):
         at.net_torque[i] = at.torque[i]
         if now.mode[i] != 0:

@@ -301,7 +301,7 @@ def rest_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
     if len(stuck) == size:
         clear(d.x[size : 2 * size], now.width)
     elif len(stuck) > 0:
-        hold_compliance(task, at, stuck)
+        hold_compliance(task, at, stuck, 0)
         fill(at.force[:], 0.0)
         fill(now.change[:], 0.0)
         invoke(task.stop_tangent, task, now, at, d, 0)

@@ -39,11 +39,11 @@ def set_stage(now: Record, at: Record, k: int) -> None:
     start, stage, h = at[0], at[k], now.length
     if k < END:
         before = at[k - 1]
-        for i in range(len(now.state)):
+        for i in range(now.unknowns):
             stage.state[i] = start.state[i] + FRACTION[k] * h * before.slope[i]
         stage.time = start.time + FRACTION[k] * h
         return
-    for i in range(len(now.state)):
+    for i in range(now.unknowns):
         reached = start.state[i]
         for stage_before in range(END):
             reached += WEIGHT[stage_before] * h * at[stage_before].slope[i]
@@ -226,7 +226,7 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
         return OK
     now.mode[joint] = 0
     if task.stiffness == 0:
-        hold_compliance(task, end, now.stuck[: count_stuck(now)])
+        hold_compliance(task, end, now.stuck[: count_stuck(now)], 0)
     invoke(task.stop_joints, task, now, end, d, 0)
     copy(now.state[:], end.state[:])
     status = invoke(task.evaluate_terms, task, now, end, d, 0)

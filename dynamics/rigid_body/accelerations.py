@@ -28,6 +28,14 @@ def response(size: int) -> ca.Function:
     return function("response", [row, factor], [ca.vertcat(*_solved(factor, ca.vertsplit(row)))])
 
 
+def acceleration_in_lanes(free: ca.Function, responding: ca.Function) -> ColumnFunction:
+    """Both for several states at once: in each column factor, b, J_theta, torque and a row; q_ddot and M^-1 row."""
+    factor, *others = free.sx_in()
+    row = responding.sx_in()[0]
+    outputs = [*free.call([factor, *others]), *responding.call([row, factor])]
+    return ColumnFunction(ca.Function("acceleration_in_lanes", [factor, *others, row], outputs), 0, LANES, LANES)
+
+
 def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     """Derivatives of the slope of the state of a platform with m coordinates, and of the net torque of joints, as if
     none was stuck.

@@ -21,7 +21,13 @@ from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import PlatformJointMotion, joint_motion, pose_rate_to_twist, twist_bias
 from dynamics.legs.leg import Leg
 from dynamics.parameters import LANES, parameter_layout
-from dynamics.rigid_body.accelerations import factored, free_acceleration, response, slope_derivative
+from dynamics.rigid_body.accelerations import (
+    acceleration_in_lanes,
+    factored,
+    free_acceleration,
+    response,
+    slope_derivative,
+)
 from dynamics.rigid_body.jacobians import freedoms, platform_arms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
@@ -30,14 +36,15 @@ def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction
     """What the closed loop integrates."""
     size, layout = len(geometry.chart.freedoms), parameter_layout(geometry.legs)
     motion, free = equation_of_motion(geometry), free_acceleration(size, layout.joints)
+    responding = response(size)
     return [
         motion,
         motion_in_lanes(motion),
         free,
-        ColumnFunction(ca.Function("acceleration_in_lanes", free.sx_in(), free.call(free.sx_in())), 0, LANES, LANES),
+        acceleration_in_lanes(free, responding),
         motion_derivatives(geometry),
         rate_map_derivative(geometry),
-        response(size),
+        responding,
         servo_jacobian(geometry),
         slope_derivative(layout, size),
     ]
