@@ -67,7 +67,7 @@ def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -
     """Write the columns of the parameters, and those of the start state if wanted."""
     start = now.step_column + 1
     copy_rows(rows, by_parameters, now.step_column)
-    copy_rows(rows[:, start:], by_start, now.width - start)
+    copy_rows(rows[:, start:], by_start, by_start.shape[1])
 
 
 @kernel

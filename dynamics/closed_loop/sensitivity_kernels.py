@@ -44,10 +44,14 @@ def differentiate_motion(
     copy(acceleration, known.inputs[2 * size : 3 * size])
     copy(torque, known.inputs[3 * size :])
     call(task.motion_derivatives, known.inputs, known.by_pose)
-    if task.shown < len(task.rigid):
-        for row in known.columns:
-            for k in range(task.shown):
-                row[k] = row[task.pivots[k]]
+
+
+@kernel
+def add_columns(task: Record, factor: float, known: Record, rows: Array) -> None:
+    """Add a factor times the derivatives by the inertial parameters that stand for all."""
+    for i in range(len(rows)):
+        for k in range(task.shown):
+            rows[i, k] += factor * known.columns[i, task.pivots[k]]
 
 
 @kernel
@@ -77,7 +81,7 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record) -> Non
     lp = rigid + 2 * count
     for i in range(len(at.bias)):
         for k in range(rigid):
-            d.push[i, k] = -now.derivatives.columns[i, k]
+            d.push[i, k] = -now.derivatives.columns[i, task.pivots[k]]
     for i in range(count):
         mode, row, law = now.mode[i], d.direct[i], follows_law(task, at, i)
         rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
@@ -273,13 +277,12 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
     fill(now.impulse[:], 0.0)
     clear(d.moved[:], width)
     differentiate_motion(task, now, now.state[:size], now.rest[:], now.rest[:], now.impulse[:])
-    copy_rows(known.columns, d.moved[:], task.shown)
+    add_columns(task, 1.0, known, d.moved[:])
     add_product(1.0, known.by_pose, pose, d.moved[:], width)
     for s in range(len(stuck)):
         now.impulse[stuck[s]] = -at.force[s]
     differentiate_motion(task, now, now.state[:size], now.rest[:], now.change[:], now.impulse[:])
-    for i in range(size):
-        add_row(-1.0, known.columns[i], d.moved[i], task.shown)  # the difference leaves out gravity
+    add_columns(task, -1.0, known, d.moved[:])  # the difference leaves out gravity
     add_product(-1.0, known.by_pose, pose, d.moved[:], width)
     solve_rows(at.factor, size, d.moved[:], width)
     for j in range(size):
