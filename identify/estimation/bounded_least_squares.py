@@ -13,12 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from dynamics import DynamicsError
 from identify.arrays import Array
 
 SHRINK, GROW = 0.25, 2.0
 POOR, GOOD = 0.25, 0.75
 SMALLEST_RADIUS = 1e-10
 AT_BOUND = 1e-12  # of the parameter's scale: what rounding may leave
+
+
+Linearisation = tuple[float, Array, Array]
 
 
 class Problem(Protocol):
@@ -28,8 +32,9 @@ class Problem(Protocol):
         """|r|^2; infinite where the model cannot run."""
         ...
 
-    def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
-        """|r|^2, and a factor R (p, p) with a vector d (p,): |r + J step|^2 = |d + R step|^2 + constant."""
+    def linearise(self, parameters: Array) -> Linearisation:
+        """|r|^2, and a factor R (p, p) with a vector d (p,): |r + J step|^2 = |d + R step|^2 + constant. Raises
+        DynamicsError where the model cannot run."""
         ...
 
 
@@ -68,15 +73,17 @@ def minimise(
     on_iteration: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Solution:
     """Minimise from `start` (p,) with p >= lower; `scale` (p,) is the size of a large change of each parameter."""
-    parameters, radius = start.copy(), 1.0
+    parameters, radius, trusted = start.copy(), 1.0, True
     cost, factor, residual = problem.linearise(parameters)
     costs, evaluations, reason = [cost], 1, ""
     while not reason:
         step, predicted = _box_step(factor, residual, parameters, lower, scale, radius)
         trial = np.maximum(parameters + step, lower)
         evaluations += predicted > 0
-        new_cost = problem.cost(trial) if predicted > 0 else cost
+        goes_on = trusted and predicted > criteria.cost_tolerance * cost
+        new_cost, linearised = _tried(problem, trial, goes_on) if predicted > 0 else (cost, None)
         ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
+        trusted = ratio > POOR
         largest = float(np.abs(step / scale).max())
         tried, radius = radius, _new_radius(radius, ratio, largest)
         if ratio > 0:
@@ -90,12 +97,24 @@ def minimise(
             costs.append(cost)
             on_iteration(len(costs) - 1, cost)
             if not reason:
-                cost, factor, residual = problem.linearise(parameters)
-                evaluations += 1
+                evaluations += linearised is None
+                cost, factor, residual = linearised or problem.linearise(parameters)
         elif radius < SMALLEST_RADIUS or predicted <= criteria.cost_tolerance * cost:
             reason = f"no step lowers the cost: predicted gain {predicted:.3g} of {cost:.6g}"
     at_bound = parameters <= lower + AT_BOUND * scale
     return Solution(parameters, at_bound, tuple(costs), evaluations, reason)
+
+
+def _tried(problem: Problem, trial: Array, goes_on: bool) -> tuple[float, Linearisation | None]:
+    """The cost of a trial (p,), and where the search is expected to go on from there at once its linearisation, which
+    the cost alone would be spent on twice."""
+    if not goes_on:
+        return problem.cost(trial), None
+    try:
+        linearised = problem.linearise(trial)
+    except DynamicsError:
+        return np.inf, None
+    return linearised[0], linearised
 
 
 def _box_step(
