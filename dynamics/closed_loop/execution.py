@@ -122,9 +122,6 @@ def _poses(problem: LoopProblem, found: dict[str, Any], measured: np.ndarray) ->
         poses["measured"][~found["measured_ok"]] = np.nan
         if problem.noise is not None:
             poses["measured"] += chart.forbidden(chart.pose(np.zeros(problem.sizes.coordinates)) + problem.noise)
-    for name in ("pose_sensitivity", "end_sensitivity"):
-        if problem.groups is not None and found[name] is not None:
-            found[name] = poses[name] = problem.groups.of_all(found[name])
     for name in ("pose_sensitivity", "start_sensitivity"):
         if found[name] is not None:
             poses[name] = chart.lifted(found[name], axis=1)

@@ -72,7 +72,8 @@ def simulate(
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     noise (frames, 6), m and rad: added to the poses that the ideal sensor measures elsewhere.
     groups: combinations through which alone the inertial parameters act, where they are known: sensitivities are then
-    computed by these, in less time; a start that is given has those of its own, and all are computed.
+    those by their pivots and all other parameters, in less time; `groups.of_all` says what follows for all. A start
+    must not be given then.
     compiled: False runs the same lines in plain Python, thousands of times slower.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
     UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
@@ -93,7 +94,7 @@ def simulate(
         latencies=latencies,
         servo_robot=servo_robot,
         controller=controller,
-        groups=groups if start is None else None,
+        groups=groups,
     )
     compiled = flag("compiled", compiled, SimulationError)
     from dynamics.closed_loop.execution import run  # imports numba, which takes its time
@@ -214,6 +215,7 @@ def _checked(
     _check_reach(robot, reference)
     frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters, settings.drives.law)
     feedforward = _checked_rows("feedforward", feedforward, (frames, robot.layout.joints))
+    started = start is not None
     if start is None:
         known, at = (parameters.tobytes(), reference.poses[0].tobytes()), (servo_robot, feedforward is not None)
         start = _at_rest(robot, *known, settings, *at)
@@ -243,7 +245,7 @@ def _checked(
         controller=controller,
         groups=groups,
     )
-    _check_together(problem, servo_robot)
+    _check_together(problem, servo_robot, started)
     _check_elasticity(problem)
     return problem
 
@@ -296,8 +298,9 @@ def _checked_rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray
     return None if rows is None else np.ascontiguousarray(floats(name, rows, shape, error=SimulationError))
 
 
-def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:
-    """Raise SimulationError for options of a run that exclude each other; servo_robot as the caller gave it."""
+def _check_together(problem: LoopProblem, servo_robot: Robot | None, started: bool) -> None:
+    """Raise SimulationError for options of a run that exclude each other; servo_robot as the caller gave it, started:
+    whether a start was given."""
     sensed, controlled, derived = problem.sensor is not None, problem.controller is not None, problem.sensitivities
     driven = problem.settings.drives.torques
     if problem.servo_robot.geometry.chart != problem.robot.geometry.chart:
@@ -316,6 +319,7 @@ def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:
         "drives that take torques need a controller or commands: the servo commands joints": driven
         and not controlled
         and problem.commands is None,
+        "groups are for runs that begin at rest: pass start=None": problem.groups is not None and started,
         "commands take the place of any controller: pass controller=None": controlled and problem.commands is not None,
     }
     for words, excluded in refusals.items():

@@ -78,10 +78,11 @@ class OutputErrorProblem:
         size, cost = len(parameters), float(known @ known)
         triangle = np.column_stack([known_jacobian, known])
         for run in self.runs:
-            residual, jacobian = run.residuals(parameters)
+            residual, shown = run.shown_residuals(parameters)
             cost += float(np.sum(residual**2))
-            rows = np.column_stack([jacobian.reshape(-1, size), residual.ravel()])
-            triangle = triangular_factor(np.vstack([triangle, triangular_factor(rows)]))
+            rows = triangular_factor(np.column_stack([shown.reshape(residual.size, -1), residual.ravel()]))
+            rows = np.column_stack([run.of_all(rows[:, :-1]), rows[:, -1]])
+            triangle = triangular_factor(np.vstack([triangle, rows]))
         return cost, triangle[:size, :size], triangle[:size, size]
 
     def known_information(self) -> Array:

@@ -49,7 +49,7 @@ class RecordedRun:
     (p,): what a known load on the platform adds to the parameters, with standard deviations payload_std (p,); common:
     errors that all measured poses have in common; drawn: those that a model's loop can have (k,), as it has them, in
     their standard deviations, None: none; marginal: what whitens residuals by them (`with_common_errors`); groups:
-    through which alone the inertial parameters act, where that is known: it makes sensitivities quicker.
+    through which alone the inertial parameters act; where that is known, sensitivities are by those that stand for all.
     """
 
     robot: Robot
@@ -206,11 +206,26 @@ class RecordedRun:
 
     def residuals(self, parameters: Array) -> tuple[Array, Array]:
         """`misses` (n, 6), and their Jacobian (n, 6, p)."""
-        missed, jacobian = self.residuals_in_noise(parameters)
-        return self.without_common(missed), self.without_common(jacobian)
+        missed, shown = self.shown_residuals(parameters)
+        return missed, self.of_all(shown)
+
+    def shown_residuals(self, parameters: Array) -> tuple[Array, Array]:
+        """`misses` (n, 6), and their derivatives (n, 6, k) by the parameters that stand for all, see `of_all`."""
+        missed, shown = self._shown_in_noise(parameters)
+        return self.without_common(missed), self.without_common(shown)
+
+    def of_all(self, shown: Array) -> Array:
+        """Derivatives (..., p) by all parameters, from those (..., k) by the ones that stand for all."""
+        if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
+            return shown
+        return self.groups.of_all(shown)
 
     def residuals_in_noise(self, parameters: Array) -> tuple[Array, Array]:
         """The same in standard deviations of the noise alone."""
+        missed, shown = self._shown_in_noise(parameters)
+        return missed, self.of_all(shown)
+
+    def _shown_in_noise(self, parameters: Array) -> tuple[Array, Array]:
         run = self.simulate(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
         return self._missed(run), np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop import ClosedLoopRun, Drives, Reference, StartState, simulate
+from dynamics.closed_loop import ClosedLoopRun, LoopFailure, Drives, Reference, StartState, simulate
 from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
 from identify.arrays import Array
 from identify.filtering import filtered_derivatives
@@ -68,6 +68,10 @@ class TorqueRun(RecordedRun):
         )
         measured = pose if noise is None else pose + noise
         return replace(fits[0].run, pose=pose, measured=measured, pose_sensitivity=slopes)
+
+    def simulate_repeats(self, parameters: Array, noises: Array) -> list[ClosedLoopRun | LoopFailure]:
+        """The model's poses, which no noise moves, with each noise (runs, N, 6) in what is measured."""
+        return [self.simulate(parameters, noise=noise) for noise in noises]
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
         """`misses`, with drawn noise where the fit of the starts has taken it out: white, if the model is right."""
