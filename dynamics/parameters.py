@@ -36,7 +36,7 @@ class RigidGroups:
     combinations: np.ndarray
 
     def of_all(self, by_pivots: np.ndarray) -> np.ndarray:
-        """Derivatives (..., p) by all parameters, of those by the pivots and the parameters behind the inertial ones."""
+        """Derivatives (..., p) by all parameters, of those by the pivots and what stands behind the inertial ones."""
         count = len(self.pivots)
         return np.concatenate([by_pivots[..., :count] @ self.combinations, by_pivots[..., count:]], axis=-1)
 

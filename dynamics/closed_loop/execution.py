@@ -40,8 +40,8 @@ FAILURES = {
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; there",
 }
 MACHINE_CODE = (
-    *("equation_of_motion", "motion_in_lanes", "free_acceleration", "acceleration_in_lanes", "response", "motion_derivatives"),
-    *("rate_map_derivative", "slope_derivative"),
+    *("equation_of_motion", "motion_in_lanes", "free_acceleration", "acceleration_in_lanes", "response"),
+    *("motion_derivatives", "rate_map_derivative", "slope_derivative"),
 )
 """Functions of a robot that kernels call, by their names."""
 

@@ -69,15 +69,16 @@ class Memory(NamedTuple):
 
 
 LAYOUT = {
-    "task": "equation_of_motion! free_acceleration! acceleration_in_lanes! response! motion_derivatives! rate_map_derivative! "
-    "slope_derivative! motion_in_lanes! servo_jacobian! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! "
-    "sensitivities! servo_knows! measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping "
-    "motor_inertia period torques! torque_limit filter_time shown! pivots:r! rigid:r coulomb:n viscous:n friction=friction",
+    "task": "equation_of_motion! motion_in_lanes! free_acceleration! acceleration_in_lanes! response! "
+    "motion_derivatives! rate_map_derivative! slope_derivative! servo_jacobian! evaluate_terms! evaluate! "
+    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld lx "
+    "rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! torque_limit filter_time "
+    "shown! pivots:r! rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=served derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
-    "pose_and_rate:M rate_map:nm first_row! status! unknowns! frame! span! steps! grid! duration target purpose! length "
-    "trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
+    "pose_and_rate:M rate_map:nm first_row! status! unknowns! frame! span! steps! grid! duration target purpose! "
+    "length trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
     # first what `equation_of_motion` and `motion_derivatives` return, in their order
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
     "served": "jacobian:nm inputs:j",

@@ -122,7 +122,7 @@ def take_known(known: Record, at: Record) -> None:
 def drive(task: Record, now: Record, at: Record) -> None:
     """Torques of the drives, whose angles and velocities are known."""
     state, count, first = at.state, len(at.angle), 2 * len(at.bias)
-    time, lp, li, ld, rate_weight = at.time, task.lp, task.li, task.ld, task.rate_weight  # read once, not at every joint
+    time, lp, li, ld = at.time, task.lp, task.li, task.ld  # read once, not at every joint
     for i in range(count):
         if task.stiffness > 0:  # from here on the motors stand for the cranks in what joint PID and friction feel
             motor, motor_rate = state[len(state) - 2 * count + i], state[len(state) - count + i]
@@ -130,7 +130,7 @@ def drive(task: Record, now: Record, at: Record) -> None:
             at.spring[i] = task.stiffness * wound + task.damping * winding
             at.angle[i], at.velocity[i] = motor, motor_rate
         error = now.command[i] + now.command_slope[i] * time - at.angle[i]
-        damped = ld * (rate_weight * now.command_rate[i] - at.velocity[i])
+        damped = ld * (task.rate_weight * now.command_rate[i] - at.velocity[i])
         if task.filter_time > 0:
             damped = ld * state[first + count + i]
         at.error[i] = error

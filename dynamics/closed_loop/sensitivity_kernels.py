@@ -1,9 +1,10 @@
 """Sensitivities over the steps of the integrator, the exact derivative of what it computes.
 
-Derivatives are rows over columns: the parameters (of rigid bodies those that stand for all), the length of the present step, and the start state if wanted. A
-Runge-Kutta step is differentiated stage by stage, the equation of motion at each implicitly. A step that an event cuts
-has the length at which a margin vanishes at its end; the margin's derivative gives that of the length, and the step
-that follows is shorter by it. Stopping joints by an impulse is differentiated implicitly too.
+Derivatives are rows over columns: the parameters (of rigid bodies those that stand for all), the length of the present
+step, and the start state if wanted. A Runge-Kutta step is differentiated stage by stage, the equation of motion at each
+implicitly. A step that an event cuts has the length at which a margin vanishes at its end; the margin's derivative
+gives that of the length, and the step that follows is shorter by it. Stopping joints by an impulse is differentiated
+implicitly too.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import (
@@ -17,12 +18,12 @@ from dynamics.closed_loop.linear_algebra_kernels import (
 )
 from dynamics.closed_loop.motion_kernels import (
     OK,
+    count_stuck,
     dry_level,
     dry_slope,
     follows_law,
     hold_compliance,
     mode_margin,
-    count_stuck,
     winds_up,
 )
 from dynamics.compiled.kernel import Array, Record, call, call_columns, entry, invoke, kernel

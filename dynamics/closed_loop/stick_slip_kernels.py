@@ -8,10 +8,10 @@ from dynamics.closed_loop.linear_algebra_kernels import clear, copy, dot, fill, 
 from dynamics.closed_loop.motion_kernels import (
     OK,
     TOO_MANY_EVENTS,
+    count_stuck,
     follow_frictionless,
     hold_compliance,
     mode_margin,
-    count_stuck,
 )
 from dynamics.closed_loop.sensitivity_kernels import END, FRACTION, WEIGHT, rest_tangent, step_tangent
 from dynamics.compiled.kernel import Record, entry, invoke, kernel

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop import ClosedLoopRun, LoopFailure, Drives, Reference, StartState, simulate
+from dynamics.closed_loop import ClosedLoopRun, Drives, LoopFailure, Reference, StartState, simulate
 from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
 from identify.arrays import Array
 from identify.filtering import filtered_derivatives
