@@ -120,8 +120,7 @@ def simulate_repeats(
     for eight of them at once. A run that leaves the reachable set gives its LoopFailure; raises what else `simulate`
     raises.
     """
-    options = {"commands": commands, "lost": lost, "latencies": latencies}
-    problem = _checked(robot, parameters, reference, settings, **options)
+    problem = _checked(robot, parameters, reference, settings, commands=commands, lost=lost, latencies=latencies)
     noises = floats("noises", noises, ("N", problem.frames, 6), error=SimulationError)
     compiled = flag("compiled", compiled, SimulationError)
     from dynamics.closed_loop.execution import run_repeats

@@ -84,7 +84,11 @@ def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
     freely, parts = pose_rate_to_twist(pose) @ freedoms(geometry), []
     for leg, arm in zip(legs, platform_arms(geometry, pose), strict=True):
         parts.append([leg.gradient(pose[0:3] + arm).T @ ca.horzcat(ca.SX.eye(3), -ca.skew(arm)) @ freely])
-    return _parted("servo_jacobian", [q, *geometry.symbols], parts, lambda rows: [ca.vertcat(*rows)], sides)
+
+    def end(rows: Sequence[ca.SX]) -> list[ca.SX]:
+        return [ca.vertcat(*rows)]
+
+    return _parted("servo_jacobian", [q, *geometry.symbols], parts, end, sides)
 
 
 def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:

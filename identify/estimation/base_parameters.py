@@ -62,7 +62,7 @@ class BaseParameters:
     @cached_property
     def rigid_groups(self) -> RigidGroups:
         """Those of the inertial parameters, which stand first, without friction: that is in no group with others."""
-        inertial = [k for k, name in enumerate(self.names) if name.split(".")[1] in INERTIAL]
+        inertial = np.flatnonzero([name.split(".")[1] in INERTIAL for name in self.names])
         rows = np.flatnonzero(np.isin(self.pivots, inertial))
         return RigidGroups(np.array(self.pivots)[rows], self.combinations[np.ix_(rows, inertial)])
 
