@@ -193,14 +193,14 @@ def next_span(task: Record, now: Record, at: Record, d: Record, plan: Record, re
     span = now.span
     now.span, now.grid, now.steps, now.target = span + 1, 0, 0, 0.0
     apply_command(task, now, d, plan.start_commands, commands, spans.command[span], spans.ramp[span])
+    copy(now.state[:], at[0].state[:])
+    at[0].time = 0.0
+    status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
     if span == spans.first[k]:
-        copy(now.state[:], at[0].state[:])
-        at[0].time = 0.0
-        status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
         copy(at[0].torque[:], record.torque[now.first_row + k])
-        if status != OK:
-            return status
-    return OK if last else begin_span(task, now, at, d, spans.duration[span], spans.steps[span])
+    if status == OK and not last:
+        begin_span(task, now, at, d, spans.duration[span], spans.steps[span])
+    return status
 
 
 @entry

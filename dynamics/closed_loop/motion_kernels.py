@@ -230,17 +230,22 @@ def hold_stuck(task: Record, now: Record, at: Record, known: int) -> None:
         fill(acceleration, 0.0)  # a robot that stands still stands still: rounding must not make it creep
 
 
+@kernel
+def accelerate(task: Record, now: Record, at: Record) -> None:
+    """The slope of the state in the present modes."""
+    size = len(at.bias)
+    push(task, now, at)
+    accelerate_freely(task, at, at.spring if task.stiffness > 0 else at.net_torque, at.slope[size : 2 * size])
+    hold_stuck(task, now, at, 0)
+
+
 @entry
 def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """The whole evaluation at its state and time, in the present modes."""
     status = invoke(task.evaluate_terms, task, now, at, d, 0)
-    if status != OK:
-        return status
-    push(task, now, at)
-    size = len(at.bias)
-    accelerate_freely(task, at, at.spring if task.stiffness > 0 else at.net_torque, at.slope[size : 2 * size])
-    hold_stuck(task, now, at, 0)
-    return OK
+    if status == OK:
+        accelerate(task, now, at)
+    return status
 
 
 @kernel

@@ -8,6 +8,7 @@ from dynamics.closed_loop.linear_algebra_kernels import clear, copy, dot, fill, 
 from dynamics.closed_loop.motion_kernels import (
     OK,
     TOO_MANY_EVENTS,
+    accelerate,
     count_stuck,
     follow_frictionless,
     hold_compliance,
@@ -260,23 +261,18 @@ def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, hel
 
 
 @kernel
-def begin_span(task: Record, now: Record, at: Record, d: Record, duration: float, steps: int) -> int:
-    """Begin a time, s, with one command. Modes are decided anew at its start, where the torque jumps."""
+def begin_span(task: Record, now: Record, at: Record, d: Record, duration: float, steps: int) -> None:
+    """Begin a time, s, with one command, whose torques are known. Modes are decided anew at its start, where these
+    jump."""
     start = at[0]
-    copy(now.state[:], start.state[:])
-    start.time = 0.0
-    status = invoke(task.evaluate_terms, task, now, start, d, 0)
-    if status != OK:
-        return status
     follow_frictionless(task, now, start)
     invoke(task.decide_modes, task, now, start, d, 0)
-    status = evaluate_anew(task, now, at, d, 0.0)
-    if status == OK and now.start_moves:
+    accelerate(task, now, start)
+    if now.start_moves:
         rest_tangent(task, now, start, d)
     now.start_moves = 0
     now.events_left = MAX_EVENTS_PER_SEGMENT
     now.duration, now.steps = duration, steps
-    return status
 
 
 @kernel

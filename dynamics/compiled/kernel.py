@@ -49,7 +49,7 @@ def part(function: Callable[..., Any]) -> Any:
     return njit(forceinline=True, **_ARITHMETIC, **_ONLY_KERNELS)(function)
 
 
-# Nothing is allocated, and references to arrays, which their owners hold, are not counted: that took a twelfth of a run.
+# Nothing is allocated, and references to arrays, which their owners hold, are not counted: that took a run's twelfth.
 _ARITHMETIC: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 _ONLY_KERNELS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # unknown to numba's stubs
 
