@@ -40,8 +40,8 @@ FAILURES = {
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; there",
 }
 MACHINE_CODE = (
-    *("equation_of_motion", "motion_in_lanes", "free_acceleration", "acceleration_in_lanes", "response"),
-    *("motion_derivatives", "rate_map_derivative", "slope_derivative"),
+    *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
+    "slope_derivative",
 )
 """Functions of a robot that kernels call, by their names."""
 
@@ -88,6 +88,8 @@ def _run_together(problem: LoopProblem, noises: np.ndarray, compiled: bool) -> l
     plan = _plan(replace(problem, noise=noises.reshape(-1, 6)), commands)
     own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
     _fill(memory, problem, own, known["servo_jacobian"], _addresses(sizes, compiled))
+    for name in ("motion_in_lanes", "acceleration_in_lanes"):
+        memory.task[name] = own[name].address
     lanes, at = np.zeros(1, record_type("lanes", sizes))[0], np.zeros((runs, 5), memory.evaluations.dtype)
     now = np.repeat(memory.now.reshape(1), runs).view(np.recarray)
     now["first_row"] = frames * np.arange(runs)

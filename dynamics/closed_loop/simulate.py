@@ -205,6 +205,8 @@ def _checked(
     check_type("settings", settings, LoopSettings, SimulationError)
     if servo_robot is not None:
         check_type("servo_robot", servo_robot, Robot, SimulationError)
+    if groups is not None:
+        check_type("groups", groups, RigidGroups, SimulationError)
     if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
         raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
     if controller is not None and not callable(controller) and not isinstance(controller, EveryFrame):

@@ -36,6 +36,7 @@ def _six_masses():
         function("equation_of_motion", [pose, rate, rigid], [mass, column, unit, column, pose, rate, factored(mass)]),
         function("motion_derivatives", [pose, rate, acceleration, torque, rigid], [zero, zero, columns, zero, zero]),
         function("rate_map_derivative", [pose, rate], [zero]),
+        function("servo_jacobian", [pose], [unit]),
         free_acceleration(6, 6),
         response(6),
         slope_derivative(load_robot("rss6").layout, 6),
