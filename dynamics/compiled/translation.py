@@ -184,18 +184,21 @@ class _ColumnBody(_Body):
         self._lines += ["br label %ask", "ask:", "%k = phi i64 [0, %0], [%next, %do]"]
         self._lines += ["%goes = icmp slt i64 %k, %width", "br i1 %goes, label %do, label %done", "do:"]
         vectors: dict[int, str] = {}
+
+        def in_lanes(number: int) -> str:
+            return vectors[number] if varies[number] else self._vector([values.of(number)] * lanes, lanes)
+
         for number in [number for number, of_column in enumerate(varies) if of_column]:
             operation, operands, _, (place, entry) = graph.nodes[number]
             if operation == "INPUT":
                 address = self._place("rows", self._inputs[place][entry] - sum(self._sizes[0][:common]))
                 vectors[number] = self.new(f"load {type_name(lanes)}, ptr {address}, align 8")
             else:
-                of = [vectors[k] if varies[k] else self._vector([values.of(k)] * lanes, lanes) for k in operands]
-                vectors[number] = self.result(operation, of, lanes, lanes)
+                vectors[number] = self.result(operation, [in_lanes(k) for k in operands], lanes, lanes)
         for places, nodes in zip(self._outputs, graph.outputs, strict=True):
             for row, found in zip(places, nodes, strict=True):
                 address = self._place("into", row)
-                self._lines.append(f"store {type_name(lanes)} {vectors[found]}, ptr {address}, align 8")
+                self._lines.append(f"store {type_name(lanes)} {in_lanes(found)}, ptr {address}, align 8")
         self._lines += [f"%next = add i64 %k, {lanes}", "br label %ask", "done:", "ret void"]
 
     def _place(self, name: str, row: int) -> str:
