@@ -6,10 +6,6 @@ the model's equation of motion under the commands that have arrived by then; a f
 certain. Of dry friction the expectation counts, given how well the joint's velocity is known and how far it changes in
 a step of the integration: coulomb erf(velocity in the middle of the step / sqrt(2) deviation).
 
-Joints that come to rest together make errors of heavy tails. Innovations therefore count as of Student's t
-distribution (Roth, Ozkan and Gustafsson, ICASSP 2013): one that is larger than was stated makes the state less certain,
-a smaller one more.
-
 How fast the disturbance walks, and how far the sensor's noise is from what the sensor says, is learnt on the way: the
 scales of both covariances climb the likelihood of the innovations, by its exact gradient.
 """
@@ -44,11 +40,6 @@ WALK = 0.003
 """What the disturbance walks in a second before anything has been learnt, relative to the torques at rest. Three times
 as much states the errors with a model that is far off better (1.4 instead of 1.9), and makes those with a true one a
 fifth larger."""
-
-TAILS = 2.0
-"""Degrees of freedom of the innovations' distribution, a coordinate. Without tails (inf) quiet frames are stated a
-third too uncertain, and a tenth of all frames, at turns, twice too certain; but predictions err by a twentieth less,
-and `computed_torque` follows closer, by up to a third where no frame is lost."""
 
 PLACE_DOUBT, RATE_DOUBT, TORQUE_DOUBT = 1e-4, 1e-5, 1e-3
 """Standard deviations at the start, where the robot rests: m and rad, m/s and rad/s, and of torques at rest."""
@@ -191,9 +182,6 @@ class Observer:
         self._covariance = kept @ self._covariance @ kept.T + gain @ seen @ gain.T
         self._by_scale = kept @ self._by_scale @ kept.T
         self._by_scale[1] += gain @ seen @ gain.T
-        surprise = (TAILS + innovation @ told / m) / (TAILS + 1)
-        self._covariance *= surprise
-        self._by_scale *= surprise
         self._scale = self._scale + np.clip(np.linalg.solve(self._information, gradient), -0.5, 0.5)
 
     def _moved(
