@@ -71,8 +71,12 @@ def minimise(
     scale: Array,
     criteria: StopCriteria,
     on_iteration: Callable[[int, float], None] = lambda iteration, cost: None,
+    ahead: bool = True,
 ) -> Solution:
-    """Minimise from `start` (p,) with p >= lower; `scale` (p,) is the size of a large change of each parameter."""
+    """Minimise from `start` (p,) with p >= lower; `scale` (p,) is the size of a large change of each parameter.
+
+    ahead: whether the problem may be linearised at a trial that is then not taken: not where it follows its own steps.
+    """
     parameters, radius, trusted = start.copy(), 1.0, True
     cost, factor, residual = problem.linearise(parameters)
     costs, evaluations, reason = [cost], 1, ""
@@ -80,7 +84,7 @@ def minimise(
         step, predicted = _box_step(factor, residual, parameters, lower, scale, radius)
         trial = np.maximum(parameters + step, lower)
         evaluations += predicted > 0
-        goes_on = trusted and predicted > criteria.cost_tolerance * cost
+        goes_on = ahead and trusted and predicted > criteria.cost_tolerance * cost
         new_cost, linearised = _tried(problem, trial, goes_on) if predicted > 0 else (cost, None)
         ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
         trusted = ratio > POOR

@@ -162,6 +162,7 @@ def _within_bounds(
         np.abs(np.linalg.inv(bounds.matrix)) @ problem.guess.std,
         criteria,
         lambda i, cost: advance(),
+        ahead=least_squares is problem,
     )
     advance(criteria.max_iterations - found.iterations)
     return replace(found, parameters=bounds.parameters(found.parameters))
