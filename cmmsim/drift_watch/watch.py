@@ -94,7 +94,7 @@ class DriftWatch:
             return
         self._judged += 1
         if not self._goes_on(measurement, base):
-            self._close()
+            self._close(self._frames - 1)
             self._begin(measurement, base)
         assert self._platform is not None
         pixels = measurement.left_pixels, measurement.right_pixels
@@ -103,12 +103,12 @@ class DriftWatch:
             pixels = base.left_pixels, base.right_pixels
             self._base.add(time, np.zeros(6), pixels, base.pixel_variances)
         if len(self._platform.times) == BLOCK:
-            self._close()
+            self._close(self._frames)
 
     @property
     def finding(self) -> Finding:
         """What the frames since the last ``restart`` say."""
-        self._close()
+        self._close(self._frames)
         self._count()
         told = self._evidence.told
         moved, share = movements(told) if self._noticed is not None else ((), 0.0)
@@ -144,11 +144,11 @@ class DriftWatch:
         if base is not None and self.watches_base:
             self._base = Sightings(base.index, taught.base_places[base.index], camera_from_base)
 
-    def _close(self) -> None:
-        """Have the frames that wait be a block."""
+    def _close(self, end: int) -> None:
+        """Have the frames that wait be a block, after so many frames of the run."""
         if self._platform is None:
             return
-        self._blocks.append(_Block(self._platform, self._base, self._frames))
+        self._blocks.append(_Block(self._platform, self._base, end))
         self._platform = self._base = None
         if len(self._blocks) == TOGETHER:
             self._count()

@@ -187,6 +187,16 @@ def test_lost_frames_say_nothing_but_that_time_passes(geometry):
     assert watch.finding.frames == 0
 
 
+@pytest.mark.filterwarnings("error")
+def test_stickers_that_only_the_last_frame_lacks_count_after_those_before(geometry):
+    watch, eye = DriftWatch(geometry), Projected(geometry, geometry.taught, np.random.default_rng(6))
+    for missing in (0, 0, 0, 1):
+        eye.index, eye.places = eye.index[missing:], eye.places[missing:]
+        watch.add(eye.measured(geometry.rig, geometry.home))
+    assert (watch.finding.frames, watch.finding.judged_frames) == (4, 4)
+    assert np.isfinite(watch.finding.evidence)
+
+
 def test_what_cannot_be_watched_is_refused_in_one_line(geometry):
     with pytest.raises(CmmError, match=r"between 0 and 1, got 1\.5"):
         DriftWatch(geometry, chance=1.5)
