@@ -68,6 +68,7 @@ def track(
       cmmsim track --law computed_torque --set control.observer=false
       cmmsim track --law feedforward --model true --motion poses.csv
     """
+    from dynamics.errors import SimulationError
     from identify.tracking.track import MODELS
     from identify.tracking.track import track as follow_all
 
@@ -81,6 +82,9 @@ def track(
     entry = follow_all(chosen, laws, models, seed, terminal_progress(quiet), run, motion)
     save_files(folder, {"track.json": entry, "scenario.toml": chosen.to_toml()})
     tell(entry, json, quiet, lambda: _print(entry, folder))
+    lost = [run["failed"] for run in entry["runs"] if "failed" in run]
+    if len(lost) == len(entry["runs"]):
+        raise SimulationError(f"no law kept the robot on its motion; {lost[0]}")
 
 
 def _each(given: list[str], every: tuple[str, ...]) -> list[str]:

@@ -208,6 +208,15 @@ def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
     assert (out / "scenario.toml").is_file()
 
 
+def test_a_robot_that_no_law_keeps_on_its_motion_is_no_success(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tracking, "taught_sensor", lambda *given: Sensor(NOISE))
+    out, settings = tmp_path / "track", ["--set", "servo.kp=40", "--set", "renderer=analytic", "--quiet"]
+    assert command("track", "quick", "--law", "pid", "--model", "true", "--out", out, *settings) == 1
+    assert "no law kept the robot on its motion; unseen 1: " in one_line(capsys.readouterr().err)
+    (run,) = json.loads((out / "track.json").read_text())["runs"]
+    assert "eigenvalue" in run["failed"]
+
+
 def test_the_identified_model_is_that_of_a_run(tmp_path):
     """Of the same robot."""
     chosen, run = plant(), RunFolder(tmp_path)
