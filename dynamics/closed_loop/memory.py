@@ -88,11 +88,11 @@ LAYOUT = {
     # first what `response` and, from the factor on, `free_acceleration` take, in their order
     "evaluation": "row:m factor:mm bias:m jacobian:nm push:n state:s slope:s time bias_acceleration:n angle:n "
     "velocity:n spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
-    # first the rows of `slope_derivative`; k: what it returns of each stage,
-    # and before the torques the slopes of filtered rates, whose trials are `filtered`
     # first what `motion_in_lanes` takes, then what it returns, and from the factor on what `acceleration_in_lanes` does
     "lanes": "shared:q states:BL bias_acceleration:nL angle:nL velocity:nL factor:mmL bias:mL jacobian:nmL push:nL "
     "row:mL acceleration:mL response:mL asked:L!",
+    # first the rows of `slope_derivative`; k: what it returns of each stage,
+    # and before the torques the slopes of filtered rates, whose trials are `filtered`
     "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w length:w "
     "stage_time:w margin:w command:nw command_slope:nw last_command:nw force:nw last_measured:mw integral:mw "
     "demand:mw moved:mw",
