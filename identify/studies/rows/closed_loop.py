@@ -19,7 +19,7 @@ from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.scenario import Scenario
 from identify.scenario.section import Section
-from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row
+from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row, unwatched
 from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 
 EXPERIMENT, TRAJECTORY = 0, 1
@@ -65,7 +65,7 @@ READS = Reads(
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoopOptions) -> Row:
     """One row. Raises EstimationError where no frame was measured, LoopFailure, and what the sensor raises."""
-    scenario = scenario.with_overrides({"rig.watch": "none"})  # of which no figure would speak
+    scenario = unwatched(scenario)
     robot = load_robot(scenario.robot)
     number = stream_seed(seed, EXPERIMENT)
     taught = exactly_taught(sensor_file(scenario)) if options.teaching == "exact" else None

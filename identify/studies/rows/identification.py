@@ -33,7 +33,7 @@ from identify.scenario import Scenario, scenario_from_toml
 from identify.scenario.section import Section
 from identify.scenario.sections import Rig
 from identify.studies.rows.coverage import coverage
-from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing
+from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing, unwatched
 from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
 from identify.validation.unseen import model_run
@@ -105,7 +105,10 @@ class IdentificationOptions(RecordOptions):
 DRAWN = {"options.sensor": lambda sensor: sensor == "drawn"}
 READS = Reads(
     ("scenario.", *SENSOR, "sensor.timing."),
-    but=("scenario.name", "scenario.description", "scenario.sensor_note", "scenario.identification.qr_threshold"),
+    but=(
+        *("scenario.name", "scenario.description", "scenario.sensor_note", "scenario.identification.qr_threshold"),
+        "scenario.rig.watch",
+    ),
     idle=(
         Idle(NOISE_OFF.keys, {**NOISE_OFF.where, "options.sensor": lambda sensor: sensor == "images"}, NOISE_OFF.why),
         Idle(("sensor.camera.noise",), DRAWN, "options.sensor is drawn: that noise is added all the same"),
@@ -143,7 +146,7 @@ class Recorded:
 
 def recorded(scenario: Scenario, seed: np.random.SeedSequence, options: RecordOptions) -> Recorded:
     """Run the plant of a row with its sensor. Raises what experiment and sensor raise."""
-    number = stream_seed(seed, EXPERIMENT)
+    number, scenario = stream_seed(seed, EXPERIMENT), unwatched(scenario)
     plant = build_plant(scenario, robot_named(scenario.robot), number)
     trajectories = designed_trajectories(scenario, options.trajectory_seed)
     drawn = options.sensor == "drawn"

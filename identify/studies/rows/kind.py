@@ -112,10 +112,10 @@ BESIDE = (
     "scenario.name", "scenario.description", "scenario.sensor_note", "sensor.name", "sensor.note", "scenario.renderer",
     *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s"), "scenario.filter.",
     "scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", "scenario.excitation.duration_s",
-    "scenario.validation.duration_s",
+    "scenario.validation.duration_s", "scenario.rig.watch",
 )  # fmt: skip
-"""What may stand among the changes of any kind: labels, what draws if anything does, and what a scenario checks against
-its frame rate, for a change of that may need one of these."""
+"""What may stand among the changes of any kind: labels, what draws if anything does, who watches the cameras if anybody
+does, and what a scenario checks against its frame rate, for a change of that may need one of these."""
 
 
 def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) -> None:
@@ -163,6 +163,11 @@ _SPELLINGS = [timing(name) for name in IN_FILE]
 
 
 Row = dict[str, float]
+
+
+def unwatched(scenario: Scenario) -> Scenario:
+    """The scenario with nobody who watches its cameras: of what a watch finds no figure of a row speaks."""
+    return scenario.with_overrides({"rig.watch": "none"})
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
 from identify.studies.rows.identification import designed_trajectories, robot_named
-from identify.studies.rows.kind import NOISE_OFF, PICTURES, PLANT, Column, Kind, Reads, Row
+from identify.studies.rows.kind import NOISE_OFF, PICTURES, PLANT, Column, Kind, Reads, Row, unwatched
 from identify.studies.rows.sensor import rms_um
 from identify.tracking.following import Followed
 from identify.tracking.motions import motions
@@ -74,7 +74,7 @@ READS = Reads(
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingOptions) -> Row:
     """One row. Raises what sensor, identification and laws raise, such as LoopFailure."""
     number, robot = stream_seed(seed, EXPERIMENT), robot_named(scenario.robot)
-    scenario = scenario.with_overrides({"rig.watch": "none"})  # of which no figure would speak
+    scenario = unwatched(scenario)
     plant = build_plant(scenario, robot, number)
     sensor = taught_sensor(scenario, robot, number, SilentProgress())
     signs = np.random.default_rng(stream_seed(seed, SIGNS)).choice([-1.0, 1.0], len(plant.parameters))
