@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynamics.checks import floats
 from dynamics.geometry import RobotGeometry
 from dynamics.legs.leg import Segment
 from dynamics.parameters import parameter_layout
-from dynamics.robot import Robot
+from dynamics.robot import CHART_TOLERANCE, Robot
 
 
 class Part(NamedTuple):
@@ -44,6 +45,27 @@ class Frames:
     spin: np.ndarray
 
 
+class Drawn(NamedTuple):
+    """What is drawn of the parts: the row of each in the placements (parts,), and that of the part before, -1: the
+    base; offset (parts, 3) in the axes of that, centre (parts, 3) and ends (parts, 2, 3) in its own, m."""
+
+    body: np.ndarray
+    before: np.ndarray
+    offset: np.ndarray
+    centre: np.ndarray
+    ends: np.ndarray
+
+
+class Room(NamedTuple):
+    """What a robot's functions take and return: at (6 + g,) and moving (12 + g,), a pose, a twist, and the constants of
+    the functions; joint coordinates and reach margins (2, n); placements (bodies, 15)."""
+
+    at: np.ndarray
+    moving: np.ndarray
+    reach: np.ndarray
+    placements: np.ndarray
+
+
 class Parts:
     """The parts of all legs of a geometry, leg by leg from the base."""
 
@@ -65,7 +87,9 @@ class Parts:
         self._rows, self._before = np.array(rows), np.array([part.before for part in self.all])
         self._offset = np.array([part.offset for part in self.all])
         self._centre = np.array([part.segment.centre for part in self.all])
-        self._rods = np.array([part.segment.rod for part in self.all])
+        before, ends = np.append(rows, -1)[self._before], np.array([part.segment.rod for part in self.all])
+        self._drawn, chart = Drawn(self._rows, before, self._offset, self._centre, ends), geometry.chart
+        self._held = np.where(chart.basis.any(axis=1), np.nan, chart.home)
 
     def frames(self, robot: Robot, pose: np.ndarray, twist: np.ndarray | None = None) -> Frames:
         """Where the parts are with the platform at a pose (6,) and moving with a twist (6,).
@@ -82,8 +106,23 @@ class Parts:
 
     def rods(self, robot: Robot, pose: np.ndarray) -> np.ndarray:
         """Ends (parts, 2, 3) of what is drawn of each part, base axes, m. Raises as `frames`."""
-        frames = self.frames(robot, pose)
-        return frames.origin[:-1, None] + self._rods @ frames.axes[:-1].transpose(0, 2, 1)
+        from dynamics.compiled.kernel import chosen  # these import numba, which takes its time
+        from dynamics.rod_kernels import place_rods
+
+        at, functions = np.array(floats("pose", pose, (6,))), robot.functions
+        kinematics, placements = functions["inverse_kinematics"], functions["placements"]
+        fixed, bodies = placements.constants, placements.outputs[0][0]
+        room = Room(
+            at=np.append(np.zeros(6), fixed),
+            moving=np.append(np.zeros(12), fixed),
+            reach=np.empty((2, robot.layout.joints)),
+            placements=np.empty((bodies, 15)),
+        )
+        ends = np.empty((len(self.all), 2, 3))
+        where = kinematics.address, placements.address, at, self._held, CHART_TOLERANCE
+        if not chosen(place_rods, True)(*where, self._drawn, room, ends):
+            robot.check_reach(at)  # says why
+        return ends
 
 
 @lru_cache(maxsize=16)

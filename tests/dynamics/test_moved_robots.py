@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from dynamics import fast_forward_dynamics, load_robot
+from dynamics.bodies import parts_of
 from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains, simulate
-from dynamics.errors import RobotFileError, ShapeError
+from dynamics.errors import ChartError, RobotFileError, ShapeError, UnreachablePoseError
 from dynamics.geometry_error import with_geometry
 
 ROBOTS = [
@@ -56,6 +57,27 @@ def test_a_moved_robot_is_the_robot_with_these_numbers(name):
     torque = rng.standard_normal(robot.layout.joints)
     found = fast_forward_dynamics(moved)(poses[0], twists[0], torque)
     np.testing.assert_allclose(found, own.forward_dynamics(poses[0], twists[0], torque), rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_rods_are_where_the_frames_of_their_parts_are_and_nowhere_out_of_reach(name):
+    """The oracle is NumPy, on code of the robot's own."""
+    robot, moved, own = both(name)
+    parts, chart = parts_of(own.geometry), own.geometry.chart
+    for seed in range(4):
+        free = np.random.default_rng(seed).standard_normal(len(robot.coordinate_names))
+        pose = own.home_pose + 5e-3 * chart.lifted(free)
+        frames = parts.frames(own, pose)
+        for k, part in enumerate(parts.all):
+            expected = [frames.origin[k] + frames.axes[k] @ end for end in part.segment.rod]
+            for one in (own, moved):
+                np.testing.assert_allclose(parts_of(one.geometry).rods(one, pose)[k], expected, rtol=0, atol=1e-12)
+    away = own.home_pose + np.array([5.0, 0, 0, 0, 0, 0])
+    with pytest.raises(UnreachablePoseError, match="leg 1"):
+        parts.rods(own, away)
+    if len(chart.freedoms) < 6:
+        with pytest.raises(ChartError, match="beta"):
+            parts.rods(own, own.home_pose + np.array([0, 0, 0, 0, 1e-6, 0]))
 
 
 @pytest.mark.parametrize("name", ROBOTS)
