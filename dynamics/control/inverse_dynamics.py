@@ -13,6 +13,11 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 """Gauss-Legendre quadrature; friction that turns within a span is met to some eighth of it."""
 
 
+VAGUE, FITTED = 1e-2, 1e-4
+"""What the torques of a model may walk from the true ones in a second, over the torque at rest, before a run has told:
+of a model that is a guess, and of one that fits what was measured."""
+
+
 class Motion(Protocol):
     """A desired motion: poses, their rates and accelerations (N, 6) at times (N,), s."""
 
@@ -28,11 +33,13 @@ class Motion(Protocol):
 
 @dataclass(frozen=True)
 class Model:
-    """A robot as a law knows it: with all its parameters (p,) and its law of friction."""
+    """A robot as a law knows it: with all its parameters (p,), its law of friction, and a doubt: what its torques may
+    walk from the true ones in a second, over the torque at rest, as an observer first takes it."""
 
     robot: Robot
     parameters: np.ndarray
     friction: FrictionLaw
+    doubt: float = VAGUE
 
     @property
     def dynamic(self) -> np.ndarray:

@@ -27,7 +27,8 @@ class Assignment:
 
     model: the robot as the law knows it; settings: of the loop, its drives left to the law; holding (n,): the torque at
     rest at the start, as drives that take torques report it; latencies (frames,), s: when the command of each frame
-    acts, of which a law may use those of frames that have come; noise(frame): covariance (6, 6) of the measured pose.
+    acts, of which a law may use those of frames that have come; noise(frame): covariance (6, 6) of the measured pose;
+    common (6, 6): that of what all measured poses have in common.
     """
 
     model: Model
@@ -38,6 +39,7 @@ class Assignment:
     holding: np.ndarray
     latencies: np.ndarray
     noise: Callable[[int], np.ndarray]
+    common: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
     def period(self) -> float:
@@ -53,7 +55,8 @@ class Assignment:
         """An observer of the run."""
         holding = self.holding if drives.torques else self.model.held(self.desired(0.0)[0], drives)[0]
         settings = replace(self.settings, drives=drives)
-        return Observer(self.model, settings, self.desired(0.0)[0], holding, self.latencies, self.noise)
+        pose = self.desired(0.0)[0]
+        return Observer(self.model, settings, pose, holding, self.latencies, self.noise, self.common)
 
 
 @dataclass(frozen=True)

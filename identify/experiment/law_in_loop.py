@@ -1,13 +1,13 @@
 """A control law with a model of the robot, made ready to follow a motion of a scenario's plant."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from dynamics.closed_loop import DriveName
 from dynamics.control.gains import check_torque_gains
-from dynamics.control.inverse_dynamics import Model, Motion
+from dynamics.control.inverse_dynamics import VAGUE, Model, Motion
 from dynamics.control.law import Assignment, Feedback, Law, LawInLoop
 from dynamics.errors import DynamicsError
 from dynamics.workspace import check_motion
@@ -40,26 +40,36 @@ class NamedMotion:
 
 @dataclass(frozen=True)
 class Seen:
-    """By what the loop sees: measure(frame, t, pose, rate) as `SensorInLoop` does, and the covariance (6, 6) of the
-    noise of a frame's pose."""
+    """By what the loop sees: measure(frame, t, pose, rate) as `SensorInLoop` does; the covariance (6, 6) of the noise
+    of a frame's pose, and that of what all poses have in common."""
 
     measure: Callable[[int, float, Array, Array], Array | None]
     noise: Callable[[int], Array]
+    common: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+
+@dataclass(frozen=True)
+class KnownModel:
+    """What a law knows: parameters (p,), the law of the drives, None: the scenario's model's; and how far the torques
+    may be from the true ones (`inverse_dynamics.Model`)."""
+
+    parameters: Array
+    drive: DriveName | None = None
+    doubt: float = VAGUE
 
 
 def by_images(eye: SensorInLoop) -> Seen:
     """By the sensor."""
-    return Seen(eye.measure, lambda frame: eye.covariances[frame])
+    return Seen(eye.measure, lambda frame: eye.covariances[frame], eye.common)
 
 
 def prepared(
     plant: Plant,
     law: str,
-    parameters: Array,
+    known: KnownModel,
     motion: NamedMotion,
     seen: Seen,
     latencies: Array | None = None,
-    drive: DriveName | None = None,
 ) -> LawInLoop:
     """A law ready to follow a motion.
 
@@ -75,11 +85,11 @@ def prepared(
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
     settings = model_settings(robot, scenario)
-    if drive is not None:
-        known = scenario.model.derivative_filter_s or scenario.plant.derivative_filter_s
-        filter_time = known if drive == FILTERED else None
-        settings = replace(settings, drives=replace(settings.drives, law=drive, filter_time=filter_time))
-    model, asked = Model(robot, parameters, settings.friction), feedback(scenario)
+    if known.drive is not None:
+        stated = scenario.model.derivative_filter_s or scenario.plant.derivative_filter_s
+        filter_time = stated if known.drive == FILTERED else None
+        settings = replace(settings, drives=replace(settings.drives, law=known.drive, filter_time=filter_time))
+    model, asked = Model(robot, known.parameters, settings.friction, known.doubt), feedback(scenario)
     usual = np.full(len(times), scenario.timing.latency_s)
     found = chosen_law(
         Assignment(
@@ -91,6 +101,7 @@ def prepared(
             holding=plant.robot.static_torque(desired[0], plant.parameters[plant.robot.layout.dynamic]),
             latencies=usual if latencies is None else latencies,
             noise=seen.noise,
+            common=seen.common,
         )
     )
     if not isinstance(found, LawInLoop):

@@ -19,7 +19,7 @@ from identify.estimation.prior import model_guess
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation.design import design_trajectories
 from identify.experiment.known_rig import known_rig
-from identify.experiment.law_in_loop import NamedMotion, by_images, prepared
+from identify.experiment.law_in_loop import KnownModel, NamedMotion, by_images, prepared
 from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, sensor_file, with_renderer
 from identify.filtering import spline_derivatives, without_gaps
@@ -167,7 +167,7 @@ def run_plant(
     if law != SERVO:
         motion = NamedMotion("the trajectory", trajectory, duration_s)
         model = model_guess(plant.nominal, scenario).values + (0.0 if load is None else load.stated)
-        in_loop = prepared(plant, law, model, motion, by_images(eye), latencies.known)
+        in_loop = prepared(plant, law, KnownModel(model), motion, by_images(eye), latencies.known)
     done = plant.run(reference, RateSensor(eye.measure), latencies.true, true_load, in_loop)
     record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
     if in_loop is not None:

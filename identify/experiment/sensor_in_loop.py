@@ -131,6 +131,12 @@ class SensorInLoop:
         self.seconds = 0.0
         sensor.start_run(seed)
 
+    @property
+    def common(self) -> Array:
+        """Covariance (6, 6) of what all its poses near home have in common, as far as teaching says."""
+        taught = getattr(self._sensor, "taught", None)
+        return np.zeros((6, 6)) if taught is None else taught.calibration_covariance(self._robot.home_pose)
+
     def measure(self, frame: int, t: float, pose: Array, rate: Array) -> Array | None:
         """Measure the platform at its true pose in motion at its true rate; only the renderer sees these.
 

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynamics import Robot
-from dynamics.closed_loop import ClosedLoopRun, DriveName, RateSensor, Reference
+from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from identify.arrays import Array
-from identify.experiment.law_in_loop import NamedMotion, Seen, prepared
+from identify.experiment.law_in_loop import KnownModel, NamedMotion, Seen, prepared
 from identify.experiment.plant import Plant
 from identify.experiment.run import Latencies
 
@@ -36,13 +36,12 @@ class Followed:
         limit = self.torque_limit
         return 0 if limit is None else int((np.abs(self.run.torque) >= limit * (1 - 1e-12)).any(axis=1).sum())
 
-    def normalised_squared_error(self, robot: Robot, common: Array) -> float | None:
-        """Mean e^T P^-1 e / m of what the observer expected of the robot's true coordinates; None without observer.
-        common (6, 6): covariance of what all measured poses have in common, which no observer can find."""
+    def normalised_squared_error(self, robot: Robot) -> float | None:
+        """Mean e^T P^-1 e / m of what the observer expected of the robot's true coordinates; None without observer."""
         if self.expected is None:
             return None
-        errors, free = robot.coordinates(self.run.pose) - self.expected[0], robot.geometry.chart.basis
-        weighted = np.linalg.solve(self.expected[1] + free.T @ common @ free, errors[..., None])[..., 0]
+        errors = robot.coordinates(self.run.pose) - self.expected[0]
+        weighted = np.linalg.solve(self.expected[1], errors[..., None])[..., 0]
         return float(np.mean(np.sum(errors * weighted, axis=1)) / errors.shape[1])
 
 
@@ -62,18 +61,16 @@ def by_drawing(covariance: Array, lost: NDArray[np.bool_], rng: np.random.Genera
 def follow(
     plant: Plant,
     law: str,
-    parameters: Array,
+    known: KnownModel,
     motion: NamedMotion,
     seen: Seen,
     latencies: Latencies = USUAL,
-    drive: DriveName | None = None,
 ) -> Followed:
-    """Follow a motion under a law with a model of these parameters (p,); latencies: where they are not the scenario's;
-    drive: the law of its drives, where that is not the scenario's model's.
+    """Follow a motion under a law that knows a model; latencies: where they are not the scenario's.
 
     Raises what `prepared` does, and LoopFailure: a loop that is lost.
     """
-    in_loop = prepared(plant, law, parameters, motion, seen, latencies.known, drive)
+    in_loop = prepared(plant, law, known, motion, seen, latencies.known)
     times = plant.scenario.timing.frame_times(motion.duration_s)
     reference = Reference(motion.motion.pose(times), motion.motion.pose_rate(times))
     run = plant.run(reference, RateSensor(seen.measure), latencies.true, law=in_loop)

@@ -1,6 +1,6 @@
 """Laws and models side by side on the same motions: tracking error, effort, and what has which share of the error."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,14 +9,15 @@ import numpy as np
 import xarray as xr
 
 import cmmsim
-from dynamics.closed_loop import DriveName
+from dynamics.control.inverse_dynamics import FITTED, VAGUE
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
+from identify.estimation.explanation import Misfit
 from identify.estimation.identification import identify
 from identify.estimation.prior import starting_guess
 from identify.excitation.design import design_trajectories
-from identify.experiment.law_in_loop import NamedMotion, Seen, by_images, prepared
+from identify.experiment.law_in_loop import KnownModel, NamedMotion, Seen, by_images, prepared
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import Latencies, drawn_latencies, excitation_run, part_exposures, taught_sensor
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, with_renderer
@@ -37,14 +38,6 @@ FIRST_RUN = 2_000_000
 
 EXACT = ("sensor", "model", "latency")
 """What is made exact, one by one, to know its share of the error."""
-
-
-@dataclass(frozen=True)
-class KnownModel:
-    """Parameters (p,) of a model, and the law of its drives."""
-
-    parameters: Array
-    drive: DriveName
 
 
 @dataclass(frozen=True)
@@ -80,7 +73,7 @@ def track(
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
     for law in laws:  # refused before the sensor is taught
         for motion in followed:
-            prepared(plant, law, plant.parameters, motion, unseen, drive=scenario.plant.drive)
+            prepared(plant, law, known_model(plant, "true", None), motion, unseen)
     sensor = taught_sensor(scenario, plant.nominal, seed, progress)
     if "identified" in models and not run_folder:
         known["identified"] = _identified(plant, sensor, seed, progress)
@@ -105,7 +98,7 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
     """
     robot, scenario = plant.nominal, plant.scenario
     if model == "true":
-        return KnownModel(plant.parameters, scenario.plant.drive)
+        return KnownModel(plant.parameters, scenario.plant.drive, FITTED)
     if model == "initial":
         law = scenario.model.drive_law
         return KnownModel(starting_guess(robot, scenario.model.start_parameters, 1.0, drive=law).values, law)
@@ -118,7 +111,7 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
     try:
         identification = load_result(path).get("identification")
         column = parameter_column(identification, "estimate", robot.layout.names)
-        return KnownModel(np.array(column), settled_drive(identification))
+        return KnownModel(np.array(column), settled_drive(identification), _fitted_doubt(identification or {}))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
 
@@ -137,7 +130,14 @@ def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progre
 def identified_model(plant: Plant, record: xr.Dataset, progress: Progress) -> KnownModel:
     """The model that a record of a plant gives. Raises what an identification raises."""
     found = identify(record, plant.nominal, plant.scenario, progress)
-    return KnownModel(found.estimate, found.drive.law)
+    return KnownModel(found.estimate, found.drive.law, _fitted_doubt(found.to_dict()))
+
+
+def _fitted_doubt(identification: Mapping[str, Any]) -> float:
+    """Of a model that was identified: that of a guess where it does not explain what was measured."""
+    names = "noise_ratio", "expected_noise_ratio", "noise_ratio_std"
+    told = [identification[name] for name in names if name in identification]
+    return FITTED if len(told) == len(names) and not Misfit(*told).significant else VAGUE
 
 
 def follow_by_images(
@@ -155,7 +155,7 @@ def follow_by_images(
     part_exposures(sensor, plant.scenario, seed)
     seen = by_images(SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, FIRST_RUN + number), advance))
     latencies = _latencies(plant, motion, seed, number)
-    return follow(plant, law, model.parameters, motion, seen, latencies, model.drive), seen
+    return follow(plant, law, model, motion, seen, latencies), seen
 
 
 def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
@@ -180,7 +180,6 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
     """One law with one model on all motions."""
     robot, known = task.plant.robot, task.models[model]
     errors, rows, effort, normalised, covariances, lost = [], [], [], [], [], 0
-    common = task.sensor.taught.calibration_covariance(robot.home_pose)
     for number, motion in enumerate(task.motions):
         try:
             done, seen = follow_by_images(task.plant, task.sensor, law, known, motion, task.seed, number, advance)
@@ -190,7 +189,7 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
         lost += int((~done.run.measured_ok).sum())
         effort.append(done.run.torque)
         covariances += [seen.noise(int(frame)) for frame in np.flatnonzero(done.run.measured_ok)]
-        found = done.normalised_squared_error(robot, common)
+        found = done.normalised_squared_error(robot)
         normalised += [] if found is None else [found]
         rows.append({"motion": motion.name, **rms_figures(done.errors), "saturated_frames": done.saturated})
     torque = np.concatenate(effort)
@@ -234,7 +233,7 @@ def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact
         known = known_model(plant, "true", None) if exact == "model" else model
         latencies = Latencies() if exact == "latency" else _latencies(task.plant, motion, task.seed, number)
         try:
-            done = follow(plant, law, known.parameters, motion, seen, latencies, known.drive)
+            done = follow(plant, law, known, motion, seen, latencies)
             squares.append(done.errors**2)
         except DynamicsError:
             return np.full(6, np.nan)

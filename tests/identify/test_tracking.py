@@ -9,7 +9,7 @@ from dynamics import load_robot
 from dynamics.control.law import LawInLoop
 from dynamics.errors import SimulationError
 from identify.errors import RecordError, ScenarioError, TrajectoryError
-from identify.experiment.law_in_loop import NamedMotion, prepared
+from identify.experiment.law_in_loop import KnownModel, NamedMotion, prepared
 from identify.experiment.plant import build_plant
 from identify.experiment.run import drawn_latencies
 from identify.files.run_folder import RunFolder, save_result
@@ -127,17 +127,17 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
 )
 def test_a_law_that_cannot_be_is_refused(law, changes, error, said):
     chosen = plant(**changes)
-    assert said in refusal(error, prepared, chosen, law, chosen.parameters, swing(), seen())
+    assert said in refusal(error, prepared, chosen, law, KnownModel(chosen.parameters), swing(), seen())
 
 
 def test_torque_beyond_the_limit_is_given_up_to_it_and_counted():
     chosen = plant(**{"control.torque_limit_N_m": 3.0})
-    done = follow(chosen, "pid", chosen.parameters, swing(), seen())
+    done = follow(chosen, "pid", KnownModel(chosen.parameters), swing(), seen())
     torque = np.abs(done.run.torque)
     assert torque.max() == 3.0
     assert done.saturated == int((torque == 3.0).any(axis=1).sum()) > 0
     free = plant()
-    assert follow(free, "pid", free.parameters, swing(), seen()).saturated == 0
+    assert follow(free, "pid", KnownModel(free.parameters), swing(), seen()).saturated == 0
 
 
 def holding(assignment):
@@ -149,8 +149,8 @@ def holding(assignment):
 
 def test_a_law_of_ones_own_is_a_function():
     chosen = plant()
-    done = follow(chosen, "tests.identify.test_tracking:holding", chosen.parameters, swing(), seen())
-    alone = follow(chosen, "pid", chosen.parameters, swing(), seen())
+    done = follow(chosen, "tests.identify.test_tracking:holding", KnownModel(chosen.parameters), swing(), seen())
+    alone = follow(chosen, "pid", KnownModel(chosen.parameters), swing(), seen())
     assert np.abs(done.errors).max() < np.abs(alone.errors).max()
 
 
@@ -183,7 +183,8 @@ def test_what_is_not_known_of_the_mean_latency_is_drawn_for_a_seed_and_no_law_kn
 def test_the_scale_of_all_parameters_makes_no_difference_to_feedforward():
     """Pose and gains tell parameters up to a factor; the commands need no more."""
     chosen = plant(**{"control.observer": False})
-    one, other = (follow(chosen, "feedforward", k * chosen.parameters, swing(), seen()).errors for k in (1.0, 1.15))
+    models = [KnownModel(k * chosen.parameters) for k in (1.0, 1.15)]
+    one, other = (follow(chosen, "feedforward", model, swing(), seen()).errors for model in models)
     assert np.allclose(one, other, rtol=0, atol=1e-9)
 
 

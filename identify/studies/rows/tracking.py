@@ -10,6 +10,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from dynamics.control.inverse_dynamics import VAGUE
+from identify.experiment.law_in_loop import KnownModel
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor
 from identify.experiment.sensor_in_loop import PoseSensor
@@ -22,7 +24,7 @@ from identify.studies.rows.kind import NOISE_OFF, PICTURES, PLANT, Column, Kind,
 from identify.studies.rows.sensor import rms_um
 from identify.tracking.following import Followed
 from identify.tracking.motions import motions
-from identify.tracking.track import KnownModel, follow_by_images, identified_model, known_model
+from identify.tracking.track import follow_by_images, identified_model, known_model
 
 EXPERIMENT, SIGNS = 0, 1
 AXES = (("position", slice(0, 3), "um"), ("orientation", slice(3, 6), "urad"))
@@ -79,15 +81,15 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
     sensor = taught_sensor(scenario, robot, number, SilentProgress())
     signs = np.random.default_rng(stream_seed(seed, SIGNS)).choice([-1.0, 1.0], len(plant.parameters))
     model = _model(plant, sensor, number, options)
-    model = replace(model, parameters=model.parameters * (1.0 + options.off * signs))
+    if options.off:
+        model = replace(model, parameters=model.parameters * (1.0 + options.off * signs), doubt=VAGUE)
     unseen = motions(robot, scenario, number)[: scenario.validation.count]
 
     def followed(law: str, known: KnownModel) -> list[Followed]:
         return [follow_by_images(plant, sensor, law, known, motion, number, k)[0] for k, motion in enumerate(unseen)]
 
     done, beside = followed(options.law, model), followed("pid", model)
-    common = sensor.taught.calibration_covariance(robot.home_pose)
-    normalised = [one.normalised_squared_error(robot, common) for one in done]
+    normalised = [one.normalised_squared_error(robot) for one in done]
     known = [value for value in normalised if value is not None]
     row = _figures(done, beside)
     if options.compared:

@@ -1,0 +1,204 @@
+"""One step of a robot in its drives, from what is known of it now to what will be known of it.
+
+The state: coordinates q (m,) and their rates (m,), the integral of the joint PID (n,); and what stays as it is: a
+torque at each joint (n,) and viscous friction of each (n,) of which the model does not know, and what all measured
+poses have in common (m,), an offset of the sensor.
+
+Without dry friction a step is an exponential one, exact for linear motion. Dry friction is then taken in implicitly, as
+time stepping does for contacts (Moreau, Unilateral contact and dry friction in finite freedom dynamics, 1988): a joint
+that would end the step with a velocity u, friction of the others counted, keeps what is beyond b, the change that the
+Coulomb torque can make in a step, and rests otherwise. The velocity is not known exactly, so that of this
+
+    torque = coulomb sat(u / b),    sat(x) = min(1, max(-1, x))
+
+the expectation counts, over normal u.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.special import ndtr
+
+from dynamics.closed_loop.problem import LoopSettings
+from dynamics.control.inverse_dynamics import Model
+
+ROUNDS, SETTLED = 12, 1e-6
+"""Of Newton's method over the joints, and the error of a saturation at which it ends."""
+
+LEAST_WIDTH = 1e-9
+"""Standard deviation of a joint's velocity, rad/s or m/s: it is never known exactly."""
+
+LEAST_REACH = 1e-3
+"""Of what dry friction can change in a step, over that deviation: where there is none, a division by zero."""
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Where the parts of a state lie, of a robot with so many coordinates, m, and joints, n."""
+
+    m: int
+    n: int
+
+    @property
+    def coordinates(self) -> slice:
+        """q (m,), m and rad."""
+        return slice(0, self.m)
+
+    @property
+    def rates(self) -> slice:
+        """Of the coordinates (m,)."""
+        return slice(self.m, 2 * self.m)
+
+    @property
+    def integral(self) -> slice:
+        """Of the joint PID (n,)."""
+        return slice(2 * self.m, 2 * self.m + self.n)
+
+    @property
+    def torque(self) -> slice:
+        """Of the joints (n,), beside that of the model."""
+        return slice(2 * self.m + self.n, 2 * self.m + 2 * self.n)
+
+    @property
+    def viscous(self) -> slice:
+        """Friction of the joints (n,), beside that of the model."""
+        return slice(2 * self.m + 2 * self.n, 2 * self.m + 3 * self.n)
+
+    @property
+    def offset(self) -> slice:
+        """Of all measured coordinates (m,)."""
+        return slice(2 * self.m + 3 * self.n, 3 * self.m + 3 * self.n)
+
+    @property
+    def moving(self) -> slice:
+        """What moves: coordinates, rates, integral."""
+        return slice(0, 2 * self.m + self.n)
+
+    @property
+    def size(self) -> int:
+        """Of a state."""
+        return 3 * self.m + 3 * self.n
+
+
+class Prediction:
+    """Steps of a robot as a model has it, in its drives."""
+
+    def __init__(self, model: Model, settings: LoopSettings) -> None:
+        robot = model.robot
+        self.blocks = Blocks(len(robot.coordinate_names), robot.layout.joints)
+        rigid, self._coulomb, self._viscous, gains = robot.layout.split(model.parameters)
+        self._rigid, self._friction, self._drives = rigid[None], model.friction, settings.drives
+        self._law = settings.drives.joint_law(gains)
+        self._motion = robot.functions["equation_of_motion"]
+        self._derivatives = robot.functions["motion_derivatives"]
+
+    def step(
+        self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, command_rate: np.ndarray, length: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The state after a time, s, in which a command and its rate (n,) act; and the map (size, size) of errors.
+
+        covariance (size, size): of the state, which says how well the velocities of joints are known.
+        """
+        at, jacobian = self.blocks, self._jacobian(state)
+        free, errors = self._without_dry_friction(state, command, command_rate, length)
+        if not self._coulomb.any():
+            return free, errors
+        by_rates, velocity = jacobian @ errors[at.rates], jacobian @ free[at.rates]
+        pushed = errors[at.moving, at.torque]  # by a torque over the step
+        turned = jacobian @ pushed[at.rates]
+        width = np.sqrt(np.einsum("ij,jk,ik->i", by_rates, covariance, by_rates) + LEAST_WIDTH**2)
+        level, kept = expected_dry_friction(velocity, width, turned, *self._dry(velocity))
+        gain = np.linalg.solve(np.eye(at.n) + kept[:, None] * (turned - np.diag(np.diag(turned))), np.diag(kept))
+        free[at.moving] -= pushed @ level
+        errors[at.moving] -= pushed @ gain @ by_rates
+        return free, errors
+
+    def _dry(self, velocity: np.ndarray) -> tuple[np.ndarray, float]:
+        """The largest dry friction (n,) at joint velocities, and the velocity over which it turns."""
+        law, largest = self._friction, self._coulomb
+        if law.name == "stribeck":
+            largest = largest * np.where(velocity == 0.0, law.static_ratio, np.abs(law.level(velocity)))
+        return largest, law.smoothing_velocity or 0.0
+
+    def _jacobian(self, state: np.ndarray) -> np.ndarray:
+        q, rate = state[self.blocks.coordinates], state[self.blocks.rates]
+        return np.asarray(self._motion(q[None], rate[None], self._rigid)[2][0])
+
+    def _without_dry_friction(
+        self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray, length: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        slope, by_state = self._slope(state, command, command_rate)
+        moving, size = self.blocks.moving, len(slope)
+        held = slice(size, by_state.shape[1])
+        augmented = np.zeros((by_state.shape[1] + 1, by_state.shape[1] + 1))
+        augmented[moving, :-1], augmented[moving, -1] = length * by_state, length * slope
+        moved, after, errors = expm(augmented), state.copy(), np.eye(self.blocks.size)
+        after[moving] += moved[moving, -1]
+        errors[moving, moving], errors[moving, held] = moved[moving, moving], moved[moving, held]
+        return after, errors
+
+    def _slope(self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """d/dt of what moves, and its derivative by the state but for the offset."""
+        at, law, pid = self.blocks, self._law, not self._drives.torques
+        li, ld, stiff = law.li, law.ld, law.lp + law.lx
+        q, rate, integral = state[at.coordinates], state[at.rates], state[at.integral]
+        found = self._motion(q[None], rate[None], self._rigid)
+        mass, bias, jacobian, _, angle, *_ = (part[0] for part in found)
+        velocity, error = jacobian @ rate, command - angle[:, 0]
+        by_error = law.lp * error + li * integral - law.lx * angle[:, 0]
+        torque = by_error + ld * (law.rate_weight * command_rate - velocity) if pid else command
+        limit, growing = self._drives.torque_limit, error
+        if limit is not None:
+            further = (np.abs(torque) >= limit) & ((li * error - law.lx * velocity) * torque > 0)
+            growing = np.where(further, law.lx * velocity / (li or 1.0), error)
+            torque = np.clip(torque, -limit, limit)
+        push, falling = np.linalg.solve(mass, jacobian.T), np.linalg.solve(mass, bias[:, 0])
+        viscous = self._viscous + state[at.viscous]
+        net = torque + state[at.torque] - viscous * velocity
+        acceleration = push @ net - falling
+        given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
+        by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*given))
+        damping = (ld * pid + viscous)[:, None]
+        by_state = np.zeros((2 * at.m + at.n, at.offset.start))
+        by_state[at.coordinates, at.rates] = np.eye(at.m)
+        of_rates = by_state[at.rates]
+        of_rates[:, at.coordinates] = push @ (-stiff * pid * jacobian - damping * (turning / 2))
+        of_rates[:, at.coordinates] -= np.linalg.solve(mass, by_q)
+        of_rates[:, at.rates] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
+        of_rates[:, at.integral], of_rates[:, at.torque] = li * pid * push, push
+        of_rates[:, at.viscous] = -push * velocity
+        by_state[at.integral, at.coordinates] = -pid * jacobian
+        return np.concatenate([rate, acceleration, pid * growing]), by_state
+
+
+def expected_dry_friction(
+    velocity: np.ndarray, width: np.ndarray, turned: np.ndarray, largest: np.ndarray, smooth: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Dry friction (n,) over a step, and how it answers to errors of each joint's velocity (n,).
+
+    velocity (n,): that of the joints after the step without dry friction, normal with standard deviations width (n,);
+    turned (n, n): what a torque over the step makes of them; largest (n,): torque; smooth: velocity over which it
+    turns. A joint rests with a probability P, and then has no error; errors of its velocity are passed on as
+    sqrt(1 - P), so that the variance is that of joints of which some rest.
+    """
+    own = np.diag(turned)
+    reach, others = np.maximum(own * largest + smooth, LEAST_REACH * width), turned - np.diag(own)
+    level = largest * np.sign(velocity) * (np.abs(velocity) > reach)
+    for _ in range(ROUNDS):
+        share, slope = expected_saturation(velocity - others @ level, width, reach)
+        miss = largest * share - level
+        level = level + np.linalg.solve(np.eye(len(level)) + (largest * slope)[:, None] * others, miss)
+        if np.abs(miss).max() <= SETTLED * largest.max():
+            break
+    _, slope = expected_saturation(velocity - others @ level, width, reach)
+    rests = np.clip(slope * own * largest, 0.0, 1.0)
+    return np.clip(level, -largest, largest), (1 - np.sqrt(1 - rests)) / own
+
+
+def expected_saturation(mean: np.ndarray, deviation: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Expectation of sat(u / reach) over normal u, and its derivative by the mean, of any shape; reach > 0."""
+    low, high = (-reach - mean) / deviation, (reach - mean) / deviation
+    inside = ndtr(high) - ndtr(low)
+    density = (np.exp(-(low**2) / 2) - np.exp(-(high**2) / 2)) / np.sqrt(2 * np.pi)
+    return ndtr(-high) - ndtr(low) + (mean * inside + deviation * density) / reach, inside / reach
