@@ -179,26 +179,33 @@ def expected_dry_friction(
 
     velocity (n,): that of the joints after the step without dry friction, normal with standard deviations width (n,);
     turned (n, n): what a torque over the step makes of them; largest (n,): torque; smooth: velocity over which it
-    turns. A joint rests with a probability P, and then has no error; errors of its velocity are passed on as
-    sqrt(1 - P), so that the variance is that of joints of which some rest.
+    turns. Errors of a joint's velocity are passed on by so much that their variance is that after dry friction, of
+    which some of the drawn joints rest, not that of a line through it.
     """
     own = np.diag(turned)
     reach, others = np.maximum(own * largest + smooth, LEAST_REACH * width), turned - np.diag(own)
     level = largest * np.sign(velocity) * (np.abs(velocity) > reach)
     for _ in range(ROUNDS):
-        share, slope = expected_saturation(velocity - others @ level, width, reach)
+        share, slope, _ = expected_saturation(velocity - others @ level, width, reach)
         miss = largest * share - level
         level = level + np.linalg.solve(np.eye(len(level)) + (largest * slope)[:, None] * others, miss)
         if np.abs(miss).max() <= SETTLED * largest.max():
             break
-    _, slope = expected_saturation(velocity - others @ level, width, reach)
-    rests = np.clip(slope * own * largest, 0.0, 1.0)
-    return np.clip(level, -largest, largest), (1 - np.sqrt(1 - rests)) / own
+    _, slope, variance = expected_saturation(velocity - others @ level, width, reach)
+    change = own * largest
+    passed = 1 - 2 * change * slope + (change / width) ** 2 * variance
+    return np.clip(level, -largest, largest), (1 - np.sqrt(np.clip(passed, 0.0, 1.0))) / own
 
 
-def expected_saturation(mean: np.ndarray, deviation: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Expectation of sat(u / reach) over normal u, and its derivative by the mean, of any shape; reach > 0."""
+def expected_saturation(
+    mean: np.ndarray, deviation: np.ndarray, reach: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Expectation of sat(u / reach) over normal u, its derivative by the mean, and its variance, of any shape;
+    deviation and reach > 0."""
     low, high = (-reach - mean) / deviation, (reach - mean) / deviation
     inside = ndtr(high) - ndtr(low)
-    density = (np.exp(-(low**2) / 2) - np.exp(-(high**2) / 2)) / np.sqrt(2 * np.pi)
-    return ndtr(-high) - ndtr(low) + (mean * inside + deviation * density) / reach, inside / reach
+    at_low, at_high = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) for end in (low, high))
+    line = mean * inside + deviation * (at_low - at_high)
+    square = mean * line + deviation * (deviation * inside - reach * (at_low + at_high))
+    share = ndtr(-high) - ndtr(low) + line / reach
+    return share, inside / reach, np.maximum(1 - inside + square / reach**2 - share**2, 0.0)
