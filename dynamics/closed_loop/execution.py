@@ -41,7 +41,7 @@ FAILURES = {
 }
 MACHINE_CODE = (
     *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
-    "slope_derivative",
+    *("stop_derivatives", "slope_derivative"),
 )
 """Functions of a robot that kernels call, by their names."""
 
@@ -256,6 +256,7 @@ def _fill(
         (now.known.inputs, own["equation_of_motion"], rigid),
         (now.served.inputs, servo_jacobian, rigid[:0]),
         (now.derivatives.inputs, own["motion_derivatives"], rigid),
+        (now.stopping.inputs, own["stop_derivatives"], rigid),
         (now.pose_and_rate, own["rate_map_derivative"], rigid[:0]),
     ):
         last = np.concatenate([fixed, function.constants])
@@ -263,8 +264,8 @@ def _fill(
         inputs[end - len(last) : end] = last
     elastic = settings.elasticity is not None
     now.unknowns = len(now.state) - (0 if elastic else 2 * sizes.joints)  # motors come last
-    now.step_column, now.start_moves = len(columns), problem.start_sensitivities
-    now.width = len(columns) + 1 + (sizes.start if problem.start_sensitivities else 0)
+    now.parameters, now.start_moves = len(columns), problem.start_sensitivities
+    now.width = now.step_column = len(columns) + (sizes.start if problem.start_sensitivities else 0)
 
 
 @lru_cache(maxsize=16)

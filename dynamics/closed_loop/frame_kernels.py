@@ -25,13 +25,13 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
         velocity = at[0].velocity[i]
         now.mode[i] = 0 if status != OK or abs(velocity) <= NO_MARGIN else 1 if velocity > 0 else -1
     if task.sensitivities:
-        copy_rows(plan.start_integral_sensitivity, d.x[2 * size :], now.step_column)
-        copy_rows(plan.start_servo_sensitivity, d.integral[:], now.step_column)
-        copy_rows(plan.start_command_sensitivity, d.issued[len(d.issued) - 1], now.step_column)
+        copy_rows(plan.start_integral_sensitivity, d.x[2 * size :], now.parameters)
+        copy_rows(plan.start_servo_sensitivity, d.integral[:], now.parameters)
+        copy_rows(plan.start_command_sensitivity, d.issued[len(d.issued) - 1], now.parameters)
         if len(plan.commands) == 0 and len(plan.feedforward) == 0:
-            copy_rows(plan.start_command_sensitivity, d.last_command[:], now.step_column)
+            copy_rows(plan.start_command_sensitivity, d.last_command[:], now.parameters)
     if now.start_moves:
-        column = now.step_column + 1
+        column = now.parameters
         for i in range(2 * size + count):
             d.x[i, column + i] = 1.0
         for i in range(size):
@@ -65,9 +65,8 @@ def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> 
 @kernel
 def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -> None:
     """Write the columns of the parameters, and those of the start state if wanted."""
-    start = now.step_column + 1
-    copy_rows(rows, by_parameters, now.step_column)
-    copy_rows(rows[:, start:], by_start, by_start.shape[1])
+    copy_rows(rows, by_parameters, now.parameters)
+    copy_rows(rows[:, now.parameters :], by_start, by_start.shape[1])
 
 
 @kernel

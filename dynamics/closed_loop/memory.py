@@ -58,8 +58,8 @@ class Memory(NamedTuple):
 
     task: what does not change: addresses of machine code and kernels, laws, parameters, gains. now: where the
     integrator stands. evaluations (5,): all that is known at the stages of a step and at its end; rows of stuck joints
-    in their order. tangent: derivatives, one row an unknown, one column for each parameter, one for the length of the
-    present step, and one for each entry of the start state.
+    in their order. tangent: derivatives, one row an unknown, one column for each parameter, one for each entry of the
+    start state, and one for the length of a step that an event cuts.
     """
 
     task: Any
@@ -70,13 +70,13 @@ class Memory(NamedTuple):
 
 LAYOUT = {
     "task": "equation_of_motion! motion_in_lanes! free_acceleration! acceleration_in_lanes! response! "
-    "motion_derivatives! rate_map_derivative! slope_derivative! servo_jacobian! evaluate_terms! evaluate! "
-    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld lx "
-    "rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! torque_limit filter_time "
+    "motion_derivatives! stop_derivatives! rate_map_derivative! slope_derivative! servo_jacobian! evaluate_terms! "
+    "evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld "
+    "lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! torque_limit filter_time "
     "shown! pivots:r! rigid:r coulomb:n viscous:n friction=friction",
-    "now": "known=known served=served derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
-    "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
-    "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
+    "now": "known=known served=served derivatives=derivatives stopping=stopping mode:n! stuck:n! ramping! "
+    "events! events_left! start_moves! time_moves! length_moves! width! parameters! step_column! elapsed state:s "
+    "command:n command_slope:n command_rate:n last_command:n last_measured:m servo_integral:m demand:m change:m "
     "pose_and_rate:M rate_map:nm first_row! status! unknowns! frame! span! steps! grid! duration target purpose! "
     "length trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
     # first what `equation_of_motion` and `motion_derivatives` return, in their order
@@ -85,6 +85,8 @@ LAYOUT = {
     # and what else the columns of `slope_derivative` share
     "derivatives": "by_pose:mm by_rate:mm columns:mr crank_by_pose:nm crank_by_rate:nm jacobian:nm pushing:nm "
     "factor:mm damping:n by_error:n by_integral:n by_command_rate:n inputs:d",
+    # first what `stop_derivatives` returns
+    "stopping": "by_pose:mm by_rate:mm columns:mr inputs:z",
     # first what `response` and, from the factor on, `free_acceleration` take, in their order
     "evaluation": "row:m factor:mm bias:m jacobian:nm push:n state:s slope:s time bias_acceleration:n angle:n "
     "velocity:n spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
@@ -117,6 +119,7 @@ def record_type(name: str, sizes: Sizes) -> np.dtype:
         "i": 2 * m + r + g,
         "j": m + g,
         "d": 3 * m + n + r + g,
+        "z": 2 * m + n + r + g,
         "w": room_for_derivatives(sizes.parameters, sizes.start),
         "c": MAX_DELAY_FRAMES + 3,
     }

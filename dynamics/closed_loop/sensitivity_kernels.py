@@ -1,10 +1,10 @@
 """Sensitivities over the steps of the integrator, the exact derivative of what it computes.
 
-Derivatives are rows over columns: the parameters (of rigid bodies those that stand for all), the length of the present
-step, and the start state if wanted. A Runge-Kutta step is differentiated stage by stage, the equation of motion at each
-implicitly. A step that an event cuts has the length at which a margin vanishes at its end; the margin's derivative
-gives that of the length, and the step that follows is shorter by it. Stopping joints by an impulse is differentiated
-implicitly too.
+Derivatives are rows over columns: the parameters (of rigid bodies those that stand for all), the start state if wanted,
+and the length of a step that an event cuts, as long as that is not known. A Runge-Kutta step is differentiated stage by
+stage, the equation of motion at each implicitly. A step that an event cuts has the length at which a margin vanishes at
+its end; the margin's derivative gives that of the length, and the step that follows is shorter by it. Stopping joints
+by an impulse is differentiated implicitly too.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import (
@@ -45,14 +45,6 @@ def differentiate_motion(
     copy(acceleration, known.inputs[2 * size : 3 * size])
     copy(torque, known.inputs[3 * size :])
     call(task.motion_derivatives, known.inputs, known.by_pose)
-
-
-@kernel
-def add_columns(task: Record, factor: float, known: Record, rows: Array) -> None:
-    """Add a factor times the derivatives by the inertial parameters that stand for all."""
-    for i in range(len(rows)):
-        for k in range(task.shown):
-            rows[i, k] += factor * known.columns[i, task.pivots[k]]
 
 
 @kernel
@@ -244,6 +236,7 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
     `cut` by an event has the length that the event sets: until that is known it is one more variable."""
     fill(d.length[:], 0.0)
     if cut:
+        now.width = now.step_column + 1
         d.length[now.step_column] = 1.0
     if not event:
         add_row(-1.0, d.time[:], d.length[:], now.width)
@@ -261,6 +254,7 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
         move_tangent(now, at, d, k, h, WEIGHT[k], d.x[:], 0)
     if cut:
         length_tangent(task, now, at[END], d)
+        now.width = now.step_column
     add_row(1.0, d.length[:], d.time[:], now.width)
     now.time_moves = event
 
@@ -271,19 +265,20 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
     M change = -J^T impulse (`at.force`) and J rate = 0 in these joints, differentiated implicitly.
     """
-    size, width, known = len(at.bias), now.width, now.derivatives
+    size, width, known = len(at.bias), now.width, now.stopping
     stuck = now.stuck[: count_stuck(now)]
     pose, rate = d.x[:size], d.x[size : 2 * size]
-    fill(now.rest[:], 0.0)
-    fill(now.impulse[:], 0.0)
-    clear(d.moved[:], width)
-    differentiate_motion(task, now, now.state[:size], now.rest[:], now.rest[:], now.impulse[:])
-    add_columns(task, 1.0, known, d.moved[:])
-    add_product(1.0, known.by_pose, pose, d.moved[:], width)
+    copy(now.state[:size], known.inputs[:size])
+    copy(now.change[:], known.inputs[size : 2 * size])
+    impulse = known.inputs[2 * size : 2 * size + len(now.mode)]
+    fill(impulse, 0.0)
     for s in range(len(stuck)):
-        now.impulse[stuck[s]] = -at.force[s]
-    differentiate_motion(task, now, now.state[:size], now.rest[:], now.change[:], now.impulse[:])
-    add_columns(task, -1.0, known, d.moved[:])  # the difference leaves out gravity
+        impulse[stuck[s]] = -at.force[s]
+    call(task.stop_derivatives, known.inputs, known.by_pose)
+    clear(d.moved[:], width)
+    for i in range(size):
+        for k in range(task.shown):
+            d.moved[i, k] = -known.columns[i, task.pivots[k]]
     add_product(-1.0, known.by_pose, pose, d.moved[:], width)
     solve_rows(at.factor, size, d.moved[:], width)
     for j in range(size):

@@ -43,6 +43,7 @@ def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction
         free,
         acceleration_in_lanes(free, responding),
         motion_derivatives(geometry),
+        stop_derivatives(geometry),
         rate_map_derivative(geometry),
         responding,
         servo_jacobian(geometry),
@@ -108,20 +109,40 @@ def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
     joint accelerations: with respect to q (n, m) and rate (n, m); the latter is 2 J_theta_dot.
     The linear solve for q_ddot is left to the caller and never differentiated.
     """
-    layout, (q, rate, acceleration) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate", "gain")
-    motion, free = _poses(geometry, q, rate, acceleration), freedoms(geometry)
+    q, rate, acceleration = _coordinates(geometry, "q", "rate", "gain")
+    motion = _poses(geometry, q, rate, acceleration)
+    return _derivatives("motion_derivatives", geometry, [q, rate, acceleration], motion, ca.DM(geometry.gravity))
+
+
+def stop_derivatives(geometry: AnyGeometry) -> PartedFunction:
+    """(q, change of rate (m,), impulse (n,), rigid (p,)) -> derivatives of M change - J_theta^T impulse with respect
+    to q (m, m), rate (m, m), which is none, and rigid (m, p): of a motion from rest without gravity."""
+    q, change = _coordinates(geometry, "q", "change")
+    motion = _poses(geometry, q, 0 * q, change)
+    return _derivatives("stop_derivatives", geometry, [q, change], motion, ca.DM.zeros(3), 3)
+
+
+def _derivatives(
+    name: str,
+    geometry: AnyGeometry,
+    coordinates: list[ca.SX],
+    motion: tuple[ca.SX, ca.SX, ca.SX],
+    gravity: ca.DM,
+    count: int = 5,
+) -> PartedFunction:
+    """The first `count` of the derivatives of `motion_derivatives` at a motion that follows from coordinates."""
+    layout, free = parameter_layout(geometry.legs), freedoms(geometry)
     torque, rigid = ca.SX.sym("torque", layout.joints), ca.SX.sym("rigid", layout.rigid.stop)
     joints, (legs, sides), parts = _joints(geometry), _legs(geometry), []
     for number, leg in enumerate(legs):
         own, gradient = rigid[layout.leg_rows(number)], joints.gradient[number]
-        local, net_force, force, joint = _leg_derivatives(
-            leg, joints.of(number), torque[number], own, ca.DM(geometry.gravity)
-        )
+        local, net_force, force, joint = _leg_derivatives(leg, joints.of(number), torque[number], own, gravity)
         by_pose = gradient.T @ _by_pose(force, joints, number) + joints.curvature(number, net_force)
         by_rate = gradient.T @ _by_rate(force, joints, number)
         of_joint = [_by_pose(joint, joints, number) @ free, _by_rate(joint, joints, number) @ free]
-        parts.append([free.T @ by_pose @ free, free.T @ by_rate @ free, free.T @ gradient.T @ local, *of_joint])
-    platform = _platform_columns(geometry, joints)
+        of_leg = [free.T @ by_pose @ free, free.T @ by_rate @ free, free.T @ gradient.T @ local, *of_joint]
+        parts.append(of_leg[:count])
+    platform = _platform_columns(joints, gravity)
     alone = [free.T @ ca.jacobian(platform @ rigid[0:4], of) @ free for of in (joints.pose, joints.rate)]
 
     def end(
@@ -133,8 +154,8 @@ def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
             columns[:, layout.leg_rows(number)] = own
         return [sum(by_pose, alone[0]), sum(by_rate, alone[1]), columns, *(ca.vertcat(*rows) for rows in of_joints)]
 
-    inputs = [q, rate, acceleration, torque, rigid, *geometry.symbols]
-    return _parted("motion_derivatives", inputs, parts, end, sides, ([joints.pose, joints.rate, joints.gain], motion))
+    inputs = [*coordinates, torque, rigid, *geometry.symbols]
+    return _parted(name, inputs, parts, end, sides, ([joints.pose, joints.rate, joints.gain], motion))
 
 
 def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
@@ -248,7 +269,7 @@ def _by_rate(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
     return by_velocity @ joints.gradient[leg] + 2 * by_acceleration @ joints.gradient_rate[leg]
 
 
-def _platform_columns(geometry: AnyGeometry, joints: PlatformJointMotion) -> ca.SX:
+def _platform_columns(joints: PlatformJointMotion, gravity: ca.DM) -> ca.SX:
     to_twist = pose_rate_to_twist(joints.pose)
     twist_dot = to_twist @ joints.gain + twist_bias(joints.pose, joints.rate)
-    return to_twist.T @ platform_columns(joints.pose, to_twist @ joints.rate, twist_dot, ca.DM(geometry.gravity))
+    return to_twist.T @ platform_columns(joints.pose, to_twist @ joints.rate, twist_dot, gravity)

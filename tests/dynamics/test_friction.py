@@ -35,6 +35,7 @@ def _six_masses():
     return [
         function("equation_of_motion", [pose, rate, rigid], [mass, column, unit, column, pose, rate, factored(mass)]),
         function("motion_derivatives", [pose, rate, acceleration, torque, rigid], [zero, zero, columns, zero, zero]),
+        function("stop_derivatives", [pose, acceleration, torque, rigid], [zero, zero, columns]),
         function("rate_map_derivative", [pose, rate], [zero]),
         function("servo_jacobian", [pose], [unit]),
         free_acceleration(6, 6),
