@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 import cmmsim
 from dynamics import Robot
-from dynamics.closed_loop import LoopFailure, Reference, simulate
+from dynamics.closed_loop import ClosedLoopRun, LoopFailure, Reference, simulate
 from dynamics.closed_loop.problem import checked_loop_parameters
 from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
@@ -109,11 +109,15 @@ class PosePrediction:
     is taken to be the same all along the motion. And what all measured poses have in common, as far as the record
     states it, and the geometry: the servo takes the platform where such an error does not show, the whole motion with
     the same draw. What the record of the identification taught of that draw is in poses and covariance.
+
+    model: its run, with sensitivities by all parameters, where that is one of the reference alone: no frame is lost,
+    and poses have nothing in common.
     """
 
     chart: Chart
     poses: Array
     covariance: Array
+    model: ClosedLoopRun | None = None
 
     @property
     def std(self) -> Array:
@@ -161,7 +165,9 @@ def predict_poses(
     common = run.pose_modes(parameters)
     slopes = np.concatenate([model.pose_sensitivity, common @ root], axis=2)
     spread = slopes @ known @ slopes.transpose(0, 2, 1) + noise.T @ noise / len(noise)
-    return PosePrediction(run.robot.geometry.chart, model.pose + common[:, :, inside:] @ likely[inside:], spread)
+    alone = run.ok.all() and not (run.driven or run.common.all_names or run.payload.any())
+    poses = model.pose + common[:, :, inside:] @ likely[inside:]
+    return PosePrediction(run.robot.geometry.chart, poses, spread, model if alone else None)
 
 
 def _known_in_common(

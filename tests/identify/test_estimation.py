@@ -1,5 +1,7 @@
 """The estimator against known truth, on records with drawn noise (images are in test_experiment)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -113,6 +115,17 @@ def test_the_error_on_unseen_motions_is_the_one_predicted(scenario, ensemble):
     assert np.mean(exact) == pytest.approx(1.0, abs=0.1), exact
     for experiment, limits in ((1, [3e-6, 15e-6]), (7, [5e-6, 25e-6])):
         assert np.all(unseen_error(scenario, ensemble[experiment].estimate) < np.repeat(limits, 3)), experiment
+
+
+def test_a_prediction_keeps_the_models_run_where_no_frame_was_lost(scenario):
+    record, _ = run_plant(scenario, seed=3, trajectory_seed=4, duration_s=3.0)
+    run, rng = recorded_run(record, rss6(), scenario), np.random.default_rng(0)
+    kept = predict_poses(replace(run, ok=np.ones_like(run.ok)), truth(), np.zeros((67, 67)), rng).model
+    alone = simulate(rss6(), truth(), run.reference, run.settings, sensitivities=True)
+    np.testing.assert_array_equal(kept.pose, alone.pose)
+    np.testing.assert_array_equal(kept.pose_sensitivity, alone.pose_sensitivity)
+    few = np.arange(len(run.ok)) != 20
+    assert predict_poses(replace(run, ok=few), truth(), np.zeros((67, 67)), rng).model is None
 
 
 @pytest.mark.slow

@@ -11,13 +11,15 @@ from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import invert, rotation_log
 from cmmsim.teaching import exactly_taught
 from dynamics import load_robot
-from dynamics.closed_loop import Reference
+from dynamics.closed_loop import Reference, simulate
 from identify.errors import EstimationError, ScenarioError
 from identify.experiment.plant import build_plant
+from identify.loop_parameters import model_settings
 from identify.scenario import load_scenario
 from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.identification import prediction_figures
 from identify.studies.rows.sensor import SENSORS_KEPT, DrawnSensor, exact_sensor
+from identify.validation.unseen import model_run
 
 NOISELESS = {
     "sensor_changes.camera.noise": False,
@@ -190,11 +192,11 @@ def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_predi
     robot = load_robot(settings.robot)
     poses = np.tile(robot.home_pose, (60, 1))
     poses[:, :3] += 0.002 * np.sin(np.arange(60)[:, None] / np.array([5.0, 7.0, 9.0]))
-    references = [Reference(poses, np.gradient(poses, settings.timing.frame_period_s, axis=0))]
+    reference = Reference(poses, np.gradient(poses, settings.timing.frame_period_s, axis=0))
     truth = build_plant(settings, robot).parameters
     error = 1e-4 * truth * np.random.default_rng(0).normal(size=len(truth))
-    estimated = truth + error, np.outer(error, error)
-    found = prediction_figures(robot, settings, estimated, truth, references)
+    model = simulate(robot, truth + error, reference, model_settings(robot, settings), sensitivities=True)
+    found = prediction_figures([model], np.outer(error, error), [model_run(robot, settings, truth, reference)])
     assert found["prediction_rms_um"] > 0.01
     assert found["stated_prediction_rms_um"] == pytest.approx(found["prediction_rms_um"], rel=0.01)
 

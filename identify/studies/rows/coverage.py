@@ -13,14 +13,17 @@ from identify.experiment.truth import true_poses
 from identify.progress import SilentProgress
 from identify.studies.rows.kind import Row
 from identify.studies.rows.sensor import rms_um
-from identify.validation.unseen import predicted_runs
+from identify.validation.unseen import PosePrediction, predicted_runs
 
 
-def coverage(result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int) -> Row:
+def coverage(
+    result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], predicted: Sequence[PosePrediction]
+) -> Row:
     """How many intervals of what is identified hold the truth, how many true coordinates on unseen trajectories are
     where they are predicted, and how far from the true positions the predicted ones are."""
     held = [inside for *_, identified, inside in quantities(result, plant.parameters) if identified]
-    errors, variances = _predicted(result, plant, unseen, seed)
+    errors = np.concatenate([true_poses(one.truth) - of.poses for one, of in zip(unseen, predicted, strict=True)])
+    variances = np.concatenate([one.covariance for one in predicted])
     free = plant.nominal.geometry.chart.basis
     within = np.abs(errors @ free) < HALF_WIDTH * np.sqrt(np.diagonal(free.T @ variances @ free, axis1=1, axis2=2))
     row: Row = {
@@ -31,18 +34,15 @@ def coverage(result: IdentificationResult, plant: Plant, unseen: Sequence[Experi
     return row | ({"covered_percent": 100.0 * float(np.mean(held))} if held else {})
 
 
-def _predicted(
+def predictions(
     result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int
-) -> tuple[Array, Array]:
-    """Errors of predicted poses (frames, 6) on all unseen trajectories, and the covariance stated of them (frames, 6,
-    6)."""
+) -> list[PosePrediction]:
+    """What the identified model predicts on all unseen trajectories."""
     records = [one.record for one in unseen]
     estimated = result.estimate, result.whole_covariance
-    predicted = predicted_runs(
+    return predicted_runs(
         plant.nominal, plant.scenario, records, *estimated, seed, SilentProgress(), result.common_errors.learned
     )
-    errors = [true_poses(one.truth) - of_one.poses for one, of_one in zip(unseen, predicted, strict=True)]
-    return np.concatenate(errors), np.concatenate([one.covariance for one in predicted])
 
 
 def quantities(result: IdentificationResult, truth: Array) -> Iterator[tuple[str, float, float, bool, bool]]:

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import Reference, simulate
+from dynamics.closed_loop import ClosedLoopRun, simulate
 from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
@@ -32,11 +32,11 @@ from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario, scenario_from_toml
 from identify.scenario.section import Section
 from identify.scenario.sections import Rig
-from identify.studies.rows.coverage import coverage
+from identify.studies.rows.coverage import coverage, predictions
 from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing, unwatched
 from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
-from identify.validation.unseen import model_run
+from identify.validation.unseen import PosePrediction, model_run
 
 EXPERIMENT = 0
 CHOSEN = {
@@ -169,23 +169,31 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
     result = identify_record(made.records, plant.nominal, scenario)
     plant = replace(plant, scenario=with_drive(scenario, result.drive.law))
     row = _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
-    row |= _unseen_figures(result, plant, unseen) | coverage(result, plant, unseen, made.number)
+    predicted = predictions(result, plant, unseen, made.number)
+    row |= _unseen_figures(result, plant, unseen, predicted) | coverage(result, plant, unseen, predicted)
     if not options.unaware:
         return row
     unaware = scenario.with_overrides({"identification.nuisances": []})
     result = identify_record(made.records, plant.nominal, unaware)
     plant = replace(plant, scenario=with_drive(unaware, result.drive.law))
-    covered = coverage(result, plant, unseen, made.number)
+    covered = coverage(result, plant, unseen, predictions(result, plant, unseen, made.number))
     return row | {f"unaware_{name}": value for name, value in covered.items()}
 
 
-def _unseen_figures(result: IdentificationResult, plant: Plant, unseen: list[Experiment]) -> Row:
-    """Errors of the identified model on unseen trajectories."""
-    robot, scenario = plant.nominal, plant.scenario
+def _unseen_figures(
+    result: IdentificationResult, plant: Plant, unseen: list[Experiment], predicted: list[PosePrediction]
+) -> Row:
+    """Errors of the identified model on unseen trajectories, by what was predicted there."""
+    robot, settings = plant.nominal, model_settings(plant.nominal, plant.scenario)
     references = [recorded_reference(one.record) for one in unseen]
-    models = [model_run(robot, scenario, result.estimate, reference) for reference in references]
-    errors = np.concatenate(models) - np.concatenate([true_poses(one.truth) for one in unseen])
-    return prediction_figures(robot, scenario, (result.estimate, result.covariance), plant.parameters, references) | {
+    models = [
+        of.model or simulate(robot, result.estimate, reference, settings, sensitivities=True)
+        for of, reference in zip(predicted, references, strict=True)
+    ]
+    true = [model_run(robot, plant.scenario, plant.parameters, reference) for reference in references]
+    pairs = zip(models, unseen, strict=True)
+    errors = np.concatenate([model.pose - true_poses(one.truth) for model, one in pairs])
+    return prediction_figures(models, result.covariance, true) | {
         "unseen_position_rms_um": rms_um(errors[:, :3]),
         "unseen_orientation_rms_urad": rms_um(errors[:, 3:]),
     }
@@ -220,22 +228,18 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     return row | {"noise_ratio": result.noise_ratio, "iterations": result.iterations}
 
 
-def prediction_figures(
-    robot: Robot, scenario: Scenario, estimated: tuple[Array, Array], truth: Array, references: list[Reference]
-) -> Row:
-    """What the error of parameters (p,), estimated with a covariance (p, p), makes of the model's positions on
-    references, and what the covariance states of it.
+def prediction_figures(models: list[ClosedLoopRun], covariance: Array, true: list[Array]) -> Row:
+    """What the error of parameters, estimated with a covariance (p, p), makes of the model's positions, and what the
+    covariance states of it: by runs of the estimated model with sensitivities, and poses (N, 6) each of the true one.
 
     Every direction in which the parameters can err counts as much as it shows; so the figure has the scatter of many
     errors, where that of a few parameters that err together has the scatter of hardly two.
     """
-    estimate, covariance = estimated
     squares, stated = [], []
-    for reference in references:
-        model = simulate(robot, estimate, reference, model_settings(robot, scenario), sensitivities=True)
+    for model, poses in zip(models, true, strict=True):
         assert model.pose_sensitivity is not None
         slopes = model.pose_sensitivity[:, :3]
-        squares.append(np.mean((model.pose - model_run(robot, scenario, truth, reference))[:, :3] ** 2))
+        squares.append(np.mean((model.pose - poses)[:, :3] ** 2))
         stated.append(np.mean(np.einsum("nip,pq,niq->ni", slopes, covariance, slopes, optimize=True)))
     return {
         "prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
