@@ -174,8 +174,14 @@ class DrawnStickers:
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """See ``StickerExposure``: in each window the sticker nearest to its middle."""
-        sides = [self._in_windows(side, corners[side], size, observer) for side in range(2)]
-        return EllipseFits(*(np.concatenate(values) for values in zip(*(vars(s).values() for s in sides), strict=True)))
+        found, fit_size = self._found, observer.settings.fit_size
+        gaps = np.abs(found.centres[:, None] - corners[:, :, None] - 0.5 * (size - 1)).max(axis=3)
+        gaps = np.where(found.seen[:, None], gaps, np.inf)
+        index, seen = gaps.argmin(axis=2), np.isfinite(gaps.min(axis=2, initial=np.inf))
+        inner = np.rint(np.take_along_axis(found.centres, index[..., None], 1) - 0.5 * (fit_size - 1)).astype(int)
+        inner = np.clip(inner, corners, corners + size - fit_size)
+        sides = np.repeat([0, 1], corners.shape[1])
+        return self._fitted(sides, index.ravel(), inner.reshape(-1, 2), seen.ravel(), observer)
 
     def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
         """See ``StickerExposure``."""
@@ -190,44 +196,36 @@ class DrawnStickers:
             index = np.flatnonzero(whole)
             fit_size = observer.settings.fit_size
             corners = np.rint(self._found.centres[side, index] - 0.5 * (fit_size - 1)).astype(int)
-            found.append(self._fitted(side, index, corners, whole[index], observer))
+            found.append(self._fitted(np.full(len(index), side), index, corners, whole[index], observer))
         return found[0], found[1]
-
-    def _in_windows(self, side: int, corners: NDArray[np.int_], size: int, observer: Observer) -> EllipseFits:
-        """Of the k windows of one image."""
-        gaps = np.abs(self._found.centres[side] - corners[:, None] - 0.5 * (size - 1)).max(axis=2)
-        gaps[:, ~self._found.seen[side]] = np.inf
-        index, fit_size = gaps.argmin(axis=1), observer.settings.fit_size
-        centres = self._found.centres[side, index]
-        inner = np.rint(centres - 0.5 * (fit_size - 1)).astype(int)
-        inner = np.clip(inner, corners, corners + size - fit_size)
-        return self._fitted(side, index, inner, np.isfinite(gaps.min(axis=1, initial=0.0)), observer)
 
     def _fitted(
         self,
-        side: int,
+        sides: NDArray[np.int_],
         index: NDArray[np.int_],
         corners: NDArray[np.int_],
         seen: NDArray[np.bool_],
         observer: Observer,
     ) -> EllipseFits:
-        """Stickers ``index`` (k,) fitted in parts of windows with first pixels ``corners`` (k,2) of one image."""
+        """Stickers ``index`` (k,) fitted in parts of windows with first pixels ``corners`` (k,2), first those of the
+        left of both images (k,) ``sides``."""
         from cmmsim.statistical.centre_kernels import (
             fit_covariances,
         )  # compiles, so it is loaded where it is first needed
 
         settings, noise = observer.settings, observer.noise
-        centres, shapes = self._found.centres[side, index], self._found.shapes[side, index]
+        centres, shapes, drawn = (a[sides, index] for a in (self._found.centres, self._found.shapes, self._found.noise))
         within = lies_inside(centres - corners, shapes, settings.fit_size)
-        within &= thinnest(shapes) > THIN_PX + THIN_STD_PX * self._found.noise[side, index, 5]
-        contrasts, grounds = self.camera.greys(noise, side, centres)
+        within &= thinnest(shapes) > THIN_PX + THIN_STD_PX * drawn[:, 5]
+        lit = [self.camera.greys(noise, side, centres[sides == side]) for side in range(2)]
+        contrasts, grounds = (np.concatenate(values) for values in zip(*lit, strict=True))
         good = seen & within & (contrasts >= settings.limits.smallest_contrast)
         spread = np.tile(np.eye(5), (len(index), 1, 1))
         chosen = np.empty((int(good.sum()), 5, 5))
         fit_covariances(
             (centres - corners)[good],
             shapes[good],
-            self._found.smears[side, index[good]],
+            self._found.smears[sides[good], index[good]],
             contrasts[good],
             grounds[good],
             settings.fit_size,
@@ -235,12 +233,12 @@ class DrawnStickers:
             chosen,
         )
         spread[good] = chosen
-        drawn = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), self._found.noise[side, index, :5])
+        off = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), drawn[:, :5])
         return EllipseFits(
-            centres + drawn[:, :2],
+            centres + off[:, :2],
             spread[:, :2, :2],
             good,
-            shapes + np.einsum("kp,pij->kij", drawn[:, 2:], SHAPE_BASIS),
+            shapes + np.einsum("kp,pij->kij", off[:, 2:], SHAPE_BASIS),
             spread[:, 2:, 2:],
             np.ones(len(index)),
             contrasts,
