@@ -23,7 +23,8 @@ NOMINAL = "initial"
 
 
 def model_settings(robot: Robot, scenario: Scenario) -> LoopSettings:
-    """The loop around the estimator's model: of the latency it knows the mean only. Raises as `loop_settings`."""
+    """The loop around the estimator's model: of the latency it knows the mean, where no record says when commands
+    acted. Raises as `loop_settings`."""
     return loop_settings(robot, scenario, scenario.model)
 
 

@@ -35,14 +35,13 @@ from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.known_geometry import FOLDER, KnownGeometry, known_geometry
 from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
-from identify.record.recorded_run import recorded_reference
 from identify.record.recording import build_model_run, write_model_runs
 from identify.reporting.report import write_report
 from identify.reporting.run_result import add_truth, parameter_vector, prediction_entry, sensor_entry, validation_entry
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import estimator_settings, with_estimator_settings
 from identify.trajectory import TrajectorySet, check_travel, load_trajectories, save_trajectories
-from identify.validation.unseen import model_on_record, model_run, predicted_runs, run_unseen
+from identify.validation.unseen import model_on_record, predicted_runs, run_unseen
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
@@ -236,9 +235,7 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress, known)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
     records = [files.experiment, *(run.record for run in runs)]
-    model_poses = [[model_on_record(robot, scenario, values, files.experiment) for values in models]]
-    for reference in (recorded_reference(seen) for seen in records[1:]):
-        model_poses.append([model_run(robot, scenario, values, reference) for values in models])
+    model_poses = [[model_on_record(robot, scenario, values, seen) for values in models] for seen in records]
     found = result["identification"].get("nuisance_estimates", {})
     predictions = predicted_runs(
         robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress, found

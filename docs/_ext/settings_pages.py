@@ -5,6 +5,7 @@ from typing import Any
 
 from cmmsim.files.sensor_file import sensor_schema
 from dynamics.robot_file import FAMILIES, robot_schema
+from identify.record.command_times import OPTIONAL
 from identify.record.csv_record import RULES
 from identify.record.own_record import record_schema
 from identify.record.recording import VARIABLES
@@ -63,7 +64,7 @@ def record_variables() -> str:
     """What a record holds as netCDF."""
     rows = "\n".join(
         f"| `{name}` | {', '.join(sizes)} | {'' if unit == '1' else unit} | {_plain(what)} |"
-        for name, (sizes, unit, what) in VARIABLES.items()
+        for name, (sizes, unit, what) in (VARIABLES | OPTIONAL).items()
     )
     return f"| variable | over | unit | what |\n| --- | --- | --- | --- |\n{rows}\n"
 

@@ -34,20 +34,28 @@ class CommandSchedule(NamedTuple):
 
 
 def command_schedule(problem: LoopProblem) -> CommandSchedule:
-    """The spans of a run; commands issued before it have the latency of its timing."""
-    timing, latencies = problem.settings.timing, problem.latencies
+    """The spans of a run; commands issued before it have the latencies of its start, or that of its timing."""
+    timing, latencies, before = problem.settings.timing, problem.latencies, problem.start.latencies
     each = None if latencies is None else tuple(latencies.tolist())
-    usual, linear = float(timing.latency_s), timing.hold == "linear"
-    return _schedule(problem.frames, problem.period, usual, each, linear, problem.settings.steps_per_frame)
+    earlier = (float(timing.latency_s),) if before is None else tuple(before.tolist())
+    linear, steps = timing.hold == "linear", problem.settings.steps_per_frame
+    return _schedule(problem.frames, problem.period, float(timing.latency_s), earlier, each, linear, steps)
 
 
 @lru_cache(maxsize=32)
 def _schedule(
-    frames: int, period: float, latency: float, latencies: tuple[float, ...] | None, linear: bool, steps_per_frame: int
+    frames: int,
+    period: float,
+    latency: float,
+    before: tuple[float, ...],
+    latencies: tuple[float, ...] | None,
+    linear: bool,
+    steps_per_frame: int,
 ) -> CommandSchedule:
-    usual = _delay(latency, period)
-    oldest = -usual[0] - 2
-    delays = [usual] * -oldest + ([usual] * frames if latencies is None else [_delay(s, period) for s in latencies])
+    earlier = [_delay(s, period) for s in before]
+    oldest = -max(whole for whole, _ in earlier) - 2
+    delays = [earlier[max(0, len(earlier) + n)] for n in range(oldest, 0)]
+    delays += [_delay(latency, period)] * frames if latencies is None else [_delay(s, period) for s in latencies]
     arrivals = list(accumulate(((oldest + n + whole, rest) for n, (whole, rest) in enumerate(delays)), max))
     ramp_ends = [(frame + 1, rest) for frame, rest in arrivals] if linear else []
     begins = sorted({(k, 0.0) for k in range(frames)} | {i for i in arrivals + ramp_ends if 0 <= i[0] < frames})

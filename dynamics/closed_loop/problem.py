@@ -124,7 +124,10 @@ class Reference:
         return f"Reference({len(self.poses)} frames)"
 
 
-OPTIONAL = ("joint_integral_sensitivity", "command_sensitivity", "motor_angle", "motor_rate", "filtered_rate")
+OPTIONAL = (
+    *("joint_integral_sensitivity", "command_sensitivity", "motor_angle", "motor_rate", "filtered_rate"),
+    "latencies",
+)
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ class StartState:
     joint_integral_sensitivity, command_sensitivity (n, p): how the joint PID integral and the commands before, with the
     servo integral that makes them, follow the parameters; None where they are just given.
     motor_angle (n,) and motor_rate (n,): of elastic joints only. filtered_rate (n,): of the errors, in drives that
-    filter it; None: none.
+    filter it; None: none. latencies (k,): after which the commands before act, s; None: that of the timing.
     Raises SimulationError for a wrong shape or a number that is not finite; the sizes of a robot are asked for when a
     run begins.
     """
@@ -154,6 +157,7 @@ class StartState:
     motor_angle: np.ndarray | None = None
     motor_rate: np.ndarray | None = None
     filtered_rate: np.ndarray | None = None
+    latencies: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         poses: dict[str, Shape] = dict.fromkeys(("pose", "pose_rate", "last_measured"), (6,))
@@ -174,6 +178,7 @@ class StartState:
         )
         wanted |= {"servo_integral": (len(robot.coordinate_names),), "commands": (len(self.commands), joints)}
         wanted |= dict.fromkeys(("joint_integral_sensitivity", "command_sensitivity"), (joints, parameters))
+        wanted |= {"latencies": (len(self.commands),)}
         for name, shape in wanted.items():
             found = getattr(self, name)
             if found is not None and found.shape != shape:

@@ -43,7 +43,8 @@ class ClosedLoopRun:
         return f"ClosedLoopRun({len(self.time)} frames to {self.time[-1]:.4g} s, {lost} lost, {self.events} events)"
 
     def state_at(self, frame: int) -> StartState:
-        """The state at a frame: a run that starts from it repeats the rest of this one, if its latency is constant.
+        """The state at a frame: a run that starts from it repeats the rest of this one, where latencies differ with
+        those of the commands before beside it.
 
         Raises SimulationError for a frame that the run does not have, or that follows a lost measurement.
         """

@@ -224,10 +224,10 @@ def _checked(
         check_type("start", start, StartState, SimulationError)
         start.check_sizes(robot)
         check_start_pose(robot, parameters, start.pose)
+        _check_latencies(settings.timing, "start latencies: that of command", start.latencies)
     if latencies is not None:
         latencies = floats("latencies", latencies, (frames,), error=SimulationError)
-        for frame, latency in enumerate(latencies.tolist()):
-            settings.timing.check_latency(f"latency of frame {frame}", latency)
+        _check_latencies(settings.timing, "latency of frame", latencies)
     problem = LoopProblem(
         robot,
         parameters,
@@ -292,6 +292,12 @@ def _listed(name: str, given: Item | Sequence[Item], kind: type[Item]) -> list[I
 def _check_reach(robot: Robot, reference: Reference) -> None:
     """Raise UnreachablePoseError, naming frame and leg, for a pose out of a robot's reach; asked once for both."""
     robot.check_reach(reference.poses, "reference pose", "frame")
+
+
+def _check_latencies(timing: FrameTiming, name: str, latencies: np.ndarray | None) -> None:
+    """Raise SimulationError for a latency that no run can have."""
+    for number, latency in enumerate([] if latencies is None else latencies.tolist()):
+        timing.check_latency(f"{name} {number}", latency)
 
 
 def _checked_rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray | None:

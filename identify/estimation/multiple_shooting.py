@@ -18,7 +18,6 @@ import numpy as np
 
 from dynamics import DynamicsError
 from dynamics.closed_loop import ClosedLoopRun, Reference, StartState, equilibrium, simulate
-from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
 from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
@@ -64,10 +63,10 @@ class Segment:
         """The model's run from a state (s,); the first segment starts in equilibrium. Raises LoopFailure."""
         run, chart = self.run, self.chart
         coordinates, rates, integral = np.split(state, [len(chart.freedoms), 2 * len(chart.freedoms)])
-        before = run.logged[max(0, self.first - MAX_DELAY_FRAMES - 2) : self.first]
-        pose = chart.pose(coordinates)
-        at_rest = np.zeros(len(chart.freedoms))
-        start = StartState(pose, chart.lifted(rates), integral, at_rest, before, pose) if self.first else None
+        pose, at_rest, start = chart.pose(coordinates), np.zeros(len(chart.freedoms)), None
+        if self.first:
+            before, latencies = run.commands_before(self.first)
+            start = StartState(pose, chart.lifted(rates), integral, at_rest, before, pose, latencies=latencies)
         return simulate(
             run.robot,
             parameters + run.payload,
@@ -77,6 +76,7 @@ class Segment:
             sensitivities=sensitivities,
             start_sensitivities=sensitivities,
             commands=run.logged[self.first : self.last + 1],
+            latencies=None if run.latencies is None else run.latencies[self.first : self.last + 1],
         )
 
     def whitened(self, values: Array) -> Array:
@@ -110,7 +110,7 @@ def measured_states(chain: list[Segment], parameters: Array, scenario: Scenario)
     run, rate_hz, filtering = chain[0].run, scenario.timing.frame_rate_hz, scenario.filter
     measured = run.robot.geometry.chart.coordinates(run.without_gaps())
     place, rate, _ = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
-    _, _, command_integral = effective_command(run.logged, scenario)
+    _, _, command_integral = effective_command(run.logged, scenario, run.latencies)
     angle_integral = running_integral(run.robot.inverse_kinematics(run.robot.pose(place)), rate_hz)
     servo, drives = run.settings.servo, run.settings.drives
     rest = equilibrium(run.robot, parameters + run.payload, run.reference.poses[0], servo, drives=drives)

@@ -32,6 +32,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
+from identify.record.command_times import acting_times
 from identify.record.common_errors import Marginal
 from identify.record.recorded_run import RecordedRun
 from identify.scenario import Scenario
@@ -78,12 +79,13 @@ def _stacked(problem: OutputErrorProblem, scenario: Scenario, law: JointLaw) -> 
     layout = runs[0].robot.layout
     count, joints = len(layout.names), layout.joints
     for place, run in enumerate(runs):
-        balance, slipping = joint_balance(run.robot, run.without_gaps(), run.logged, scenario, law)
+        latencies = run.latencies
+        balance, slipping = joint_balance(run.robot, run.without_gaps(), run.logged, scenario, law, latencies)
         columns = balance[slipping]
         if run.settings.drives.torques:
             columns[:, layout.joint_pid] = 0.0
             matrices.append(columns[:, :count])
-            felt = effective_command(run.logged, scenario)[0][slipping]
+            felt = effective_command(run.logged, scenario, latencies)[0][slipping]
             right.append(felt - columns[:, :count] @ run.payload)
             common.append(np.zeros((len(columns), 0)))
             continue
@@ -103,7 +105,9 @@ def _common_torques(run: RecordedRun, guess: StartingGuess, scenario: Scenario) 
     by_pose = run.robot.pose_jacobian(run.reference.poses) @ run.common.modes if run.common.names else None
     by_geometry = run.common.geometry.joints(poses) if run.common.geometry else None
     latency_std = run.common.latency_std
-    by_latency = latency_std * effective_command(run.logged, scenario)[1][:, :, None] if latency_std else None
+    by_latency = None
+    if latency_std:
+        by_latency = latency_std * effective_command(run.logged, scenario, run.latencies)[1][:, :, None]
     moved = [part for part in (by_pose, by_geometry, by_latency) if part is not None]
     if not moved:
         return np.zeros((*run.logged.shape, 0))
@@ -112,11 +116,11 @@ def _common_torques(run: RecordedRun, guess: StartingGuess, scenario: Scenario) 
 
 
 def joint_balance(
-    robot: Robot, measured: Array, commands: Array, scenario: Scenario, law: JointLaw
+    robot: Robot, measured: Array, commands: Array, scenario: Scenario, law: JointLaw, latencies: Array | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Torque balance of every joint (N, n, p + n) of poses (N, 6) and commands (N, n), and where it slips (N, n).
 
-    law: of the drives.
+    law: of the drives; latencies (N,): of the commands, s, None: that of the timing.
 
     Columns: the dynamic parameters, which give the joint's torque, then lp, li, ld and the starting torques, which give
     the controller's with the opposite sign; N m or N per unit of each.
@@ -130,7 +134,7 @@ def joint_balance(
     torque_map = np.linalg.inv(robot.joint_jacobian(pose) @ chart.basis).transpose(0, 2, 1)
     angle = robot.inverse_kinematics(pose)
     velocity = np.einsum("nij,nj->ni", robot.joint_jacobian(pose), twist)
-    command, command_rate, integral = effective_command(commands, scenario)
+    command, command_rate, integral = effective_command(commands, scenario, latencies)
     angle_integral = running_integral(angle, rate_hz)
     count, joints = len(measured), robot.layout.joints
     start = np.broadcast_to(-np.eye(joints), (count, joints, joints))
@@ -144,11 +148,16 @@ def joint_balance(
     return columns, slipping
 
 
-def effective_command(commands: Array, scenario: Scenario) -> tuple[Array, Array, Array]:
+def effective_command(
+    commands: Array, scenario: Scenario, latencies: Array | None = None
+) -> tuple[Array, Array, Array]:
     """Filtered command as the joints feel it, its rate as the joint PID sees it, and its integral, at the frames.
 
     A held command lags by half a frame, a ramped one by a whole frame; U_dot is the difference of two commands, held.
+    latencies (N,): of the commands, s, where they have not all that of the timing.
     """
+    if latencies is not None:
+        return _acted(commands, scenario, latencies)
     timing, filtering = scenario.timing, scenario.filter
     rate_hz, period = timing.frame_rate_hz, timing.frame_period_s
     smooth = zero_phase_filter(commands, rate_hz, filtering.cutoff_hz, filtering.order)
@@ -158,6 +167,32 @@ def effective_command(commands: Array, scenario: Scenario) -> tuple[Array, Array
     felt = spline(np.clip(times - lag, 0.0, None))
     rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
     return felt, rate, running_integral(felt, rate_hz)
+
+
+def _acted(commands: Array, scenario: Scenario, latencies: Array) -> tuple[Array, Array, Array]:
+    """`effective_command` of commands that each arrive after a latency of its own: filtered rates of the integrals of
+    what acts from one arrival to the next."""
+    timing, filtering = scenario.timing, scenario.filter
+    rate_hz, period = timing.frame_rate_hz, timing.frame_period_s
+    times = np.arange(len(commands), dtype=float) * period
+    arrivals = acting_times(times, latencies)
+    newest = np.maximum(np.searchsorted(arrivals, times, side="right") - 1, 0)
+    differences = np.diff(commands, axis=0, prepend=commands[:1])
+
+    def felt(values: Array, ramped: float) -> Array:
+        def since(which: NDArray[np.intp] | slice, duration: Array) -> Array:
+            """Integral of what acts since its arrival: under a ramp of one frame, of so much, it is behind at first."""
+            behind = np.minimum(duration, period)
+            behind = behind - behind**2 / (2 * period)
+            return values[which] * duration[:, None] - (ramped * differences)[which] * behind[:, None]
+
+        so_far = np.vstack([arrivals[0] * values[:1], since(slice(-1), np.diff(arrivals))]).cumsum(axis=0)
+        integral = so_far[newest] + since(newest, times - arrivals[newest])
+        held = make_interp_spline(times, integral, k=5).derivative()(times)
+        return zero_phase_filter(held, rate_hz, filtering.cutoff_hz, filtering.order)
+
+    command = felt(commands, float(timing.hold == "linear"))
+    return command, felt(differences * rate_hz, 0.0), running_integral(command, rate_hz)
 
 
 def low_pass(samples: Array, time_constant: float, rate_hz: float) -> Array:

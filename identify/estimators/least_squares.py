@@ -73,7 +73,7 @@ def torque_equations(
     timing, filtering = scenario.timing, scenario.filter
     layout, guess = run.robot.layout, run.robot.parameter_sets[scenario.model.start_parameters]
     law = run.settings.drives.joint_law(guess.joint_pid)
-    balance, found = joint_balance(run.robot, poses, run.logged, scenario, law)
+    balance, found = joint_balance(run.robot, poses, run.logged, scenario, law, run.latencies)
     rows = found if slipping is None else slipping
     columns = balance[rows]
     smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)[rows]

@@ -36,6 +36,7 @@ from identify.random_streams import (
     stream_seed,
 )
 from identify.record import recording
+from identify.record.command_times import acting_times
 from identify.record.common_errors import CommonErrors, store_common_errors
 from identify.record.drift import store_finding
 from identify.record.geometry_errors import store_geometry_covariance
@@ -51,8 +52,8 @@ PAYLOAD_RUN = 1_000_000
 
 @dataclass(frozen=True)
 class Latencies:
-    """Of the frames of a run (frames,), s: the true ones, and as a law of control knows them, which does not know how
-    far their mean is from the scenario's. None: all are the scenario's."""
+    """Of the frames of a run (frames,), s: the true ones, and as they are known to a law of control and to the record,
+    which do not know how far their mean is from the scenario's. None: all are the scenario's."""
 
     true: Array | None = None
     known: Array | None = None
@@ -169,7 +170,7 @@ def run_plant(
         model = model_guess(plant.nominal, scenario).values + (0.0 if load is None else load.stated)
         in_loop = prepared(plant, law, KnownModel(model), motion, by_images(eye), latencies.known)
     done = plant.run(reference, RateSensor(eye.measure), latencies.true, true_load, in_loop)
-    record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
+    record, truth = _record(plant, reference, done, eye, seed, latencies.known), plant.truth(done)
     if in_loop is not None:
         store_law(record, law, in_loop.drives)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
@@ -217,7 +218,11 @@ def drawn_latencies(scenario: Scenario, frames: int, seed: int, run: int) -> Lat
     return Latencies(true, known)
 
 
-def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorInLoop, seed: int) -> xr.Dataset:
+def _record(
+    plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorInLoop, seed: int, latencies: Array | None
+) -> xr.Dataset:
+    """What is seen of a run; latencies (frames,) s as they are known, None: all are the scenario's."""
+    latencies = np.full(len(run.time), plant.scenario.timing.latency_s) if latencies is None else latencies
     record = recording.build_record(
         time=run.time,
         reference_pose=reference.poses,
@@ -226,6 +231,7 @@ def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorI
         measured_covariance=np.array(eye.covariances),
         measured_ok=run.measured_ok,
         command=run.command,
+        command_time=acting_times(run.time, latencies),
         scenario_toml=plant.scenario.to_toml(),
         robot=plant.nominal.name,
         seed=seed,

@@ -22,8 +22,9 @@ starts from there without a jump of its rate. It has one row a frame, at the fra
 frame whose pose the sensor lost stays, with empty measured columns. Units are m, rad and s. Poses are those of the
 platform frame in the base frame of the robot file, R = Rx(alpha) Ry(beta) Rz(gamma); time is the instant at which the
 sensor saw the pose. A command is the joint coordinate that the servo asked for from its row on, with the zero and the
-direction of the robot file. Rates are time derivatives of the reference pose's six numbers, not the angular velocity;
-without these columns they are taken from a spline through the reference.
+direction of the robot file; it acts at its command_time_s, which may be empty only in a row whose pose was lost, and
+without that column after the latency of [timing]. Rates are time derivatives of the reference pose's six numbers, not
+the angular velocity; without these columns they are taken from a spline through the reference.
 """
 """What must hold of a record of one's own."""
 
@@ -51,6 +52,9 @@ def columns_of(robot: Robot) -> dict[str, Group]:
         "reference": Group(tuple(f"reference_{a}_{UNITS[a]}" for a in POSE), "pose that was asked for"),
         "measured": Group(tuple(f"measured_{a}_{UNITS[a]}" for a in POSE), "pose that the sensor measured, or empty"),
         "command": Group(tuple(f"command_{n}_{unit}" for n in joints), "joint command from this row on"),
+        "command_time": Group(
+            ("command_time_s",), "time at which the row's command was written to the drives, or empty", True
+        ),
         "rate": Group(tuple(f"rate_{a}_{UNITS[a]}_s" for a in POSE), "time derivative of the reference", True),
         "ok": Group(("measured_ok",), "1 where the pose was measured, 0 where it was lost", True),
         "covariance": Group(
@@ -144,6 +148,6 @@ def _numbers(path: Path, number: int, header: list[str], cells: list[str]) -> li
             values.append(float(cell) if cell else np.nan)
         except ValueError:
             raise RecordError(f"{path} line {number}: {name} is {cell[:40]!r}, which is no number") from None
-        if not (np.isfinite(values[-1]) or name.startswith(("measured_", "covariance_"))):
+        if not (np.isfinite(values[-1]) or name.startswith(("measured_", "covariance_", "command_time"))):
             raise RecordError(f"{path} line {number}: {name} is {cell or 'empty'}, must be a finite number")
     return values

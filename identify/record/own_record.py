@@ -74,21 +74,22 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
     robot = load_robot(scenario.robot)
     table = read_table(path, robot)
     table.check_times(scenario.timing.frame_rate_hz)
-    poses, ok = table.groups["measured"], _measured_ok(table)
+    poses, ok, start = table.groups["measured"], _measured_ok(table), table.groups["time"][0, 0]
     record = build_record(
-        time=table.groups["time"][:, 0] - table.groups["time"][0, 0],
+        time=table.groups["time"][:, 0] - start,
         reference_pose=table.groups["reference"],
         reference_rate=_rates(table, scenario),
         measured_pose=np.where(ok[:, None], poses, np.nan),
         measured_covariance=_covariances(table, measured, ok),
         measured_ok=ok,
         command=table.groups["command"],
+        command_time=table.groups["command_time"][:, 0] - start if "command_time" in table.groups else None,
         robot=robot.name,
         scenario_toml=scenario.to_toml(),
         frame_rate_hz=scenario.timing.frame_rate_hz,
-        title=f"Record of {path.name}",
         prismatic=robot.layout.prismatic,
     )
+    record.attrs["title"] = f"Record of {path.name}"
     _state_anchor(record, scenario, measured, description_file(path))
     if measured.under_payload:
         _state_payload(record, robot, scenario)

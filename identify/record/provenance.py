@@ -19,6 +19,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.files.dataset import plain, read_covariance, shown
 from identify.files.run_folder import RunFolder, load_result
+from identify.record.command_times import OPTIONAL
 from identify.record.payload import ADDED
 from identify.record.recording import VARIABLES, read, read_model_runs, read_runs
 from identify.scenario import Scenario, scenario_from_toml
@@ -226,7 +227,8 @@ def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
 def _record_digest(records: Sequence[xr.Dataset]) -> str:
     whole = sha256()
     for record in records:
-        arrays = {name: record[name].values for name in ("time", *VARIABLES)}
+        held = ("time", *VARIABLES, *(name for name in OPTIONAL if name in record))
+        arrays = {name: record[name].values for name in held}
         stated = {name: plain(record.attrs[name]) for name in STATED if name in record.attrs}
         scenario = recorded_scenario(record)
         stated |= {section: getattr(scenario, section).model_dump(mode="json") for section in ("timing", "servo")}

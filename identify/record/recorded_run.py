@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopFailure, LoopSettings, Reference, simulate, simulate_repeats
+from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
@@ -26,6 +27,7 @@ from identify.record.checks import (
     check_reference,
     checked_covariance,
 )
+from identify.record.command_times import logged_latencies
 from identify.record.common_errors import NONE, CommonErrors, Marginal, read_common_errors
 from identify.record.drift import drift_warnings
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
@@ -47,7 +49,8 @@ class RecordedRun:
     measured: poses (N, 6), NaN where lost; ok (N,) bool; covariance (6, 6) of one measured pose; logged: the joint
     commands (N, n) as they were given; driven: whether the model's joints get these, or its own servo acts; payload
     (p,): what a known load on the platform adds to the parameters, with standard deviations payload_std (p,); common:
-    errors that all measured poses have in common; drawn: those that a model's loop can have (k,), as it has them, in
+    errors that all measured poses have in common; acted (N,): latencies after which the commands acted, s, where they
+    were logged, None: all after that of the timing; drawn: those that a model's loop can have (k,), as it has them, in
     their standard deviations, None: none; marginal: what whitens residuals by them (`with_common_errors`); groups:
     through which alone the inertial parameters act; where that is known, sensitivities are by those that stand for all.
     """
@@ -63,6 +66,7 @@ class RecordedRun:
     payload_std: Array
     common: CommonErrors = NONE
     driven: bool = False
+    acted: Array | None = None
     drawn: Array | None = None
     marginal: Marginal | None = None
     groups: RigidGroups | None = None
@@ -126,18 +130,21 @@ class RecordedRun:
         return np.concatenate([modes, by_geometry], axis=2)
 
     @property
-    def latency_s(self) -> float | None:
-        """Latency of the model's commands, with the common error that it has of that; None: that of its timing."""
+    def latencies(self) -> Array | None:
+        """Latencies of the model's commands (N,), s, with the common error that it has of them; None: that of its
+        timing."""
         if self.drawn is None or not self.common.latency_std:
-            return None
-        return max(self.settings.timing.latency_s + self.common.latency_std * float(self.drawn[-1]), 0.0)
+            return self.acted
+        stated = np.full(len(self.ok), self.settings.timing.latency_s) if self.acted is None else self.acted
+        return np.maximum(stated + self.common.latency_std * float(self.drawn[-1]), 0.0)
 
     @property
     def _lowest(self) -> Array:
         """The least that a model can have (k,) of each common error that its loop can have: no latency is negative."""
         lowest = np.full(len(self.common.names) + bool(self.common.latency_std), -np.inf)
         if self.common.latency_std:
-            lowest[-1] = -self.settings.timing.latency_s / self.common.latency_std
+            mean = self.settings.timing.latency_s if self.acted is None else self.acted.mean()
+            lowest[-1] = -mean / self.common.latency_std
         return lowest
 
     @property
@@ -177,12 +184,17 @@ class RecordedRun:
     @property
     def _as_recorded(self) -> dict[str, Any]:
         """What a model's run has in common with the recorded one: commands, lost frames, latencies."""
-        latency_s = self.latency_s
         return {
             "commands": self.logged if self.driven else None,
             "lost": None if self.driven else ~self.ok,
-            "latencies": None if latency_s is None else np.full(len(self.ok), latency_s),
+            "latencies": self.latencies,
         }
+
+    def commands_before(self, frame: int) -> tuple[Array, Array | None]:
+        """Commands (k, n) that may still be on their way at a frame, or act there, the first where there is none before
+        it; and their latencies (k,), s, None: that of the timing."""
+        rows, latencies = slice(max(0, frame - MAX_DELAY_FRAMES - 2), max(frame, 1)), self.latencies
+        return self.logged[rows], None if latencies is None else latencies[rows]
 
     def _sensed(self, noise: Array | None) -> Array | None:
         """What is added to the poses (N, 6) that a model's servo measures: its common errors, and noise (..., N, 6)."""
@@ -326,6 +338,7 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
         logged=np.asarray(record["command"].values, dtype=float),
         payload=load,
         payload_std=load_std,
+        acted=logged_latencies(record, scenario.timing),
     )
     run = replace(run, common=_common_errors(record, scenario, run))
     if not takes_torques(record):

@@ -29,6 +29,7 @@ from identify.files.dataset import (
     write_groups,
 )
 from identify.files.versions import versions
+from identify.record.command_times import COMMAND_TIME, OPTIONAL, check_command_times
 
 TRUTH_GROUP = "truth"
 
@@ -65,25 +66,28 @@ def build_record(
     measured_covariance: ArrayLike,
     measured_ok: ArrayLike,
     command: ArrayLike,
+    command_time: ArrayLike | None = None,
     scenario_toml: str,
     robot: str,
     frame_rate_hz: float,
     seed: int | None = None,
-    title: str = "Visual closed-loop experiment",
     prismatic: bool = False,
 ) -> xr.Dataset:
     """Record of one run: ``time`` (N,) [s], poses and rates (N, 6), ``command`` (N, n), covariance (N, 6, 6), ok (N,).
 
     SI units; the poses, and what is a rate, as CONVENTIONS says. ``command``: of the n joints [rad, or m where they are
-    ``prismatic``], each from its frame on. Where ``measured_ok`` is 0 the pose was lost, and may be NaN.
+    ``prismatic``], each from its frame on, or from ``command_time`` (N,) [s] on, when it was written to the drives, see
+    `identify.record.command_times`. Where ``measured_ok`` is 0 the pose was lost, and may be NaN.
     ``scenario_toml``: timing and servo of the run, as `Scenario.to_toml` gives them. ``seed``: of a simulated run; that
     of a real robot has none.
 
     Raises RecordError: wrong shapes, numbers that are not finite where a measurement was not lost, or a `measured_ok`
     that is neither 1 nor 0.
     """
+    logged = {} if command_time is None else {COMMAND_TIME: np.asarray(command_time, dtype=float)}
     record = described_dataset(
         {
+            **logged,
             **pose_parts(reference_pose, "reference_pose", "reference_position", "reference_orientation"),
             **pose_parts(reference_rate, "reference_rate", "reference_velocity", "reference_orientation_rate"),
             **pose_parts(measured_pose, "measured_pose", "measured_position", "measured_orientation"),
@@ -92,11 +96,11 @@ def build_record(
             "command": np.asarray(command, dtype=float),
         },
         time,
-        with_joint_units(VARIABLES, prismatic),
+        with_joint_units(VARIABLES | (OPTIONAL if logged else {}), prismatic),
         joint=joint_numbers(command),
     )
     record.attrs = {
-        "title": title,
+        "title": "Visual closed-loop experiment",
         "conventions_text": CONVENTIONS,
         "robot": robot,
         **({} if seed is None else {"seed": np.int64(seed)}),
@@ -191,6 +195,7 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
     steps = np.diff(record["time"].values)
     if not (steps > 0).all():
         raise RecordError(f"{source}: time does not increase after frame {np.argmin(steps > 0)}")
+    check_command_times(record, source)
     return record
 
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from dynamics import DynamicsError, Robot
 from dynamics.closed_loop import ClosedLoopRun, Drives, LoopFailure, Reference, StartState, simulate
-from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
 from identify.arrays import Array
 from identify.filtering import filtered_derivatives
 from identify.record.recorded_run import RecordedRun
@@ -139,17 +138,17 @@ class TorqueRun(RecordedRun):
         chart, reference, (first, last) = robot.geometry.chart, self.reference, span
         coordinates, rates = np.split(start, 2)
         pose, none = chart.pose(coordinates), np.zeros(robot.layout.joints)
-        before = self.logged[max(0, first - MAX_DELAY_FRAMES - 2) : max(first, 1)]
-        latency = self.latency_s
+        before, earlier = self.commands_before(first)
+        begin = StartState(pose, chart.lifted(rates), none, np.zeros(len(coordinates)), before, pose, latencies=earlier)
         run = simulate(
             robot,
             parameters,
             Reference(reference.poses[first:last], reference.rates[first:last]),
             self.settings,
-            start=StartState(pose, chart.lifted(rates), none, np.zeros(len(coordinates)), before, pose),
+            start=begin,
             start_sensitivities=True,
             commands=self.logged[first:last],
-            latencies=None if latency is None else np.full(last - first, latency),
+            latencies=None if self.latencies is None else self.latencies[first:last],
         )
         ok, by_start = self.ok[first:last], np.asarray(run.start_sensitivity)[:, :, : len(start)]
         missed = ((run.pose - self.measured[first:last])[ok] @ self.whitener.T).ravel()

@@ -33,14 +33,14 @@ from identify.files.dataset import write_groups
 from identify.files.run_folder import load_result, rms_figures, rms_row
 from identify.loop_parameters import settled_drive, with_drive
 from identify.progress import Progress
-from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
+from identify.random_streams import INSTRUMENTS, mixed_generator
+from identify.record.command_times import logged_latencies
 from identify.record.known_geometry import known_geometry
 from identify.record.law import takes_torques
 from identify.record.provenance import RunFiles
-from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.plant_sections import AUTO
-from identify.validation.unseen import model_run
+from identify.validation.unseen import model_on_record
 
 START = "starting guess"
 
@@ -68,7 +68,7 @@ class Examination:
         rows = []
         for record, truth in self.unseen:
             try:
-                poses = model_run(self.robot, self.scenario, parameters, recorded_reference(record))
+                poses = model_on_record(self.robot, self.scenario, parameters, record)
             except (ParameterError, SimulationError):
                 return float("nan"), float("nan")
             rows.append(rms_row(rms_figures(poses - true_poses(truth))))
@@ -131,8 +131,7 @@ def instrumented(
     record: xr.Dataset, truth: xr.Dataset, scenario: Scenario, instruments: JointInstruments, seed: int
 ) -> xr.Dataset:
     """What instruments at the joints, whose noise is of a seed, read during a run."""
-    draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))
-    latencies = scenario.timing.drawn_latencies(record.sizes["time"], draws)
+    latencies = logged_latencies(record, scenario.timing)
     return measure_joints(record, truth, scenario.timing, instruments, mixed_generator(INSTRUMENTS, seed), latencies)
 
 

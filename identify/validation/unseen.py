@@ -30,6 +30,7 @@ from identify.loop_parameters import model_settings
 from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
+from identify.record.command_times import logged_latencies
 from identify.record.known_geometry import KnownGeometry
 from identify.record.law import SERVO, recorded_law
 from identify.record.recorded_run import RecordedRun, recorded_reference, watched_run
@@ -70,23 +71,27 @@ def run_unseen(
             return list(pool.map(_run_in_worker, numbers, trajectories))
 
 
-def model_run(robot: Robot, scenario: Scenario, parameters: Array, reference: Reference) -> Array:
+def model_run(
+    robot: Robot, scenario: Scenario, parameters: Array, reference: Reference, latencies: Array | None = None
+) -> Array:
     """Poses (N, 6) of the model on a reference; NaN throughout when its loop is unstable.
 
-    Raises dynamics.DynamicsError for what is no model: parameters of another shape or outside their range, poses out of
-    reach.
+    latencies (N,): of its commands, s; None: that of the timing. Raises dynamics.DynamicsError for what is no model:
+    parameters of another shape or outside their range, poses out of reach.
     """
     try:
-        return simulate(robot, parameters, reference, model_settings(robot, scenario)).pose
+        return simulate(robot, parameters, reference, model_settings(robot, scenario), latencies=latencies).pose
     except LoopFailure:
         return np.full_like(reference.poses, np.nan)
 
 
 def model_on_record(robot: Robot, scenario: Scenario, parameters: Array, record: xr.Dataset) -> Array:
-    """Poses (N, 6) of the model on the motion of a record: in the servo's loop where that made the record, and under
-    the logged commands where another law did; NaN throughout where it is unstable. Raises as `model_run`."""
+    """Poses (N, 6) of the model on the motion of a record, with the latencies that it logs: in the servo's loop where
+    that made the record, and under the logged commands where another law did; NaN throughout where it is unstable.
+    Raises as `model_run`."""
     if recorded_law(record) == SERVO:
-        return model_run(robot, scenario, parameters, recorded_reference(record))
+        latencies = logged_latencies(record, scenario.timing)
+        return model_run(robot, scenario, parameters, recorded_reference(record), latencies)
     run = watched_run(record, robot, scenario).driven_by_commands()
     try:
         return run.model_poses(parameters)
@@ -110,8 +115,8 @@ class PosePrediction:
     states it, and the geometry: the servo takes the platform where such an error does not show, the whole motion with
     the same draw. What the record of the identification taught of that draw is in poses and covariance.
 
-    model: its run, with sensitivities by all parameters, where that is one of the reference alone: no frame is lost,
-    and poses have nothing in common.
+    model: its run, with sensitivities by all parameters, where that is one of reference and latencies alone: no frame
+    is lost, and poses have nothing in common.
     """
 
     chart: Chart

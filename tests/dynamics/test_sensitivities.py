@@ -105,6 +105,21 @@ def test_a_run_from_the_state_of_another_repeats_its_rest(loop, timing):
             np.testing.assert_array_equal(getattr(rest, name), getattr(run, name)[frame:], err_msg=name)
 
 
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_a_state_with_the_latencies_of_its_commands_goes_on_where_each_frame_has_its_own(loop, hold):
+    """Bit by bit, also where a command that was issued long before arrives after the state."""
+    settings, frames = loop.settings(latency_s=1.3 / 60, hold=hold), 45
+    latencies = np.random.default_rng(3).uniform(0.0, 4.2, frames) / 60
+    latencies[FRAME - 4] = 6.5 / 60
+    run = loop.run(frames, settings, latencies=latencies)
+    for frame in (3, FRAME, 33):
+        reference, start = loop.half_way(frames, frame, settings)[0], run.state_at(frame)
+        before = np.concatenate([[settings.timing.latency_s], latencies[:frame]])
+        rest = loop.run(reference, settings, start=replace(start, latencies=before), latencies=latencies[frame:])
+        for name in RECORDS[:-2]:
+            np.testing.assert_array_equal(getattr(rest, name), getattr(run, name)[frame:], err_msg=name)
+
+
 def test_the_default_start_is_the_equilibrium(robot, loop):
     """Given or not, it is the same start, and the sensitivities contain that it follows the parameters."""
     reference, settings = loop.reference(20), loop.settings()

@@ -69,18 +69,23 @@ def unseen_error(scenario, parameters, seed=7):
     return np.sqrt(np.mean((problem.runs[0].model_poses(parameters) - run.pose) ** 2, axis=0))
 
 
-def test_warm_start_equation_holds_for_the_true_parameters(scenario):
-    """Without dry friction the regression times the truth vanishes against the torques in it."""
-    parameters = truth()
+@pytest.mark.parametrize("jitter", [False, True])
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_warm_start_equation_holds_for_the_true_parameters(scenario, hold, jitter):
+    """Without dry friction the regression times the truth vanishes against the torques in it, also where each command
+    has a latency of its own."""
+    parameters, scenario = truth(), scenario.with_overrides({"timing.hold": hold, "timing.latency_s": 1 / 60})
     parameters[52:58] = 0
-    _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters)
+    latencies = np.random.default_rng(1).uniform(0.0, 2.0, 600) / 60 if jitter else None
+    _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters, latency_s=latencies)
     law = joint_law("pid", parameters[64:])
-    columns, slipping = joint_balance(rss6(), run.pose, run.command, scenario, law)
+    columns, slipping = joint_balance(rss6(), run.pose, run.command, scenario, law, latencies)
     columns = columns[slipping]
     start = equilibrium(rss6(), parameters, run.pose[0], build_plant(scenario, rss6()).settings.servo)
     unknowns = np.concatenate([parameters, start.joint_integral * parameters[65]])
     balance = columns @ unknowns
-    assert np.sqrt(np.mean(balance**2)) < 1e-3 * np.sqrt(np.mean((columns[:, 64:67] @ parameters[64:]) ** 2))
+    limit = 3e-3 if jitter else 1e-3
+    assert np.sqrt(np.mean(balance**2)) < limit * np.sqrt(np.mean((columns[:, 64:67] @ parameters[64:]) ** 2))
 
 
 @pytest.mark.slow

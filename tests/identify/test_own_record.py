@@ -12,6 +12,7 @@ import pytest
 from identify.commands.help import NOT_DONE
 from identify.errors import EstimationError
 from identify.files.run_folder import load_result
+from identify.record.command_times import OPTIONAL
 from identify.record.own_record import read_own_records
 from identify.record.payload import recorded_payload
 from identify.record.recorded_run import recorded_run
@@ -43,6 +44,7 @@ def table_of(record):
     columns |= {f"rate_{a}_{UNIT[a]}_s": rates[:, k] for k, a in enumerate(POSE)}
     columns |= {f"measured_{a}_{UNIT[a]}": poses(record, "measured")[:, k] for k, a in enumerate(POSE)}
     columns |= {f"command_{k + 1}_rad": record["command"].values[:, k] for k in range(6)}
+    columns["command_time_s"] = record["command_time"].values
     covariance = record["measured_covariance"].values
     for i, a in enumerate(POSE):
         columns |= {f"covariance_{a}_{b}": covariance[:, i, j] for j, b in enumerate(POSE) if j >= i}
@@ -51,7 +53,10 @@ def table_of(record):
 
 @pytest.fixture(scope="module")
 def record():
-    return short_run()[0]
+    """With a log of when commands acted, which is empty where the frame was lost."""
+    found = short_run()[0]
+    acted = np.where(found["measured_ok"] == 1, found["time"] + 0.004, np.nan)
+    return found.assign(command_time=("time", acted))
 
 
 @pytest.fixture
@@ -70,7 +75,7 @@ def change(path, old, new):
 
 def test_a_table_is_read_as_the_record_that_it_was_written_from_with_its_lost_frame(mine, record):
     (found,), scenario = read_own_records([mine])
-    for name in ("time", *VARIABLES):
+    for name in ("time", *VARIABLES, *OPTIONAL):
         np.testing.assert_allclose(found[name], record[name], rtol=1e-12, atol=1e-15, equal_nan=True)
     assert found["measured_ok"].values[5] == 0
     kept = ("robot", "frame_rate_hz", "scale_anchor", "scale_anchor_value", "scale_anchor_std")
@@ -82,10 +87,12 @@ def test_a_table_is_read_as_the_record_that_it_was_written_from_with_its_lost_fr
 def test_optional_columns_may_be_left_out(mine, record):
     """Rates come from a spline, within 1e-3 of their range but for the ends; covariances from stated deviations."""
     table = pd.read_csv(mine)
-    table.drop(columns=[name for name in table if name.startswith(("rate_", "covariance_"))]).to_csv(mine, index=False)
+    optional = ("rate_", "covariance_", "command_time")
+    table.drop(columns=[name for name in table if name.startswith(optional)]).to_csv(mine, index=False)
     with mine.with_suffix(".toml").open("a") as file:
         file.write("position_std_m = 5e-6\norientation_std_rad = 3e-5\n")
     (found,), _ = read_own_records([mine])
+    assert "command_time" not in found
     rates, known = found["reference_velocity"].values, record["reference_velocity"].values
     assert np.abs(rates - known)[3:-3].max() < 1e-3 * np.abs(known).max()
     assert np.abs(rates - known).max() < 0.01 * np.abs(known).max()
@@ -135,7 +142,7 @@ def moved(column, factor=1.0, shift=0.0):
     """A table with all columns of a prefix scaled and shifted."""
 
     def change(table):
-        names = [name for name in table if name.startswith(column)]
+        names = [name for name in table if name.startswith(column) and name != "command_time_s"]
         return table.assign(**{name: factor * table[name] + shift for name in names})
 
     return change
@@ -159,6 +166,8 @@ def moved(column, factor=1.0, shift=0.0):
         (lambda t: t.iloc[:0], "has no rows below its header"),
         (lambda t: t.assign(reference_z_m="a"), "line 2: reference_z_m is 'a', which is no number"),
         (lambda t: t.assign(command_1_rad=np.inf), "line 2: command_1_rad is inf, must be a finite"),
+        (lambda t: t.rename(columns={"command_time_s": "command_time_ms"}), "command_time_s is meant, in s"),
+        (lambda t: t.assign(command_time_s=0.0), "command_time of frame 1 .* is 0 s; it is before the frame itself"),
         (lambda t: t.assign(measured_ok=1), "line 7: measured_ok is 1, and a measured column is empty"),
         (lambda t: t.assign(measured_ok=2), "line 2: measured_ok must be 1 or 0"),
         (moved("covariance_z_z", np.nan), "measured_covariance is not finite in 119 frames"),

@@ -27,6 +27,7 @@ from identify.experiment.truth import true_poses
 from identify.loop_parameters import model_settings, with_drive
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
+from identify.record.command_times import logged_latencies
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario, scenario_from_toml
@@ -36,7 +37,7 @@ from identify.studies.rows.coverage import coverage, predictions
 from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing, unwatched
 from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
-from identify.validation.unseen import PosePrediction, model_run
+from identify.validation.unseen import PosePrediction, model_on_record
 
 EXPERIMENT = 0
 CHOSEN = {
@@ -184,13 +185,15 @@ def _unseen_figures(
     result: IdentificationResult, plant: Plant, unseen: list[Experiment], predicted: list[PosePrediction]
 ) -> Row:
     """Errors of the identified model on unseen trajectories, by what was predicted there."""
-    robot, settings = plant.nominal, model_settings(plant.nominal, plant.scenario)
-    references = [recorded_reference(one.record) for one in unseen]
-    models = [
-        of.model or simulate(robot, result.estimate, reference, settings, sensitivities=True)
-        for of, reference in zip(predicted, references, strict=True)
-    ]
-    true = [model_run(robot, plant.scenario, plant.parameters, reference) for reference in references]
+    robot, scenario = plant.nominal, plant.scenario
+    settings = model_settings(robot, scenario)
+    models = []
+    for of, one in zip(predicted, unseen, strict=True):
+        reference, latencies = recorded_reference(one.record), logged_latencies(one.record, scenario.timing)
+        models.append(
+            of.model or simulate(robot, result.estimate, reference, settings, sensitivities=True, latencies=latencies)
+        )
+    true = [model_on_record(robot, scenario, plant.parameters, one.record) for one in unseen]
     pairs = zip(models, unseen, strict=True)
     errors = np.concatenate([model.pose - true_poses(one.truth) for model, one in pairs])
     return prediction_figures(models, result.covariance, true) | {
