@@ -10,8 +10,8 @@ from dynamics.rigid_body.virtual_work import robot_functions
 
 HOT = (
     *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
-    *("stop_derivatives", "slope_derivative", "forward_dynamics", "motion_in_lanes", "acceleration_in_lanes"),
-    "servo_jacobian",
+    *("stage_derivatives", "stop_derivatives", "slope_derivative", "forward_dynamics", "motion_in_lanes"),
+    *("acceleration_in_lanes", "servo_jacobian"),
 )
 """What inner loops evaluate."""
 

@@ -41,7 +41,7 @@ FAILURES = {
 }
 MACHINE_CODE = (
     *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
-    *("stop_derivatives", "slope_derivative"),
+    *("stage_derivatives", "stop_derivatives", "slope_derivative"),
 )
 """Functions of a robot that kernels call, by their names."""
 
@@ -256,12 +256,13 @@ def _fill(
         (now.known.inputs, own["equation_of_motion"], rigid),
         (now.served.inputs, servo_jacobian, rigid[:0]),
         (now.derivatives.inputs, own["motion_derivatives"], rigid),
+        (now.stages.inputs, own["stage_derivatives"], rigid),
         (now.stopping.inputs, own["stop_derivatives"], rigid),
         (now.pose_and_rate, own["rate_map_derivative"], rigid[:0]),
     ):
         last = np.concatenate([fixed, function.constants])
         end = sum(function.inputs)
-        inputs[end - len(last) : end] = last
+        inputs[end - len(last) : end].T[...] = last
     elastic = settings.elasticity is not None
     now.unknowns = len(now.state) - (0 if elastic else 2 * sizes.joints)  # motors come last
     now.parameters, now.start_moves = len(columns), problem.start_sensitivities

@@ -35,16 +35,42 @@ NO_APPROACH = 1e-9  # rad/s^2 or N m/s: an event so slow has no derivative
 
 
 @kernel
-def differentiate_motion(
-    task: Record, now: Record, pose: Array, rate: Array, acceleration: Array, torque: Array
-) -> None:
+def differentiate_motion(task: Record, now: Record, at: Record) -> None:
     """Derivatives of the equation of motion at fixed acceleration and net joint torque."""
-    size, known = len(pose), now.derivatives
-    copy(pose, known.inputs[:size])
-    copy(rate, known.inputs[size : 2 * size])
-    copy(acceleration, known.inputs[2 * size : 3 * size])
-    copy(torque, known.inputs[3 * size :])
+    size, known = len(at.bias), now.derivatives
+    copy(at.state[: 2 * size], known.inputs[: 2 * size])
+    copy(at.slope[size : 2 * size], known.inputs[2 * size : 3 * size])
+    copy(at.net_torque, known.inputs[3 * size :])
     call(task.motion_derivatives, known.inputs, known.by_pose)
+
+
+@kernel
+def differentiate_stages(task: Record, now: Record, at: Record) -> None:
+    """The same at all stages of a step together."""
+    size, given = len(at[0].bias), now.stages.inputs
+    for k in range(END):
+        for j in range(2 * size):
+            given[j, k] = at[k].state[j]
+        for j in range(size):
+            given[2 * size + j, k] = at[k].slope[size + j]
+        for i in range(len(now.mode)):
+            given[3 * size + i, k] = at[k].net_torque[i]
+    call(task.stage_derivatives, given, now.stages.by_pose)
+
+
+@kernel
+def take_stage(task: Record, now: Record, k: int) -> None:
+    """Those of one of the stages, of the inertial parameters that stand for all."""
+    found, known = now.stages, now.derivatives
+    for i in range(len(known.by_pose)):
+        for j in range(len(known.by_pose)):
+            known.by_pose[i, j], known.by_rate[i, j] = found.by_pose[i, j, k], found.by_rate[i, j, k]
+        for parameter in task.pivots[: task.shown]:
+            known.columns[i, parameter] = found.columns[i, parameter, k]
+    for i in range(len(known.crank_by_pose)):
+        for j in range(len(known.by_pose)):
+            known.crank_by_pose[i, j] = found.crank_by_pose[i, j, k]
+            known.crank_by_rate[i, j] = found.crank_by_rate[i, j, k]
 
 
 @kernel
@@ -131,13 +157,12 @@ def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> No
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Derivative of the slope at one state, and behind it of the net torques, into `d.k[k]`: implicitly, for those of
-    the state and the time in `d.trial`, `d.filtered` and `d.stage_time`. See `slope_derivative`.
+    the state and the time in `d.trial`, `d.filtered` and `d.stage_time`, with those of the equation of motion that are
+    known. See `slope_derivative`.
     """
     size, count, width, known = len(at.bias), len(now.mode), now.width, now.derivatives
     pose, rate = d.trial[:size], d.trial[size : 2 * size]
     acceleration, torque = d.k[k, size : 2 * size], d.k[k, len(d.k[k]) - count :]
-    state = at.state
-    differentiate_motion(task, now, state[:size], state[size : 2 * size], at.slope[size : 2 * size], at.net_torque[:])
     share_with_columns(task, now, at)
     copy_rows(d.command[:], d.acting[:], width)
     for i in range(count):
@@ -216,6 +241,7 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
         copy(d.time[:], d.stage_time[:])
         d.stage_time[column] = 1.0
         try_tangent(now, d)
+        differentiate_motion(task, now, end)
         invoke(task.slope_tangent, task, now, end, d, 0)
         torque = d.k[0, len(d.k[0]) - len(now.mode) + joint]
         add_row(1.0 if end.stick_force[joint] > 0 else -1.0, torque, d.margin[:], width)
@@ -241,7 +267,8 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
     if not event:
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
-    for k in range(4):
+    differentiate_stages(task, now, at)
+    for k in range(END):
         try_tangent(now, d)
         if k > 0:
             move_tangent(now, at, d, k - 1, h, FRACTION[k], d.trial[:], 0)
@@ -249,8 +276,9 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
             move_tangent(now, at, d, k - 1, h, FRACTION[k], d.filtered[: len(d.x) - late], late)
         copy(d.time[:], d.stage_time[:])
         add_row(FRACTION[k], d.length[:], d.stage_time[:], now.width)
+        take_stage(task, now, k)
         invoke(task.slope_tangent, task, now, at[k], d, k)
-    for k in range(4):
+    for k in range(END):
         move_tangent(now, at, d, k, h, WEIGHT[k], d.x[:], 0)
     if cut:
         length_tangent(task, now, at[END], d)

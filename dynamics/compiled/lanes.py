@@ -25,11 +25,13 @@ LEAVES = ("CONST", "INPUT")
 class PartedFunction:
     """A function by its parts. parts: (inputs, constants) -> a column of the same length for each part; end: (inputs,
     columns of the parts) -> outputs, under the function's name. constants (c,): numbers that CasADi would simplify
-    away, such as a sign, and so make parts unlike."""
+    away, such as a sign, and so make parts unlike. side_by_side: for so many sets of inputs at once, each entry of
+    which, and of the outputs, is a row of as many numbers."""
 
     parts: ca.Function
     end: ca.Function
     constants: np.ndarray
+    side_by_side: int = 1
 
     @property
     def inputs(self) -> int:
@@ -46,6 +48,11 @@ class PartedFunction:
         inputs = self.end.sx_in()[: self.inputs]
         columns = self.parts.call([*inputs, ca.SX(ca.DM(self.constants))])
         return ca.Function(self.name(), inputs, self.end.call([*inputs, *columns]))
+
+    def beside(self, count: int, name: str) -> "PartedFunction":
+        """The same for so many sets of inputs at once, under another name."""
+        inputs = self.end.sx_in()
+        return PartedFunction(self.parts, ca.Function(name, inputs, self.end.call(inputs)), self.constants, count)
 
 
 @dataclass(frozen=True)
@@ -92,6 +99,21 @@ class Group(NamedTuple):
     lanes: tuple[int, ...]
     steps: list[tuple[str, list[Operand]]]
     outputs: list[Operand]
+
+    def split(self, count: int) -> list["Group"]:
+        """Groups of at most so many of the parts."""
+
+        def some(operands: list[Operand], first: int) -> list[Operand]:
+            return [of if isinstance(of, int) else of[first : first + count] for of in operands]
+
+        return [
+            Group(
+                self.lanes[first : first + count],
+                [(operation, some(of, first)) for operation, of in self.steps],
+                some(self.outputs, first),
+            )
+            for first in range(0, len(self.lanes), count)
+        ]
 
 
 def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Graph:

@@ -15,6 +15,9 @@ from dynamics.compiled.operations import CALLED, MEANING, OF_VECTORS, constant, 
 from dynamics.compiled.quick_arithmetic import quickened
 from dynamics.errors import DynamicsError
 
+MOST_LANES = 8
+"""Numbers that a register of present processors holds."""
+
 AnyFunction = ca.Function | PartedFunction | ColumnFunction
 
 
@@ -59,6 +62,8 @@ class _Body:
         if not last.is_a("SXFunction"):
             raise DynamicsError(f"only SX functions become machine code: {last.name()} is {last.class_name()}")
         self._name, self._sizes, self.own_inputs = last.name(), shapes(function), _inputs(function)
+        self._beside = function.side_by_side if isinstance(function, PartedFunction) else 1
+        self._number = type_name(self._beside)
         self._inputs = _places(self._name, [last.sparsity_in(k) for k in range(self.own_inputs)])
         self._outputs = _places(self._name, [last.sparsity_out(k) for k in range(last.n_out())])
         self._quickened: Callable[[Graph], Graph] = quickened if quick else lambda graph: graph
@@ -73,25 +78,26 @@ class _Body:
         lines = "\n".join(self._lines)
         signature = "(ptr noalias readonly %inputs, ptr noalias %outputs)"
         body = f"define void @{self._name}{signature} nounwind {{\n{lines}\nret void\n}}\n"
-        return body + _rows(self._name, *self._sizes)
+        return body + (_rows(self._name, *self._sizes) if self._beside == 1 else "")
 
     def _write(self, graph: Graph, parts: list[list[str]]) -> None:
         """The values of a graph, and its outputs. parts: columns of what is known of the last of its inputs."""
         values = _Values(self, graph, parts)
         for places, nodes in zip(self._outputs, graph.outputs, strict=True):
             for place, node in zip(places, nodes, strict=True):
-                address = self.new(f"getelementptr double, ptr %outputs, i64 {place}")
-                self._lines.append(f"store double {values.of(node)}, ptr {address}")
+                address = self.new(f"getelementptr double, ptr %outputs, i64 {place * self._beside}")
+                self._lines.append(f"store {self._number} {values.of(node)}, ptr {address}, align 8")
 
     def _parts(self, function: PartedFunction) -> list[list[str]]:
         """The columns of all parts, group by group of those that are alike."""
         graph = self._quickened(graph_of(function.parts, function.constants))
         values, columns = _Values(self, graph, []), [[""] * len(of) for of in graph.outputs]
         for group in lane_groups(graph):
-            width = lanes_for(len(group.lanes))
-            for row, vector in enumerate(self._group(group, values, width)):
-                for lane, part in enumerate(group.lanes):
-                    columns[part][row] = self._entry(vector, lane, width)
+            for some in group.split(max(1, MOST_LANES // self._beside)):
+                width = lanes_for(len(some.lanes))
+                for row, vector in enumerate(self._group(some, values, width)):
+                    for lane, part in enumerate(some.lanes):
+                        columns[part][row] = self._entry(vector, lane, width)
         return columns
 
     def _group(self, group: Group, values: "_Values", width: int) -> list[str]:
@@ -109,11 +115,12 @@ class _Body:
         """What an operation makes of numbers, or of vectors with so many lanes in use."""
         if operation == "ASSIGN":
             return operands[0]
+        lanes, width = lanes * self._beside, width * self._beside
         if operation in OF_VECTORS and width > 1:
             return self._call(f"{OF_VECTORS[operation]}.v{width}f64", operands, type_name(width))
         if operation in CALLED:
-            entries = [[self._entry(of, lane, width) for of in operands] for lane in range(lanes)]
-            return self._vector([self._call(CALLED[operation], of, "double") for of in entries], width)
+            entries = [[self._lane(of, lane, width) for of in operands] for lane in range(lanes)]
+            return self._of_lanes([self._call(CALLED[operation], of, "double") for of in entries], width)
         if operation not in MEANING:
             known = ", ".join(sorted({*MEANING, *CALLED}))
             raise DynamicsError(f"{self._name}: no machine code for the operation {operation}; known: {known}")
@@ -129,6 +136,24 @@ class _Body:
         return self.new(f"call {kind} @{name}({', '.join(f'{kind} {of}' for of in operands)})")
 
     def _vector(self, entries: list[str], width: int) -> str:
+        """A vector of numbers, or of several side by side; lanes without one repeat the first."""
+        if self._beside == 1:
+            return self._of_lanes(entries, width)
+        joined, size = entries + entries[:1] * (width - len(entries)), self._beside
+        while len(joined) > 1:
+            pairs, kind = zip(joined[::2], joined[1::2], strict=True), type_name(size)
+            mask = f"<{2 * size} x i32> <{', '.join(f'i32 {lane}' for lane in range(2 * size))}>"
+            joined = [self._once(f"shufflevector {kind} {one}, {kind} {other}, {mask}") for one, other in pairs]
+            size *= 2
+        return joined[0]
+
+    def _once(self, text: str) -> str:
+        """A value by the line that makes it, or the one that the same line has made before."""
+        if (known := self._vectors.get((text,))) is None:
+            known = self._vectors[(text,)] = self.new(text)
+        return known
+
+    def _of_lanes(self, entries: list[str], width: int) -> str:
         """A vector of numbers; lanes without one repeat the first."""
         if width == 1:
             return entries[0]
@@ -145,13 +170,25 @@ class _Body:
             self._vectors[tuple(filled)] = known
         return known
 
-    def _entry(self, vector: str, lane: int, width: int) -> str:
+    def _entry(self, vector: str, part: int, width: int) -> str:
+        """The number, or the several side by side, of a part in a vector."""
+        if width == 1 or self._beside == 1:
+            return self._lane(vector, part, width)
+        kind, own = type_name(width * self._beside), range(part * self._beside, (part + 1) * self._beside)
+        mask = f"<{self._beside} x i32> <{', '.join(f'i32 {lane}' for lane in own)}>"
+        return self.new(f"shufflevector {kind} {vector}, {kind} poison, {mask}")
+
+    def _lane(self, vector: str, lane: int, width: int) -> str:
         return vector if width == 1 else self.new(f"extractelement {type_name(width)} {vector}, i64 {lane}")
 
     def input(self, number: int, entry: int) -> str:
         """An entry of an input."""
-        place = self.new(f"getelementptr double, ptr %inputs, i64 {self._inputs[number][entry]}")
-        return self.new(f"load double, ptr {place}")
+        place = self.new(f"getelementptr double, ptr %inputs, i64 {self._inputs[number][entry] * self._beside}")
+        return self.new(f"load {self._number}, ptr {place}, align 8")
+
+    def constant(self, value: float) -> str:
+        """A constant."""
+        return constant([value] * self._beside)
 
     def new(self, text: str) -> str:
         """A value by the line that makes it."""
@@ -227,7 +264,7 @@ class _Values:
 
     def _written(self, node: Node) -> str:
         if node.operation == "CONST":
-            return constant([node.value])
+            return self._body.constant(node.value)
         if node.operation != "INPUT":
             return self._body.result(node.operation, [self._known[k] for k in node.operands])
         number, entry = node.entry

@@ -31,18 +31,22 @@ from dynamics.rigid_body.accelerations import (
 from dynamics.rigid_body.jacobians import freedoms, platform_arms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
+STAGES = 4
+"""Of a step of the integrator."""
+
 
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:
     """What the closed loop integrates."""
     size, layout = len(geometry.chart.freedoms), parameter_layout(geometry.legs)
     motion, free = equation_of_motion(geometry), free_acceleration(size, layout.joints)
-    responding = response(size)
+    responding, derivatives = response(size), motion_derivatives(geometry)
     return [
         motion,
         motion_in_lanes(motion),
         free,
         acceleration_in_lanes(free, responding),
-        motion_derivatives(geometry),
+        derivatives,
+        derivatives.beside(STAGES, "stage_derivatives"),
         stop_derivatives(geometry),
         rate_map_derivative(geometry),
         responding,

@@ -52,7 +52,7 @@ def test_every_function_of_a_robot_is_that_of_the_virtual_machine(robot):
     round otherwise."""
     rng, names = np.random.default_rng(6), []
     for given in [*robot_functions(robot.geometry), *motion_functions(robot.geometry)]:
-        if isinstance(given, ColumnFunction):
+        if isinstance(given, ColumnFunction) or getattr(given, "side_by_side", 1) > 1:
             names.append(given.name())
             continue
         function = given.whole if isinstance(given, PartedFunction) else given
@@ -146,7 +146,8 @@ def test_every_operation_is_that_of_the_virtual_machine_whatever_its_arguments(o
 
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_operations_in_lanes_are_those_one_by_one(own_cache, name):
-    """Bit by bit as above, of three parts alike, and a fourth that is not and has the same operation inside."""
+    """Bit by bit as above, of three parts alike, and a fourth that is not and has the same operation inside; and for
+    four sets of inputs side by side."""
     function, x, y = machine_function(name)
     z, (p, q, r) = np.roll(x, 5), (ca.SX.sym(name) for name in "pqr")
     alike = [function(first, second) for first, second in ((p, q), (q, r), (r, p))]
@@ -155,8 +156,19 @@ def test_operations_in_lanes_are_those_one_by_one(own_cache, name):
     end = ca.Function("f", [p, q, r, *columns], [ca.vertcat(*columns)])
     given = PartedFunction(parts, end, np.zeros(0))
     assert sorted(group.lanes for group in lane_groups(graph_of(parts, np.zeros(0)))) == [(0, 1, 2), (3,)]
-    found = compiled_functions(name.encode(), lambda: [given])["f"](x[:, None], y[:, None], z[:, None])[0][..., 0]
-    check_bits(found, given.whole(*(ca.DM(of).T for of in (x, y, z))).full().T)
+    machine = compiled_functions(name.encode(), lambda: [given, given.beside(4, "four")])
+    found, expected = machine["f"](x[:, None], y[:, None], z[:, None])[0][..., 0], given.whole(*map(_row, (x, y, z)))
+    check_bits(found, expected.full().T)
+    inputs, outputs = np.zeros((3, 4)), np.zeros((4, 4))
+    four = machine["four"].bound_to(inputs, outputs)
+    for some in np.split(np.arange(len(x) // 4 * 4), len(x) // 4):
+        inputs[:] = x[some], y[some], z[some]
+        four()
+        check_bits(outputs, found[some].T)
+
+
+def _row(values):
+    return ca.DM(values).T
 
 
 def machine_function(name):

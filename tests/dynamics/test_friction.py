@@ -13,10 +13,12 @@ from dynamics import load_robot
 from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, ServoGains, StartState
 from dynamics.closed_loop.execution import run
 from dynamics.closed_loop.problem import LoopProblem
+from dynamics.compiled.lanes import PartedFunction
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.expressions import function
 from dynamics.kinematics.chart import Chart
 from dynamics.rigid_body.accelerations import factored, free_acceleration, response, slope_derivative
+from dynamics.rigid_body.equation_of_motion import STAGES
 from tests.dynamics.conftest import BOX, at_rest
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
@@ -32,9 +34,13 @@ def _six_masses():
     rigid = ca.SX.sym("rigid", 52)
     zero, unit, column = ca.SX(6, 6), ca.SX.eye(6), ca.SX(6, 1)
     columns, mass = ca.horzcat(acceleration, ca.SX(6, 51)), rigid[0] * unit
+    derived = [pose, rate, acceleration, torque, rigid], [zero, zero, columns, zero, zero]
+    nothing = ca.SX.sym("nothing")
+    no_part = function("no_part", [*derived[0], nothing], [nothing])
     return [
         function("equation_of_motion", [pose, rate, rigid], [mass, column, unit, column, pose, rate, factored(mass)]),
-        function("motion_derivatives", [pose, rate, acceleration, torque, rigid], [zero, zero, columns, zero, zero]),
+        function("motion_derivatives", *derived),
+        PartedFunction(no_part, function("stage_derivatives", [*derived[0], nothing], derived[1]), np.zeros(1), STAGES),
         function("stop_derivatives", [pose, acceleration, torque, rigid], [zero, zero, columns]),
         function("rate_map_derivative", [pose, rate], [zero]),
         function("servo_jacobian", [pose], [unit]),
