@@ -22,6 +22,8 @@ from dynamics.errors import SimulationError
 HALF_POWER = 2**-0.5
 AT_ONCE = 1e-3
 """Magnitude of eigenvalues below which a motion has died within a frame."""
+SLOWEST = 1e-2
+"""rad/s: slower loops are not looked for."""
 MET = 0.02
 """Share by which a designed loop may miss what was asked."""
 
@@ -85,29 +87,60 @@ def design_servo(
 def torque_figures(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> LoopFigures:
     """Figures of the law computed_torque near rest at a pose (6,): with an observer, which foresees the latency, of the
     feedback of what it foresees; its bandwidth is the one asked for."""
-    period, delay = 1 / settings.timing.frame_rate_hz, 0.0 if feedback.observer else settings.timing.latency_s
+    period, delay = _times(settings, feedback)
 
     def map_of(factor: float) -> np.ndarray:
         return _torque_map(model, pose, feedback, factor, period, delay)
 
-    radius = float(np.abs(np.linalg.eigvals(map_of(1.0))).max())
-    margin = stability.last_stable(
-        lambda factor: float(np.abs(np.linalg.eigvals(map_of(factor))).max()), 1.0, 1e2, 1e-2
-    )
-    return LoopFigures(feedback.bandwidth, _damping(map_of(1.0)), radius, margin)
+    margin = stability.last_stable(lambda factor: _radius(map_of(factor)), 1.0, 1e2, 1e-2)
+    return LoopFigures(feedback.bandwidth, _damping(map_of(1.0)), _radius(map_of(1.0)), margin)
+
+
+def torque_radius(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> float:
+    """Largest magnitude of an eigenvalue of the law computed_torque, as `torque_figures` says."""
+    return _radius(_torque_map(model, pose, feedback, 1.0, *_times(settings, feedback)))
+
+
+def largest_bandwidth(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> float:
+    """Up to which bandwidth, rad/s, the law computed_torque is stable near rest, from that of the feedback on; at most
+    half the frame rate, beyond which a command a frame shows no motion. NaN where it is stable with none."""
+
+    def radius(bandwidth: float) -> float:
+        return torque_radius(model, settings, pose, replace(feedback, bandwidth=bandwidth))
+
+    nyquist = np.pi * settings.timing.frame_rate_hz
+    return stability.last_stable(radius, min(feedback.bandwidth, nyquist), nyquist, SLOWEST)
 
 
 def check_torque_gains(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> None:
-    """Raise SimulationError, with eigenvalue and limit, where the law computed_torque is unstable near rest."""
-    figures = torque_figures(model, settings, pose, feedback)
-    if figures.radius >= 1:
-        times = figures.gain_margin
-        mend = f"its gains must be {times:.3g} times as large" if times > 0 else "no factor of its gains makes it so"
+    """Raise SimulationError, with eigenvalue and limit, where the law computed_torque is unstable near rest, or faster
+    than frames can show: a torque that acts for a frame then stops the platform, and hardly brings it back."""
+    rate, radius = settings.timing.frame_rate_hz, torque_radius(model, settings, pose, feedback)
+    asked = (
+        f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s and a damping of {feedback.damping:.3g}"
+    )
+    if radius >= 1:
+        limit = largest_bandwidth(model, settings, pose, feedback)
+        mend = f"it is up to {limit:.3g} rad/s" if limit > 0 else "no bandwidth makes it so"
         raise SimulationError(
-            f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s and a damping of "
-            f"{feedback.damping:.3g} is unstable with this model at {settings.timing.frame_rate_hz:g} Hz: its largest "
-            f"eigenvalue from frame to frame is {figures.radius:.4g}, must be below 1; {mend}"
+            f"{asked} is unstable with this model at {rate:g} Hz: its largest eigenvalue from frame to frame is "
+            f"{radius:.4g}, must be below 1; {mend}"
         )
+    if feedback.bandwidth > np.pi * rate:
+        wanted = np.exp(np.linalg.eigvals(error_map(feedback)).real.max() / rate)
+        raise SimulationError(
+            f"{asked} is too fast for {rate:g} Hz, half of which is {np.pi * rate:.3g} rad/s: its largest eigenvalue "
+            f"from frame to frame is {radius:.4g}, and {wanted:.3g} was asked for"
+        )
+
+
+def _times(settings: LoopSettings, feedback: Feedback) -> tuple[float, float]:
+    """Time between two frames and, of what an observer does not foresee, the latency, s."""
+    return 1 / settings.timing.frame_rate_hz, 0.0 if feedback.observer else settings.timing.latency_s
+
+
+def _radius(map_: np.ndarray) -> float:
+    return float(np.abs(np.linalg.eigvals(map_)).max())
 
 
 def _torque_map(

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from dynamics import Robot, closed_loop, workspace
 from dynamics.closed_loop import stability
-from dynamics.control.gains import design_servo, servo_figures, torque_figures
+from dynamics.control.gains import design_servo, largest_bandwidth, servo_figures, torque_figures
 from dynamics.control.inverse_dynamics import Model
 from dynamics.errors import DynamicsError, SimulationError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
@@ -188,6 +188,7 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
         found = servo_figures(model, settings, home)
         asked = feedback(scenario)
         torques = torque_figures(model, settings, home, asked)
+        limit = largest_bandwidth(model, settings, home, asked)
     except DynamicsError as error:
         yield Finding("bandwidth", False, None, None, "rad/s", None, f"the loop cannot be judged at home: {error}")
         return
@@ -207,10 +208,15 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
             yield Finding("servo by design", made.radius < 1, made.gain_margin, 1.0, "1", None, text)
         except SimulationError as error:
             yield Finding("servo by design", False, None, 1.0, "1", None, str(error))
-    w = asked.bandwidth
+    w, nyquist = asked.bandwidth, np.pi * settings.timing.frame_rate_hz
     text = f"computed_torque at {w:.3g} rad/s, Kp = {w**2:.4g} 1/s^2 and Kd = {2 * asked.damping * w:.4g} 1/s, "
-    text += f"has the largest eigenvalue {torques.radius:.4g}; {torques.gain_margin:.3g} times these gains lose it"
+    text += f"has the largest eigenvalue {torques.radius:.4g}, which is stable below 1"
+    if torques.radius < 1:
+        text += f"; {torques.gain_margin:.3g} times these gains lose it"
     yield Finding("computed torque", torques.radius < 1, torques.radius, 1.0, "1", None, text)
+    known, most = (limit, f"up to {limit:.3g} rad/s") if limit > 0 else (None, "with no bandwidth")
+    text = f"computed_torque is stable {most}" if limit != nyquist else f"half the frame rate is {nyquist:.3g} rad/s"
+    yield Finding("torque bandwidth", w <= limit, w, known, "rad/s", None, text)
 
 
 def _seen(robot: Robot, scenario: Scenario) -> Iterator[Finding]:

@@ -46,6 +46,17 @@ def test_gains_are_designed_for_the_bandwidth_and_damping_that_are_asked_for(tmp
     assert "no gains of the servo give delta3 a bandwidth of 60 rad/s" in one_line(capfd.readouterr().err)
 
 
+@pytest.mark.parametrize(("observer", "most"), [("true", np.pi * 60), ("false", pytest.approx(69.503, rel=1e-4))])
+def test_a_bandwidth_that_frames_cannot_show_or_that_is_unstable_fails_with_the_largest_one(observer, most, tmp_path):
+    """Without observer the linear loop of vision alone: its largest bandwidth was found by bisection of its radius."""
+    asked = ["--set", "control.bandwidth_rad_s=400.0", "--set", f"control.observer={observer}", "--quiet"]
+    assert command("check", "ups6", *asked, "--json", tmp_path / "found.json") == BEYOND_LIMIT
+    found = _found(tmp_path / "found.json")
+    fast = found["torque bandwidth"]
+    assert (fast["ok"], fast["value"], fast["limit"], fast["unit"]) == (False, 400.0, most, "rad/s")
+    assert found["computed torque"]["ok"] == (observer == "true")
+
+
 @pytest.mark.slow
 def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
     """A cylinder that no body is, a travel beyond what the legs can reach, and gains that no frame rate holds."""

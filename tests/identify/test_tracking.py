@@ -23,6 +23,7 @@ from tests.identify.synthetic import SIGMA, rss6, trajectory
 
 NOISE = np.diag(SIGMA**2)
 UNSTABLE = {"control.bandwidth_rad_s": 240.0, "control.damping": 0.1}
+TOO_FAST, BLIND = {"control.bandwidth_rad_s": 400.0}, {"control.observer": False}
 SHORT = {"validation.count": 1, "validation.duration_s": 2.0}
 
 
@@ -119,11 +120,18 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
     ("law", "changes", "error", "said"),
     [
         ("computed_torque", {"control.torque_access": False}, ScenarioError, "control.torque_access = false"),
-        ("computed_torque", UNSTABLE, SimulationError, "from frame to frame is 2.203, must be below 1; its gains must"),
+        ("computed_torque", UNSTABLE, SimulationError, "from frame to frame is 2.203, must be below 1; it is up to "),
+        ("computed_torque", {**TOO_FAST, **BLIND}, SimulationError, "frame is 25.74, must be below 1; it is up to "),
+        (
+            "computed_torque",
+            TOO_FAST,
+            SimulationError,
+            "is too fast for 60 Hz, half of which is 188 rad/s: its largest",
+        ),
         ("sliding_mode", {}, ScenarioError, "unknown law 'sliding_mode'; valid: pid, feedforward, computed_torque"),
         ("builtins:repr", {}, ScenarioError, "must return a LawInLoop, returned str"),
     ],
-    ids=["access", "gains", "name", "own"],
+    ids=["access", "gains", "blind", "fast", "name", "own"],
 )
 def test_a_law_that_cannot_be_is_refused(law, changes, error, said):
     chosen = plant(**changes)
