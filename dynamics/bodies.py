@@ -113,8 +113,8 @@ class Parts:
         kinematics, placements = functions["inverse_kinematics"], functions["placements"]
         fixed, bodies = placements.constants, placements.outputs[0][0]
         room = Room(
-            at=np.append(np.zeros(6), fixed),
-            moving=np.append(np.zeros(12), fixed),
+            at=np.concatenate((at, fixed)),
+            moving=np.concatenate((at, np.zeros(6), fixed)),
             reach=np.empty((2, robot.layout.joints)),
             placements=np.empty((bodies, 15)),
         )

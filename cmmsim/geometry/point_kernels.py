@@ -157,6 +157,31 @@ def move_by(transform: Array, change: Array) -> None:
 
 
 @compiled
+def farthest_from_rigid(transforms: Array) -> float:
+    """How far entries of R'R of the rotations R of transforms (k,4,4), and of their last rows, are from those of rigid
+    ones, at most; infinite where one is not finite, or mirrors."""
+    farthest = 0.0
+    for k in range(len(transforms)):
+        t = transforms[k]
+        for i in range(4):
+            for j in range(i + 1):
+                wanted = 1.0 if i == j else 0.0
+                product = t[0, i] * t[0, j] + t[1, i] * t[1, j] + t[2, i] * t[2, j]
+                off = abs(t[3, j] - wanted) if i == 3 else abs(product - wanted)
+                if not (off < np.inf and abs(t[j, 3]) < np.inf):
+                    return np.inf
+                farthest = max(farthest, off)
+        minors = (
+            t[1, 1] * t[2, 2] - t[1, 2] * t[2, 1],
+            t[1, 2] * t[2, 0] - t[1, 0] * t[2, 2],
+            t[1, 0] * t[2, 1] - t[1, 1] * t[2, 0],
+        )
+        if not t[0, 0] * minors[0] + t[0, 1] * minors[1] + t[0, 2] * minors[2] > 0.0:
+            return np.inf
+    return farthest
+
+
+@compiled
 def rigid_fits(
     source: Array, target: Array, weights: Array, starts: Array, steps: int, transforms: Array, covariances: Array
 ) -> None:

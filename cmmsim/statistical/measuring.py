@@ -71,7 +71,7 @@ class StatisticalTracker:
         used, estimator = frame.used, self._estimator
         return Measurement(
             found, spread, frame.points[used], frame.covariances[used], frame.pixels[0, used], frame.pixels[1, used],
-            estimator.platform.sticker_ids[used], True, "", estimator.common_at, _variances(frame, used),
+            estimator.platform.sticker_ids[used], True, "", estimator.common_at, frame.variances[used],
         )  # fmt: skip
 
     def measure_many(
@@ -110,7 +110,7 @@ class StatisticalTracker:
 
     def _frame(self) -> Frame:
         n = len(self._estimator.platform.sticker_ids)
-        shapes = ((2, n, 2), (2, n, 2, 2), (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3), (1,))
+        shapes = ((2, n, 2), (2, n, 2, 2), (n,), (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3), (1,))
         return Frame(*np.empty((2, n), dtype=bool), *(np.empty(shape) for shape in shapes))
 
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
@@ -123,18 +123,12 @@ class StatisticalTracker:
         """What the estimator makes of all of a frame's stickers."""
         index = np.flatnonzero(frame.seen)
         left, right = frame.pixels[:, index]
-        seen = StickerObservation(
-            index, left, right, frame.points[index], frame.covariances[index], _variances(frame, index)
-        )
+        found = frame.points[index], frame.covariances[index], frame.variances[index]
+        seen = StickerObservation(index, left, right, *found)
         try:
             return self._estimator.measured(seen)[0]
         except LostError as error:
             return lost_measurement(str(error))
-
-
-def _variances(frame: Frame, chosen: NDArray) -> Array:
-    """Mean variances (k,) of a coordinate of chosen stickers' centres, px²."""
-    return 0.25 * np.einsum("ckii->k", frame.spreads[:, chosen])
 
 
 def _eyes(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> Eyes:

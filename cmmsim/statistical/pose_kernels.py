@@ -138,6 +138,7 @@ def see(side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: A
         pixels[n, 1] = v + across * noise[n, 0] + math.sqrt(high - across * across) * noise[n, 1]
         spread = spreads[n]
         spread[0, 0], spread[0, 1], spread[1, 0], spread[1, 1] = wide, tilt, tilt, high
+        frame.variances[n] = 0.25 * (wide + high) + (frame.variances[n] if side else 0.0)
 
 
 @compiled

@@ -32,14 +32,15 @@ class Belief(NamedTuple):
 
 class Frame(NamedTuple):
     """What one frame holds of n stickers: seen (n,) whether found in both images, and used (n,) whether believed;
-    pixels (2,n,2) and their covariances (2,n,2,2) px²; points (n,3) m in the camera frame, informations and
-    covariances (n,3,3) of them, found (n,3): points less where they are expected, arms (n,3) from the platform's
-    origin; longest (1,) px of a sticker's way during the exposure."""
+    pixels (2,n,2), their covariances (2,n,2,2) px², and variances (n,) of a coordinate in the mean of both images;
+    points (n,3) m in the camera frame, informations and covariances (n,3,3) of them, found (n,3): points less where
+    they are expected, arms (n,3) from the platform's origin; longest (1,) px of a sticker's way during the exposure."""
 
     seen: Array
     used: Array
     pixels: Array
     spreads: Array
+    variances: Array
     points: Array
     informations: Array
     covariances: Array

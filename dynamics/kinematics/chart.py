@@ -46,7 +46,9 @@ class Chart:
     def pose(self, coordinates: ArrayLike) -> np.ndarray:
         """Poses (6,) or (N, 6) of coordinates (n,) or (N, n)."""
         values = np.asarray(coordinates, dtype=float)
-        poses = np.tile(np.array(self.home), (*values.shape[:-1], 1))
+        poses = np.empty((*values.shape[:-1], len(POSE_NAMES)))
+        if len(self.freedoms) < len(POSE_NAMES):
+            poses[...] = self.home
         poses[..., list(self.freedoms)] = values
         return poses
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from cmmsim.errors import LostError
+from cmmsim.errors import LostError, ShapeError
 from cmmsim.geometry import pose as p
 from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.plane_frame import fit_plane, frame_from_planes, frame_of_points, frames_of_points
@@ -37,6 +37,29 @@ def test_rotation_vector_round_trips(size, azimuth, elevation):
     rotation = p.rotation_exp(vector)
     np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(p.rotation_log(rotation), vector, atol=1e-8)
+
+
+@pytest.mark.parametrize("spoil", [None, "entry", "nan", "infinite", "mirror", "transpose", "scale"])
+def test_transforms_are_told_rigid_together_where_each_passes_its_own_check(spoil):
+    """The check of a single one is NumPy, and says what is wrong."""
+    rng = np.random.default_rng(0)
+    for size in (1e-7, 4e-7, 1e-6, 2e-6, 1e-3):
+        for row, column in np.ndindex(4, 4):
+            together = np.array([p.pose_to_transform(rng.uniform(-3, 3, 6)) for _ in range(3)])
+            one = together[rng.integers(3)]
+            if spoil in ("entry", "nan", "infinite"):
+                one[row, column] += {"entry": size, "nan": np.nan, "infinite": -np.inf}[spoil]
+            elif spoil is not None:
+                flip = np.diag([1.0, -1.0, 1.0, 1.0])
+                grown = np.diag([1 + size, 1 + size, 1 + size, 1.0])
+                one[:] = {"mirror": flip @ one, "transpose": one.T, "scale": grown @ one}[spoil]
+            passes = True
+            for each in together:
+                try:
+                    p.checked_transform(each)
+                except ShapeError:
+                    passes = False
+            assert p.all_rigid(together) == passes, together
 
 
 def test_euler_rates_match_finite_differences():
