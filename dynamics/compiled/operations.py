@@ -2,7 +2,7 @@
 
 import numpy as np
 
-_TRUTH = "uitofp {i1} {last} to {double}"
+TRUTH = "uitofp {i1} {last} to {double}"
 MEANING: dict[str, tuple[str, ...]] = {
     "ADD": ("fadd {double} {0}, {1}",),
     "SUB": ("fsub {double} {0}, {1}",),
@@ -12,11 +12,11 @@ MEANING: dict[str, tuple[str, ...]] = {
     "SQ": ("fmul {double} {0}, {0}",),
     "TWICE": ("fadd {double} {0}, {0}",),
     "INV": ("fdiv {double} {one}, {0}",),
-    "LT": ("fcmp olt {double} {0}, {1}", _TRUTH),
-    "LE": ("fcmp ole {double} {0}, {1}", _TRUTH),
-    "EQ": ("fcmp oeq {double} {0}, {1}", _TRUTH),
-    "NE": ("fcmp une {double} {0}, {1}", _TRUTH),
-    "NOT": ("fcmp oeq {double} {0}, {zero}", _TRUTH),
+    "LT": ("fcmp olt {double} {0}, {1}", TRUTH),
+    "LE": ("fcmp ole {double} {0}, {1}", TRUTH),
+    "EQ": ("fcmp oeq {double} {0}, {1}", TRUTH),
+    "NE": ("fcmp une {double} {0}, {1}", TRUTH),
+    "NOT": ("fcmp oeq {double} {0}, {zero}", TRUTH),
     "IF_ELSE_ZERO": ("fcmp une {double} {0}, {zero}", "select {i1} {last}, {double} {1}, {double} {zero}"),
     "SIGN": (
         "fcmp ogt {double} {0}, {zero}",
@@ -26,6 +26,12 @@ MEANING: dict[str, tuple[str, ...]] = {
     ),
 }
 """Instructions of LLVM by the names of CasADi's operations; {last} and {before} are the results of the ones above."""
+
+OF_TRUTH: dict[str, tuple[str, ...]] = {
+    "NOT": ("xor {i1} {last}, {true}", TRUTH),
+    "IF_ELSE_ZERO": MEANING["IF_ELSE_ZERO"][1:],
+}
+"""The same where the first operand is a bit, {last}."""
 
 OF_VECTORS = {
     **{name: f"llvm.{name.lower()}" for name in ("SQRT", "FABS", "FLOOR", "CEIL")},

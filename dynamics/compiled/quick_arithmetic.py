@@ -45,7 +45,7 @@ LEAST_TURNED = 0.66
 
 def quickened(graph: Graph) -> Graph:
     """The same values, but for rounding, in less time."""
-    return _fused(_with_reciprocals(_with_approximations(graph)))
+    return _once_each(_fused(_with_reciprocals(_with_approximations(graph))))
 
 
 @cache
@@ -133,6 +133,15 @@ def _fused(graph: Graph) -> Graph:
                 node, operands = Node("FMA"), (*factors(node.operands[0]), rest)
         placed.append(put(node._replace(operands=operands)))
     return Graph(nodes, [[placed[k] for k in of] for of in graph.outputs])
+
+
+def _once_each(graph: Graph) -> Graph:
+    """Every value once, however often it is asked for."""
+    nodes: dict[Node, int] = {}
+    placed: list[int] = []
+    for node in graph.nodes:
+        placed.append(nodes.setdefault(node._replace(operands=tuple(placed[k] for k in node.operands)), len(nodes)))
+    return Graph(list(nodes), [[placed[k] for k in of] for of in graph.outputs])
 
 
 def _sine_and_cosine() -> ca.Function:

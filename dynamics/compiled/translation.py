@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection
 import casadi as ca
 
 from dynamics.compiled.lanes import LEAVES, ColumnFunction, Graph, Group, Node, PartedFunction, graph_of, lane_groups
-from dynamics.compiled.operations import CALLED, MEANING, OF_VECTORS, constant, lanes_for, type_name
+from dynamics.compiled.operations import CALLED, MEANING, OF_TRUTH, OF_VECTORS, TRUTH, constant, lanes_for, type_name
 from dynamics.compiled.quick_arithmetic import quickened
 from dynamics.errors import DynamicsError
 
@@ -69,6 +69,7 @@ class _Body:
         self._quickened: Callable[[Graph], Graph] = quickened if quick else lambda graph: graph
         self._count, self._vectors = 0, dict[tuple[str, ...], str]()
         self._lines: list[str] = []
+        self._truth: dict[str, str] = {}  # of numbers that say whether something holds, the bit that says it
         self.called: set[str] = set()
         parts = self._parts(function) if isinstance(function, PartedFunction) else []
         self._write(self._quickened(graph_of(last)), parts)
@@ -126,9 +127,15 @@ class _Body:
             raise DynamicsError(f"{self._name}: no machine code for the operation {operation}; known: {known}")
         words = {"double": type_name(width), "i1": type_name(width, "i1")}
         words |= {name: constant([value] * width) for name, value in (("zero", 0.0), ("one", 1.0), ("minus", -1.0))}
+        words["true"] = "true" if width == 1 else f"<{', '.join(['i1 true'] * width)}>"
         last = before = ""
-        for line in MEANING[operation]:
+        lines = MEANING[operation]
+        if operation in OF_TRUTH and operands[0] in self._truth:
+            last, lines = self._truth[operands[0]], OF_TRUTH[operation]
+        for line in lines:
             last, before = self.new(line.format(*operands, last=last, before=before, **words)), last
+        if lines[-1] == TRUTH:
+            self._truth[last] = before
         return last
 
     def _call(self, name: str, operands: list[str], kind: str) -> str:
