@@ -58,7 +58,7 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     plan, measured = _plan(problem, commands), np.full((frames, 6), np.nan)
     own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
     _fill(memory, problem, own, known["servo_jacobian"], _addresses(problem.sizes, compiled))
-    do = chosen(run_frames, compiled)
+    do, arrays = chosen(run_frames, compiled), [part if part.ndim else part.base for part in memory]
     for first, last in [(k, k + 1) for k in range(frames)] if problem.asked else [(0, frames)]:
         if problem.asked:
             try:
@@ -66,7 +66,7 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
             except Exception as error:
                 error.add_note(f"at frame {first} of the closed loop")
                 raise
-        status, frame = do(*memory, plan, record, first, last)
+        status, frame = do(*arrays, plan, record, first, last)
         if status:
             raise _failure(problem, status, frame, memory.now, record)
     return _result(problem, record, measured, memory.now)
