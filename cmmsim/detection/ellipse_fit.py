@@ -9,6 +9,7 @@ variance at the fitted grey value. The inverse of the normal matrix is the covar
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -99,6 +100,7 @@ def fit_ellipses(
     return fits.within(limits or FitLimits(), noise)
 
 
+@lru_cache(maxsize=16)
 def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "FitSettings":
     """How windows with this noise and point spread are fitted."""
     from cmmsim.detection.fit_kernels import FitSettings

@@ -8,16 +8,16 @@ does to the fit beyond the first order is left out; so is a sticker of which any
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.detection.detector import DetectedCentres
-from cmmsim.detection.ellipse_fit import EllipseFits, fit_settings, lies_inside
+from cmmsim.detection.ellipse_fit import SMALLEST_RADIUS_PX, EllipseFits, fit_settings
 from cmmsim.errors import CmmError
 from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.disc_image import SHAPE_BASIS, bending, project_discs, symmetric_root
+from cmmsim.geometry.disc_image import bending, project_discs, symmetric_root
 from cmmsim.geometry.pose import IDENTITY, Array, frozen, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.exposure import Quality
@@ -27,6 +27,9 @@ from cmmsim.pose_estimation.observation import Observer
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.statistical.conditions import NAME, Light, require_short
 from cmmsim.statistical.scene import StickerScene
+
+if TYPE_CHECKING:
+    from cmmsim.statistical.window_kernels import Ellipses, Windows
 
 THIN_PX, THIN_STD_PX = 0.885, 0.055
 """Half of an ellipse's width at which half of the fits end at the smallest one, and how softly that sets in: measured
@@ -120,18 +123,6 @@ class StatisticalStereoCamera:
         return middles, shapes, facing & ~self.scene.hidden(moves, places, normals, facing)
 
 
-@dataclass(frozen=True)
-class _Ellipses:
-    """Centres (2,m,2) px, shapes (2,m,2,2) px and smears (2,m,2) px of the ellipses of m stickers, seen (2,m) whether
-    whole, and unit normal noise (2,m,6): of centres and shapes, and of how thin an ellipse may be."""
-
-    centres: Array
-    shapes: Array
-    smears: Array
-    seen: NDArray[np.bool_]
-    noise: Array
-
-
 class DrawnStickers:
     """What a fit would find in one exposure, worked out as far as it is asked for.
 
@@ -147,8 +138,10 @@ class DrawnStickers:
         self.camera, self.exposed, self.bodies, self.rng = camera, exposed, bodies, rng
 
     @cached_property
-    def _found(self) -> "_Ellipses":
-        """The ellipses of all stickers."""
+    def _found(self) -> "Ellipses":
+        """The ellipses of all stickers; their grey values, which the observer's noise decides, are not known yet."""
+        from cmmsim.statistical.window_kernels import Ellipses
+
         camera = self.camera
         centres: list[Array] = []
         shapes: list[Array] = []
@@ -170,83 +163,59 @@ class DrawnStickers:
             smears.append(np.asarray(np.subtract(*ends)))
         require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))
         noise = self.rng.standard_normal((2, len(seen[0]), 6))
-        return _Ellipses(np.stack(centres), np.stack(shapes), np.stack(smears), np.stack(seen), noise)
+        unknown = np.zeros((2, 0))
+        return Ellipses(*(np.stack(values) for values in (centres, shapes, smears, seen)), noise, unknown, unknown)
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """See ``StickerExposure``: in each window the sticker nearest to its middle."""
-        found, fit_size = self._found, observer.settings.fit_size
-        gaps = np.abs(found.centres[:, None] - corners[:, :, None] - 0.5 * (size - 1)).max(axis=3)
-        gaps = np.where(found.seen[:, None], gaps, np.inf)
-        index, seen = gaps.argmin(axis=2), np.isfinite(gaps.min(axis=2, initial=np.inf))
-        inner = np.rint(np.take_along_axis(found.centres, index[..., None], 1) - 0.5 * (fit_size - 1)).astype(int)
-        inner = np.clip(inner, corners, corners + size - fit_size)
-        sides = np.repeat([0, 1], corners.shape[1])
-        return self._fitted(sides, index.ravel(), inner.reshape(-1, 2), seen.ravel(), observer)
+        from cmmsim.statistical.window_kernels import nearest_stickers
+
+        windows, ellipses = _empty_windows(2 * corners.shape[1], observer), self._found
+        nearest_stickers(ellipses.seen, ellipses.centres, np.ascontiguousarray(corners), size, windows)
+        return self._fitted(windows, observer)
 
     def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
         """See ``StickerExposure``."""
         found = []
         for side, camera in enumerate(self.camera.rig.cameras):
+            centres = self._found.centres[side]
             reach = np.linalg.norm(self._found.shapes[side], axis=2)
             whole = self._found.seen[side] & np.all(
-                (self._found.centres[side] - reach > 0.0)
-                & (self._found.centres[side] + reach < (camera.width - 1, camera.height - 1)),
-                axis=1,
+                (centres - reach > 0.0) & (centres + reach < (camera.width - 1, camera.height - 1)), axis=1
             )
-            index = np.flatnonzero(whole)
-            fit_size = observer.settings.fit_size
-            corners = np.rint(self._found.centres[side, index] - 0.5 * (fit_size - 1)).astype(int)
-            found.append(self._fitted(np.full(len(index), side), index, corners, whole[index], observer))
+            windows = _empty_windows(int(whole.sum()), observer)
+            windows.sides[:], windows.index[:], windows.found[:] = side, np.flatnonzero(whole), True
+            windows.corners[:] = np.rint(centres[whole] - 0.5 * (windows.size - 1))
+            found.append(self._fitted(windows, observer))
         return found[0], found[1]
 
-    def _fitted(
-        self,
-        sides: NDArray[np.int_],
-        index: NDArray[np.int_],
-        corners: NDArray[np.int_],
-        seen: NDArray[np.bool_],
-        observer: Observer,
-    ) -> EllipseFits:
-        """Stickers ``index`` (k,) fitted in parts of windows with first pixels ``corners`` (k,2), first those of the
-        left of both images (k,) ``sides``."""
-        from cmmsim.statistical.centre_kernels import (
-            fit_covariances,
-        )  # compiles, so it is loaded where it is first needed
+    def _fitted(self, windows: "Windows", observer: Observer) -> EllipseFits:
+        """What is found in windows."""
+        from cmmsim.statistical.window_kernels import Fits, Smallest, fit_stickers
 
-        settings, noise = observer.settings, observer.noise
-        centres, shapes, drawn = (a[sides, index] for a in (self._found.centres, self._found.shapes, self._found.noise))
-        within = lies_inside(centres - corners, shapes, settings.fit_size)
-        within &= thinnest(shapes) > THIN_PX + THIN_STD_PX * drawn[:, 5]
-        lit = [self.camera.greys(noise, side, centres[sides == side]) for side in range(2)]
-        contrasts, grounds = (np.concatenate(values) for values in zip(*lit, strict=True))
-        good = seen & within & (contrasts >= settings.limits.smallest_contrast)
-        spread = np.tile(np.eye(5), (len(index), 1, 1))
-        chosen = np.empty((int(good.sum()), 5, 5))
-        fit_covariances(
-            (centres - corners)[good],
-            shapes[good],
-            self._found.smears[sides[good], index[good]],
-            contrasts[good],
-            grounds[good],
-            settings.fit_size,
-            fit_settings(noise, settings.optics.psf_px),
-            chosen,
-        )
-        spread[good] = chosen
-        off = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), drawn[:, :5])
+        settings, noise, count = observer.settings, observer.noise, len(windows.index)
+        sides = [self.camera.greys(noise, side, centres) for side, centres in enumerate(self._found.centres)]
+        contrasts, grounds = (np.stack(values) for values in zip(*sides, strict=True))
+        shapes = ((2,), (2, 2), (5, 5), (), ())
+        found = Fits(np.empty(count, dtype=bool), *(np.empty((count, *shape)) for shape in shapes))
+        smallest = Smallest(1.01 * SMALLEST_RADIUS_PX, THIN_PX, THIN_STD_PX, float(settings.limits.smallest_contrast))
+        how = fit_settings(noise, settings.optics.psf_px)
+        fit_stickers(self._found._replace(contrasts=contrasts, grounds=grounds), windows, smallest, how, found)
         return EllipseFits(
-            centres + off[:, :2],
-            spread[:, :2, :2],
-            good,
-            shapes + np.einsum("kp,pij->kij", off[:, 2:], SHAPE_BASIS),
-            spread[:, 2:, 2:],
-            np.ones(len(index)),
-            contrasts,
-            grounds,
+            found.centres,
+            found.covariances[:, :2, :2],
+            found.good,
+            found.shapes,
+            found.covariances[:, 2:, 2:],
+            np.ones(count),
+            found.contrasts,
+            found.grounds,
         )
 
 
-def thinnest(shapes: Array) -> Array:
-    """Shorter half axes (k,) px of ellipses with shapes (k,2,2)."""
-    mean, half = 0.5 * (shapes[:, 0, 0] + shapes[:, 1, 1]), 0.5 * (shapes[:, 0, 0] - shapes[:, 1, 1])
-    return np.asarray(mean - np.hypot(half, shapes[:, 0, 1]))
+def _empty_windows(count: int, observer: Observer) -> "Windows":
+    """Room for windows."""
+    from cmmsim.statistical.window_kernels import Windows  # compiles, so it is loaded where it is first needed
+
+    whole, found = np.empty((2, count), dtype=int), np.empty(count, dtype=bool)
+    return Windows(whole[0], whole[1], np.empty((count, 2), dtype=int), found, observer.settings.fit_size)

@@ -10,12 +10,15 @@ import pytest
 from scipy.stats import chi2, chi2_contingency, ks_2samp, kstest
 
 import cmmsim
+from cmmsim.detection.ellipse_fit import fit_settings, lies_inside
+from cmmsim.geometry.disc_image import SHAPE_BASIS
 from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from cmmsim.geometry.pose import invert
 from cmmsim.geometry.stereo_rig import triangulate
 from cmmsim.pose_estimation.observation import StickerObservation
 from cmmsim.statistical.centre_kernels import fit_covariances, tabulated
 from cmmsim.statistical.conditions import LONGEST_STREAK_PX
+from cmmsim.statistical.exposure import THIN_PX, THIN_STD_PX
 from cmmsim.statistical.measuring import StatisticalTracker
 from cmmsim.statistical.pose_kernels import MEASURED, measure_frame
 from tests.cmmsim.sensors import (
@@ -46,6 +49,43 @@ def poses_of(sensor, count, seed=5):
 
 def statistical(lens="perfect", changes=None, **arguments):
     return exact(lens, changes, renderer="statistical", **arguments)
+
+
+@pytest.mark.parametrize("lens", ["perfect", "all"])
+def test_what_is_found_in_windows_is_what_a_fit_states_of_the_nearest_stickers(lens):
+    """NumPy's own lines, window by window, some of which hold a part of a sticker, or none."""
+    sensor, rng, counted = statistical(lens, {"timing.exposure": 0.004}), np.random.default_rng(3), 0
+    observer, size = sensor.observer, 16
+    noise, fit_size = observer.noise, observer.settings.fit_size
+    settings = fit_settings(noise, observer.settings.optics.psf_px)
+    for pose in poses_of(sensor, 8):
+        look = sensor.look(pose, pose_rate=np.full(6, 0.02))
+        seen = look._found
+        corners = np.rint(seen.centres - 0.5 * (size - 1) + rng.uniform(-3.0, 3.0, seen.centres.shape)).astype(int)
+        corners[:, ::7] += 300
+        found = look.detected(corners, size, observer)
+        for k, (side, n) in enumerate(np.ndindex(corners.shape[:2])):
+            gaps = np.abs(seen.centres[side] - corners[side, n] - 0.5 * (size - 1)).max(axis=1)
+            nearest = np.where(seen.seen[side], gaps, np.inf).argmin()
+            centre, shape, drawn = (each[side, nearest] for each in (seen.centres, seen.shapes, seen.noise))
+            first = corners[side, n]
+            inner = np.clip(np.rint(centre - 0.5 * (fit_size - 1)), first, first + size - fit_size)
+            contrast, ground = look.camera.greys(noise, side, centre[None])
+            thin = np.linalg.eigvalsh(shape)[0] > THIN_PX + THIN_STD_PX * drawn[5]
+            inside = lies_inside((centre - inner)[None], shape[None], fit_size)[0]
+            assert found.good[k] == (thin and inside and contrast[0] >= observer.settings.limits.smallest_contrast)
+            if not found.good[k]:
+                continue
+            spread, smear = np.empty((1, 5, 5)), seen.smears[side, nearest][None]
+            fit_covariances((centre - inner)[None], shape[None], smear, contrast, ground, fit_size, settings, spread)
+            off, counted = np.linalg.cholesky(spread[0]) @ drawn[:5], counted + 1
+            np.testing.assert_allclose(found.centres[k], centre + off[:2], rtol=0, atol=1e-9)
+            off_shape = np.tensordot(off[2:], SHAPE_BASIS, 1)
+            np.testing.assert_allclose(found.shapes[k], shape + off_shape, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(found.covariances[k], spread[0, :2, :2], rtol=1e-9)
+            np.testing.assert_allclose(found.shape_covariances[k], spread[0, 2:, 2:], rtol=1e-9)
+            assert (found.contrast[k], found.ground[k]) == (contrast[0], ground[0])
+    assert counted > 100
 
 
 @pytest.mark.parametrize("known", [False, True])
