@@ -163,8 +163,8 @@ class DrawnStickers:
             smears.append(np.asarray(np.subtract(*ends)))
         require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))
         noise = self.rng.standard_normal((2, len(seen[0]), 6))
-        unknown = np.zeros((2, 0))
-        return Ellipses(*(np.stack(values) for values in (centres, shapes, smears, seen)), noise, unknown, unknown)
+        at, shape, smear = (np.stack(values) for values in (centres, shapes, smears))
+        return Ellipses(at, shape, smear, np.stack(seen), noise, np.zeros((2, 0)), np.zeros((2, 0)))
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """See ``StickerExposure``: in each window the sticker nearest to its middle."""
@@ -184,7 +184,7 @@ class DrawnStickers:
                 (centres - reach > 0.0) & (centres + reach < (camera.width - 1, camera.height - 1)), axis=1
             )
             windows = _empty_windows(int(whole.sum()), observer)
-            windows.sides[:], windows.index[:], windows.found[:] = side, np.flatnonzero(whole), True
+            windows.sides[:], windows.stickers[:], windows.found[:] = side, np.flatnonzero(whole), True
             windows.corners[:] = np.rint(centres[whole] - 0.5 * (windows.size - 1))
             found.append(self._fitted(windows, observer))
         return found[0], found[1]
@@ -193,7 +193,7 @@ class DrawnStickers:
         """What is found in windows."""
         from cmmsim.statistical.window_kernels import Fits, Smallest, fit_stickers
 
-        settings, noise, count = observer.settings, observer.noise, len(windows.index)
+        settings, noise, count = observer.settings, observer.noise, len(windows.stickers)
         sides = [self.camera.greys(noise, side, centres) for side, centres in enumerate(self._found.centres)]
         contrasts, grounds = (np.stack(values) for values in zip(*sides, strict=True))
         shapes = ((2,), (2, 2), (5, 5), (), ())

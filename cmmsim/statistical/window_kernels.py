@@ -28,11 +28,11 @@ class Ellipses(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Parts of ``size`` px that are fitted: sides (k,) and index (k,) of their stickers, first pixels corners (k,2),
-    and whether there is one to be found (k,)."""
+    """Parts of ``size`` px that are fitted: sides (k,) and the numbers of their stickers (k,), first pixels corners
+    (k,2), and whether there is one to be found (k,)."""
 
     sides: Array
-    index: Array
+    stickers: Array
     corners: Array
     found: Array
     size: int
@@ -62,21 +62,21 @@ class Smallest(NamedTuple):
 
 @compiled
 def nearest_stickers(seen: Array, centres: Array, corners: Array, side_px: int, windows: Windows) -> None:
-    """Fill index, corners and found of what is fitted in windows of ``side_px`` px with first pixels ``corners``
-    (2,k,2): about the sticker nearest to the middle of each, as far as the window goes."""
+    """Fill what is fitted in windows of ``side_px`` px with first pixels ``corners`` (2,k,2): parts about the sticker
+    nearest to the middle of each, as far as the window goes."""
     at, slack, middle, half = 0, side_px - windows.size, 0.5 * (side_px - 1), 0.5 * (windows.size - 1)
     for side in range(2):
         for k in range(corners.shape[1]):
             least, corner = np.inf, corners[side, k]
-            windows.index[at] = 0
+            windows.stickers[at] = 0
             for n in range(seen.shape[1]):
                 x, y = centres[side, n, 0] - corner[0] - middle, centres[side, n, 1] - corner[1] - middle
                 gap = max(abs(x), abs(y))
                 if seen[side, n] and gap < least:
-                    least, windows.index[at] = gap, n
+                    least, windows.stickers[at] = gap, n
             windows.sides[at], windows.found[at] = side, least < np.inf
             for i in range(2):
-                first = int(np.rint(centres[side, windows.index[at], i] - half))
+                first = int(np.rint(centres[side, windows.stickers[at], i] - half))
                 windows.corners[at, i] = min(max(first, corner[i]), corner[i] + slack)
             at += 1
 
@@ -84,11 +84,11 @@ def nearest_stickers(seen: Array, centres: Array, corners: Array, side_px: int, 
 @compiled
 def fit_stickers(ellipses: Ellipses, windows: Windows, smallest: Smallest, settings: FitSettings, fits: Fits) -> None:
     """Fill what is found in windows. What is not good has unit covariances and means nothing."""
-    count, size = len(windows.index), windows.size
+    count, size = len(windows.stickers), windows.size
     local, shapes, smears = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty((count, 2))
     greys, known, chosen = np.empty((2, count)), np.empty((count, 5, 5)), 0
     for k in range(count):
-        side, n = windows.sides[k], windows.index[k]
+        side, n = windows.sides[k], windows.stickers[k]
         shape = ellipses.shapes[side, n]
         width = 0.5 * (shape[0, 0] + shape[1, 1]) - length_of(0.5 * (shape[0, 0] - shape[1, 1]), shape[0, 1])
         good = windows.found[k] and ellipses.contrasts[side, n] >= smallest.contrast
@@ -114,7 +114,7 @@ def fit_stickers(ellipses: Ellipses, windows: Windows, smallest: Smallest, setti
     )  # fmt: skip
     root, off, chosen = np.empty((5, 5)), np.empty(5), 0
     for k in range(count):
-        side, n = windows.sides[k], windows.index[k]
+        side, n = windows.sides[k], windows.stickers[k]
         for i in range(5):
             for j in range(5):
                 fits.covariances[k, i, j] = known[chosen, i, j] if fits.good[k] else 1.0 if i == j else 0.0
