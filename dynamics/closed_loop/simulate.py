@@ -173,11 +173,14 @@ def simulate_batch(
 
 
 def prepare(robot: Robot) -> None:
-    """Compile what a robot's runs need, if that has not been done: its functions and the loop (some seconds)."""
+    """Compile what a robot's runs need, one or many, if that has not been done: its functions and the loop (some
+    seconds)."""
     check_type("robot", robot, Robot, SimulationError)
     reference = Reference(np.tile(robot.home_pose, (2, 1)), np.zeros((2, 6)))
     settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), FrameTiming(60.0))
-    simulate(robot, next(iter(robot.parameter_sets.values())).vector, reference, settings)
+    given = robot, next(iter(robot.parameter_sets.values())).vector, reference, settings
+    simulate(*given)
+    simulate_repeats(*given, np.zeros((1, 2, 6)))
 
 
 def _checked(
