@@ -76,4 +76,4 @@ def feedforward(assignment: Assignment) -> LawInLoop:
         watched.issue(frame, issued)
         return issued
 
-    return LawInLoop(controller=EveryFrame(command), drives=drives, expected=expected)
+    return LawInLoop(controller=EveryFrame(command), drives=drives, expected=expected, by_servo=True)

@@ -62,12 +62,13 @@ class Assignment:
 @dataclass(frozen=True)
 class LawInLoop:
     """What a law gives `closed_loop.simulate`, and what its observer, if any, expected of each frame; of the drives it
-    decides whether they take torques."""
+    decides whether they take torques. by_servo: whether a controller corrects by the gains of the servo."""
 
     feedforward: np.ndarray | None = None
     controller: Controller | EveryFrame | None = None
     drives: Drives = field(default_factory=Drives)
     expected: list[Estimate] = field(default_factory=list)
+    by_servo: bool = False
 
 
 Law = Callable[[Assignment], LawInLoop]

@@ -1,5 +1,6 @@
 """The command ``track``: what a model is worth to a controller. Heavy imports are late."""
 
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -104,12 +105,13 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
             run["law"],
             run["model"],
             f"{run['effort_rms']:.3g}",
-            *(f"{100 * share['position']:.0f} %" for share in run["shares"].values()),
+            *(_percent(share["position"]) for share in run["shares"].values()),
         )
         for run in done
     ]
-    of_effort = ("law", "model", f"effort\n{entry['effort_unit']}", "sensor", "model", "latency")
-    print_table(of_effort, shares, header[:2], "rms effort, and what of the squared error an exact one would take away")
+    of_effort = ("law", "model", f"effort\n{entry['effort_unit']}", "sensor", "model", "latency", "rest")
+    said = "rms effort, and what of the squared error of positions an exact sensor, model or latency would take away"
+    print_table(of_effort, shares, header[:2], said)
     for run in entry["runs"]:
         if "failed" in run:
             typer.echo(f"lost: {run['law']} with the {run['model']} model: {run['failed']}")
@@ -119,6 +121,10 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
                 f"{run['saturated_frames']} frames"
             )
     typer.echo(f"files: {folder}")
+
+
+def _percent(share: float) -> str:
+    return f"{round(100 * share)} %" if isfinite(share) else "–"
 
 
 def _rounded(value: float) -> str:

@@ -136,10 +136,12 @@ def read_motion(path: Path, robot: Robot) -> NamedMotion:
     numbers that are not finite, or poses that the platform cannot have.
     """
     try:
-        lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        lines = [line.split(",") for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"cannot read the motion {path}: {error}") from None
+        raise TrajectoryError(f"cannot read the motion {path}: {getattr(error, 'strerror', None) or error}") from None
     header = [name.strip() for name in lines[0]] if lines else []
+    if len(header) == 1 and ";" in header[0]:
+        raise TrajectoryError(f"{path}: cells are separated by commas, and these by semicolons")
     missing = [name for name in COLUMNS if name not in header]
     if missing:
         raise TrajectoryError(f"{path} lacks the columns {', '.join(missing)}; it needs {', '.join(COLUMNS)}")
@@ -150,10 +152,14 @@ def read_motion(path: Path, robot: Robot) -> NamedMotion:
         except (ValueError, IndexError):
             raise TrajectoryError(f"{path}, row {row + 1}: {','.join(line)!r} are not {len(COLUMNS)} numbers") from None
     times, poses = table[:, 0], table[:, 1:]
-    if len(table) < FEWEST_ROWS or not np.isfinite(table).all():
-        raise TrajectoryError(f"{path} has {len(table)} rows; it needs at least {FEWEST_ROWS}, of finite numbers")
+    if len(table) < FEWEST_ROWS:
+        raise TrajectoryError(f"{path} has {len(table)} rows; it needs at least {FEWEST_ROWS}")
+    if not np.isfinite(table).all():
+        row = int(np.argmin(np.isfinite(table).all(axis=1)))
+        raise TrajectoryError(f"{path}, row {row + 1}: {','.join(lines[row + 1])!r} are not all finite numbers")
     if times[0] != 0 or not (np.diff(times) > 0).all():
-        raise TrajectoryError(f"{path}: times must begin at 0 and increase")
+        row = int(np.argmin(np.diff(times, prepend=-1.0) > 0)) if times[0] == 0 else 0
+        raise TrajectoryError(f"{path}, row {row + 1}: t is {times[row]:g}; times must begin at 0 and increase")
     try:
         robot.charted(poses)
     except DynamicsError as error:

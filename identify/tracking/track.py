@@ -39,6 +39,8 @@ FIRST_RUN = 2_000_000
 EXACT = ("sensor", "model", "latency")
 """What is made exact, one by one, to know its share of the error."""
 
+PARTS = ("position", "orientation")
+
 
 @dataclass(frozen=True)
 class Tracking:
@@ -69,6 +71,8 @@ def track(
     scenario = with_renderer(scenario)
     plant = build_plant(scenario)
     followed = motions(plant.nominal, scenario, seed, own)
+    if run_folder and "identified" not in models:
+        raise ScenarioError(f"--run {run_folder} holds the identified model, and only {', '.join(models)} is asked for")
     known = {name: known_model(plant, name, run_folder) for name in models if name != "identified" or run_folder}
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
     for law in laws:  # refused before the sensor is taught
@@ -206,16 +210,17 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
 
 
 def _shares(task: Tracking, law: str, known: KnownModel, covariance: Array) -> dict[str, Any]:
-    """Shares of the squared error that go when sensor, model or latency is made exact, of positions and orientations;
-    by runs whose poses are drawn with the noise that the sensor stated."""
+    """Shares of the squared error that go when sensor, model or latency is made exact, and the rest, of positions and
+    orientations; by runs whose poses are drawn with the noise that the sensor stated."""
     base = _drawn(task, law, known, covariance, None)
     shares = {}
     for what in EXACT:
         exact = _drawn(task, law, known, covariance, what)
         with np.errstate(invalid="ignore", divide="ignore"):
             left = [np.nansum(exact[part]) / np.nansum(base[part]) for part in (slice(0, 3), slice(3, 6))]
-        shares[what] = dict(zip(("position", "orientation"), (1 - np.array(left)).tolist(), strict=True))
-    return shares
+        shares[what] = dict(zip(PARTS, (1 - np.array(left)).tolist(), strict=True))
+    rest = {part: 1 - sum(share[part] for share in shares.values()) for part in PARTS}
+    return shares | {"rest": rest}
 
 
 def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact: str | None) -> Array:

@@ -171,9 +171,13 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     text = f"largest eigenvalue of the loop from frame to frame {at} is {radius:.6f}; it is stable below 1"
     yield Finding("loop", radius < 1, radius, 1.0, "1", None, text)
     factor = stability.gain_margin(*arguments)
-    text = f"the servo's gains may be {factor:.3g} times as large until the loop is lost"
+    gains = settings.servo
+    text = f"the servo's gains, kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s, "
+    text += f"may be {factor:.3g} times as large until the loop is lost"
     if not factor > 0:
         text = "the loop is lost with any gains of the servo"
+    elif factor < 1:
+        text = text.replace("may be", "must be").replace(" until the loop is lost", " for the loop to hold")
     yield Finding("gain margin", factor > 1, factor, 1.0, "1", None, text)
     rate = stability.lowest_frame_rate(*arguments)
     text = f"the loop holds from {rate:.3g} Hz on with this latency" if rate > 0 else "no frame rate makes it stable"
@@ -215,7 +219,9 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
         text += f"; {torques.gain_margin:.3g} times these gains lose it"
     yield Finding("computed torque", torques.radius < 1, torques.radius, 1.0, "1", None, text)
     known, most = (limit, f"up to {limit:.3g} rad/s") if limit > 0 else (None, "with no bandwidth")
-    text = f"computed_torque is stable {most}" if limit != nyquist else f"half the frame rate is {nyquist:.3g} rad/s"
+    text = f"computed_torque is stable {most}"
+    if limit == nyquist:
+        text = f"computed_torque may have up to {nyquist:.3g} rad/s, half the frame rate"
     yield Finding("torque bandwidth", w <= limit, w, known, "rad/s", None, text)
 
 

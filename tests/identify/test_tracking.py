@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dynamics import load_robot
+from dynamics.closed_loop import LoopFailure
 from dynamics.control.law import LawInLoop
 from dynamics.errors import SimulationError
 from identify.errors import RecordError, ScenarioError, TrajectoryError
@@ -91,10 +92,11 @@ def test_the_jerk_of_the_square_is_bounded():
     [
         ({"rows": 4}, "has 4 rows; it needs at least 6"),
         ({"to": "1.0,0,0,zero,0,0,0"}, "row 21: '1.0,0,0,zero,0,0,0' are not 7 numbers"),
-        ({"to": "0.1,0,0,0.2,0,0,0"}, "times must begin at 0 and increase"),
-        ({"to": "nan,0,0,0.2,0,0,0"}, "of finite numbers"),
+        ({"to": "0.1,0,0,0.2,0,0,0"}, "row 21: t is 0.1; times must begin at 0 and increase"),
+        ({"to": "1.0,0,nan,0.2,0,0,0"}, "row 21: '1.0,0,nan,0.2,0,0,0' are not all finite numbers"),
+        ({"at": 0, "to": "0.01,0,0,0.2,0,0,0"}, "row 1: t is 0.01; times must begin at 0"),
     ],
-    ids=["few", "word", "back", "nan"],
+    ids=["few", "word", "back", "nan", "late"],
 )
 def test_a_file_that_is_no_motion_is_refused(tmp_path, changes, said):
     assert said in refusal(TrajectoryError, read_motion, own(tmp_path / "own.csv", **changes), rss6())
@@ -102,7 +104,12 @@ def test_a_file_that_is_no_motion_is_refused(tmp_path, changes, said):
 
 def test_a_file_without_a_column_or_that_the_platform_cannot_follow_is_refused(tmp_path):
     path = own(tmp_path / "own.csv")
-    path.write_text(path.read_text().replace("gamma", "yaw"))
+    whole = path.read_text()
+    path.write_text("\ufeff" + whole, encoding="utf-8")  # as spreadsheets write it
+    assert read_motion(path, rss6()).duration_s == 2.0
+    path.write_text(whole.replace(",", ";"))
+    assert "by commas, and these by semicolons" in refusal(TrajectoryError, read_motion, path, rss6())
+    path.write_text(whole.replace("gamma", "yaw"))
     assert "lacks the columns gamma" in refusal(TrajectoryError, read_motion, path, rss6())
     tilted = own(tmp_path / "tilted.csv", at=20, to="1.02564103,0,0,0.204,0.01,0,0")
     assert "alpha" in refusal(TrajectoryError, read_motion, tilted, load_robot("delta3"))
@@ -213,6 +220,10 @@ def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
     assert size["feedforward", "true"] < size["feedforward", "initial"] / 4 < size["pid", "true"] / 8
     assert runs["feedforward", "initial"]["shares"]["model"]["position"] > 0.9
     assert runs["feedforward", "true"]["shares"]["model"]["position"] == 0
+    for run in runs.values():
+        assert list(run["shares"]) == ["sensor", "model", "latency", "rest"]
+        for part in ("position", "orientation"):
+            assert sum(share[part] for share in run["shares"].values()) == pytest.approx(1)
     assert {row["motion"] for row in runs["pid", "true"]["motions"]} == {"unseen 1", "circle", "corner"}
     assert (out / "scenario.toml").is_file()
 
@@ -224,6 +235,13 @@ def test_a_robot_that_no_law_keeps_on_its_motion_is_no_success(tmp_path, monkeyp
     assert "no law kept the robot on its motion; unseen 1: " in one_line(capsys.readouterr().err)
     (run,) = json.loads((out / "track.json").read_text())["runs"]
     assert "eigenvalue" in run["failed"]
+
+
+def test_a_feedforward_that_is_lost_by_the_servos_gains_says_its_eigenvalue():
+    """With an observer, too, as its corrections are those of the servo."""
+    wild = plant(**{"servo.ki": 400.0})
+    said = refusal(LoopFailure, follow, wild, "feedforward", KnownModel(wild.parameters), swing(), seen())
+    assert "its largest eigenvalue from frame to frame near the start is" in said
 
 
 def test_the_identified_model_is_that_of_a_run(tmp_path):
@@ -243,10 +261,11 @@ def test_the_identified_model_is_that_of_a_run(tmp_path):
     [
         (["--model", "best"], "unknown model 'best'; valid: initial, identified, true, or all"),
         (["--law", "mpc"], "unknown law 'mpc'"),
-        (["--motion", "no.csv"], "cannot read the motion no.csv"),
+        (["--motion", "no.csv"], "cannot read the motion no.csv: No such file"),
+        (["--run", "."], "--run . holds the identified model, and only true is asked for"),
         (["--law", "computed_torque", "--set", "control.torque_access=false"], "do not take"),
     ],
-    ids=["model", "law", "motion", "torques"],
+    ids=["model", "law", "motion", "run", "torques"],
 )
 def test_what_cannot_be_tracked_is_one_line_and_leaves_nothing(asked, said, tmp_path, capsys):
     out = tmp_path / "out"
