@@ -14,7 +14,7 @@ from dynamics.checks import floats
 from dynamics.closed_loop.command_schedule import command_schedule
 from dynamics.closed_loop.frame_kernels import measure_ideally, run_frames
 from dynamics.closed_loop.lane_kernels import run_lanes
-from dynamics.closed_loop.memory import Memory, Plan, empty_memory, empty_record, record_type
+from dynamics.closed_loop.memory import Memory, Plan, empty, empty_memory, empty_record
 from dynamics.closed_loop.motion_kernels import (
     LEFT_REACH,
     MEASURED_OUT_OF_REACH,
@@ -26,7 +26,7 @@ from dynamics.closed_loop.motion_kernels import (
 )
 from dynamics.closed_loop.problem import EveryFrame, LoopProblem, RateSensor, Sizes
 from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
-from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent
+from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent, whole_vectors
 from dynamics.closed_loop.stick_slip_kernels import stop_joints
 from dynamics.compiled.kernel import address, chosen, plain
 from dynamics.compiled.machine_code import MachineFunction
@@ -40,7 +40,7 @@ FAILURES = {
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; there",
 }
 MACHINE_CODE = (
-    *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
+    *("equation_of_motion", "free_acceleration", "response", "rate_map_derivative"),
     *("stage_derivatives", "stop_derivatives", "slope_derivative"),
 )
 """Functions of a robot that kernels call, by their names."""
@@ -90,7 +90,7 @@ def _run_together(problem: LoopProblem, noises: np.ndarray, compiled: bool) -> l
     _fill(memory, problem, own, known["servo_jacobian"], _addresses(sizes, compiled))
     for name in ("motion_in_lanes", "acceleration_in_lanes"):
         memory.task[name] = own[name].address
-    lanes, at = np.zeros(1, record_type("lanes", sizes))[0], np.zeros((runs, 5), memory.evaluations.dtype)
+    lanes, at = empty("lanes", sizes), np.zeros((runs, 5), memory.evaluations.dtype)
     now = np.repeat(memory.now.reshape(1), runs).view(np.recarray)
     now["first_row"] = frames * np.arange(runs)
     lanes.shared = memory.now.known.inputs[2 * sizes.coordinates :]
@@ -255,7 +255,6 @@ def _fill(
     for inputs, function, fixed in (
         (now.known.inputs, own["equation_of_motion"], rigid),
         (now.served.inputs, servo_jacobian, rigid[:0]),
-        (now.derivatives.inputs, own["motion_derivatives"], rigid),
         (now.stages.inputs, own["stage_derivatives"], rigid),
         (now.stopping.inputs, own["stop_derivatives"], rigid),
         (now.pose_and_rate, own["rate_map_derivative"], rigid[:0]),
@@ -266,7 +265,8 @@ def _fill(
     elastic = settings.elasticity is not None
     now.unknowns = len(now.state) - (0 if elastic else 2 * sizes.joints)  # motors come last
     now.parameters, now.start_moves = len(columns), problem.start_sensitivities
-    now.width = now.step_column = len(columns) + (sizes.start if problem.start_sensitivities else 0)
+    now.step_column = len(columns) + (sizes.start if problem.start_sensitivities else 0)
+    now.width = plain(whole_vectors)(int(now.step_column))
 
 
 @lru_cache(maxsize=16)

@@ -7,7 +7,7 @@ the errors times the frame period. Lost frames leave both alone. A feedforward c
 
 import numpy as np
 
-from dynamics.closed_loop.linear_algebra_kernels import add_product, add_row, clear, copy, copy_rows, dot, fill
+from dynamics.closed_loop.linear_algebra_kernels import add, add_product, clear, copy, copy_rows, dot, fill
 from dynamics.closed_loop.motion_kernels import MEASURED_OUT_OF_REACH, OK, all_finite
 from dynamics.closed_loop.sensitivity_kernels import velocity_by_pose
 from dynamics.closed_loop.stick_slip_kernels import NO_MARGIN, begin_span, judge, next_step, try_step
@@ -79,7 +79,7 @@ def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
     if not seen:
         fill(measured, np.nan)
     if len(plan.noise) > 0:
-        add_row(1.0, plan.noise[row], measured, len(measured))
+        add(plan.noise[row], measured)
 
 
 @kernel
@@ -138,7 +138,7 @@ def issue_command(task: Record, now: Record, d: Record, plan: Record, record: Re
         serve(task, now, d, plan, record.measured[row], k)
     copy(now.last_command[:], record.command[row])
     if len(plan.feedforward) > 0:
-        add_row(1.0, plan.feedforward[k], record.command[row], len(now.mode))
+        add(plan.feedforward[k], record.command[row])
     if task.sensitivities:
         copy_rows(d.last_command[:], d.issued[k % (len(d.issued) - 1)], now.width)
     return OK if all_finite(record.command[row : row + 1]) else MEASURED_OUT_OF_REACH
@@ -173,6 +173,7 @@ def apply_command(
             d.command_rate[i, k] = change / task.period
             d.command[i, k] = older[i, k] + ramp * change if now.ramping else newer[i, k]
             d.command_slope[i, k] = d.command_rate[i, k] if now.ramping else 0.0
+    copy_rows(d.command[:], d.acting[:], now.width)
 
 
 @kernel

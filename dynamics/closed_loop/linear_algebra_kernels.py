@@ -1,6 +1,6 @@
 """Small dense linear algebra, and the rows of derivatives that follow it: one row an unknown, one column a variable."""
 
-from dynamics.compiled.kernel import Array, kernel, part
+from dynamics.compiled.kernel import Array, add_row, kernel, part
 
 
 @part
@@ -51,6 +51,13 @@ def fill(into: Array, value: float) -> None:
 
 
 @part
+def add(source: Array, into: Array) -> None:
+    """Add a vector to another."""
+    for k in range(len(source)):
+        into[k] += source[k]
+
+
+@part
 def clear(rows: Array, width: int) -> None:
     """Zero the columns in use of some rows."""
     for i in range(len(rows)):
@@ -64,13 +71,6 @@ def copy_rows(source: Array, into: Array, width: int) -> None:
     for i in range(len(source)):
         for k in range(width):
             into[i, k] = source[i, k]
-
-
-@part
-def add_row(factor: float, row: Array, into: Array, width: int) -> None:
-    """Add factor times a row of derivatives to another, over the columns in use."""
-    for k in range(width):
-        into[k] += factor * row[k]
 
 
 @kernel

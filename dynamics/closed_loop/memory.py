@@ -14,6 +14,9 @@ from dynamics.closed_loop.joints import FRICTION
 from dynamics.closed_loop.problem import MAX_DELAY_FRAMES, LoopProblem, Sizes
 from dynamics.parameters import LANES, room_for_derivatives
 
+LINE = 64
+"""Bytes in a line of a processor's cache."""
+
 
 class Plan(NamedTuple):
     """What a run reads at its frames, one row each; no rows where that is not given."""
@@ -70,23 +73,22 @@ class Memory(NamedTuple):
 
 LAYOUT = {
     "task": "equation_of_motion! motion_in_lanes! free_acceleration! acceleration_in_lanes! response! "
-    "motion_derivatives! stage_derivatives! stop_derivatives! rate_map_derivative! slope_derivative! servo_jacobian! "
+    "stage_derivatives! stop_derivatives! rate_map_derivative! slope_derivative! servo_jacobian! "
     "evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! "
     "measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! "
     "torque_limit filter_time shown! pivots:r! rigid:r coulomb:n viscous:n friction=friction",
-    "now": "known=known served=served derivatives=derivatives stages=stages stopping=stopping mode:n! stuck:n! "
+    "now": "stages=stages known=known served=served stopping=stopping mode:n! stuck:n! "
     "ramping! events! events_left! start_moves! time_moves! length_moves! width! parameters! step_column! elapsed "
     "state:s command:n command_slope:n command_rate:n last_command:n last_measured:m servo_integral:m demand:m "
     "change:m pose_and_rate:M rate_map:nm first_row! status! unknowns! frame! span! steps! grid! duration target "
     "purpose! length trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
-    # first what `equation_of_motion` and `motion_derivatives` return, in their order
+    # first what `equation_of_motion` returns, in its order
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
     "served": "jacobian:nm inputs:j",
-    # and what else the columns of `slope_derivative` share
-    "derivatives": "by_pose:mm by_rate:mm columns:mr crank_by_pose:nm crank_by_rate:nm jacobian:nm pushing:nm "
-    "factor:mm damping:n by_error:n by_integral:n by_command_rate:n inputs:d",
-    # what `stage_derivatives` returns, which are those of all stages of a step
-    "stages": "by_pose:mm4 by_rate:mm4 columns:mr4 crank_by_pose:nm4 crank_by_rate:nm4 inputs:d4",
+    # first what `stage_derivatives` returns of all stages of a step, and what else the columns of `slope_derivative`
+    # share
+    "stages": "by_pose:mm4 by_rate:mm4 columns:mr4 crank_by_pose:nm4 crank_by_rate:nm4 jacobian:nm4 pushing:nm4 "
+    "factor:mm4 damping:n4 by_error:n4 by_integral:n4 by_command_rate:n4 inputs:d4",
     # first what `stop_derivatives` returns
     "stopping": "by_pose:mm by_rate:mm columns:mr inputs:z",
     # first what `response` and, from the factor on, `free_acceleration` take, in their order
@@ -94,8 +96,8 @@ LAYOUT = {
     "velocity:n spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn "
     "stuck_factor:nn",
     # first what `motion_in_lanes` takes, then what it returns, and from the factor on what `acceleration_in_lanes` does
-    "lanes": "shared:q states:BL bias_acceleration:nL angle:nL velocity:nL factor:mmL bias:mL jacobian:nmL push:nL "
-    "row:mL acceleration:mL response:mL asked:L!",
+    "lanes": "states:BL bias_acceleration:nL angle:nL velocity:nL factor:mmL bias:mL jacobian:nmL push:nL "
+    "row:mL acceleration:mL response:mL asked:L! shared:q",
     # first the rows of `slope_derivative`; k: what it returns of each stage,
     # and before the torques the slopes of filtered rates, whose trials are `filtered`
     "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w "
@@ -139,5 +141,13 @@ def record_type(name: str, sizes: Sizes) -> np.dtype:
 
 def empty_memory(sizes: Sizes) -> Memory:
     """Room for one run."""
-    task, now, tangent = (np.zeros(1, record_type(name, sizes))[0] for name in ("task", "now", "tangent"))
+    task, now, tangent = (empty(name, sizes) for name in ("task", "now", "tangent"))
     return Memory(task, now, np.zeros(5, record_type("evaluation", sizes)), tangent)
+
+
+def empty(name: str, sizes: Sizes) -> Any:
+    """An empty record that begins where a line of the processor's cache does: vectors in it then lie in one line."""
+    kind = record_type(name, sizes)
+    room = np.zeros(kind.itemsize + LINE, np.uint8)
+    first = -room.ctypes.data % LINE
+    return room[first : first + kind.itemsize].view(kind)[0]

@@ -9,7 +9,6 @@ by an impulse is differentiated implicitly too.
 
 from dynamics.closed_loop.linear_algebra_kernels import (
     add_product,
-    add_row,
     clear,
     copy,
     copy_rows,
@@ -26,7 +25,8 @@ from dynamics.closed_loop.motion_kernels import (
     mode_margin,
     winds_up,
 )
-from dynamics.compiled.kernel import Array, Record, call, call_columns, entry, invoke, kernel
+from dynamics.compiled.kernel import Array, Record, add_row, call, call_columns, entry, invoke, kernel
+from dynamics.parameters import LANES
 
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -35,72 +35,53 @@ NO_APPROACH = 1e-9  # rad/s^2 or N m/s: an event so slow has no derivative
 
 
 @kernel
-def differentiate_motion(task: Record, now: Record, at: Record) -> None:
-    """Derivatives of the equation of motion at fixed acceleration and net joint torque."""
-    size, known = len(at.bias), now.derivatives
-    copy(at.state[: 2 * size], known.inputs[: 2 * size])
-    copy(at.slope[size : 2 * size], known.inputs[2 * size : 3 * size])
-    copy(at.net_torque, known.inputs[3 * size :])
-    call(task.motion_derivatives, known.inputs, known.by_pose)
+def ask_derivatives(now: Record, at: Record, k: int) -> None:
+    """Ask for the derivatives of the equation of motion at an evaluation, in place of a step's stage `k`."""
+    size, given = len(at.bias), now.stages.inputs
+    for j in range(2 * size):
+        given[j, k] = at.state[j]
+    for j in range(size):
+        given[2 * size + j, k] = at.slope[size + j]
+    for i in range(len(now.mode)):
+        given[3 * size + i, k] = at.net_torque[i]
 
 
 @kernel
-def differentiate_stages(task: Record, now: Record, at: Record) -> None:
-    """The same at all stages of a step together."""
-    size, given = len(at[0].bias), now.stages.inputs
-    for k in range(END):
-        for j in range(2 * size):
-            given[j, k] = at[k].state[j]
-        for j in range(size):
-            given[2 * size + j, k] = at[k].slope[size + j]
-        for i in range(len(now.mode)):
-            given[3 * size + i, k] = at[k].net_torque[i]
-    call(task.stage_derivatives, given, now.stages.by_pose)
+def differentiate_stages(task: Record, now: Record) -> None:
+    """Derivatives of the equation of motion at fixed acceleration and net joint torque, of all stages together."""
+    call(task.stage_derivatives, now.stages.inputs, now.stages.by_pose)
 
 
 @kernel
-def take_stage(task: Record, now: Record, k: int) -> None:
-    """Those of one of the stages, of the inertial parameters that stand for all."""
-    found, known = now.stages, now.derivatives
-    for i in range(len(known.by_pose)):
-        for j in range(len(known.by_pose)):
-            known.by_pose[i, j], known.by_rate[i, j] = found.by_pose[i, j, k], found.by_rate[i, j, k]
-        for parameter in task.pivots[: task.shown]:
-            known.columns[i, parameter] = found.columns[i, parameter, k]
-    for i in range(len(known.crank_by_pose)):
-        for j in range(len(known.by_pose)):
-            known.crank_by_pose[i, j] = found.crank_by_pose[i, j, k]
-            known.crank_by_rate[i, j] = found.crank_by_rate[i, j, k]
-
-
-@kernel
-def share_with_columns(task: Record, now: Record, at: Record) -> None:
+def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
     """What the derivatives of a slope have in common beside the derivatives of the equation of motion."""
-    known = now.derivatives
-    copy_rows(at.jacobian, known.jacobian, len(at.bias))
-    copy_rows(at.factor, known.factor, len(at.bias))
+    known, size = now.stages, len(at.bias)
+    for i in range(size):
+        for j in range(size):
+            known.factor[i, j, k] = at.factor[i, j]
     filtering = task.filter_time > 0
     for i in range(len(now.mode)):
         mode, slips, law = now.mode[i], now.mode[i] != 0, follows_law(task, at, i)
-        known.by_error[i] = law * (task.lp + task.lx)
-        known.by_integral[i] = law * task.li
-        known.by_command_rate[i] = 0.0 if filtering else law * task.rate_weight * task.ld
-        known.damping[i] = 0.0 if filtering else law * task.ld
+        known.by_error[i, k] = law * (task.lp + task.lx)
+        known.by_integral[i, k] = law * task.li
+        known.by_command_rate[i, k] = 0.0 if filtering else law * task.rate_weight * task.ld
+        known.damping[i, k] = 0.0 if filtering else law * task.ld
         if slips:
-            known.damping[i] += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
-        for j in range(len(at.bias)):
-            known.pushing[i, j] = at.jacobian[i, j] if slips else 0.0
+            known.damping[i, k] += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
+        for j in range(size):
+            known.jacobian[i, j, k] = at.jacobian[i, j]
+            known.pushing[i, j, k] = at.jacobian[i, j] if slips else 0.0
 
 
 @kernel
-def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
+def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage: int) -> None:
     """What the parameters do at a fixed state: to -M q_ddot - b (`d.push`), and to the torque of each joint without the
     friction that holds it (`d.direct`)."""
     count, first, rigid = len(now.mode), 2 * len(at.bias), task.shown
     lp = rigid + 2 * count
     for i in range(len(at.bias)):
         for k in range(rigid):
-            d.push[i, k] = -now.derivatives.columns[i, task.pivots[k]]
+            d.push[i, k] = -now.stages.columns[i, task.pivots[k], stage]
     for i in range(count):
         mode, row, law = now.mode[i], d.direct[i], follows_law(task, at, i)
         rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
@@ -130,7 +111,9 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
     slopes, torque = d.k[k, first : first + count], d.k[k, first + count :]
     copy_rows(slopes, torque, width)
     clear(slopes, width)
-    add_product(-0.5 / task.filter_time, now.derivatives.crank_by_rate, d.trial[:size], slopes, width)
+    for i in range(count):
+        for j in range(size):
+            add_row(-0.5 / task.filter_time * now.stages.crank_by_rate[i, j, k], d.trial[j], slopes[i], width)
     add_product(-1 / task.filter_time, at.jacobian, d.trial[size : 2 * size], slopes, width)
     for i in range(count):
         add_row(task.rate_weight / task.filter_time, d.command_rate[i], slopes[i], width)
@@ -140,14 +123,14 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
 @kernel
 def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
     """Derivative of the slopes of integrals that a drive at its limit holds: lx / li times the joint's velocity."""
-    size, width, known = len(at.bias), now.width, now.derivatives
+    size, width, known = len(at.bias), now.width, now.stages
     lp = task.shown + 2 * len(now.mode)
     for i in range(len(now.mode)):
         if winds_up(task, at, i):
             row, share = d.k[k, 2 * size + i], task.lx / task.li
             fill(row, 0.0)
             for j in range(size):
-                add_row(0.5 * share * known.crank_by_rate[i, j], d.trial[j], row, width)
+                add_row(0.5 * share * known.crank_by_rate[i, j, k], d.trial[j], row, width)
                 add_row(share * at.jacobian[i, j], d.trial[size + j], row, width)
             for gain in range(3):
                 row[lp + gain] += task.lx_by[gain] / task.li * at.velocity[i]
@@ -160,17 +143,17 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     the state and the time in `d.trial`, `d.filtered` and `d.stage_time`, with those of the equation of motion that are
     known. See `slope_derivative`.
     """
-    size, count, width, known = len(at.bias), len(now.mode), now.width, now.derivatives
+    size, count, width, known = len(at.bias), len(now.mode), now.width, now.stages
     pose, rate = d.trial[:size], d.trial[size : 2 * size]
     acceleration, torque = d.k[k, size : 2 * size], d.k[k, len(d.k[k]) - count :]
-    share_with_columns(task, now, at)
-    copy_rows(d.command[:], d.acting[:], width)
-    for i in range(count):
-        if now.ramping:
+    share_with_columns(task, now, at, k)
+    if now.ramping:
+        copy_rows(d.command[:], d.acting[:], width)
+        for i in range(count):
             add_row(at.time, d.command_slope[i], d.acting[i], width)
             add_row(now.command_slope[i], d.stage_time[:], d.acting[i], width)
-    fixed_state_tangent(task, now, at, d)
-    call_columns(task.slope_derivative, known.by_pose, d.trial, d.k[k], width)
+    fixed_state_tangent(task, now, at, d, k)
+    call_columns(task.slope_derivative, known.by_pose[0, 0, k:], d.trial, d.k[k], width)
     if task.filter_time > 0:
         filtered_tangent(task, now, at, d, k)
     if task.torque_limit > 0:
@@ -181,8 +164,8 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     clear(d.force[:], width)
     for s in range(len(stuck)):
         for j in range(size):
-            add_row(known.crank_by_pose[stuck[s], j], pose[j], d.force[s], width)
-            add_row(known.crank_by_rate[stuck[s], j], rate[j], d.force[s], width)
+            add_row(known.crank_by_pose[stuck[s], j, k], pose[j], d.force[s], width)
+            add_row(known.crank_by_rate[stuck[s], j, k], rate[j], d.force[s], width)
             add_row(at.jacobian[stuck[s], j], acceleration[j], d.force[s], width)
     give_back(at, d, len(stuck), acceleration, width)
     for s in range(len(stuck)):
@@ -241,7 +224,8 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
         copy(d.time[:], d.stage_time[:])
         d.stage_time[column] = 1.0
         try_tangent(now, d)
-        differentiate_motion(task, now, end)
+        ask_derivatives(now, end, 0)
+        differentiate_stages(task, now)
         invoke(task.slope_tangent, task, now, end, d, 0)
         torque = d.k[0, len(d.k[0]) - len(now.mode) + joint]
         add_row(1.0 if end.stick_force[joint] > 0 else -1.0, torque, d.margin[:], width)
@@ -257,17 +241,25 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
 
 
 @kernel
+def whole_vectors(columns: int) -> int:
+    """The columns in use, so many at least; those behind them are zero."""
+    return -(-columns // LANES) * LANES
+
+
+@kernel
 def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, event: bool, cut: bool) -> None:
     """Sensitivities over the stored step. One that ends on the grid is shorter by what its start is later; one that is
     `cut` by an event has the length that the event sets: until that is known it is one more variable."""
     fill(d.length[:], 0.0)
     if cut:
-        now.width = now.step_column + 1
+        now.width = whole_vectors(now.step_column + 1)
         d.length[now.step_column] = 1.0
     if not event:
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
-    differentiate_stages(task, now, at)
+    for k in range(END):
+        ask_derivatives(now, at[k], k)
+    differentiate_stages(task, now)
     for k in range(END):
         try_tangent(now, d)
         if k > 0:
@@ -276,13 +268,12 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
             move_tangent(now, at, d, k - 1, h, FRACTION[k], d.filtered[: len(d.x) - late], late)
         copy(d.time[:], d.stage_time[:])
         add_row(FRACTION[k], d.length[:], d.stage_time[:], now.width)
-        take_stage(task, now, k)
         invoke(task.slope_tangent, task, now, at[k], d, k)
     for k in range(END):
         move_tangent(now, at, d, k, h, WEIGHT[k], d.x[:], 0)
     if cut:
         length_tangent(task, now, at[END], d)
-        now.width = now.step_column
+        now.width = whole_vectors(now.step_column)
     add_row(1.0, d.length[:], d.time[:], now.width)
     now.time_moves = event
 

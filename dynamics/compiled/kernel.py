@@ -16,12 +16,14 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba import njit, typeof, types
+from numba.core import cgutils
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
 from dynamics.compiled.object_files import cache_folder, load_object, save_object
+from dynamics.compiled.operations import MOST_LANES
 
 Array = np.ndarray  # of any type and shape, which docstrings state
 Record = Any  # a numpy.record, whose fields are those of its type
@@ -145,6 +147,24 @@ def _call_columns(context: Any, address: Any, common: Any, rows: Any, into: Any,
 invoke: Any = intrinsic(_invoke)
 """Calls an entry by its address with four records and a number; returns its status."""
 
+
+def _add_row(context: Any, factor: Any, row: Any, into: Any, width: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        arrays = zip(signature.args[1:3], values[1:3], strict=True)
+        row, into = (context.make_array(kind)(context, builder, value=value).data for kind, value in arrays)
+        vector = ir.VectorType(ir.DoubleType(), MOST_LANES)
+        first = builder.insert_element(ir.Constant(vector, ir.Undefined), values[0], ir.IntType(32)(0))
+        lanes = ir.Constant(ir.VectorType(ir.IntType(32), MOST_LANES), [0] * MOST_LANES)
+        factors, start = builder.shuffle_vector(first, first, lanes), ir.IntType(64)(0)
+        with cgutils.for_range_slice(builder, start, values[3], ir.IntType(64)(MOST_LANES)) as (column, _):
+            places = [builder.bitcast(builder.gep(one, [column]), vector.as_pointer()) for one in (row, into)]
+            given, before = (builder.load(place, align=8) for place in places)
+            builder.store(builder.fadd(before, builder.fmul(factors, given)), places[1], align=8)
+        return context.get_dummy_value()
+
+    return types.void(types.float64, row, into, types.int64), code
+
+
 call: Any = intrinsic(_call)
 """Calls a `MachineFunction` by its address with its inputs and outputs, which lie in memory one after the other."""
 
@@ -152,6 +172,9 @@ call: Any = intrinsic(_call)
 call_columns: Any = intrinsic(_call_columns)
 """Calls a `ColumnFunction` by its address with what columns have in common, the first of their rows, the first of those
 that it writes, and the number of columns."""
+
+add_row: Any = intrinsic(_add_row)
+"""Adds a factor times a row to another one, over a number of columns, which fill whole vectors."""
 
 
 def _invoke_plain(address: int, *arguments: Any) -> int:
@@ -166,6 +189,10 @@ def _call_plain(address: int, inputs: np.ndarray, outputs: np.ndarray) -> None:
 def _call_columns_plain(address: int, common: np.ndarray, rows: np.ndarray, into: np.ndarray, width: int) -> None:
     function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
     function(int(address))(common.ctypes.data, rows.ctypes.data, into.ctypes.data, int(width))
+
+
+def _add_row_plain(factor: float, row: np.ndarray, into: np.ndarray, width: int) -> None:
+    into[:width] += factor * row[:width]
 
 
 @lru_cache(maxsize=1)
@@ -183,7 +210,8 @@ def plain(compiled: Any) -> Callable[..., Any]:
     lines = {name: getattr(value, "py_func", value) for name, value in names.items()}
     kernels = [name for name, value in lines.items() if isinstance(value, FunctionType) and hasattr(value, "kernel")]
     called: dict[str, Any] = {name: plain(names[name]) for name in kernels}
-    called |= {"invoke": _invoke_plain, "call": _call_plain, "call_columns": _call_columns_plain}
+    called |= {"invoke": _invoke_plain, "call": _call_plain}
+    called |= {"call_columns": _call_columns_plain, "add_row": _add_row_plain}
     return FunctionType(source.__code__, source.__globals__ | called, source.__name__, source.__defaults__)
 
 

@@ -59,12 +59,13 @@ class PartedFunction:
 class ColumnFunction:
     """A function of columns: the first `common` inputs are the same for all, the others and the outputs have a row an
     entry, with `room` for so many columns. It is computed for `lanes` of them at once, and what is behind the last one
-    asked for is overwritten up to there."""
+    asked for is overwritten up to there. apart: how far entries of the first inputs are from each other."""
 
     function: ca.Function
     common: int
     room: int
     lanes: int
+    apart: int = 1
 
     def name(self) -> str:
         """That of the function."""

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+MOST_LANES = 8
+"""Numbers that a register of present processors holds."""
+
 TRUTH = "uitofp {i1} {last} to {double}"
 MEANING: dict[str, tuple[str, ...]] = {
     "ADD": ("fadd {double} {0}, {1}",),

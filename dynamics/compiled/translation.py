@@ -11,12 +11,19 @@ from collections.abc import Callable, Collection
 import casadi as ca
 
 from dynamics.compiled.lanes import LEAVES, ColumnFunction, Graph, Group, Node, PartedFunction, graph_of, lane_groups
-from dynamics.compiled.operations import CALLED, MEANING, OF_TRUTH, OF_VECTORS, TRUTH, constant, lanes_for, type_name
+from dynamics.compiled.operations import (
+    CALLED,
+    MEANING,
+    MOST_LANES,
+    OF_TRUTH,
+    OF_VECTORS,
+    TRUTH,
+    constant,
+    lanes_for,
+    type_name,
+)
 from dynamics.compiled.quick_arithmetic import quickened
 from dynamics.errors import DynamicsError
-
-MOST_LANES = 8
-"""Numbers that a register of present processors holds."""
 
 AnyFunction = ca.Function | PartedFunction | ColumnFunction
 
@@ -190,8 +197,12 @@ class _Body:
 
     def input(self, number: int, entry: int) -> str:
         """An entry of an input."""
-        place = self.new(f"getelementptr double, ptr %inputs, i64 {self._inputs[number][entry] * self._beside}")
+        place = self.new(f"getelementptr double, ptr %inputs, i64 {self._inputs[number][entry] * self._apart()}")
         return self.new(f"load {self._number}, ptr {place}, align 8")
+
+    def _apart(self) -> int:
+        """How far the entries of inputs are from each other."""
+        return self._beside
 
     def constant(self, value: float) -> str:
         """A constant."""
@@ -244,6 +255,9 @@ class _ColumnBody(_Body):
                 address = self._place("into", row)
                 self._lines.append(f"store {type_name(lanes)} {in_lanes(found)}, ptr {address}, align 8")
         self._lines += [f"%next = add i64 %k, {lanes}", "br label %ask", "done:", "ret void"]
+
+    def _apart(self) -> int:
+        return self._given.apart
 
     def _place(self, name: str, row: int) -> str:
         """Where the present columns of a row are."""

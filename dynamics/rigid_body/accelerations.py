@@ -12,6 +12,9 @@ from dynamics.compiled.lanes import ColumnFunction
 from dynamics.expressions import function
 from dynamics.parameters import LANES, ParameterLayout
 
+STAGES = 4
+"""Of a step of the integrator."""
+
 
 def free_acceleration(size: int, joints: int) -> ca.Function:
     """(factor of M (m, m), b (m,), J_theta (n, m), torque (n,)) -> q_ddot (m,) under torques at free joints, of m
@@ -40,9 +43,9 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     """Derivatives of the slope of the state of a platform with m coordinates, and of the net torque of joints, as if
     none was stuck.
 
-    What all columns share: what `motion_derivatives` returns; J_theta (n, m), and the same with zeros for stuck joints;
-    the factor of M (m, m); by what a joint's torque falls with its velocity (n,), and grows with its error, the
-    integral of that and the command's rate (n,). In each column the
+    What all columns share, of one of the stages that lie side by side: what `motion_derivatives` returns; J_theta (n,
+    m), and the same with zeros for stuck joints; the factor of M (m, m); by what a joint's torque falls with its
+    velocity (n,), and grows with its error, the integral of that and the command's rate (n,). In each column the
     derivatives of pose and rate (m,), joint integral, command and its rate (n,); of -M q_ddot - b (m,) and of the
     torque (n,) at a fixed state.
     In each column then: those of rate, acceleration (m,), command error and torque (n,).
@@ -71,7 +74,7 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     rows = [ca.vertcat(*row) for row in (pose, rate, integral, command, command_rate, push, direct)]
     outputs = [rate, _solved(factor, accelerations), errors, torques]
     found = ca.Function("slope_derivative", [*common, *rows], [ca.vertcat(*row) for row in outputs])
-    return ColumnFunction(found, len(common), layout.derivatives(m), LANES)
+    return ColumnFunction(found, len(common), layout.derivatives(m), LANES, STAGES)
 
 
 def factored(matrix: ca.SX) -> ca.SX:

@@ -22,6 +22,7 @@ from dynamics.kinematics.platform import PlatformJointMotion, joint_motion, pose
 from dynamics.legs.leg import Leg
 from dynamics.parameters import LANES, parameter_layout
 from dynamics.rigid_body.accelerations import (
+    STAGES,
     acceleration_in_lanes,
     factored,
     free_acceleration,
@@ -30,9 +31,6 @@ from dynamics.rigid_body.accelerations import (
 )
 from dynamics.rigid_body.jacobians import freedoms, platform_arms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
-
-STAGES = 4
-"""Of a step of the integrator."""
 
 
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:

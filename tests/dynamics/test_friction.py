@@ -17,8 +17,7 @@ from dynamics.compiled.lanes import PartedFunction
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.expressions import function
 from dynamics.kinematics.chart import Chart
-from dynamics.rigid_body.accelerations import factored, free_acceleration, response, slope_derivative
-from dynamics.rigid_body.equation_of_motion import STAGES
+from dynamics.rigid_body.accelerations import STAGES, factored, free_acceleration, response, slope_derivative
 from tests.dynamics.conftest import BOX, at_rest
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
@@ -39,7 +38,6 @@ def _six_masses():
     no_part = function("no_part", [*derived[0], nothing], [nothing])
     return [
         function("equation_of_motion", [pose, rate, rigid], [mass, column, unit, column, pose, rate, factored(mass)]),
-        function("motion_derivatives", *derived),
         PartedFunction(no_part, function("stage_derivatives", [*derived[0], nothing], derived[1]), np.zeros(1), STAGES),
         function("stop_derivatives", [pose, acceleration, torque, rigid], [zero, zero, columns]),
         function("rate_map_derivative", [pose, rate], [zero]),
