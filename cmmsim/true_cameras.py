@@ -22,7 +22,7 @@ from cmmsim.geometry.pose import Array, all_rigid, apply, checked_transform, pos
 from cmmsim.imaging.exposure import VirtualStereoCamera
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
-from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
+from cmmsim.imaging.scene import Mesh, PlacedBodies, scene_body, solid_mesh
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.statistical.conditions import Light, require_proved
 from cmmsim.statistical.exposure import STATISTICAL, StatisticalStereoCamera
@@ -73,8 +73,10 @@ class TrueCameras:
         self.obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
         self._draw_anew()
 
-    def placed(self, obstacles: Mapping[str, Array] | None) -> dict[str, Array]:
+    def placed(self, obstacles: Mapping[str, Array] | None) -> Mapping[str, Array]:
         """Obstacles at base_from_body (4,4) each, checked. Raises as ``Sensor.look``."""
+        if isinstance(obstacles, PlacedBodies) and self._are_placed(obstacles):  # a robot's legs, every frame
+            return obstacles
         obstacles = {} if obstacles is None else obstacles
         require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
         for name in obstacles:
@@ -83,11 +85,18 @@ class TrueCameras:
         plain = [place for place in obstacles.values() if isinstance(place, np.ndarray) and place.shape == (4, 4)]
         if plain and len(plain) == len(obstacles):
             together = np.array(plain)
-            if together.dtype == float and all_rigid(together):  # a robot's legs, every frame
+            if together.dtype == float and all_rigid(together):
                 return dict(zip(obstacles, together, strict=True))
         return {
             name: checked_transform(place, f"obstacle {name!r}: base_from_body") for name, place in obstacles.items()
         }
+
+    def _are_placed(self, bodies: PlacedBodies) -> bool:
+        """Whether they are all of the obstacles, in their order, and stand where bodies can."""
+        shape = len(self.obstacles), 4, 4
+        if bodies.names != tuple(self.obstacles) or bodies.together.shape != shape or bodies.together.dtype != float:
+            return False
+        return all_rigid(bodies.together)
 
     def move(self, changes: Mapping[str, float], right_later: float) -> None:
         """As ``Sensor.move_rig``."""

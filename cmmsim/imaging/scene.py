@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,6 +158,26 @@ def rod_transforms(starts: Array, ends: Array) -> Array:
             "needed"
         )
     return transforms
+
+
+class PlacedBodies(Mapping[str, Array]):
+    """Bodies by their names, at base_from_body ``together`` (k,4,4): a mapping that need not be put together again, for
+    a sensor that is asked for every frame."""
+
+    def __init__(self, names: tuple[str, ...], together: Array) -> None:
+        self.names, self.together = names, together
+
+    def __getitem__(self, name: str) -> Array:
+        try:
+            return np.asarray(self.together[self.names.index(name)])
+        except ValueError:
+            raise KeyError(name) from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
 
 
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:

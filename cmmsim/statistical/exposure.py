@@ -22,6 +22,7 @@ from cmmsim.geometry.pose import IDENTITY, Array, frozen, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.exposure import Quality
 from cmmsim.imaging.renderer import Renderer
+from cmmsim.imaging.scene import PlacedBodies
 from cmmsim.plugins import RENDERERS
 from cmmsim.pose_estimation.observation import Observer
 from cmmsim.radiometry.noise import CameraNoise
@@ -90,6 +91,8 @@ class StatisticalStereoCamera:
 
     def placed(self, obstacles: Mapping[str, Array]) -> Array:
         """base_from_body (b,4,4) of the base and of all obstacles; those without a place lie far below."""
+        if isinstance(obstacles, PlacedBodies) and obstacles.names == tuple(self.obstacle_names):
+            return np.concatenate((IDENTITY[None], obstacles.together))
         return np.array([IDENTITY, *(obstacles.get(name, ABSENT) for name in self.obstacle_names)])
 
     def centre_error_px(self, quality: Quality) -> float:

@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 import cmmsim
 from cmmsim.files import SensorFile, read_sensor_file
@@ -13,9 +15,10 @@ from cmmsim.files.schema import unit
 from cmmsim.files.setup import marked_body
 from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.imaging.renderer import choose_renderer
-from cmmsim.imaging.scene import rod_transforms
+from cmmsim.imaging.scene import PlacedBodies, rod_transforms
 from dynamics import Robot
-from dynamics.bodies import parts_of
+from dynamics.bodies import Part, parts_of
+from dynamics.geometry import RobotGeometry
 from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.progress import Advance
@@ -27,18 +30,31 @@ OFF_PLATFORM_M = 0.05
 
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
     """Meshes [m] of the bodies of all legs, rods along their z axes from their first joints; they hide stickers."""
+    return dict(_meshes(robot.geometry))
+
+
+@lru_cache(maxsize=4)
+def _meshes(geometry: RobotGeometry) -> dict[str, trimesh.Trimesh]:
+    """Those of a geometry, made once a process: rows of a study have a sensor each, and mostly the same robot."""
     return {
         part.name: cmmsim.rod(float(np.linalg.norm(np.diff(part.segment.rod, axis=0))), part.segment.radius)
-        for part in sorted(parts_of(robot.geometry).all, key=lambda part: part.body)  # as parameters are ordered
+        for part in _drawn(geometry)[0]
     }
 
 
-def robot_transforms(robot: Robot, pose: Array) -> dict[str, Array]:
-    """base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,)."""
-    parts = parts_of(robot.geometry)
-    ends = np.asarray(parts.rods(robot, pose), dtype=float)
-    places = rod_transforms(ends[:, 0], ends[:, 1])
-    return dict(zip((part.name for part in parts.all), places, strict=True))
+@lru_cache(maxsize=16)
+def _drawn(geometry: RobotGeometry) -> tuple[list[Part], tuple[str, ...], NDArray[np.int_]]:
+    """The parts of a geometry as its parameters are ordered, their names, and their places leg by leg."""
+    parts = parts_of(geometry).all
+    places = sorted(range(len(parts)), key=lambda place: parts[place].body)
+    return [parts[place] for place in places], tuple(parts[place].name for place in places), np.array(places)
+
+
+def robot_transforms(robot: Robot, pose: Array) -> PlacedBodies:
+    """base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,), in the order of their meshes."""
+    _, names, order = _drawn(robot.geometry)
+    ends = parts_of(robot.geometry).rods(robot, pose)[order]
+    return PlacedBodies(names, rod_transforms(ends[:, 0], ends[:, 1]))
 
 
 def make_sensor(

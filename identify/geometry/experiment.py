@@ -5,6 +5,7 @@ puts it, and an encoder's offset is part of that geometry. Poses are measured th
 that the sensor states for one image.
 """
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -115,7 +116,7 @@ def measured(sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, see
     return Sighted(means, stated * kept[:, None, None], seen, int(len(poses) * frames - counts.sum()))
 
 
-def _frames_at(sensor: cmmsim.Sensor, pose: Array, bodies: dict[str, Array], frames: int) -> tuple[Array, Array]:
+def _frames_at(sensor: cmmsim.Sensor, pose: Array, bodies: Mapping[str, Array], frames: int) -> tuple[Array, Array]:
     """Poses (k, 6) and covariances (k, 6, 6) of the frames at a pose that gave one: images are searched as a whole
     until they give one, in all others stickers are looked for near that."""
     left = frames

@@ -1,5 +1,6 @@
 """A robot and the stereo sensor that looks at it, as they stand: bodies, stickers, legs and cameras, to be drawn."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -159,7 +160,7 @@ class Workcell:
             sensor.add_bodies(robot_meshes(self.robot))
         return sensor
 
-    def obstacles(self, pose: Array) -> dict[str, Array]:
+    def obstacles(self, pose: Array) -> Mapping[str, Array]:
         """base_from_body (4, 4) by name of the legs' bodies, which may hide stickers, at a pose (6,)."""
         return {} if self.robot is None else robot_transforms(self.robot, pose)
 

@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 
 import cmmsim
+from cmmsim.imaging.scene import PlacedBodies
 from cmmsim.pose_estimation.estimator import lost_measurement
 from dynamics.closed_loop import simulate
 from dynamics.errors import SimulationError
@@ -17,7 +18,7 @@ from identify.estimation.identification import identify
 from identify.experiment.joint_instruments import measure_joints
 from identify.experiment.plant import build_plant
 from identify.experiment.run import run_experiment, run_plant, taught_sensor
-from identify.experiment.sensor_in_loop import make_sensor, robot_transforms
+from identify.experiment.sensor_in_loop import make_sensor, robot_meshes, robot_transforms
 from identify.experiment.truth import check_truth, read_truth, true_poses
 from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
@@ -68,6 +69,27 @@ def test_rods_join_the_robots_joints():
         assert np.allclose(crank[:3, 3], robot.geometry.base_joints[leg], atol=1e-12)
         assert np.allclose(tip, link[:3, 3], atol=1e-12)
         assert np.allclose(end, joint, atol=1e-12)
+
+
+def test_legs_that_are_placed_together_are_those_placed_one_by_one(sensor):
+    """Also in another order, and where one of them is missing; what is no place is refused by its name."""
+    robot = rss6()
+    pose = robot.home_pose + np.array([0.004, -0.006, 0.005, 0.02, -0.01, 0.03])
+    together, found = robot_transforms(robot, pose), []
+    assert together.names == tuple(robot_meshes(robot))
+    assert (len(together), "crank7" in together) == (12, False)
+    for placed in (together, dict(together), dict(reversed([*together.items()]))):
+        sensor.start_run(3)
+        found.append(sensor.measure(pose, placed))
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.pose, found[0].pose)
+        np.testing.assert_array_equal(other.target_ids, found[0].target_ids)
+    torn = PlacedBodies(together.names, together.together + np.eye(4)[3])
+    for wrong in (torn, PlacedBodies(together.names, 1.01 * together.together)):
+        with pytest.raises(cmmsim.ShapeError, match="obstacle 'crank1'"):
+            sensor.measure(pose, wrong)
+    with pytest.raises(cmmsim.UnknownBodyError, match="crank9"):
+        sensor.measure(pose, PlacedBodies(("crank9",), together.together[:1]))
 
 
 def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(sensor):
