@@ -3,11 +3,11 @@
 Each field states its unit; an error names the key, the value, the unit and, for a wrong name, the valid names.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
@@ -198,8 +198,17 @@ def scenario_schema() -> dict[str, Any]:
     return Scenario.model_json_schema()
 
 
+def numbers_by_name() -> Iterator[str]:
+    """The keys of a scenario, dotted, whose values are tables of numbers by names, which may have dots themselves."""
+    for section, field in Scenario.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            entries = field.annotation.model_fields.items()
+            yield from (f"{section}.{name}" for name, entry in entries if entry.annotation == dict[str, float])
+
+
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:
-    *sections, key = path.split(".", 1 if path.startswith("sensor_changes.") else -1)
+    table = next((one for one in ("sensor_changes", *numbers_by_name()) if path.startswith(f"{one}.")), "")
+    *sections, key = path.split(".", table.count(".") + 1 if table else -1)
     for section in sections:
         data = data.setdefault(section, {})
         if not isinstance(data, dict):

@@ -23,6 +23,7 @@ from identify.errors import ScenarioError, StudyError
 from identify.experiment.sensor_in_loop import sensor_file, with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
+from identify.scenario.scenario import numbers_by_name
 from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.kind import Kind, check_read
 from identify.studies.study_file import Law, Range, Study
@@ -117,7 +118,7 @@ class Design:
         if isinstance(values, list):
             return values[int(share * len(values))]
         kind = KINDS.get(self._study.kind)  # a table is read where the module of one's own kind may not be
-        field = valid_keys(kind.options if kind else None).get(path)
+        field = field_of(path, kind.options if kind else None)
         if field is not None and field.annotation is int:
             return int(values.low) + int(share * (values.high - values.low + 1))
         if values.scale == "log":
@@ -204,13 +205,13 @@ def _check_values(path: str, values: list[Any], kind: Kind) -> None:
     """Refuse a path that does not exist and values that are not of its type; options of one's own kind may be any."""
     if kind.options is None and path.startswith("options."):
         return
-    known = valid_keys(kind.options)
-    if path not in known:
+    known, field = valid_keys(kind.options), field_of(path, kind.options)
+    if field is None:
         own = [key for key in known if path.startswith("options.") and key.startswith("options.")]
         valid = f"the kind has {', '.join(own)}" if own else _nearest(path, known)
         raise StudyError(f"unknown key {path!r}; {valid}")
     # As in JSON, so that a list is a tuple's spelling but a text or a truth value is no number.
-    annotation: Any = Annotated[known[path].annotation, known[path]]
+    annotation: Any = Annotated[field.annotation, field]
     adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=ConfigDict(allow_inf_nan=False))
     for value in values:
         try:
@@ -230,6 +231,13 @@ def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
     for path in (f"scenario.{SENSOR_CHANGES}", "sensor.based_on"):
         del found[path]
     return found | (_leaves(options, "options.") if options is not None else {})
+
+
+def field_of(path: str, options: type[BaseModel] | None = None) -> FieldInfo | None:
+    """The field of a dotted path that a study may vary, or of a number by its name in a table of such; None: none."""
+    tables = (f"scenario.{table}." for table in numbers_by_name())
+    entry = FieldInfo(annotation=float) if path.startswith(tuple(tables)) else None
+    return valid_keys(options).get(path, entry)
 
 
 def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:

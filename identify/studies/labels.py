@@ -3,7 +3,7 @@
 import re
 from textwrap import wrap
 
-from identify.studies.design import valid_keys
+from identify.studies.design import field_of, valid_keys
 from identify.studies.rows import KINDS
 from identify.studies.study_file import Study
 
@@ -28,9 +28,11 @@ WIDEST = 36
 
 def factor_unit(path: str) -> str:
     """Unit of a factor by dotted path; empty where it has none."""
-    field = valid_keys(None).get(path)
+    field = field_of(path)
     if field is None:
         return "s" if path.startswith("options.") and path.endswith("_s") else ""
+    if path not in valid_keys(None):
+        return _suffix(path)[1]
     extra = field.json_schema_extra
     unit = str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
     return "" if unit == "1" else unit
@@ -81,7 +83,7 @@ def _words(name: str, study: Study) -> str:
         said = columns[name].meaning
     else:
         kind = KINDS.get(study.kind)
-        field = valid_keys(kind.options if kind else None).get(name)
+        field = field_of(name, kind.options if kind else None)
         said = (field.description if field is not None else None) or ""
     first = re.split(r"[;:]", said)[0]
     return _plain_name(name) if not first or first.startswith("the same") else first

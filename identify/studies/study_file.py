@@ -157,9 +157,10 @@ class Study(Section):
                 data[path] = value
             elif root in ("scenario", "sensor", "options") and key:
                 place, name = ("options", key) if root == "options" else ("changes", path)
-                data["factors"].pop(path, None)
-                data[place].pop(name, None)
-                table, name = ("factors", path) if isinstance(value, (list, dict)) else (place, name)
+                for held, old in (("factors", path), (place, name)):  # and what stands in a table of this name
+                    data[held] = {key: one for key, one in data[held].items() if not f"{key}.".startswith(f"{old}.")}
+                varied = isinstance(value, list) or (isinstance(value, dict) and set(value) & set(Range.model_fields))
+                table, name = ("factors", path) if varied else (place, name)
                 data[table][name] = value
             else:
                 raise StudyError(

@@ -158,6 +158,39 @@ def test_factors_may_be_written_as_dotted_keys_tables_or_quoted_paths():
         assert STUDIES.from_toml(toml(factors=text), "study") == STUDIES.from_toml(toml(), "study")
 
 
+DRIFT = "scenario.rig.drift.right.cx_px"
+
+
+def test_numbers_by_names_with_dots_are_varied_by_name_or_as_a_table():
+    """How far a camera drifts, as a change, a factor, a setting of the command line, or several at once."""
+
+    def drifts(chosen):
+        return [prepare(chosen).row_scenario(case).rig.drift for case in cases(chosen)]
+
+    def written(lines, factors="scenario.servo.ki = [2.4]"):
+        return STUDIES.from_toml(toml(lines, factors=factors), "mine")
+
+    drift, none = "scenario.rig.drift", {"scenario.rig.drift": {}}
+    table = written(f'[changes]\n{drift} = {{ "right.cx_px" = 0.1, "left.cx_px" = 0.2 }}')
+    assert drifts(table) == [{"right.cx_px": 0.1, "left.cx_px": 0.2}]
+    assert drifts(table.with_settings({DRIFT: 0.3})) == [{"right.cx_px": 0.3, "left.cx_px": 0.2}]
+    assert drifts(table.with_settings({drift: {"right.cx_px": 0.4}})) == [{"right.cx_px": 0.4}]
+    assert drifts(table.with_settings(none)) == [{}]
+    factor = written("", f'{drift}."right.cx_px" = [0.0, 0.1]')
+    assert (
+        drifts(factor)
+        == [{"right.cx_px": 0.0}, {"right.cx_px": 0.1}]
+        == drifts(written("").with_settings({DRIFT: [0.0, 0.1]}))
+    )
+    assert list(factor.factors) == [DRIFT]
+    assert factor_unit(DRIFT) == "px"
+    assert drifts(written("", f'{drift} = [{{}}, {{ "right.cx_px" = 0.1 }}]')) == [{}, {"right.cx_px": 0.1}]
+    assert "input should be a valid number" in refusal(StudyError, prepare, written("", f'{drift}."a.b" = ["x"]'))
+    assert "do not read it" in refusal(
+        StudyError, prepare, STUDIES.from_toml(toml("", "static_pose", f'{drift}."right.cx_px" = [0.1]'), "mine")
+    )
+
+
 def plain_row(scenario, seed):
     """A row of a study without options."""
     return {"rate_hz": scenario.timing.frame_rate_hz, "draw": float(np.random.default_rng(seed).normal())}

@@ -50,8 +50,8 @@ class Reads:
 
 
 def among(path: str, keys: tuple[str, ...]) -> bool:
-    """Whether a path is one of the keys, or in a section of them."""
-    return any(path == key or (key.endswith(".") and path.startswith(key)) for key in keys)
+    """Whether a path is one of the keys, or in a section or a table of them."""
+    return any(path == key or path.startswith(f"{key.removesuffix('.')}.") for key in keys)
 
 
 def timing(*names: str) -> tuple[str, ...]:
