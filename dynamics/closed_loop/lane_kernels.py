@@ -8,9 +8,9 @@ import numpy as np
 
 from dynamics.closed_loop.frame_kernels import begin, next_span
 from dynamics.closed_loop.linear_algebra_kernels import copy
-from dynamics.closed_loop.motion_kernels import OK, count_stuck, drive, hold_stuck, push, take_known
+from dynamics.closed_loop.motion_kernels import OK, count_stuck, drive, hold_stuck, push
 from dynamics.closed_loop.sensitivity_kernels import END
-from dynamics.closed_loop.stick_slip_kernels import judge, next_step, set_stage
+from dynamics.closed_loop.stick_slip_kernels import BRACKET, TAKEN, begin_step, judge, next_step, set_stage
 from dynamics.compiled.kernel import Array, Record, call_columns, entry, invoke, kernel
 from dynamics.parameters import LANES
 
@@ -28,11 +28,8 @@ def evaluate_lanes(task: Record, now: Record, at: Record, d: Record, lanes: Reco
         own, stage = now[lane], at[lane, k]
         if own.status != OK:
             continue
-        if k == END:
-            copy(stage.state[: 2 * size], own.known.inputs[: 2 * size])
-            take_lane(lanes, lane, own.known)
-            take_known(own.known, stage)
-        elif task.stiffness == 0 and count_stuck(own) > 1:
+        stuck = count_stuck(own)
+        if task.stiffness == 0 and (stuck > 1 or (k == END and (stuck > 0 or own.purpose >= BRACKET))):
             take_lane(lanes, lane, stage)
         for i in range(count):
             stage.angle[i], stage.velocity[i] = lanes.angle[i, lane], lanes.velocity[i, lane]
@@ -40,7 +37,7 @@ def evaluate_lanes(task: Record, now: Record, at: Record, d: Record, lanes: Reco
         push(task, own, stage)
         for i in range(count):
             lanes.push[i, lane] = stage.spring[i] if task.stiffness > 0 else stage.net_torque[i]
-        if count_stuck(own) > 0:
+        if stuck > 0:
             joint = own.stuck[0]
             stage.bias_acceleration[joint] = lanes.bias_acceleration[joint, lane]
             for j in range(size):
@@ -84,8 +81,19 @@ def take_lane(lanes: Record, lane: int, into: Record) -> None:
 
 
 @kernel
+def know_lane(now: Record, at: Record, lanes: Record, lane: int) -> None:
+    """Keep what is known of the platform at the end of a span, where the next one begins."""
+    known, size = now.known, len(at.bias)
+    copy(at.state[: 2 * size], known.inputs[: 2 * size])
+    take_lane(lanes, lane, known)
+    known.valid = True
+
+
+@kernel
 def try_steps(task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array) -> None:
     """The steps that lanes ask for; the status of each."""
+    for lane in asked:
+        now[lane].status = begin_step(task, now[lane], at[lane], d)
     for k in range(1, END + 1):
         for lane in asked:
             set_stage(now[lane], at[lane], k)
@@ -111,5 +119,8 @@ def run_lanes(task: Record, now: Record, at: Record, d: Record, plan: Record, re
                 count += 1
         try_steps(task, now, at, d, lanes, asked[:count])
         for lane in asked[:count]:
-            if now[lane].status == OK:
-                now[lane].status = judge(task, now[lane], at[lane], d)
+            own = now[lane]
+            if own.status == OK:
+                own.status = judge(task, own, at[lane], d)
+            if own.purpose == TAKEN and own.grid == own.steps and not own.moved:
+                know_lane(own, at[lane, 0], lanes, lane)

@@ -73,15 +73,15 @@ class Memory(NamedTuple):
 
 LAYOUT = {
     "task": "equation_of_motion! motion_in_lanes! free_acceleration! acceleration_in_lanes! response! "
-    "stage_derivatives! stop_derivatives! rate_map_derivative! slope_derivative! servo_jacobian! "
-    "evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! "
-    "measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! "
-    "torque_limit filter_time shown! pivots:r! rigid:r coulomb:n viscous:n friction=friction",
-    "now": "stages=stages known=known served=served stopping=stopping mode:n! stuck:n! "
-    "ramping! events! events_left! start_moves! time_moves! length_moves! width! parameters! step_column! elapsed "
-    "state:s command:n command_slope:n command_rate:n last_command:n last_measured:m servo_integral:m demand:m "
-    "change:m pose_and_rate:M rate_map:nm first_row! status! unknowns! frame! span! steps! grid! duration target "
-    "purpose! length trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
+    "stage_derivatives! stop_derivatives! rate_map_derivative! slope_derivative! servo_jacobian! evaluate_terms! "
+    "evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li "
+    "ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! torque_limit "
+    "filter_time shown! pivots:r! rigid:r coulomb:n viscous:n friction=friction",
+    "now": "stages=stages known=known served=served stopping=stopping mode:n! stuck:n! ramping! moved! events! "
+    "events_left! start_moves! time_moves! length_moves! width! parameters! step_column! elapsed state:s command:n "
+    "command_slope:n command_rate:n last_command:n last_measured:m servo_integral:m demand:m change:m "
+    "pose_and_rate:M rate_map:nm first_row! status! unknowns! frame! span! steps! grid! duration target purpose! "
+    "length trials! cut low high low_margin high_margin half_margin tried:4 tried_margin:4 tried_crossing:4",
     # first what `equation_of_motion` returns, in its order
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
     "served": "jacobian:nm inputs:j",
@@ -96,8 +96,8 @@ LAYOUT = {
     "velocity:n spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn "
     "stuck_factor:nn",
     # first what `motion_in_lanes` takes, then what it returns, and from the factor on what `acceleration_in_lanes` does
-    "lanes": "states:BL bias_acceleration:nL angle:nL velocity:nL factor:mmL bias:mL jacobian:nmL push:nL "
-    "row:mL acceleration:mL response:mL asked:L! shared:q",
+    "lanes": "states:BL bias_acceleration:nL angle:nL velocity:nL factor:mmL bias:mL jacobian:nmL push:nL row:mL "
+    "acceleration:mL response:mL asked:L! shared:q",
     # first the rows of `slope_derivative`; k: what it returns of each stage,
     # and before the torques the slopes of filtered rates, whose trials are `filtered`
     "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w "

@@ -53,8 +53,20 @@ def set_stage(now: Record, at: Record, k: int) -> None:
 
 
 @kernel
+def begin_step(task: Record, now: Record, at: Record, d: Record) -> int:
+    """Evaluate the state that the integrator has reached, unless that is known from the end of the step before."""
+    if not now.moved:
+        return OK
+    now.moved = 0
+    return invoke(task.evaluate, task, now, at[0], d, 0)
+
+
+@kernel
 def try_step(task: Record, now: Record, at: Record, d: Record) -> int:
     """The Runge-Kutta step that is asked for, with fixed modes, from the evaluation `at[0]`: its stages and its end."""
+    status = begin_step(task, now, at, d)
+    if status != OK:
+        return status
     for k in range(1, END + 1):
         set_stage(now, at, k)
         status = invoke(task.evaluate, task, now, at[k], d, 0)
@@ -210,14 +222,6 @@ def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int
 
 
 @kernel
-def evaluate_anew(task: Record, now: Record, at: Record, d: Record, time: float) -> int:
-    """The evaluation at the state that the integrator has reached, from which the next step starts."""
-    copy(now.state[:], at[0].state[:])
-    at[0].time = time
-    return invoke(task.evaluate, task, now, at[0], d, 0)
-
-
-@kernel
 def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) -> int:
     """Change the modes; `held` is False where a joint that starts from rest turns back at once: it sticks."""
     end = at[END]
@@ -257,14 +261,16 @@ def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, hel
             at[0] = at[END]
             at[0].time = time
             return OK
-    return evaluate_anew(task, now, at, d, time)
+    copy(now.state[:], at[0].state[:])
+    at[0].time, now.moved = time, 1
+    return OK
 
 
 @kernel
 def begin_span(task: Record, now: Record, at: Record, d: Record, duration: float, steps: int) -> None:
     """Begin a time, s, with one command, whose torques are known. Modes are decided anew at its start, where these
     jump."""
-    start = at[0]
+    start, now.moved = at[0], 0
     follow_frictionless(task, now, start)
     invoke(task.decide_modes, task, now, start, d, 0)
     accelerate(task, now, start)
