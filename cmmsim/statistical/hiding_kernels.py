@@ -9,6 +9,7 @@ import numpy as np
 from cmmsim.compiled import Array, compiled
 from cmmsim.geometry.disc_kernels import probe_discs
 from cmmsim.imaging.kernels import enters
+from cmmsim.statistical.camera_kernels import carry
 
 PROBES = 12  # points about a sticker, asked with its middle whether a solid hides them
 TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
@@ -64,9 +65,10 @@ def hidden_stickers(
     solids that carry them, which do not hide them. Only stickers that are ``asked`` (n,) are looked at.
     """
     camera, eyes, point, probes = np.zeros(3), np.empty((len(moves), 3)), np.empty(3), np.empty((1, PROBES + 1, 3))
-    reach = np.full(1, clear)
+    middles, reach = np.empty((len(moves), 3)), np.full(1, clear)
     for b in range(len(moves)):
         to_body(moves[b], camera, eyes[b])
+        carry(moves[b], solids.middles[b], 1.0, middles[b])
     for n in range(len(places)):
         hidden[n] = False
         if not asked[n]:
@@ -75,10 +77,10 @@ def hidden_stickers(
         for b in range(len(moves)):
             if b == owners[n] or hidden[n]:
                 continue
+            if not reaches(camera, places[n], middles[b], solids.radii[b] + clear):
+                continue
             eye = eyes[b]
             to_body(moves[b], places[n], point)
-            if not reaches(eye, point, solids.middles[b], solids.radii[b] + clear):
-                continue
             first, last = solids.starts[b], solids.starts[b + 1]
             faces, offsets = solids.normals[first:last], solids.offsets[first:last]
             if not enters(eye, point, faces, offsets, clear, 0.0):
