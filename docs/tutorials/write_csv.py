@@ -14,6 +14,7 @@ for kind in ("reference", "measured"):
         columns[f"{kind}_{name}_rad"] = record[f"{kind}_orientation"].values[:, k]
 for k in range(record.sizes["joint"]):
     columns[f"command_{k + 1}_rad"] = record["command"].values[:, k]
+columns["command_time_s"] = record["command_time"].values
 pd.DataFrame(columns).to_csv("mine.csv", index=False)
 
 std = np.sqrt(np.einsum("nii->ni", record["measured_covariance"].values).mean(axis=0))

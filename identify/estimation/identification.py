@@ -28,6 +28,7 @@ from identify.estimation.warm_start import linear_warm_start
 from identify.loop_parameters import with_drive
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
+from identify.record.command_times import command_time_warnings
 from identify.record.drift import drift_warnings
 from identify.record.law import SERVO, recorded_law
 from identify.record.provenance import recorded_seed
@@ -74,6 +75,7 @@ def identify(
     driven = judged if method == "command_driven" else by_commands.linearised()
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
+    told = (*command_time_warnings(records, scenario.timing), *drift_warnings(records))
     ended = time.perf_counter()
     return IdentificationResult(
         layout=robot.layout,
@@ -100,7 +102,7 @@ def identify(
             "search": searched - warmed,
             "uncertainty": ended - searched,
         },
-        **vars(judgement) | {"warnings": (*drift_warnings(records), *drive.warnings(), *judgement.warnings)},
+        **vars(judgement) | {"warnings": (*told, *drive.warnings(), *judgement.warnings)},
     )
 
 

@@ -5,6 +5,8 @@ loop. Of a record that says nothing of it the model's commands have the latency 
 far the mean latency is from what is stated (`timing.latency_std_s`), it does not know either.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 
@@ -57,6 +59,16 @@ def check_command_times(record: xr.Dataset, source: str) -> None:
                 f"{source}: {COMMAND_TIME} of frame {frames[0]} (t = {time[frames[0]]:.6g} s) is "
                 f"{acted[frames[0]]:.6g} s; it {what}" + (f"; so in {len(frames)} frames" if len(frames) > 1 else "")
             )
+
+
+def command_time_warnings(records: Sequence[xr.Dataset], timing: Timing) -> tuple[str, ...]:
+    """One line where a latency jitters, and a record does not say when its commands acted."""
+    if not timing.latency_jitter_s or all(COMMAND_TIME in record for record in records):
+        return ()
+    return (
+        f"the latency varies by {1e3 * timing.latency_jitter_s:.3g} ms from frame to frame, and a record does not say "
+        f"when its commands acted ({COMMAND_TIME}): the model takes the mean for all, and is another loop",
+    )
 
 
 def logged_latencies(record: xr.Dataset, timing: Timing) -> Array | None:

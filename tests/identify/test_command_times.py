@@ -57,6 +57,8 @@ def test_a_record_with_half_a_frame_of_jitter_is_identified_as_well_as_one_witho
     assert not blind.groups.identifiable.any()
     assert blind.noise_ratio > 5 * blind.expected_noise_ratio
     assert blind.whiteness.p_value < 1e-9
+    assert "a record does not say when its commands acted" in blind.warnings[0]
+    assert not any("commands acted" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize("hold", ["zero", "linear"])
