@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.sharedctypes import Synchronized
 
 import numpy as np
@@ -17,10 +17,11 @@ from scipy.linalg import block_diag
 
 import cmmsim
 from dynamics import Robot
-from dynamics.closed_loop import ClosedLoopRun, LoopFailure, Reference, simulate
+from dynamics.closed_loop import LoopFailure, Reference, simulate
 from dynamics.closed_loop.problem import checked_loop_parameters
 from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
+from identify.estimation.base_parameters import structure
 from identify.estimation.covariance import repeated_experiments
 from identify.excitation.design import unseen_trajectories
 from identify.experiment.plant import build_plant
@@ -115,14 +116,14 @@ class PosePrediction:
     states it, and the geometry: the servo takes the platform where such an error does not show, the whole motion with
     the same draw. What the record of the identification taught of that draw is in poses and covariance.
 
-    model: its run, with sensitivities by all parameters, where that is one of reference and latencies alone: no frame
-    is lost, and poses have nothing in common.
+    slopes (N, 6, p): sensitivities of the poses, where these are of reference and latencies alone: no frame is lost,
+    and poses have nothing in common.
     """
 
     chart: Chart
     poses: Array
     covariance: Array
-    model: ClosedLoopRun | None = None
+    slopes: Array | None = None
 
     @property
     def std(self) -> Array:
@@ -168,11 +169,12 @@ def predict_poses(
         drawn.append(repeated.pose - model.pose)
     noise = np.concatenate(drawn)
     common = run.pose_modes(parameters)
-    slopes = np.concatenate([model.pose_sensitivity, common @ root], axis=2)
+    by_parameters = run.of_all(model.pose_sensitivity)
+    slopes = np.concatenate([by_parameters, common @ root], axis=2)
     spread = slopes @ known @ slopes.transpose(0, 2, 1) + noise.T @ noise / len(noise)
     alone = run.ok.all() and not (run.driven or run.common.all_names or run.payload.any())
     poses = model.pose + common[:, :, inside:] @ likely[inside:]
-    return PosePrediction(run.robot.geometry.chart, poses, spread, model if alone else None)
+    return PosePrediction(run.robot.geometry.chart, poses, spread, by_parameters if alone else None)
 
 
 def _known_in_common(
@@ -212,7 +214,8 @@ def predicted_runs(
         for number, record in enumerate(records, start=1):
             rng = np.random.default_rng(stream_seed(seed, PREDICTION, number))
             try:
-                prediction = predict_poses(watched_run(record, robot, scenario), parameters, covariance, rng, learned)
+                run = replace(watched_run(record, robot, scenario), groups=structure(robot).rigid_groups)
+                prediction = predict_poses(run, parameters, covariance, rng, learned)
             except (LoopFailure, TooFewFramesError):
                 shape = (record.sizes["time"], 6)
                 chart = robot.geometry.chart

@@ -9,6 +9,7 @@ from dynamics.closed_loop import LoopFailure, equilibrium, simulate
 from dynamics.closed_loop.drives import joint_law
 from dynamics.errors import ParameterError
 from identify.errors import EstimationError
+from identify.estimation.base_parameters import structure
 from identify.estimation.covariance import correlation_matrix, estimate_uncertainty
 from identify.estimation.identifiability import POOR
 from identify.estimation.identification import identify, output_error_problem
@@ -122,15 +123,19 @@ def test_the_error_on_unseen_motions_is_the_one_predicted(scenario, ensemble):
         assert np.all(unseen_error(scenario, ensemble[experiment].estimate) < np.repeat(limits, 3)), experiment
 
 
-def test_a_prediction_keeps_the_models_run_where_no_frame_was_lost(scenario):
+def test_a_prediction_keeps_the_models_slopes_where_no_frame_was_lost(scenario):
+    """Found by the parameters that stand for all, they are those by all."""
     record, _ = run_plant(scenario, seed=3, trajectory_seed=4, duration_s=3.0)
     run, rng = recorded_run(record, rss6(), scenario), np.random.default_rng(0)
-    kept = predict_poses(replace(run, ok=np.ones_like(run.ok)), truth(), np.zeros((67, 67)), rng).model
+    whole, few = (np.arange(len(run.ok)) != lost for lost in (-1, 20))
     alone = simulate(rss6(), truth(), run.reference, run.settings, sensitivities=True)
-    np.testing.assert_array_equal(kept.pose, alone.pose)
-    np.testing.assert_array_equal(kept.pose_sensitivity, alone.pose_sensitivity)
-    few = np.arange(len(run.ok)) != 20
-    assert predict_poses(replace(run, ok=few), truth(), np.zeros((67, 67)), rng).model is None
+    for groups in (None, structure(rss6()).rigid_groups):
+        one = replace(run, ok=whole, groups=groups)
+        found = predict_poses(one, truth(), np.zeros((67, 67)), rng)
+        np.testing.assert_array_equal(found.poses, alone.pose)
+        scale = np.abs(alone.pose_sensitivity).max()
+        np.testing.assert_allclose(found.slopes, alone.pose_sensitivity, rtol=0, atol=1e-12 * scale)
+        assert predict_poses(replace(one, ok=few), truth(), np.zeros((67, 67)), rng).slopes is None
 
 
 @pytest.mark.slow

@@ -196,7 +196,8 @@ def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_predi
     truth = build_plant(settings, robot).parameters
     error = 1e-4 * truth * np.random.default_rng(0).normal(size=len(truth))
     model = simulate(robot, truth + error, reference, model_settings(robot, settings), sensitivities=True)
-    found = prediction_figures([model], np.outer(error, error), [model_run(robot, settings, truth, reference)])
+    true = model_run(robot, settings, truth, reference)
+    found = prediction_figures([(model.pose, model.pose_sensitivity)], np.outer(error, error), [true])
     assert found["prediction_rms_um"] > 0.01
     assert found["stated_prediction_rms_um"] == pytest.approx(found["prediction_rms_um"], rel=0.01)
 

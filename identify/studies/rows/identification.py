@@ -16,7 +16,7 @@ from pydantic import Field
 
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import ClosedLoopRun, simulate
+from dynamics.closed_loop import simulate
 from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
@@ -189,13 +189,15 @@ def _unseen_figures(
     settings = model_settings(robot, scenario)
     models = []
     for of, one in zip(predicted, unseen, strict=True):
+        if of.slopes is not None:
+            models.append((of.poses, of.slopes))
+            continue
         reference, latencies = recorded_reference(one.record), logged_latencies(one.record, scenario.timing)
-        models.append(
-            of.model or simulate(robot, result.estimate, reference, settings, sensitivities=True, latencies=latencies)
-        )
+        run = simulate(robot, result.estimate, reference, settings, sensitivities=True, latencies=latencies)
+        assert run.pose_sensitivity is not None
+        models.append((run.pose, run.pose_sensitivity))
     true = [model_on_record(robot, scenario, plant.parameters, one.record) for one in unseen]
-    pairs = zip(models, unseen, strict=True)
-    errors = np.concatenate([model.pose - true_poses(one.truth) for model, one in pairs])
+    errors = np.concatenate([poses - true_poses(one.truth) for (poses, _), one in zip(models, unseen, strict=True)])
     return prediction_figures(models, result.covariance, true) | {
         "unseen_position_rms_um": rms_um(errors[:, :3]),
         "unseen_orientation_rms_urad": rms_um(errors[:, 3:]),
@@ -231,19 +233,18 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     return row | {"noise_ratio": result.noise_ratio, "iterations": result.iterations}
 
 
-def prediction_figures(models: list[ClosedLoopRun], covariance: Array, true: list[Array]) -> Row:
+def prediction_figures(models: list[tuple[Array, Array]], covariance: Array, true: list[Array]) -> Row:
     """What the error of parameters, estimated with a covariance (p, p), makes of the model's positions, and what the
-    covariance states of it: by runs of the estimated model with sensitivities, and poses (N, 6) each of the true one.
+    covariance states of it: by poses (N, 6) of the estimated model, their slopes (N, 6, p), and poses of the true one.
 
     Every direction in which the parameters can err counts as much as it shows; so the figure has the scatter of many
     errors, where that of a few parameters that err together has the scatter of hardly two.
     """
     squares, stated = [], []
-    for model, poses in zip(models, true, strict=True):
-        assert model.pose_sensitivity is not None
-        slopes = model.pose_sensitivity[:, :3]
-        squares.append(np.mean((model.pose - poses)[:, :3] ** 2))
-        stated.append(np.mean(np.einsum("nip,pq,niq->ni", slopes, covariance, slopes, optimize=True)))
+    for (poses, slopes), true_ones in zip(models, true, strict=True):
+        shown = slopes[:, :3]
+        squares.append(np.mean((poses - true_ones)[:, :3] ** 2))
+        stated.append(np.mean(np.einsum("nip,pq,niq->ni", shown, covariance, shown, optimize=True)))
     return {
         "prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
         "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated))),
