@@ -237,6 +237,18 @@ def test_a_robot_that_no_law_keeps_on_its_motion_is_no_success(tmp_path, monkeyp
     assert "eigenvalue" in run["failed"]
 
 
+@pytest.mark.slow
+def test_an_exact_sensor_takes_away_more_than_half_of_an_error_that_noise_makes():
+    """Of a law that weighs what it sees by the noise that is stated, with a model that is one per cent off."""
+    chosen = plant()
+    known = KnownModel(chosen.parameters * (1 + 0.01 * np.random.default_rng(4).standard_normal(67)))
+    size = {}
+    for exact in (False, True):
+        drawn = by_drawing(NOISE, np.zeros(120, bool), np.random.default_rng(0), exact)
+        size[exact] = np.sqrt(np.mean(follow(chosen, "computed_torque", known, swing(), drawn).errors[:, :3] ** 2))
+    assert size[True] < 0.5 * size[False]
+
+
 def test_a_feedforward_that_is_lost_by_the_servos_gains_says_its_eigenvalue():
     """With an observer, too, as its corrections are those of the servo."""
     wild = plant(**{"servo.ki": 400.0})
