@@ -36,7 +36,6 @@ from identify.record.known_geometry import FOLDER, KnownGeometry, known_geometry
 from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
 from identify.record.recording import build_model_run, write_model_runs
-from identify.reporting.report import write_report
 from identify.reporting.run_result import add_truth, parameter_vector, prediction_entry, sensor_entry, validation_entry
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import estimator_settings, with_estimator_settings
@@ -260,6 +259,8 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
 
 def report(folder: Path, progress: Progress) -> None:
     """Draw the figures and write report.html."""
+    from identify.reporting.report import write_report  # imports Matplotlib, for which no other stage waits
+
     began = time.perf_counter()
     write_report(folder, progress)
     _add_seconds(RunFolder(folder), report=time.perf_counter() - began)
