@@ -9,7 +9,7 @@ import numpy as np
 
 from cmmsim.compiled import Array, compiled
 from cmmsim.detection.start_kernels import bound_radii, moments, start_ellipse
-from cmmsim.geometry.disc_kernels import blur_window, inverse_of
+from cmmsim.geometry.disc_kernels import blur_window, inverse_shape
 from cmmsim.geometry.point_kernels import factor, invert_factored, solve_factored
 from cmmsim.geometry.rim_kernels import cover_window
 
@@ -118,7 +118,7 @@ def add_products(rows: Array, normal: Array, right: Array) -> None:
 @compiled
 def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int:
     """Mark the pixels within ``reach`` radii of the ellipse; returns their number."""
-    m, count = inverse_of(shape), 0
+    m, count = inverse_shape(shape), 0
     for row in range(mask.shape[0]):
         for column in range(mask.shape[1]):
             x, y = column - parameters[0], row - parameters[1]

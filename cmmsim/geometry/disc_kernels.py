@@ -72,7 +72,7 @@ def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> 
 
 
 @compiled
-def inverse_of(shape: Array) -> Array:
+def inverse_shape(shape: Array) -> Array:
     """Inverse (2,2) of a (2,2) matrix."""
     det = shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0]
     m = np.empty((2, 2))
@@ -119,7 +119,7 @@ def blur_window(
     derivatives[:] = 0.0
     across_x, passed_x, across_y, passed_y = np.empty(width), np.empty(width), np.empty(height), np.empty(height)
     whole = np.zeros((height, width + 1))  # what passes all pixels left of a column
-    m, count = inverse_of(shape), rim_points(shape, psf_px)
+    m, count = inverse_shape(shape), rim_points(shape, psf_px)
     scale = 2.0 * math.pi / count * (shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0])
     reach = REACH * psf_px + 0.5
     for k in range(count):

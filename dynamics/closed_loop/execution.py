@@ -51,14 +51,13 @@ CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, st
 
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     """Do one run; see `closed_loop.simulate`."""
-    memory, record, frames = empty_memory(problem.sizes), empty_record(problem), problem.frames
+    frames = problem.frames
     commands = problem.commands  # a controller's are written frame by frame, and take the place of the servo's, too
     if commands is None:
         commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
-    plan, measured = _plan(problem, commands), np.full((frames, 6), np.nan)
-    own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
-    _fill(memory, problem, own, known["servo_jacobian"], _addresses(problem.sizes, compiled))
+    memory, record, plan, *_held = _set_up(problem, commands, compiled)
     do, arrays = chosen(run_frames, compiled), [part if part.ndim else part.base for part in memory]
+    measured = np.full((frames, 6), np.nan)
     for first, last in [(k, k + 1) for k in range(frames)] if problem.asked else [(0, frames)]:
         if problem.asked:
             try:
@@ -83,11 +82,9 @@ def run_repeats(problem: LoopProblem, noises: np.ndarray, compiled: bool = True)
 def _run_together(problem: LoopProblem, noises: np.ndarray, compiled: bool) -> list[ClosedLoopRun | LoopFailure]:
     """Runs that differ in their noise (runs, frames, 6), a lane each."""
     sizes, frames, runs = problem.sizes, problem.frames, len(noises)
-    memory, record = empty_memory(sizes), empty_record(problem, runs)
     commands = np.zeros((0, sizes.joints)) if problem.commands is None else problem.commands
-    plan = _plan(replace(problem, noise=noises.reshape(-1, 6)), commands)
-    own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
-    _fill(memory, problem, own, known["servo_jacobian"], _addresses(sizes, compiled))
+    every = replace(problem, noise=noises.reshape(-1, 6))
+    memory, record, plan, own, *_held = _set_up(every, commands, compiled, runs)
     for name in ("motion_in_lanes", "acceleration_in_lanes"):
         memory.task[name] = own[name].address
     lanes, at = empty("lanes", sizes), np.zeros((runs, 5), memory.evaluations.dtype)
@@ -105,6 +102,14 @@ def _run_together(problem: LoopProblem, noises: np.ndarray, compiled: bool) -> l
         else:
             found.append(_result(replace(problem, noise=noise), one, np.full((frames, 6), np.nan), now[lane]))
     return found
+
+
+def _set_up(problem: LoopProblem, commands: np.ndarray, compiled: bool, runs: int = 1) -> tuple[Any, ...]:
+    """Memory, record and plan of runs, and the functions of robot and servo, which the caller holds: code that nobody
+    holds is freed."""
+    memory, own, known = empty_memory(problem.sizes), problem.robot.functions, problem.servo_robot.functions
+    _fill(memory, problem, own, known["servo_jacobian"], _addresses(problem.sizes, compiled))
+    return memory, empty_record(problem, runs), _plan(problem, commands), own, known
 
 
 def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -> ClosedLoopRun:
