@@ -259,6 +259,15 @@ def follow_frictionless(task: Record, now: Record, at: Record) -> bool:
     return turns
 
 
+@kernel
+def all_hold(task: Record, now: Record, at: Record) -> bool:
+    """Whether no stuck joint is at its breakaway torque."""
+    holds = True
+    for i in range(len(now.mode)):
+        holds = holds and (now.mode[i] != 0 or abs(at.stick_force[i]) < breakaway(task, i))
+    return holds
+
+
 @entry
 def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Which of the joints in mode 0, at rest, stick, and how the others start: projected Gauss-Seidel on friction."""

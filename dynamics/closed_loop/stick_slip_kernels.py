@@ -9,6 +9,7 @@ from dynamics.closed_loop.motion_kernels import (
     OK,
     TOO_MANY_EVENTS,
     accelerate,
+    all_hold,
     count_stuck,
     follow_frictionless,
     hold_compliance,
@@ -269,11 +270,13 @@ def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, hel
 @kernel
 def begin_span(task: Record, now: Record, at: Record, d: Record, duration: float, steps: int) -> None:
     """Begin a time, s, with one command, whose torques are known. Modes are decided anew at its start, where these
-    jump."""
+    jump, unless all stuck joints hold."""
     start, now.moved = at[0], 0
     follow_frictionless(task, now, start)
-    invoke(task.decide_modes, task, now, start, d, 0)
     accelerate(task, now, start)
+    if not all_hold(task, now, start):
+        invoke(task.decide_modes, task, now, start, d, 0)
+        accelerate(task, now, start)
     if now.start_moves:
         rest_tangent(task, now, start, d)
     now.start_moves = 0
