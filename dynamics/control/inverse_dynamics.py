@@ -13,9 +13,9 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 """Gauss-Legendre quadrature; friction that turns within a span is met to some eighth of it."""
 
 
-VAGUE, FITTED = 1e-2, 1e-4
-"""What the torques of a model may walk from the true ones in a second, over the torque at rest, before a run has told:
-of a model that is a guess, and of one that fits what was measured."""
+VAGUE, FITTED = 5e-2, 5e-4
+"""How fast the torques of a model may depart from the true ones along a motion, over the torque at rest, 1/s, before a
+run has told: of a model that is a guess, and of one that fits what was measured."""
 
 
 class Motion(Protocol):
@@ -33,8 +33,8 @@ class Motion(Protocol):
 
 @dataclass(frozen=True)
 class Model:
-    """A robot as a law knows it: with all its parameters (p,), its law of friction, and a doubt: what its torques may
-    walk from the true ones in a second, over the torque at rest, as an observer first takes it."""
+    """A robot as a law knows it: with all its parameters (p,), its law of friction, and a doubt: how fast its torques
+    may depart from the true ones, over the torque at rest, 1/s, as an observer first takes it."""
 
     robot: Robot
     parameters: np.ndarray

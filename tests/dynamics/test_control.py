@@ -22,7 +22,7 @@ from dynamics.closed_loop import (
 from dynamics.control.computed_torque import WayBack, computed_torque, error_map
 from dynamics.control.feedforward import feedforward, joint_commands
 from dynamics.control.gains import design_servo, servo_figures, torque_figures
-from dynamics.control.inverse_dynamics import Model, spans
+from dynamics.control.inverse_dynamics import FITTED, Model, spans
 from dynamics.control.law import Assignment, Feedback
 from dynamics.errors import SimulationError
 
@@ -66,7 +66,7 @@ def follow(robot, timing, law, seconds=4.0, noise=NOISE, dropout=0.0, jitter=0.0
     drawn = rng.standard_normal((frames, 6)) * np.sqrt(np.diag(noise))
     reference = Reference(motion.pose(times), motion.pose_rate(times))
     task = Assignment(
-        Model(robot, parameters if known is None else known, settings.friction),
+        Model(robot, *((parameters, settings.friction, 5e-4) if known is None else (known, settings.friction))),
         motion,
         frames,
         settings,
