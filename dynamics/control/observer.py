@@ -83,9 +83,9 @@ class Observer:
         else:
             self._state[at.integral] = self._model.held(pose, self._drives)[1]
         scale = np.abs(torque).mean()
-        # what is wrong of a model is smooth along a motion: its change in a frame grows with the time, not with its root
+        # what is wrong of a model is smooth along a motion: its rate walks, and it changes by period^(3/2) in a frame
         walk, doubt = np.zeros(at.size), np.zeros(at.size)
-        walk[at.torque] = self._model.doubt * scale * np.sqrt(self._period)
+        walk[at.torque] = self._model.doubt * scale * self._period
         self._walk = np.diag(walk**2)
         jacobian = robot.coordinate_jacobian(pose)
         mass = free.T @ robot.mass_matrix(pose, self._model.dynamic) @ free

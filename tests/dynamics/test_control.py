@@ -28,6 +28,8 @@ from dynamics.errors import SimulationError
 
 SERVO = ServoGains(0.3, 0.001, 2.4)
 FAST, SLOW = FrameTiming(60.0), FrameTiming(29.0, 1 / 29)
+EXACT = 0.645 * FITTED
+"""Doubt of a model with the plant's parameters: what is left are the steps in which the observer follows."""
 NOISE = np.diag(np.repeat([5e-6, 30e-6], 3) ** 2)
 
 
@@ -66,7 +68,7 @@ def follow(robot, timing, law, seconds=4.0, noise=NOISE, dropout=0.0, jitter=0.0
     drawn = rng.standard_normal((frames, 6)) * np.sqrt(np.diag(noise))
     reference = Reference(motion.pose(times), motion.pose_rate(times))
     task = Assignment(
-        Model(robot, *((parameters, settings.friction, 5e-4) if known is None else (known, settings.friction))),
+        Model(robot, *((parameters, settings.friction, EXACT) if known is None else (known, settings.friction))),
         motion,
         frames,
         settings,

@@ -101,9 +101,9 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
 def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptions) -> KnownModel:
     """The model that the law knows."""
     if options.model_error is not None:
-        start = known_model(plant, "initial", None)
-        between = plant.parameters + options.model_error * (start.parameters - plant.parameters)
-        return replace(start, parameters=between)
+        start, truth = (known_model(plant, name, None) for name in ("initial", "true"))
+        between = truth.parameters + options.model_error * (start.parameters - truth.parameters)
+        return replace(start if options.model_error else truth, parameters=between)
     if options.model != "identified":
         return known_model(plant, options.model, None)
     trajectory = designed_trajectories(plant.scenario, options.trajectory_seed).excitation
