@@ -18,7 +18,7 @@ from dynamics.closed_loop.run import LoopFailure
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.prediction import Prediction
 
-STEP = 4e-3
+STEP = 3e-3
 """Of the prediction, s, at most: what dry friction does to a joint that turns back takes some milliseconds."""
 
 PLACE_DOUBT, RATE_DOUBT, TORQUE_DOUBT = 1e-4, 1e-5, 1e-3
