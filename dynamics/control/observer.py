@@ -27,6 +27,9 @@ PLACE_DOUBT, RATE_DOUBT, TORQUE_DOUBT = 1e-4, 1e-5, 1e-3
 VISCOUS_DOUBT = 5.0
 """Standard deviation of the viscous friction that the model does not know of, over the inertia at the joint, 1/s."""
 
+SCALE_FELT = 2.0
+"""How much more of a model's error torques meet than joint commands do: that of the factor common to all parameters."""
+
 MEMORY = 2.0
 """Time, s, over which what innovations said of the scales fades: what was learnt far from the truth, of a slope that is
 another there, would hold them back."""
@@ -85,7 +88,8 @@ class Observer:
         scale = np.abs(torque).mean()
         # what is wrong of a model is smooth along a motion: its rate walks, and it changes by period^(3/2) in a frame
         walk, doubt = np.zeros(at.size), np.zeros(at.size)
-        walk[at.torque] = self._model.doubt * scale * self._period
+        felt_scale = SCALE_FELT if self._drives.torques else 1.0
+        walk[at.torque] = felt_scale * self._model.doubt * scale * self._period
         self._walk = np.diag(walk**2)
         jacobian = robot.coordinate_jacobian(pose)
         mass = free.T @ robot.mass_matrix(pose, self._model.dynamic) @ free
