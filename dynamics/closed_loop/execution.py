@@ -127,7 +127,7 @@ def _poses(problem: LoopProblem, found: dict[str, Any], measured: np.ndarray) ->
     if problem.sensor is None:
         poses["measured"] = chart.pose(found["measured"])
         poses["measured"][~found["measured_ok"]] = np.nan
-        if problem.noise is not None:
+        if problem.noise is not None and problem.sizes.coordinates < 6:
             poses["measured"] += chart.forbidden(chart.pose(np.zeros(problem.sizes.coordinates)) + problem.noise)
     for name in ("pose_sensitivity", "start_sensitivity"):
         if found[name] is not None:

@@ -47,14 +47,21 @@ class Chart:
         """Poses (6,) or (N, 6) of coordinates (n,) or (N, n)."""
         values = np.asarray(coordinates, dtype=float)
         poses = np.empty((*values.shape[:-1], len(POSE_NAMES)))
-        if len(self.freedoms) < len(POSE_NAMES):
-            poses[...] = self.home
+        if len(self.freedoms) == len(POSE_NAMES):
+            poses[...] = values
+            return poses
+        poses[...] = self.home
         poses[..., list(self.freedoms)] = values
         return poses
 
     def coordinates(self, pose: ArrayLike) -> np.ndarray:
         """Coordinates (n,) or (N, n) of poses (6,) or (N, 6); what the platform cannot change is not asked for."""
         return np.asarray(pose, dtype=float)[..., list(self.freedoms)]
+
+    def projected(self, rows: np.ndarray) -> np.ndarray:
+        """What rows (..., 6, k), one for each entry of the twist, say of the coordinates (..., n, k), basis.T @ rows:
+        the same if n is 6."""
+        return rows if len(self.freedoms) == len(POSE_NAMES) else rows[..., list(self.freedoms), :]
 
     def lifted(self, values: np.ndarray, axis: int = -1) -> np.ndarray:
         """Rates or derivatives of coordinates, along an axis of length m, as those of poses; the same if m is 6."""

@@ -130,7 +130,7 @@ def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) ->
             reason = error
             continue
         unit = np.repeat([size, 1.0], 3)
-        regressor = chart.basis.T @ robot.regressor(poses, draws[1] * unit, 10.0 * draws[2] * unit)
+        regressor = chart.projected(robot.regressor(poses, draws[1] * unit, 10.0 * draws[2] * unit))
         return np.asarray(regressor, dtype=float).reshape(-1, regressor.shape[2])
     raise EstimationError(f"robot {robot.name} reaches no neighbourhood of its home pose: {reason}")
 
@@ -165,7 +165,7 @@ def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> A
     acceleration, _ = spline_derivatives(reference.rates, rate_hz)
     twist = robot.twist(reference.poses, reference.rates)
     twist_dot = robot.twist_dot(reference.poses, reference.rates, acceleration)
-    regressor = robot.geometry.chart.basis.T @ robot.regressor(reference.poses, twist, twist_dot)
+    regressor = robot.geometry.chart.projected(robot.regressor(reference.poses, twist, twist_dot))
     return np.asarray(regressor.reshape(-1, regressor.shape[2]), dtype=float)
 
 

@@ -60,17 +60,25 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
     law = drives.joint_law(guess.values[pid])
     matrix, right, common = _stacked(problem, scenario, law)
     lower = np.concatenate([np.zeros(count), np.full(matrix.shape[1] - count, -np.inf)])
+    rows = _condensed(matrix, right, common)
     for _ in range(REWEIGHTINGS):
-        rows = np.column_stack([matrix, right])
         whitened = rows / noise
         if common.shape[1]:
             whitened = Marginal.of(common / noise).whiten(whitened)
         solution = bounded_fit(whitened[:, :-1], whitened[:, -1], guess, problem.anchor, lower)
-        noise = max(noise * float(np.sqrt(np.mean((whitened @ np.append(solution, -1.0)) ** 2))), 1e-9)
+        noise = max(noise * float(np.sqrt(np.sum((whitened @ np.append(solution, -1.0)) ** 2) / len(right))), 1e-9)
         if law.lx:
             law = drives.joint_law(np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
             matrix, right, common = _stacked(problem, scenario, law)
+            rows = _condensed(matrix, right, common)
     return np.maximum(solution[:count], 0.0)
+
+
+def _condensed(matrix: Array, right: Array, common: Array) -> Array:
+    """Equations with their right side behind them (rows, u + 1); where errors are independent, their triangular factor,
+    which says the same at any noise."""
+    rows = np.column_stack([matrix, right])
+    return rows if common.shape[1] else triangular_factor(rows)
 
 
 def _stacked(problem: OutputErrorProblem, scenario: Scenario, law: JointLaw) -> tuple[Array, Array, Array]:
@@ -130,7 +138,7 @@ def joint_balance(
     coordinates = filtered_derivatives(chart.coordinates(measured), rate_hz, cutoff_hz, order)
     pose, pose_rate, acceleration = chart.pose(coordinates[0]), *(chart.lifted(rows) for rows in coordinates[1:])
     twist, twist_dot = robot.twist(pose, pose_rate), robot.twist_dot(pose, pose_rate, acceleration)
-    regressor = chart.basis.T @ robot.regressor(pose, twist, twist_dot)
+    regressor = chart.projected(robot.regressor(pose, twist, twist_dot))
     torque_map = np.linalg.inv(robot.joint_jacobian(pose) @ chart.basis).transpose(0, 2, 1)
     angle = robot.inverse_kinematics(pose)
     velocity = np.einsum("nij,nj->ni", robot.joint_jacobian(pose), twist)
