@@ -61,13 +61,14 @@ class OutputErrorProblem:
         (p,) shows it. Raises LoopFailure where that is unstable."""
         return replace(self, runs=tuple(run.with_common_errors(parameters) for run in self.runs))
 
-    def cost(self, parameters: Array) -> float:
-        """Sum of squared whitened residuals; infinite where the model cannot run."""
+    def cost(self, parameters: Array, ahead: bool = False) -> float:
+        """Sum of squared whitened residuals; infinite where the model cannot run. ahead: from the runs that `linearise`
+        will need, if it is asked next."""
         known, _ = self.known(parameters)
         total = float(known @ known)
         try:
             for run in self.runs:
-                total += float(np.sum(run.misses(parameters) ** 2))
+                total += float(np.sum(run.misses(parameters, ahead) ** 2))
         except DynamicsError:
             return np.inf
         return total

@@ -119,9 +119,16 @@ def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress
 
 def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
     """The better of warm start and starting guess (p,), within the bounds; None where the model runs with neither."""
-    costs = [(problem.cost(start), start) for start in _candidates(problem, warm)]
+    first, second = _candidates(problem, warm)
+    costs = [(problem.cost(first, ahead=_begins_there(problem)), first), (problem.cost(second), second)]
     cost, start = min(costs, key=lambda entry: entry[0])
     return start if np.isfinite(cost) else None
+
+
+def _begins_there(problem: OutputErrorProblem) -> bool:
+    """Whether a search linearises this very problem at just the parameters that it is given: not where it is whitened
+    otherwise first, or goes through other coordinates."""
+    return not problem.physical and not any(run.common.all_names for run in problem.runs)
 
 
 def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:

@@ -6,6 +6,7 @@ A record that cannot carry an identification is refused, see `identify.record.ch
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -207,9 +208,24 @@ class RecordedRun:
         """Poses (N, 6) of the model. Raises LoopFailure where it is unstable."""
         return self.simulate(parameters).pose
 
-    def misses(self, parameters: Array) -> Array:
-        """Whitened pose residuals model - measurement (n, 6) of the good frames. Raises LoopFailure."""
-        return self.without_common(self._missed(self.simulate(parameters)))
+    def misses(self, parameters: Array, ahead: bool = False) -> Array:
+        """Whitened pose residuals model - measurement (n, 6) of the good frames; ahead: from a run with the
+        sensitivities that `residuals` will need. Raises LoopFailure."""
+        return self.without_common(self._missed(self._latest_run(parameters, sensitivities=ahead)))
+
+    def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
+        """The model's run, the one that is there if it was the latest of its kind. Raises LoopFailure."""
+        given = parameters.tobytes()
+        known, run = self._runs.get(sensitivities, (b"", None))
+        if run is None or known != given:
+            run = self.simulate(parameters, sensitivities=sensitivities)
+            self._runs[sensitivities] = given, run
+        return run
+
+    @cached_property
+    def _runs(self) -> dict[bool, tuple[bytes, ClosedLoopRun]]:
+        """The latest runs without and with sensitivities, and the parameters that they were made with."""
+        return {}
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
         """`misses` (n, 6) of a model driven by the logged commands, which are white if it is right; rng: for what a fit
@@ -238,7 +254,7 @@ class RecordedRun:
         return missed, self.of_all(shown)
 
     def _shown_in_noise(self, parameters: Array) -> tuple[Array, Array]:
-        run = self.simulate(parameters, sensitivities=True)
+        run = self._latest_run(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
         return self._missed(run), np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
 
@@ -283,7 +299,7 @@ class RecordedRun:
             f"runs through {gaps[longest] / rate_hz:.2f} s unobserved",
         )
 
-    @property
+    @cached_property
     def whitener(self) -> Array:
         """Matrix (6, 6) that brings pose differences to standard deviations of the sensor."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)), dtype=float)

@@ -72,6 +72,10 @@ class TorqueRun(RecordedRun):
         """The model's poses, which no noise moves, with each noise (runs, N, 6) in what is measured."""
         return [self.simulate(parameters, noise=noise) for noise in noises]
 
+    def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
+        """The model's run; what is kept of the latest one are its fits, from which the next ones start."""
+        return self.simulate(parameters, sensitivities)
+
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
         """`misses`, with drawn noise where the fit of the starts has taken it out: white, if the model is right."""
         drawn = []
