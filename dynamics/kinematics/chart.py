@@ -56,7 +56,8 @@ class Chart:
 
     def coordinates(self, pose: ArrayLike) -> np.ndarray:
         """Coordinates (n,) or (N, n) of poses (6,) or (N, 6); what the platform cannot change is not asked for."""
-        return np.asarray(pose, dtype=float)[..., list(self.freedoms)]
+        values = np.asarray(pose, dtype=float)
+        return values.copy() if len(self.freedoms) == len(POSE_NAMES) else values[..., list(self.freedoms)]
 
     def projected(self, rows: np.ndarray) -> np.ndarray:
         """What rows (..., 6, k), one for each entry of the twist, say of the coordinates (..., n, k), basis.T @ rows:

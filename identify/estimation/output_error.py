@@ -81,7 +81,7 @@ class OutputErrorProblem:
         for run in self.runs:
             residual, shown = run.shown_residuals(parameters)
             cost += float(np.sum(residual**2))
-            rows = triangular_factor(np.column_stack([shown.reshape(residual.size, -1), residual.ravel()]))
+            rows = triangular_factor(shown.reshape(residual.size, -1), residual.ravel())
             rows = np.column_stack([run.of_all(rows[:, :-1]), rows[:, -1]])
             triangle = triangular_factor(np.vstack([triangle, rows]))
         return cost, triangle[:size, :size], triangle[:size, size]

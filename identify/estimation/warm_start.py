@@ -77,8 +77,7 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
 def _condensed(matrix: Array, right: Array, common: Array) -> Array:
     """Equations with their right side behind them (rows, u + 1); where errors are independent, their triangular factor,
     which says the same at any noise."""
-    rows = np.column_stack([matrix, right])
-    return rows if common.shape[1] else triangular_factor(rows)
+    return np.column_stack([matrix, right]) if common.shape[1] else triangular_factor(matrix, right)
 
 
 def _stacked(problem: OutputErrorProblem, scenario: Scenario, law: JointLaw) -> tuple[Array, Array, Array]:
@@ -225,7 +224,7 @@ def bounded_fit(matrix: Array, right: Array, guess: StartingGuess, anchor: Scale
     """
     size, known_size = matrix.shape[1], len(guess.values)
     extra = size - known_size
-    triangle = triangular_factor(np.column_stack([matrix, right]))[:size]
+    triangle = triangular_factor(matrix, right)[:size]
     prior = np.eye(known_size, size) / guess.std[:, None]
     place, measured = anchor.row(guess.layout)
     known = np.vstack([triangle[:, :size], prior, np.pad(place, ((0, 0), (0, extra)))])
