@@ -27,7 +27,7 @@ from dynamics.kinematics.chart import Chart
 INTEGRAL = 0.2
 """Of the gain Ki = INTEGRAL bandwidth^3, without observer."""
 
-FOLLOWED = 2.0
+FOLLOWED = 1.0
 """How fast the disturbance is taken off, over the bandwidth: noise of it that is faster would only shake the robot."""
 
 Command = Callable[[int, float, np.ndarray | None], np.ndarray]
