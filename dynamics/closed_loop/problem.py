@@ -303,10 +303,10 @@ def equilibrium(
     check_type("robot", robot, Robot, SimulationError)
     check_type("servo", servo, ServoGains, SimulationError)
     parameters, pose = checked_loop_parameters(robot, parameters, drives.law), floats("pose", pose, (6,))
-    rest, free, law = np.zeros(6), robot.geometry.chart.basis, drives.joint_law(parameters[robot.layout.joint_pid])
+    rest, chart, law = np.zeros(6), robot.geometry.chart, drives.joint_law(parameters[robot.layout.joint_pid])
     check_start_pose(robot, parameters, pose)
-    angles = robot.inverse_kinematics(pose)
-    torque_map = np.linalg.solve((robot.joint_jacobian(pose) @ free).T, free.T @ robot.regressor(pose, rest, rest))
+    angles, regressor = robot.inverse_kinematics(pose), robot.regressor(pose, rest, rest)
+    torque_map = np.linalg.solve((robot.joint_jacobian(pose) @ chart.basis).T, chart.projected(regressor))
     torque, motors = torque_map @ parameters[robot.layout.dynamic], {}
     if elasticity is not None:
         angles = angles + torque / elasticity.stiffness
@@ -314,7 +314,7 @@ def equilibrium(
     command, integral = law.held(torque, angles)
     by_command, by_integral = law.held_by_parameters(torque, angles, torque_map)
     known = servo_robot or robot
-    servo_integral = np.zeros(free.shape[1])
+    servo_integral = np.zeros(len(chart.freedoms))
     if servo.ki and not fed_forward:
         servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), command) / servo.ki
     moving = by_command if by_command.any() else None

@@ -98,8 +98,8 @@ class Observer:
         doubt[at.torque], doubt[at.viscous] = TORQUE_DOUBT * scale, VISCOUS_DOUBT * felt
         self._covariance = np.diag(doubt**2)
         self._covariance[at.offset, at.offset] = free.T @ common @ free
-        self._seen = np.zeros((at.m, at.size))
-        self._seen[:, at.coordinates] = self._seen[:, at.offset] = np.eye(at.m)
+        self._seen = np.zeros((len(mass), at.size))
+        self._seen[:, at.coordinates] = self._seen[:, at.offset] = np.eye(len(mass))
         self._by_scale = np.zeros((2, at.size, at.size))
         self._scale, self._information = np.zeros(2), np.diag(KNOWN_BEFORE)
 

@@ -14,7 +14,8 @@ Coulomb torque can make in a step, and rests otherwise. The velocity is not know
 the expectation counts, over normal u.
 """
 
-from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -36,52 +37,31 @@ LEAST_REACH = 1e-3
 """Of what dry friction can change in a step, over that deviation: where there is none, a division by zero."""
 
 
-@dataclass(frozen=True)
-class Blocks:
-    """Where the parts of a state lie, of a robot with so many coordinates, m, and joints, n."""
+class Blocks(NamedTuple):
+    """Where the parts of a state lie: those that move, then those that stay as they are."""
 
-    m: int
-    n: int
+    coordinates: slice
+    rates: slice
+    integral: slice
+    torque: slice
+    viscous: slice
+    offset: slice
 
-    @property
-    def coordinates(self) -> slice:
-        """q (m,), m and rad."""
-        return slice(0, self.m)
-
-    @property
-    def rates(self) -> slice:
-        """Of the coordinates (m,)."""
-        return slice(self.m, 2 * self.m)
-
-    @property
-    def integral(self) -> slice:
-        """Of the joint PID (n,)."""
-        return slice(2 * self.m, 2 * self.m + self.n)
-
-    @property
-    def torque(self) -> slice:
-        """Of the joints (n,), beside that of the model."""
-        return slice(2 * self.m + self.n, 2 * self.m + 2 * self.n)
-
-    @property
-    def viscous(self) -> slice:
-        """Friction of the joints (n,), beside that of the model."""
-        return slice(2 * self.m + 2 * self.n, 2 * self.m + 3 * self.n)
-
-    @property
-    def offset(self) -> slice:
-        """Of all measured coordinates (m,)."""
-        return slice(2 * self.m + 3 * self.n, 3 * self.m + 3 * self.n)
+    @classmethod
+    def of(cls, m: int, n: int) -> "Blocks":
+        """Of a robot with so many coordinates, m, and joints, n."""
+        ends = np.cumsum([m, m, n, n, n, m]).tolist()
+        return cls(*(slice(begin, end) for begin, end in pairwise([0, *ends])))
 
     @property
     def moving(self) -> slice:
         """What moves: coordinates, rates, integral."""
-        return slice(0, 2 * self.m + self.n)
+        return slice(0, self.integral.stop)
 
     @property
     def size(self) -> int:
         """Of a state."""
-        return 3 * self.m + 3 * self.n
+        return self.offset.stop
 
 
 class Prediction:
@@ -89,7 +69,7 @@ class Prediction:
 
     def __init__(self, model: Model, settings: LoopSettings) -> None:
         robot = model.robot
-        self.blocks = Blocks(len(robot.coordinate_names), robot.layout.joints)
+        self.blocks = Blocks.of(len(robot.coordinate_names), robot.layout.joints)
         rigid, self._coulomb, self._viscous, gains = robot.layout.split(model.parameters)
         self._rigid, self._friction, self._drives = rigid[None], model.friction, settings.drives
         self._law = settings.drives.joint_law(gains)
@@ -115,8 +95,8 @@ class Prediction:
         self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, command_rate: np.ndarray, length: float
     ) -> tuple[np.ndarray, np.ndarray, bool]:
         """The same in one go, and whether a joint comes to rest or breaks away by more than is not known of it."""
-        at, jacobian = self.blocks, self._jacobian(state)
-        free, errors = self._without_dry_friction(state, command, command_rate, length)
+        at = self.blocks
+        free, errors, jacobian = self._without_dry_friction(state, command, command_rate, length)
         if not self._coulomb.any():
             return free, errors, False
         by_rates, velocity = jacobian @ errors[at.rates], jacobian @ free[at.rates]
@@ -125,7 +105,7 @@ class Prediction:
         width = np.sqrt(np.einsum("ij,jk,ik->i", by_rates, covariance, by_rates) + LEAST_WIDTH**2)
         largest, smooth = self._dry(velocity)
         level, kept = expected_dry_friction(velocity, width, turned, largest, smooth)
-        gain = np.linalg.solve(np.eye(at.n) + kept[:, None] * (turned - np.diag(np.diag(turned))), np.diag(kept))
+        gain = np.linalg.solve(np.eye(len(level)) + kept[:, None] * (turned - np.diag(np.diag(turned))), np.diag(kept))
         free[at.moving] -= pushed @ level
         errors[at.moving] -= pushed @ gain @ by_rates
         moved = np.maximum(np.abs(jacobian @ state[at.rates]), np.abs(jacobian @ free[at.rates]))
@@ -139,14 +119,11 @@ class Prediction:
             largest = largest * np.where(velocity == 0.0, law.static_ratio, np.abs(law.level(velocity)))
         return largest, law.smoothing_velocity or 0.0
 
-    def _jacobian(self, state: np.ndarray) -> np.ndarray:
-        q, rate = state[self.blocks.coordinates], state[self.blocks.rates]
-        return np.asarray(self._motion(q[None], rate[None], self._rigid)[2][0])
-
     def _without_dry_friction(
         self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray, length: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        slope, by_state = self._slope(state, command, command_rate)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """State after the step, the map of errors, and the Jacobian of the joints (n, m) at its start."""
+        slope, by_state, jacobian = self._slope(state, command, command_rate)
         moving, size = self.blocks.moving, len(slope)
         held = slice(size, by_state.shape[1])
         augmented = np.zeros((by_state.shape[1] + 1, by_state.shape[1] + 1))
@@ -154,10 +131,12 @@ class Prediction:
         moved, after, errors = expm(augmented), state.copy(), np.eye(self.blocks.size)
         after[moving] += moved[moving, -1]
         errors[moving, moving], errors[moving, held] = moved[moving, moving], moved[moving, held]
-        return after, errors
+        return after, errors, jacobian
 
-    def _slope(self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """d/dt of what moves, and its derivative by the state but for the offset."""
+    def _slope(
+        self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """d/dt of what moves, its derivative by the state but for the offset, and the Jacobian of the joints (n, m)."""
         at, law, pid = self.blocks, self._law, not self._drives.torques
         li, ld, stiff = law.li, law.ld, law.lp + law.lx
         q, rate, integral = state[at.coordinates], state[at.rates], state[at.integral]
@@ -178,8 +157,8 @@ class Prediction:
         given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
         by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*given))
         damping = (ld * pid + viscous)[:, None]
-        by_state = np.zeros((2 * at.m + at.n, at.offset.start))
-        by_state[at.coordinates, at.rates] = np.eye(at.m)
+        by_state = np.zeros((at.moving.stop, at.offset.start))
+        by_state[at.coordinates, at.rates] = np.eye(len(rate))
         of_rates = by_state[at.rates]
         of_rates[:, at.coordinates] = push @ (-stiff * pid * jacobian - damping * (turning / 2))
         of_rates[:, at.coordinates] -= np.linalg.solve(mass, by_q)
@@ -187,7 +166,7 @@ class Prediction:
         of_rates[:, at.integral], of_rates[:, at.torque] = li * pid * push, push
         of_rates[:, at.viscous] = -push * velocity
         by_state[at.integral, at.coordinates] = -pid * jacobian
-        return np.concatenate([rate, acceleration, pid * growing]), by_state
+        return np.concatenate([rate, acceleration, pid * growing]), by_state, jacobian
 
 
 def expected_dry_friction(

@@ -83,12 +83,16 @@ class IdentificationResult:
         """Names of the parameters."""
         return self.layout.names
 
+    @property
+    def misfit(self) -> Misfit:
+        """Whether the model explains the record."""
+        return Misfit(self.noise_ratio, self.expected_noise_ratio, self.noise_ratio_std)
+
     def __repr__(self) -> str:
-        misfit = Misfit(self.noise_ratio, self.expected_noise_ratio, self.noise_ratio_std)
         return (
             f"<IdentificationResult: {np.sum(self.identifiable)} of {len(self.names)} parameters and "
             f"{np.sum(self.groups.identifiable)} of {len(self.groups.names)} groups identified in {self.iterations} "
-            f"iterations, {misfit}, {len(self.warnings)} warnings>"
+            f"iterations, {self.misfit}, {len(self.warnings)} warnings>"
         )
 
     def to_dataframe(self) -> pd.DataFrame:

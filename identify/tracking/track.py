@@ -1,6 +1,6 @@
 """Laws and models side by side on the same motions: tracking error, effort, and what has which share of the error."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,9 @@ EXACT = ("sensor", "model", "latency")
 
 PARTS = ("position", "orientation")
 
+MISFIT = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
+"""Keys of a result by which its `Misfit` is told."""
+
 
 @dataclass(frozen=True)
 class Tracking:
@@ -75,9 +78,10 @@ def track(
         raise ScenarioError(f"--run {run_folder} holds the identified model, and only {', '.join(models)} is asked for")
     known = {name: known_model(plant, name, run_folder) for name in models if name != "identified" or run_folder}
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
+    true = known_model(plant, "true", None)
     for law in laws:  # refused before the sensor is taught
         for motion in followed:
-            prepared(plant, law, known_model(plant, "true", None), motion, unseen)
+            prepared(plant, law, true, motion, unseen)
     sensor = taught_sensor(scenario, plant.nominal, seed, progress)
     if "identified" in models and not run_folder:
         known["identified"] = _identified(plant, sensor, seed, progress)
@@ -115,7 +119,9 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
     try:
         identification = load_result(path).get("identification")
         column = parameter_column(identification, "estimate", robot.layout.names)
-        return KnownModel(np.array(column), settled_drive(identification), _fitted_doubt(identification or {}))
+        told = [(identification or {}).get(name) for name in MISFIT]
+        misfit = None if None in told else Misfit(*told)
+        return KnownModel(np.array(column), settled_drive(identification), _fitted_doubt(misfit))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
 
@@ -134,14 +140,12 @@ def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progre
 def identified_model(plant: Plant, record: xr.Dataset, progress: Progress) -> KnownModel:
     """The model that a record of a plant gives. Raises what an identification raises."""
     found = identify(record, plant.nominal, plant.scenario, progress)
-    return KnownModel(found.estimate, found.drive.law, _fitted_doubt(found.to_dict()))
+    return KnownModel(found.estimate, found.drive.law, _fitted_doubt(found.misfit))
 
 
-def _fitted_doubt(identification: Mapping[str, Any]) -> float:
-    """Of a model that was identified: that of a guess where it does not explain what was measured."""
-    names = "noise_ratio", "expected_noise_ratio", "noise_ratio_std"
-    told = [identification[name] for name in names if name in identification]
-    return FITTED if len(told) == len(names) and not Misfit(*told).significant else VAGUE
+def _fitted_doubt(misfit: Misfit | None) -> float:
+    """Of a model that was identified: that of a guess where it is not known to explain what was measured."""
+    return VAGUE if misfit is None or misfit.significant else FITTED
 
 
 def follow_by_images(

@@ -44,7 +44,7 @@ def test_the_map_of_errors_is_that_of_differences_of_steps(robot, identified, dr
     prediction = Prediction(model, replace(SETTINGS, drives=drives))
     at, rng = prediction.blocks, np.random.default_rng(4)
     state = np.zeros(at.size)
-    state[at.coordinates], state[at.rates] = robot.coordinates(robot.home_pose), 0.01 * rng.standard_normal(at.m)
+    state[at.coordinates], state[at.rates] = robot.coordinates(robot.home_pose), 0.01 * rng.standard_normal(6)
     command, state[at.integral] = model.held(robot.home_pose, drives)
     if drives.torques:
         command = robot.static_torque(robot.home_pose, model.dynamic)
@@ -63,7 +63,7 @@ def test_the_map_of_errors_is_that_of_differences_of_steps(robot, identified, dr
         (at.viscous, 0.2),
     ):
         assert np.abs(found - map_)[at.rates, part].max() <= near * np.abs(map_[at.rates, part]).max()
-    assert np.array_equal(map_[at.offset, at.offset], np.eye(at.m))
+    assert np.array_equal(map_[at.offset, at.offset], np.eye(6))
 
 
 def test_expected_saturation_is_the_mean_over_drawn_velocities():
