@@ -119,7 +119,7 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
     try:
         identification = load_result(path).get("identification")
         column = parameter_column(identification, "estimate", robot.layout.names)
-        told = [(identification or {}).get(name) for name in MISFIT]
+        told: list[Any] = [(identification or {}).get(name) for name in MISFIT]
         misfit = None if None in told else Misfit(*told)
         return KnownModel(np.array(column), settled_drive(identification), _fitted_doubt(misfit))
     except RecordError as error:

@@ -148,7 +148,7 @@ def test_rate_of_sensor_rows(two_cores, run, record_property):
 @pytest.mark.parametrize(
     ("study", "rows", "minutes"),
     [
-        pytest.param(identifications(IDENTIFICATIONS), 1000, 20.0, marks=pytest.mark.xfail(reason="not reached yet")),
+        (identifications(IDENTIFICATIONS), 1000, 20.0),
         (load_study("estimators"), 200, 15.0),
     ],
     ids=["identifications", "leaderboard"],
