@@ -13,10 +13,9 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 """Gauss-Legendre quadrature; friction that turns within a span is met to some eighth of it."""
 
 
-VAGUE, FITTED = 1.2, 2.5e-3
-"""How much the torques of a model depart from the true ones along a motion, over the torque at rest, before a run has
-told: of a model that is a guess, and of one that fits what was measured. It is what the rate of their difference walks
-in a second, 1/s."""
+VAGUE, FITTED = 0.2, 4e-4
+"""How fast the torques of a model depart from the true ones along a motion, over the torque at rest, 1/s, before a run
+has told: of a model that is a guess, and of one that fits what was measured."""
 
 
 class Motion(Protocol):
@@ -34,8 +33,8 @@ class Motion(Protocol):
 
 @dataclass(frozen=True)
 class Model:
-    """A robot as a law knows it: with all its parameters (p,), its law of friction, and a doubt: what the rate
-    of its torques' errors walks in a second, over the torque at rest, 1/s, as an observer first takes it."""
+    """A robot as a law knows it: with all its parameters (p,), its law of friction, and a doubt: how fast
+    its torques' errors change, over the torque at rest, 1/s, as an observer first takes it."""
 
     robot: Robot
     parameters: np.ndarray

@@ -86,10 +86,10 @@ class Observer:
         else:
             self._state[at.integral] = self._model.held(pose, self._drives)[1]
         scale = np.abs(torque).mean()
-        # what is wrong of a model is smooth along a motion: its rate walks, and it changes by period^(3/2) in a frame
+        # in a frame the walk changes by as much as the error of a model does, which is smooth along a motion
         walk, doubt = np.zeros(at.size), np.zeros(at.size)
         felt_scale = SCALE_FELT if self._drives.torques else 1.0
-        walk[at.torque] = felt_scale * self._model.doubt * scale * self._period
+        walk[at.torque] = felt_scale * self._model.doubt * scale * np.sqrt(self._period)
         self._walk = np.diag(walk**2)
         jacobian = robot.coordinate_jacobian(pose)
         mass = free.T @ robot.mass_matrix(pose, self._model.dynamic) @ free
