@@ -15,7 +15,10 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 VAGUE, FITTED = 0.2, 4e-4
 """How fast the torques of a model depart from the true ones along a motion, over the torque at rest, 1/s, before a run
-has told: of a model that is a guess, and of one that fits what was measured."""
+has told: of a model that is a guess, and of one that fits what was measured.
+
+The latter is what the covariances of identified parameters say along unseen motions, where no joint turns back: 3.3e-4
+to 5.4e-4 of three robots, at 29 and 60 Hz."""
 
 
 class Motion(Protocol):
