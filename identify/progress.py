@@ -43,12 +43,12 @@ class SilentProgress:
 
 
 LINE_S = 60.0
-"""How often a stage with a rate says where it is when not on a terminal, seconds."""
+"""How often a stage says where it is when not on a terminal, seconds."""
 
 
 class RichProgress:
-    """Bars with elapsed time and time left; when not on a terminal, a plain line for each finished stage, and for one
-    with a rate also once a minute while it lasts."""
+    """Bars with elapsed time and time left; when not on a terminal, a plain line for each stage, once a minute while it
+    lasts and at its end."""
 
     def __init__(self, console: Console | None = None, rate: str = "") -> None:
         """``rate``: unit of the steps' rate, such as rows/s; empty shows none."""
@@ -86,7 +86,7 @@ class RichProgress:
         def advance(n: int = 1) -> None:
             nonlocal done, said
             done += n
-            if self._rate and done < total and time.perf_counter() > said + LINE_S:
+            if done < total and time.perf_counter() > said + LINE_S:
                 said = time.perf_counter()
                 say()
 

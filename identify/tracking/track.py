@@ -172,7 +172,7 @@ def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
     without_model: dict[str, Any] = {}
     runs = []
     followed = sum(1 if law == "pid" else len(task.models) for law in task.laws)
-    with progress.stage("track", frames * followed) as advance:
+    with progress.stage("track", frames * followed * (2 + len(EXACT))) as advance:
         for law in task.laws:
             for model in task.models:
                 if law == "pid" and without_model:  # the same whatever the model
@@ -184,7 +184,7 @@ def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
     return runs
 
 
-def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]:
+def _entry(task: Tracking, law: str, model: str, advance: Advance) -> dict[str, Any]:
     """One law with one model on all motions."""
     robot, known = task.plant.robot, task.models[model]
     errors, rows, effort, normalised, covariances, lost = [], [], [], [], [], 0
@@ -208,18 +208,18 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
         "saturated_frames": sum(row["saturated_frames"] for row in rows),
         "lost_frames": lost,
         "observer_normalised_error": float(np.mean(normalised)) if normalised else None,
-        "shares": _shares(task, law, known, np.mean(covariances, axis=0)),
+        "shares": _shares(task, law, known, np.mean(covariances, axis=0), advance),
         "motions": rows,
     }
 
 
-def _shares(task: Tracking, law: str, known: KnownModel, covariance: Array) -> dict[str, Any]:
+def _shares(task: Tracking, law: str, known: KnownModel, covariance: Array, advance: Advance) -> dict[str, Any]:
     """Shares of the squared error that go when sensor, model or latency is made exact, and the rest, of positions and
     orientations; by runs whose poses are drawn with the noise that the sensor stated."""
-    base = _drawn(task, law, known, covariance, None)
+    base = _drawn(task, law, known, covariance, None, advance)
     shares = {}
     for what in EXACT:
-        exact = _drawn(task, law, known, covariance, what)
+        exact = _drawn(task, law, known, covariance, what, advance)
         with np.errstate(invalid="ignore", divide="ignore"):
             left = [np.nansum(exact[part]) / np.nansum(base[part]) for part in (slice(0, 3), slice(3, 6))]
         shares[what] = dict(zip(PARTS, (1 - np.array(left)).tolist(), strict=True))
@@ -227,7 +227,9 @@ def _shares(task: Tracking, law: str, known: KnownModel, covariance: Array) -> d
     return shares | {"rest": rest}
 
 
-def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact: str | None) -> Array:
+def _drawn(
+    task: Tracking, law: str, model: KnownModel, covariance: Array, exact: str | None, advance: Advance
+) -> Array:
     """Mean squared errors (6,) over all motions, with one thing exact."""
     plant = task.plant
     if exact == "latency":
@@ -244,6 +246,7 @@ def _drawn(task: Tracking, law: str, model: KnownModel, covariance: Array, exact
         try:
             done = follow(plant, law, known, motion, seen, latencies)
             squares.append(done.errors**2)
+            advance(len(lost))
         except DynamicsError:
             return np.full(6, np.nan)
     return np.asarray(np.concatenate(squares).mean(axis=0))
