@@ -8,8 +8,11 @@ import api_pages
 import command_pages
 import kept_figures
 import settings_pages
+from answer_figures import picture
 from pydantic import BaseModel
 from sphinx.application import Sphinx
+
+from identify.files.atomic import write_figure
 
 PAGES: dict[str, Callable[[], str]] = {
     "commands.md": command_pages.commands,
@@ -55,16 +58,8 @@ COVERED = {
 }
 """Figures of stated uncertainty against the truth."""
 
-FIGURES: dict[str, Callable[[Path], str]] = {
-    "goals.md": kept_figures.goals,
-    "excitation_errors.md": kept_figures.excitation_errors,
-    "accuracy.md": kept_figures.accuracy,
-    "sensor_speed.md": kept_figures.sensor_speed,
-    "dynamics_speed.md": kept_figures.dynamics_speed,
-    "robots.md": kept_figures.robots,
-    "laws.md": kept_figures.laws,
-    "answer_friction_timing.md": kept_figures.answer(
-        "friction_timing",
+ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
+    "friction_timing": (
         {"scenario.timing.frame_rate_hz": "frame rate, Hz", "scenario.timing.latency_s": "latency, s"},
         {
             "coulomb_error_percent": "error of Coulomb friction, %",
@@ -72,8 +67,7 @@ FIGURES: dict[str, Callable[[Path], str]] = {
             "viscous_error_percent": "error of viscous friction, %",
         },
     ),
-    "answer_parameter_groups.md": kept_figures.answer(
-        "parameter_groups",
+    "parameter_groups": (
         {"sensor.camera.dark_noise": "dark noise, electrons"},
         {
             "pose_noise_um": "noise of a position, µm",
@@ -83,8 +77,7 @@ FIGURES: dict[str, Callable[[Path], str]] = {
             "group_std_percent": "groups of masses and inertias, %",
         },
     ),
-    "answer_excitation_methods.md": kept_figures.answer(
-        "excitation_methods",
+    "excitation_methods": (
         {"scenario.excitation.method": "method"},
         {
             "identified_groups": "groups identified",
@@ -93,27 +86,35 @@ FIGURES: dict[str, Callable[[Path], str]] = {
             "unseen_position_rms_um": "position on unseen motion, µm",
         },
     ),
-    "answer_interval_coverage.md": kept_figures.answer(
-        "interval_coverage",
+    "interval_coverage": (
         {"scenario.robot": "robot"},
         COVERED,
     ),
-    "answer_inexact.md": kept_figures.answer(
-        "inexact",
+    "inexact": (
         {"scenario.rig.known": "cameras known"},
         COVERED,
     ),
-    "answer_inexact_unaware.md": kept_figures.answer(
-        "inexact_unaware",
+    "inexact_unaware": (
         {"scenario.rig.known": "cameras known"},
         {f"unaware_{name}": said for name, said in COVERED.items()},
     ),
-    "answer_estimators.md": kept_figures.leaderboard,
-    "answer_control_value.md": kept_figures.answer(
-        "control_value",
+    "control_value": (
         {"options.law": "law", "options.model_error": "error of the model, starting model 1"},
         FOLLOWED,
     ),
+}
+"""Answers with a picture: factors and figures of a study with their heads."""
+
+FIGURES: dict[str, Callable[[Path], str]] = {
+    "goals.md": kept_figures.goals,
+    "excitation_errors.md": kept_figures.excitation_errors,
+    "accuracy.md": kept_figures.accuracy,
+    "sensor_speed.md": kept_figures.sensor_speed,
+    "dynamics_speed.md": kept_figures.dynamics_speed,
+    "robots.md": kept_figures.robots,
+    "laws.md": kept_figures.laws,
+    "answer_estimators.md": kept_figures.leaderboard,
+    **{f"answer_{name}.md": kept_figures.answer(name, *heads) for name, heads in ANSWERS.items()},
     "answer_control_laws.md": kept_figures.answers(
         at_both_rates("control_laws"), TIMING, {"options.law": "law"}, COMPARED
     ),
@@ -142,6 +143,18 @@ def write_pages(app: Sphinx) -> None:
         path = folder / name
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
+    draw_answers(figures, folder)
+
+
+def draw_answers(figures: Path, folder: Path) -> None:
+    """The pictures of answers, of kept figures, into a folder."""
+    drawn = {
+        name: (kept_figures.answer_points(figures, name, *heads), list(heads[0].values()), heads[1])
+        for name, heads in ANSWERS.items()
+    }
+    drawn["estimators"] = kept_figures.leaderboard_points(figures), ["estimator"], kept_figures.ESTIMATED
+    for name, (points, factors, shown) in drawn.items():
+        write_figure(folder / f"answer_{name}.png", picture(points, factors, shown))
 
 
 def without_fields(

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from answer_figures import Middle, Point
+
 from identify.accuracy.saved import read_saved
 from identify.accuracy.session import markdown_table
 from identify.reporting.tables import excitation_error_table, goals_table
@@ -15,6 +17,14 @@ from identify.studies.study_file import STUDIES, load_study
 
 LAWS = "test_rows_of_a_study_follow_its_laws"
 WORST = "unseen_position_um_"
+ESTIMATED = {
+    "groups_percent": "groups, %",
+    "gains_percent": "gains, %",
+    "position_um": "position, µm",
+    "orientation_urad": "orientation, µrad",
+    "seconds": "time, s",
+}
+"""What is told of an estimator."""
 
 
 def kept(folder: Path, name: str) -> dict[str, Any]:
@@ -141,8 +151,18 @@ def laws(folder: Path) -> str:
 
 def answer(name: str, factors: dict[str, str], shown: dict[str, str]) -> Callable[[Path], str]:
     """The table of a built-in study that asks a question, of its kept summary: factors and figures with their heads."""
-
     return answers({name: ()}, (), factors, shown)
+
+
+def answer_points(folder: Path, name: str, factors: dict[str, str], shown: dict[str, str]) -> list[Point]:
+    """The same as numbers."""
+    return [
+        (
+            tuple(point["factors"][path] for path in factors),
+            {figure: _middle(figure, point["figures"]) for figure in shown if figure in point["figures"]},
+        )
+        for point in kept(folder / "answers", name)["points"]
+    ]
 
 
 def answers(
@@ -169,21 +189,38 @@ def answers(
 def leaderboard(folder: Path) -> str:
     """Median errors of the nine estimators, rms over the kept experiments."""
     content = kept(folder / "answers", "estimators")
-    (point,) = content["points"]
-    ends = ("groups_percent", "gains_percent", "position_um", "orientation_urad", "seconds")
-    names = [name.removesuffix("_position_um") for name in point["figures"] if name.endswith("_position_um")]
-    rows = [(f"`{name}`", *(_average(f"{name}_{end}", point["figures"]) for end in ends)) for name in names]
-    heads = ("estimator", "groups, %", "gains, %", "position, µm", "orientation, µrad", "time, s")
-    return _table(heads, rows) + _kept_rows([content])
+    rows = [
+        (f"`{name}`", *(_text(found.get(end)) for end in ESTIMATED)) for (name,), found in leaderboard_points(folder)
+    ]
+    return _table(("estimator", *ESTIMATED.values()), rows) + _kept_rows([content])
+
+
+def leaderboard_points(folder: Path) -> list[Point]:
+    """The same as numbers."""
+    (point,) = kept(folder / "answers", "estimators")["points"]
+    found, end = point["figures"], "_position_um"
+    names = [name.removesuffix(end) for name in found if name.endswith(end)]
+    return [
+        ((name,), {end: _middle(f"{name}_{end}", found) for end in ESTIMATED if f"{name}_{end}" in found})
+        for name in names
+    ]
 
 
 def _average(name: str, figures: dict[str, Any]) -> str:
     """Mean of shares, counts, ratios and differences, rms of all else, with its 95 % band."""
-    if name not in figures:
-        return "none"
+    return _text(_middle(name, figures) if name in figures else None)
+
+
+def _middle(name: str, figures: dict[str, Any]) -> Middle:
     ends = ("intervals", "groups", "ratio", "normalised_error")
     kind = "mean" if "covered" in name or "excess" in name or name.endswith(ends) else "rms"
-    middle, band = figures[name][kind], figures[name][f"{kind}_band"]
+    return figures[name][kind], figures[name][f"{kind}_band"]
+
+
+def _text(figure: Middle | None) -> str:
+    if figure is None:
+        return "none"
+    middle, band = figure
     return f"{middle:.3g}" if band is None else f"{middle:.3g} ({band[0]:.3g} to {band[1]:.3g})"
 
 
