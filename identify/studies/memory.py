@@ -21,8 +21,8 @@ def check_memory(study: Study, workers: int) -> None:
     kind = find_kind(study.kind)
     if kind.memory is None:
         return
-    longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
     setup = prepare(study)
+    longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
     overrides = {path.removeprefix("scenario."): value for path, value in longest.items()}
     needed, there = kind.memory(setup.scenario.with_overrides(overrides)), psutil.virtual_memory().total
     if workers * needed > there:

@@ -190,6 +190,12 @@ def test_rows_that_need_more_memory_than_there_is_are_refused_with_the_workers_t
     assert not (tmp_path / "a").exists()
 
 
+def test_a_text_among_lengths_of_records_is_refused_before_memory_is_looked_at(tmp_path, capsys):
+    mixed = 'scenario.excitation.duration_s=[10.0, "b"]'
+    assert command("study", "parameter_groups", "--set", mixed, "--out", tmp_path / "a") == 1
+    assert "scenario.excitation.duration_s = 'b'" in one_line(capsys.readouterr().err)
+
+
 def test_wrong_calls_are_refused_in_the_words_of_the_options(mine, capsys):
     for words, evidence in (
         ((), "--list"),
