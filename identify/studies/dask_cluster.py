@@ -242,7 +242,7 @@ def running_cluster(address: str) -> Iterator[DaskExecutor]:
         asyncio.run(_identity(address))
         client = Client(address, timeout=CONNECT_SECONDS)
     except OSError as error:
-        raise _no_scheduler(address, str(error) or "what listens there says nothing") from error
+        raise _no_scheduler(address, str(error) or "nothing listens there, or what does says nothing") from error
     except Exception as error:  # Dask takes the first bytes of whatever it is told for the size of a message
         raise _no_scheduler(address, "what listens there speaks another protocol") from error
     with client:
