@@ -27,7 +27,11 @@ def acceptance(
     out: Annotated[Path | None, new_folder("runs/acceptance-SENSOR-SEED")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all sensor noise.")] = 0,
     renderer: Annotated[
-        str | None, typer.Option(help="pyrender, analytic or auto.", show_default="what the sensor file says")
+        str | None,
+        typer.Option(
+            help="pyrender, analytic, auto, or statistical, which draws nothing.",
+            show_default="what the sensor file says",
+        ),
     ] = None,
     standard: Annotated[str, typer.Option(help="vdi (lengths), e3064 (moving bar), e3124 (latency) or all.")] = "all",
     volume: Annotated[
