@@ -97,7 +97,14 @@ def sensor_speed(folder: Path) -> str:
     rows = [
         (title, *(f"{found[f'{renderer}_{name}']:.0f}" for renderer in renderers)) for name, title in titles.items()
     ]
-    return _table(("renderer", "`analytic`", "`pyrender`"), rows) + _measured(folder, "test_sensor_speed")
+    others = {
+        "images_in_the_loop": "`pyrender`, in the loop, between other work",
+        "images_together": "`analytic`, many at once, on all cores",
+        "without_images": "`statistical`, many at once, on all cores",
+    }
+    more = [(title, f"{found[f'{name}_frames_a_second']:,.0f}") for name, title in others.items()]
+    table = _table(("renderer", "`analytic`", "`pyrender`"), rows)
+    return f"{table}\n\n{_table(('frames a second', ''), more)}" + _measured(folder, "test_sensor_speed")
 
 
 def dynamics_speed(folder: Path) -> str:
