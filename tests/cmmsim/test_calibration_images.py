@@ -131,6 +131,7 @@ def test_chessboard_corners_are_found_to_a_tenth_of_a_pixel_by_the_older_search_
     assert np.sqrt(np.mean(pixel_errors(PERFECT, CHESSBOARD, *drawn) ** 2)) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", [PERFECT, BENT])
 def test_one_threshold_finds_the_dots_that_opencv_finds(rig):
     """Turned round, too; what it cannot read is left to OpenCV: a dot too many, one too few, nothing at all."""
@@ -173,6 +174,7 @@ def test_no_board_is_a_reason_and_not_an_error():
     assert find_board(half, DOTS) == "no dots of 9 x 7 found"
 
 
+@pytest.mark.slow
 def test_poses_do_not_depend_on_how_many_are_looked_at_together(monkeypatch):
     """Nor does what is drawn after them; one pose at a time is the plain way. Large boards take thousands of tries."""
     board = DOTS.model_copy(update={"spacing": 0.08})

@@ -96,6 +96,7 @@ def test_intervals_hold_although_points_of_a_view_err_alike(kind):
     assert 0.92 < coverage(errors, covariances).mean() < 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [100, pytest.param(1000, marks=pytest.mark.thorough)])
 def test_covariance_of_independent_errors_is_true_and_left_as_it_is(runs):
     """Squared errors of all 24 together as chi-square, 95 % intervals hold 95 %, no bias; only by chance is one

@@ -213,6 +213,7 @@ def test_code_is_compiled_once_per_content(own_cache):
     assert {file.stat().st_mode & 0o777 for file in files} == {0o600}
 
 
+@pytest.mark.slow
 def test_two_processes_that_compile_at_once_leave_one_whole_file(own_cache):
     """Both end well, and no temporary file is left behind."""
     load = "import casadi as ca, numpy as np\nfrom dynamics.compiled.machine_code import compiled_functions\n"
@@ -314,6 +315,7 @@ for number in map(int, sys.argv[1:]):
 """
 
 
+@pytest.mark.slow
 def test_kernels_of_robots_of_other_sizes_have_other_symbols_and_the_same_in_every_process():
     """Whatever was compiled before: kernels from the cache, of several processes, stand beside each other."""
     first, second = (

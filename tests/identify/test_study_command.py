@@ -160,6 +160,7 @@ def test_where_no_scheduler_answers_there_is_one_line_and_nothing_left_or_what_w
     unchanged("runs", "--repeats", 3, "--scheduler", "nonsense")
 
 
+@pytest.mark.slow
 def test_another_study_is_drawn_beside_one_and_refused_where_it_has_other_factors(mine, capsys):
     assert command("study", mine, "--workers", 0, "--quiet", "--set", "repeats=3", "--out", "other") == 0
     assert command("study", mine, "--workers", 0, "--quiet", "--beside", "other") == 0

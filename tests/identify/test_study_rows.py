@@ -106,6 +106,7 @@ def test_rows_without_images_have_the_means_and_bands_of_rows_with_them(kind, ro
         assert ks_2samp(drawn, said).pvalue > 3e-4, name
 
 
+@pytest.mark.slow
 def test_teaching_by_the_sensor_adds_its_own_error_and_is_seeded_by_the_row():
     taught = static(0, captures=1, teaching="sensor")
     assert taught == static(0, captures=1, teaching="sensor")
