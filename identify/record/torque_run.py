@@ -26,6 +26,9 @@ STEPS, HALVINGS, SETTLED = 8, 8, 1e-3
 """Gauss-Newton steps of a start at most, halvings of one, and the largest change of a pose, in standard deviations,
 that ends them."""
 
+SHORTEST = 4
+"""Frames of a span, or of a part of it, that is fitted without its first half before."""
+
 NEAR, RATE = 10.0, 20.0
 """Deviations of the noise by which a start may be off the filtered poses, which is next to nothing known of it; and
 what the filter makes of the noise of a pose in its rate, 1/s."""
@@ -112,9 +115,13 @@ class TorqueRun(RecordedRun):
     def _fitted(
         self, parameters: Array, robot: Robot, span: tuple[int, int], filtered: Array, before: Fit | None
     ) -> Fit:
-        """The span from the start that fits it best, from one before on, if there is one. Raises LoopFailure."""
-        near = np.diag(1 / self._width)
+        """The span from the start that fits it best, from one before on, if there is one; else from that which fits
+        half of it. Raises LoopFailure."""
+        near, (first, last) = np.diag(1 / self._width), span
         fit = None if before is None else self._tried(parameters, robot, span, before.start, filtered)
+        if fit is None and last - first > SHORTEST:
+            half = self._fitted(parameters, robot, (first, (first + last) // 2), filtered, None)
+            fit = self._tried(parameters, robot, span, half.start, filtered)
         fit = fit or self._from(parameters, robot, span, filtered, filtered)
         for _ in range(STEPS):
             step = np.linalg.lstsq(np.vstack([fit.seen, near]), fit.missed, rcond=None)[0]

@@ -1,5 +1,7 @@
 """Records made under other laws than the paper's servo, and what identification makes of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,16 @@ def test_a_record_of_torques_shows_base_parameters_without_the_gains():
     np.testing.assert_allclose(result.estimate[GAINS], result.initial[GAINS], rtol=1e-9)
     assert not result.to_dict()["drive"]["in_loop"]
     assert any("the drives took torques" in warning for warning in result.warnings)
+
+
+@pytest.mark.slow
+def test_spans_of_torques_find_their_starts_from_filtered_rates_that_are_far_off():
+    """By ten times what the filter makes of noise, so that joints stick and slip otherwise."""
+    scenario, plant, made = excited("computed_torque", seconds=4.0)
+    run = recorded_run(made.record, rss6(), scenario)
+    off = 2e-3 * np.array([1, 1, 1, 6, 6, 6]) * np.random.default_rng(0).choice([-1, 1], (len(run.starts), 6))
+    far = replace(run, starts=run.starts + np.hstack([0 * off, 5 * off]))
+    assert np.sqrt(np.mean(far.misses(plant.parameters) ** 2)) < 1.2
 
 
 @pytest.mark.thorough
