@@ -43,6 +43,9 @@ NOISE_DECIDES = 3.0
 REACH = 0.2
 """Of a record's length: the lags after which residuals are taken as independent; up to there correlations fade out."""
 
+MISFIT = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
+"""Entries of a result that tell a `Misfit`, in its order."""
+
 
 @dataclass(frozen=True)
 class Misfit:

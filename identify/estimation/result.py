@@ -15,7 +15,7 @@ from identify.arrays import Array
 from identify.estimation.common_errors import CommonErrorEstimates
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.drive_choice import DriveChoice
-from identify.estimation.explanation import Misfit, Whiteness
+from identify.estimation.explanation import MISFIT, Misfit, Whiteness
 from identify.estimation.identifiability import RESTS_ON_PRIOR, Conditioning, GroupEstimates
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.files.dataset import POSE
@@ -134,7 +134,7 @@ class IdentificationResult:
             "costs": [list(costs) for costs in self.costs],
             "searches": list(self.searches),
             "active_bounds": list(self.active_bounds),
-            **{name: getattr(self, name) for name in ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")},
+            **{name: getattr(self, name) for name in MISFIT},
             "whiteness": {"p_value": whiteness.p_value, "p_values": dict(zip(POSE, whiteness.p_values, strict=True))},
             "conditioning": asdict(self.conditioning),
             "strongest_correlations": pairs,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.estimation.explanation import SIGNIFICANT, SUSPICIOUS
+from identify.estimation.explanation import MISFIT, SIGNIFICANT, SUSPICIOUS
 from identify.files.run_folder import rms_row
 
 VALIDATION_UM, VALIDATION_URAD = 2.0, 10.0
@@ -47,8 +47,7 @@ def explanation_goals(result: dict[str, Any]) -> list[Goal]:
     """Whether the model explains the record: what it leaves is no larger than noise alone makes it, and is white."""
     found, goals = result.get("identification", {}), []
     if "noise_ratio_std" in found:
-        keys = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
-        ratio, expected, std = (math.nan if found[key] is None else found[key] for key in keys)
+        ratio, expected, std = (math.nan if found[key] is None else found[key] for key in MISFIT)
         text = (
             "mean square of measured minus identified pose, in units of the noise that the cameras state; noise alone "
             f"leaves {expected:.3f} ± {std:.3f}"

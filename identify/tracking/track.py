@@ -13,7 +13,7 @@ from dynamics.control.inverse_dynamics import FITTED, VAGUE
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
-from identify.estimation.explanation import Misfit
+from identify.estimation.explanation import MISFIT, Misfit
 from identify.estimation.identification import identify
 from identify.estimation.prior import starting_guess
 from identify.excitation.design import design_trajectories
@@ -40,9 +40,6 @@ EXACT = ("sensor", "model", "latency")
 """What is made exact, one by one, to know its share of the error."""
 
 PARTS = ("position", "orientation")
-
-MISFIT = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
-"""Keys of a result by which its `Misfit` is told."""
 
 
 @dataclass(frozen=True)
