@@ -25,16 +25,18 @@ from dynamics.closed_loop.motion_kernels import (
     evaluate_terms,
 )
 from dynamics.closed_loop.problem import EveryFrame, LoopProblem, RateSensor, Sizes
-from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
+from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure, saturated_frames
 from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent, whole_vectors
 from dynamics.closed_loop.stick_slip_kernels import stop_joints
 from dynamics.compiled.kernel import address, chosen, plain
 from dynamics.compiled.machine_code import MachineFunction
-from dynamics.errors import SimulationError
+from dynamics.errors import DynamicsError, SimulationError
 from dynamics.parameters import LANES
 
+UNSTABLE = " (the loop is unstable)"
+
 FAILURES = {
-    LEFT_REACH: "the robot left the reachable set (the loop is unstable):",
+    LEFT_REACH: f"the robot left the reachable set{UNSTABLE}:",
     SINGULAR_MASS: "the mass matrix is not positive definite: masses or inertias are zero or overflow",
     TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; there",
@@ -62,6 +64,8 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
         if problem.asked:
             try:
                 _consult(problem, first, memory.now, plan, record, commands, measured)
+            except DynamicsError as error:
+                raise _stopped(problem, first, record, str(error)) from error
             except Exception as error:
                 error.add_note(f"at frame {first} of the closed loop")
                 raise
@@ -155,7 +159,7 @@ def _consult(
         pose, rate = chart.pose(state[:size]), chart.lifted(state[size : 2 * size]).copy()
         given = sensor.measure(frame, time, pose, rate) if isinstance(sensor, RateSensor) else sensor(frame, time, pose)
         record.measured_ok[frame] = given is not None
-        what = f"what the pose sensor returned at frame {frame}"
+        what = "what the pose sensor returned"
         measured[frame] = np.nan if given is None else floats(what, given, (6,), error=SimulationError)
         record.measured[frame] = chart.coordinates(measured[frame])
     controller = problem.controller
@@ -169,20 +173,30 @@ def _consult(
         command = controller(frame, time, seen, problem.reference.poses[frame], problem.reference.rates[frame])
     else:
         return
-    what = f"what the controller returned at frame {frame}"
+    what = "what the controller returned"
     commands[frame] = floats(what, command, (problem.sizes.joints,), error=SimulationError)
 
 
 def _failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any) -> LoopFailure:
     """The error of a run that ended early, with the leg to blame for a pose out of reach."""
-    said = f"closed loop stopped at frame {frame} (t = {frame * problem.period:.3f} s): {FAILURES[status]}"
+    why = FAILURES[status]
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
         stopped = now.known.inputs[: problem.sizes.coordinates]
         at = problem.robot.pose(stopped if status == LEFT_REACH else record.measured[frame])
         margin = problem.robot.reach_margin(at)
         leg = int(np.argmin(margin))
-        said += f" leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"
-    return LoopFailure(said, frame)
+        why += f" leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"
+    return _stopped(problem, frame, record, why)
+
+
+def _stopped(problem: LoopProblem, frame: int, record: Any, why: str) -> LoopFailure:
+    """The same of any reason, with what the actuators had to give before."""
+    limit, unit = problem.settings.drives.torque_limit, problem.robot.layout.unit("joint1.coulomb")
+    saturated, when = saturated_frames(record.torque[:frame], limit), f"t = {frame * problem.period:.3f} s"
+    if saturated:  # of weak actuators, too, a robot leaves the set
+        why = why.replace(UNSTABLE, "")
+        when += f", saturated in {saturated} of {frame} frames, limit {limit:g} {unit}"
+    return LoopFailure(f"closed loop stopped at frame {frame} ({when}): {why}", frame, saturated)
 
 
 def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:

@@ -68,8 +68,13 @@ class ClosedLoopRun:
 
 
 class LoopFailure(SimulationError):
-    """A run that ended early; `frame` says where."""
+    """A run that ended early: `frame` says where, `saturated` at how many frames before an actuator gave all."""
 
-    def __init__(self, message: str, frame: int) -> None:
+    def __init__(self, message: str, frame: int, saturated: int = 0) -> None:
         super().__init__(message)
-        self.frame = frame
+        self.frame, self.saturated = frame, saturated
+
+
+def saturated_frames(torque: np.ndarray, limit: float | None) -> int:
+    """Frames at which an actuator gave all that it has, of torques (frames, n), with a limit, N m or N, or none."""
+    return 0 if limit is None else int((np.abs(torque) >= limit * (1 - 1e-12)).any(axis=1).sum())

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynamics.closed_loop.problem import LoopSettings
-from dynamics.closed_loop.run import LoopFailure
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.prediction import Prediction
+from dynamics.errors import SimulationError
 
 STEP = 3e-3
 """Of the prediction, s, at most: what dry friction does to a joint that turns back takes some milliseconds."""
@@ -190,8 +190,7 @@ class Observer:
                 by_scale[0] += walked
             at = end
         if not np.isfinite(state).all():
-            frame = round(time / self._period)
-            raise LoopFailure(f"the observer has lost the robot at frame {frame} (t = {time:.3f} s)", frame)
+            raise SimulationError(f"the observer has lost the robot: its prediction for {time:.3f} s is not finite")
         return state, covariance
 
     def _acting(self, time: float) -> tuple[np.ndarray, np.ndarray]:

@@ -83,19 +83,35 @@ def track(
     entry = follow_all(chosen, laws, models, seed, terminal_progress(quiet), run, motion)
     save_files(folder, {"track.json": entry, "scenario.toml": chosen.to_toml()})
     tell(entry, json, quiet, lambda: _print(entry, folder))
-    lost = [run["failed"] for run in entry["runs"] if "failed" in run]
-    if len(lost) == len(entry["runs"]):
-        raise SimulationError(f"no law kept the robot on its motion; {lost[0]}")
+    first = entry["runs"][0]
+    if all("failed" in run for run in entry["runs"]):
+        raise SimulationError(f"no law kept the robot on its motion; {_called(first)}: {first['failed']}")
 
 
 def _each(given: list[str], every: tuple[str, ...]) -> list[str]:
     return list(dict.fromkeys(name for one in given for name in (every if one == ALL else (one,))))
 
 
+def _called(run: dict[str, Any]) -> str:
+    return f"{run['law']} with the {run['model']} model" if run["model"] else str(run["law"])
+
+
 def _print(entry: dict[str, Any], folder: Path) -> None:
     done = [run for run in entry["runs"] if "failed" not in run]
+    if done:
+        _print_tables(done, entry["effort_unit"])
+    for run in entry["runs"] if done else entry["runs"][1:]:  # the error of a command that lost all says the first
+        if "failed" in run:
+            typer.echo(f"lost: {_called(run)}: {run['failed']}")
+        elif run["saturated_frames"]:
+            where = f"in {run['saturated_frames']} of {run['frames']} frames"
+            typer.echo(f"{_called(run)}: an actuator is at its limit {where}")
+    typer.echo(f"files: {folder}")
+
+
+def _print_tables(done: list[dict[str, Any]], effort_unit: str) -> None:
     errors = [
-        (run["law"], run["model"], *map(_rounded, (*run["position_rms_um"], *run["orientation_rms_urad"])))
+        (run["law"], run["model"] or "–", *map(_rounded, (*run["position_rms_um"], *run["orientation_rms_urad"])))
         for run in done
     ]
     header = ("law", "model", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad")
@@ -103,24 +119,15 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
     shares = [
         (
             run["law"],
-            run["model"],
+            run["model"] or "–",
             f"{run['effort_rms']:.3g}",
             *(_percent(share["position"]) for share in run["shares"].values()),
         )
         for run in done
     ]
-    of_effort = ("law", "model", f"effort\n{entry['effort_unit']}", "sensor", "model", "latency", "rest")
+    of_effort = ("law", "model", f"effort\n{effort_unit}", "sensor", "model", "latency", "rest")
     said = "rms effort, and what of the squared error of positions an exact sensor, model or latency would take away"
     print_table(of_effort, shares, header[:2], said)
-    for run in entry["runs"]:
-        if "failed" in run:
-            typer.echo(f"lost: {run['law']} with the {run['model']} model: {run['failed']}")
-        elif run["saturated_frames"]:
-            typer.echo(
-                f"{run['law']} with the {run['model']} model: an actuator is at its limit in "
-                f"{run['saturated_frames']} frames"
-            )
-    typer.echo(f"files: {folder}")
 
 
 def _percent(share: float) -> str:

@@ -1,22 +1,25 @@
 """A control law with a model of the robot, made ready to follow a motion of a scenario's plant."""
 
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from dynamics.closed_loop import DriveName
+from dynamics.closed_loop import DriveName, EveryFrame
 from dynamics.control.gains import check_torque_gains
 from dynamics.control.inverse_dynamics import VAGUE, Model, Motion
 from dynamics.control.law import Assignment, Feedback, Law, LawInLoop
-from dynamics.errors import DynamicsError
+from dynamics.errors import DynamicsError, SimulationError
 from dynamics.workspace import check_motion
 from identify.arrays import Array
 from identify.errors import ScenarioError, TrajectoryError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop
 from identify.loop_parameters import model_settings
-from identify.plugins import LAWS, chosen
+from identify.plugins import LAWS, chosen, is_own
 from identify.scenario import Scenario
 from identify.scenario.plant_sections import FILTERED
 
@@ -73,11 +76,12 @@ def prepared(
 ) -> LawInLoop:
     """A law ready to follow a motion.
 
-    Raises ScenarioError: a law that is none, or needs torques which the drives do not take. Raises TrajectoryError: a
-    motion beyond reach or travel, with time and leg. Raises SimulationError: gains that are unstable with this model.
+    Raises ScenarioError: a law that is none, or needs torques which the drives do not take, or actuators that cannot
+    hold the platform. Raises TrajectoryError: a motion beyond reach or travel, with time and leg. Raises
+    SimulationError: gains that are unstable with this model, or a law of one's own that fails.
     """
     scenario, robot = plant.scenario, plant.nominal
-    chosen_law: Law = chosen(law, "law", LAWS)
+    chosen_law: Law = _telling(law, chosen(law, "law", LAWS))
     times = scenario.timing.frame_times(motion.duration_s)
     desired = motion.motion.pose(times)
     try:
@@ -98,7 +102,7 @@ def prepared(
             frames=len(times),
             settings=settings,
             feedback=asked,
-            holding=plant.robot.static_torque(desired[0], plant.parameters[plant.robot.layout.dynamic]),
+            holding=plant.holding(desired[0]),
             latencies=usual if latencies is None else latencies,
             noise=seen.noise,
             common=seen.common,
@@ -113,7 +117,23 @@ def prepared(
         )
     if law == "computed_torque":
         check_torque_gains(model, settings, desired[0], asked)
-    return found
+    if isinstance(found.controller, EveryFrame):
+        return replace(found, controller=EveryFrame(_telling(law, found.controller.command)))
+    return replace(found, controller=found.controller and _telling(law, found.controller))
+
+
+def _telling(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of a law, which tells what one of a user's own raises in one line, with its place in the file."""
+
+    def told(*given: Any) -> Any:
+        try:
+            return asked(*given)
+        except Exception as error:
+            at = traceback.extract_tb(error.__traceback__)[:2][-1]
+            place = f"{Path(at.filename).name}, line {at.lineno}"
+            raise SimulationError(f"law {law!r} raised {type(error).__name__}: {error} ({place})") from error
+
+    return told if is_own(law) else asked
 
 
 def feedback(scenario: Scenario) -> Feedback:

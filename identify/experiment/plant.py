@@ -52,8 +52,21 @@ class Plant:
     geometry_covariance: Array | None = None
 
     def check(self) -> None:
-        """Raise dynamics.DynamicsError, with the evidence, where it cannot be simulated."""
+        """Raise dynamics.DynamicsError, with the evidence, where it cannot be simulated, and as `holding` at home."""
         self._settings_at(self.parameters, self.nominal.home_pose)
+        self.holding(self.nominal.home_pose)
+
+    def holding(self, pose: Array) -> Array:
+        """Torques or forces (n,) at rest at a pose (6,). Raises ScenarioError where the actuators do not have them."""
+        robot, limit = self.robot, self.settings.drives.torque_limit
+        torque = robot.static_torque(pose, self.parameters[robot.layout.dynamic])
+        leg, unit = int(np.argmax(np.abs(torque))), robot.layout.unit("joint1.coulomb")
+        if limit is not None and abs(torque[leg]) > limit:
+            raise ScenarioError(
+                f"leg {leg + 1} of {robot.name} takes {abs(torque[leg]):.4g} {unit} to stand still at the start, limit "
+                f"control.torque_limit_{unit.replace(' ', '_')} = {limit:g}"
+            )
+        return torque
 
     def run(
         self,
@@ -80,7 +93,7 @@ class Plant:
             if law.controller is not None and not law.by_servo:
                 raise
             said = stability.verdict(self.nominal, parameters, settings, reference.poses[0])
-            raise LoopFailure(f"{error}; {said}", error.frame) from None
+            raise LoopFailure(f"{error}; {said}", error.frame, error.saturated) from None
 
     def truth(self, run: ClosedLoopRun) -> xr.Dataset:
         """The truth of a run: what it did, the parameters without a load, and what the model has no place for."""

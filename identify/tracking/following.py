@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
+from dynamics.closed_loop.run import saturated_frames
 from identify.arrays import Array
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, Seen, prepared
 from identify.experiment.plant import Plant
@@ -36,8 +37,7 @@ class Followed:
     @property
     def saturated(self) -> int:
         """Frames at which an actuator gave all that it has."""
-        limit = self.torque_limit
-        return 0 if limit is None else int((np.abs(self.run.torque) >= limit * (1 - 1e-12)).any(axis=1).sum())
+        return saturated_frames(self.run.torque, self.torque_limit)
 
     def normalised_squared_error(self, robot: Robot) -> float | None:
         """Mean e^T P^-1 e / m of what the observer expected of the robot's true coordinates; None without observer."""

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 import cmmsim
+from dynamics.closed_loop import LoopFailure
 from dynamics.control.inverse_dynamics import FITTED, VAGUE
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
@@ -26,6 +27,7 @@ from identify.files.versions import versions
 from identify.loop_parameters import parameter_column, settled_drive
 from identify.progress import Advance, Progress
 from identify.random_streams import NOISE, TRACKED, child, stream_seed
+from identify.record.law import SERVO
 from identify.scenario import Scenario, load_scenario
 from identify.tracking.following import Followed, by_drawing, follow
 from identify.tracking.motions import motions
@@ -166,30 +168,25 @@ def follow_by_images(
 def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
     timing = task.plant.scenario.timing
     frames = sum(timing.frames(motion.duration_s) for motion in task.motions)
-    without_model: dict[str, Any] = {}
-    runs = []
-    followed = sum(1 if law == "pid" else len(task.models) for law in task.laws)
-    with progress.stage("track", frames * followed * (2 + len(EXACT))) as advance:
-        for law in task.laws:
-            for model in task.models:
-                if law == "pid" and without_model:  # the same whatever the model
-                    entry = without_model
-                else:
-                    entry = _entry(task, law, model, advance)
-                without_model = entry if law == "pid" else without_model
-                runs.append({"law": law, "model": model} | entry)
-    return runs
+    runs = [(law, model) for law in task.laws for model in ([None] if law == SERVO else task.models)]
+    with progress.stage("track", frames * len(runs) * (2 + len(EXACT))) as advance:
+        return [{"law": law, "model": model} | _entry(task, law, model, advance) for law, model in runs]
 
 
-def _entry(task: Tracking, law: str, model: str, advance: Advance) -> dict[str, Any]:
-    """One law with one model on all motions."""
-    robot, known = task.plant.robot, task.models[model]
-    errors, rows, effort, normalised, covariances, lost = [], [], [], [], [], 0
+def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dict[str, Any]:
+    """One law with one model on all motions; None: that of a law which reads none."""
+    robot, known = task.plant.robot, task.models[model or next(iter(task.models))]
+    errors, rows, effort, normalised, covariances = [], [], [], [], []
+    frames = saturated = lost = 0
     for number, motion in enumerate(task.motions):
         try:
             done, seen = follow_by_images(task.plant, task.sensor, law, known, motion, task.seed, number, advance)
         except DynamicsError as error:
-            return {"failed": f"{motion.name}: {error}"} | rms_figures(np.full((1, 6), np.nan))
+            if isinstance(error, LoopFailure):
+                frames, saturated = frames + error.frame, saturated + error.saturated
+            told = {"failed": f"{motion.name}: {error}", "frames": frames, "saturated_frames": saturated}
+            return told | rms_figures(np.full((1, 6), np.nan))
+        frames, saturated = frames + len(done.errors), saturated + done.saturated
         errors.append(done.errors)
         lost += int((~done.run.measured_ok).sum())
         effort.append(done.run.torque)
@@ -202,7 +199,8 @@ def _entry(task: Tracking, law: str, model: str, advance: Advance) -> dict[str, 
         **rms_figures(np.concatenate(errors)),
         "effort_rms": float(np.sqrt(np.mean(torque**2))),
         "effort_largest": float(np.abs(torque).max()),
-        "saturated_frames": sum(row["saturated_frames"] for row in rows),
+        "frames": frames,
+        "saturated_frames": saturated,
         "lost_frames": lost,
         "observer_normalised_error": float(np.mean(normalised)) if normalised else None,
         "shares": _shares(task, law, known, np.mean(covariances, axis=0), advance),

@@ -207,6 +207,19 @@ def test_an_actuator_gives_no_more_than_its_limit(robot, identified):
     assert not np.array_equal(free.pose, held.pose)
 
 
+def test_a_run_that_weak_actuators_lose_says_so(robot, identified):
+    """All of them: at rest each has to give half as much again."""
+    reference, drives = Reference(np.tile(robot.home_pose, (60, 1)), np.zeros((60, 6))), Drives(torque_limit=2.0)
+    assert np.abs(robot.static_torque(robot.home_pose, identified[robot.layout.dynamic])).min() > 1.4 * 2.0
+    with pytest.raises(LoopFailure) as caught:
+        simulate(robot, identified, reference, LoopSettings(SERVO, FAST, drives=drives))
+    frame = caught.value.frame
+    assert caught.value.saturated == frame > 0
+    assert f", saturated in {frame} of {frame} frames, limit 2 N m): the robot left the reachable set: leg" in str(
+        caught.value
+    )
+
+
 def test_a_controller_of_every_frame_is_asked_where_the_measurement_is_lost(robot, identified):
     asked = []
 

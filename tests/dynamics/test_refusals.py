@@ -263,11 +263,11 @@ def test_parameters_of_the_joint_pid_have_their_limits_and_a_start_what_its_run_
 
 def test_answers_of_sensor_and_controller_are_six_numbers_or_name_the_frame(robot, loop):
     """Never a lost frame; None is one of a sensor, and nothing of a controller."""
-    with pytest.raises(SimulationError, match=r"what the pose sensor returned at frame 2.* is nan, must"):
+    with pytest.raises(SimulationError, match=r"at frame 2 .*what the pose sensor returned.* is nan, must"):
         loop.run(5, sensor=lambda frame, time, pose: pose * (np.nan if frame == 2 else 1))
     for answer, words in ((np.zeros((1, 6)), "shape"), (None, "must be numbers")):
         answers = [*robot.inverse_kinematics(loop.reference(2).poses), answer]
-        with pytest.raises(SimulationError, match=rf"what the controller returned at frame 2.* {words}"):
+        with pytest.raises(SimulationError, match=rf"at frame 2 .*what the controller returned.* {words}"):
             loop.run(5, controller=lambda frame, *_, answers=answers: answers[frame])
 
 

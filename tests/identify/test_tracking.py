@@ -137,8 +137,15 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
         ),
         ("sliding_mode", {}, ScenarioError, "unknown law 'sliding_mode'; valid: pid, feedforward, computed_torque"),
         ("builtins:repr", {}, ScenarioError, "must return a LawInLoop, returned str"),
+        (
+            "builtins:len",
+            {},
+            SimulationError,
+            "law 'builtins:len' raised TypeError: object of type 'Assignment' has no",
+        ),
+        ("pid", {"control.torque_limit_N_m": 3.0}, ScenarioError, "leg 6 of rss6 takes 3.042 N m to stand still at"),
     ],
-    ids=["access", "gains", "blind", "fast", "name", "own"],
+    ids=["access", "gains", "blind", "fast", "name", "own", "raises", "weak"],
 )
 def test_a_law_that_cannot_be_is_refused(law, changes, error, said):
     chosen = plant(**changes)
@@ -146,11 +153,11 @@ def test_a_law_that_cannot_be_is_refused(law, changes, error, said):
 
 
 def test_torque_beyond_the_limit_is_given_up_to_it_and_counted():
-    chosen = plant(**{"control.torque_limit_N_m": 3.0})
+    chosen = plant(**{"control.torque_limit_N_m": 3.1})
     done = follow(chosen, "pid", KnownModel(chosen.parameters), swing(), seen())
     torque = np.abs(done.run.torque)
-    assert torque.max() == 3.0
-    assert done.saturated == int((torque == 3.0).any(axis=1).sum()) > 0
+    assert torque.max() == 3.1
+    assert done.saturated == int((torque == 3.1).any(axis=1).sum()) > 0
     free = plant()
     assert follow(free, "pid", KnownModel(free.parameters), swing(), seen()).saturated == 0
 
@@ -167,6 +174,20 @@ def test_a_law_of_ones_own_is_a_function():
     done = follow(chosen, "tests.identify.test_tracking:holding", KnownModel(chosen.parameters), swing(), seen())
     alone = follow(chosen, "pid", KnownModel(chosen.parameters), swing(), seen())
     assert np.abs(done.errors).max() < np.abs(alone.errors).max()
+
+
+def failing(assignment):
+    """A law whose list of commands is too short."""
+    commands = assignment.model.robot.inverse_kinematics(assignment.motion.pose(np.zeros(20)))
+    return LawInLoop(controller=lambda frame, *_: commands[frame], drives=assignment.settings.drives)
+
+
+def test_a_law_of_ones_own_that_fails_is_one_line_with_frame_time_and_place():
+    chosen = plant()
+    given = chosen, "tests.identify.test_tracking:failing", KnownModel(chosen.parameters), swing(), seen()
+    said = refusal(LoopFailure, follow, *given)
+    assert "at frame 20 (t = 0.333 s): law 'tests.identify.test_tracking:failing' raised IndexError: index" in said
+    assert f"(test_tracking.py, line {failing.__code__.co_firstlineno + 3})" in said
 
 
 KNOWN_LATENCIES = []
@@ -205,7 +226,7 @@ def test_the_scale_of_all_parameters_makes_no_difference_to_feedforward():
 
 @pytest.mark.slow
 def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
-    """By drawn poses; `pid`, which knows no model, is followed once. A model that is better leaves less error."""
+    """By drawn poses; `pid`, which knows no model, is there once. A model that is better leaves less error."""
     monkeypatch.setattr(tracking, "taught_sensor", lambda *given: Sensor(NOISE))
     out = tmp_path / "track"
     settings = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
@@ -214,26 +235,28 @@ def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
     assert command("track", "quick", *asked, *settings) == 0
     told = json.loads((out / "track.json").read_text())
     runs = {(run["law"], run["model"]): run for run in told["runs"]}
-    assert list(runs) == [(law, model) for law in ("pid", "feedforward") for model in ("initial", "true")]
+    assert list(runs) == [("pid", None), ("feedforward", "initial"), ("feedforward", "true")]
     size = {key: np.linalg.norm(run["position_rms_um"]) for key, run in runs.items()}
-    assert size["pid", "initial"] == size["pid", "true"]
-    assert size["feedforward", "true"] < size["feedforward", "initial"] / 4 < size["pid", "true"] / 8
+    assert size["feedforward", "true"] < size["feedforward", "initial"] / 4 < size["pid", None] / 8
     assert runs["feedforward", "initial"]["shares"]["model"]["position"] > 0.9
     assert runs["feedforward", "true"]["shares"]["model"]["position"] == 0
     for run in runs.values():
         assert list(run["shares"]) == ["sensor", "model", "latency", "rest"]
         for part in ("position", "orientation"):
             assert sum(share[part] for share in run["shares"].values()) == pytest.approx(1)
-    assert {row["motion"] for row in runs["pid", "true"]["motions"]} == {"unseen 1", "circle", "corner"}
+    assert {row["motion"] for row in runs["pid", None]["motions"]} == {"unseen 1", "circle", "corner"}
     assert (out / "scenario.toml").is_file()
 
 
 def test_a_robot_that_no_law_keeps_on_its_motion_is_no_success(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(tracking, "taught_sensor", lambda *given: Sensor(NOISE))
-    out, settings = tmp_path / "track", ["--set", "servo.kp=40", "--set", "renderer=analytic", "--quiet"]
+    out, settings = tmp_path / "track", ["--set", "servo.kp=40", "--set", "renderer=analytic"]
+    settings += ["--set", "control.torque_limit_N_m=3.1"]
     assert command("track", "quick", "--law", "pid", "--model", "true", "--out", out, *settings) == 1
-    assert "no law kept the robot on its motion; unseen 1: " in one_line(capsys.readouterr().err)
-    (run,) = json.loads((out / "track.json").read_text())["runs"]
+    said, (run,) = capsys.readouterr(), json.loads((out / "track.json").read_text())["runs"]
+    assert f"error: no law kept the robot on its motion; pid: {run['failed']}" in said.err
+    assert said.out == f"files: {out}\n"
+    assert f"saturated in {run['saturated_frames']} of {run['frames']} frames, limit 3.1 N m" in run["failed"]
     assert "eigenvalue" in run["failed"]
 
 
