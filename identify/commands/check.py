@@ -1,5 +1,6 @@
 """The command ``check``: a robot file judged before anything is built or run. Heavy imports are late."""
 
+from textwrap import shorten
 from typing import Annotated
 
 import typer
@@ -7,6 +8,9 @@ import typer
 from identify.commands.options import JsonFile, Quiet, RobotArgument, Settings, chosen_scenario, completion, tell
 from identify.errors import VerificationError
 from identify.progress import print_table, terminal_progress
+
+LONGEST = 160
+"""Characters of a finding in the line of the error; the table and the JSON have all of it."""
 
 
 def check(
@@ -63,5 +67,6 @@ def check(
     entry = {"ok": not failed, "findings": [finding.entry() for finding in findings]}
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
-        said = "; ".join(f"{finding.check}: {finding.text}" for finding in failed)
+        told = (shorten(f"{finding.check}: {finding.text}", LONGEST, placeholder=" …") for finding in failed)
+        said = "; ".join(told)
         raise VerificationError(f"{len(failed)} of {len(findings)} findings about {chosen.name} fail: {said}")

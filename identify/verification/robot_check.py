@@ -21,7 +21,7 @@ from identify.arrays import Array
 from identify.estimation.base_parameters import structure
 from identify.experiment.law_in_loop import feedback
 from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distances, sensor_file
-from identify.loop_parameters import model_settings
+from identify.loop_parameters import model_settings, of_actuators
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Excitation, Scenario
 
@@ -62,7 +62,7 @@ def check_robot(
         lambda: _freedoms(robot),
         lambda: _travel(robot, scenario.excitation),
         lambda: _assembly(robot),
-        lambda: _holding(robot, parameters),
+        lambda: _holding(robot, parameters, scenario),
         lambda: _visible(robot),
         lambda: _bodies(robot, parameters),
         lambda: _loop(robot, parameters, model_settings(robot, scenario)),
@@ -126,15 +126,14 @@ def _assembly(robot: Robot) -> Iterator[Finding]:
     yield Finding("assembly modes", len(modes) > 0, len(modes), None, "1", None, text)
 
 
-def _holding(robot: Robot, parameters: Array) -> Iterator[Finding]:
-    torque, unit = (
-        robot.static_torque(robot.home_pose, parameters[robot.layout.dynamic]),
-        robot.layout.unit("joint1.coulomb"),
-    )
+def _holding(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[Finding]:
+    torque = robot.static_torque(robot.home_pose, parameters[robot.layout.dynamic])
+    unit, limit = robot.layout.unit("joint1.coulomb"), of_actuators(robot, scenario.control, "torque_limit")
     leg = int(np.argmax(np.abs(torque)))
-    mean = np.abs(torque).mean()
+    most, mean = float(np.abs(torque[leg])), np.abs(torque).mean()
     text = f"joint {leg + 1} holds the most at home, {torque[leg]:.3g} {unit}; the mean of all is {mean:.3g} {unit}"
-    yield Finding("holding torque", True, float(np.abs(torque[leg])), None, unit, leg + 1, text)
+    text += "" if limit is None else f", and the actuators have {limit:.3g} {unit}"
+    yield Finding("holding torque", limit is None or most <= limit, most, limit, unit, leg + 1, text)
 
 
 def _visible(robot: Robot) -> Iterator[Finding]:
@@ -155,7 +154,7 @@ def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
         worst = robot.layout.bodies.index(max(effects, key=effects.__getitem__))
         leg = next((leg + 1 for leg, bodies in enumerate(robot.layout.of_leg) if worst in bodies), None)
         felt = f"accelerations change by up to {100 * largest:.2g} %" if largest > UNFELT else "no motion feels it"
-        text = f"no rigid body has these: {'; '.join(grouped(inertias.changes))}; {felt}"
+        text = f"no rigid body has these, and {felt}: {'; '.join(grouped(inertias.changes))}"
     yield Finding("inertias", largest <= UNFELT, largest, UNFELT, "1", leg, text)
 
 

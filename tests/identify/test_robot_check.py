@@ -79,6 +79,15 @@ def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
     assert f"{len(failed)} of {len(found)} findings about ups6 fail" in one_line(capfd.readouterr().err)
 
 
+def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read(capfd):
+    """Beside the inertias of ten bodies, of which the table has the whole list."""
+    assert command("check", "rss6", "--set", "control.torque_limit_N_m=3.0", "--quiet") == BEYOND_LIMIT
+    said = one_line(capfd.readouterr().err)
+    assert "2 of 21 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
+    assert "and the actuators have 3 N m; inertias: no rigid body has these, and accelerations change by up to" in said
+    assert len(said) < 400
+
+
 def test_a_report_that_cannot_be_written_and_an_unknown_set_are_named_in_one_line(tmp_path, capfd):
     assert command("check", "ups6", "--quiet", "--json", tmp_path) != 0
     assert "cannot write" in one_line(capfd.readouterr().err)
