@@ -75,8 +75,9 @@ def simulate(
     those by their pivots and all other parameters, in less time; `groups.of_all` says what follows for all. A start
     must not be given then.
     compiled: False runs the same lines in plain Python, thousands of times slower.
-    Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
-    UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
+    Raises LoopFailure when the robot leaves the reachable set (an unstable loop, or actuators at their limit), or where
+    sensor or controller raise a DynamicsError; and before the run UnreachablePoseError where reference or start leave
+    it, ParameterError, SimulationError, SingularPoseError.
     """
     problem = _checked(
         robot,
