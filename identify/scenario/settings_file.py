@@ -53,7 +53,7 @@ class SettingsFiles(Generic[Settings]):
         try:
             return path.read_text(encoding="utf-8"), path
         except (OSError, UnicodeDecodeError) as error:
-            reason = f", and {error}" if path.exists() else " nor a file"
+            reason = f", and {error}" if path.is_file() else " nor a file" + ", but a folder" * path.is_dir()
             raise self.error(f"{self.kind} {name!r} is neither built in ({', '.join(built_in)}){reason}") from error
 
     def from_toml(self, text: str, source: str, folder: Path = Path()) -> Settings:
