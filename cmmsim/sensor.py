@@ -28,7 +28,7 @@ from cmmsim.geometry.pose import Array, checked_pose
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.renderer import choose_renderer
-from cmmsim.many_frames import expected_at, measure_at_rest, measure_moving
+from cmmsim.many_frames import expected_at, measure_frames
 from cmmsim.plugins import is_own, require_renderer
 from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
 from cmmsim.pose_estimation.many import ManySeen, MeasuredPoses
@@ -293,8 +293,8 @@ class Sensor:
         still: one frame each, with noise and dropout of its own, and without drift.
 
         Nothing is searched or tracked: stickers are looked for near poses (N,6), or where they are where that is not
-        said. Each frame has the noise that ``measure`` would have given it. At rest, frames are drawn and measured in
-        blocks on all cores, moving ones with images one by one; without images, 60,000 frames a second and core.
+        said, as they move at pose_rates. Each frame has the noise that ``measure`` would have given it. With images,
+        frames are drawn and measured in blocks on all cores; without, 60,000 frames a second and core.
         Raises CmmError for a sensor without images that measures by planes.
         """
         at = _rows(poses, "poses are rows of six finite numbers")
@@ -302,7 +302,6 @@ class Sensor:
             0.0 * at if pose_rates is None else pose_rates, at.shape, "there is a pose_rate to each pose"
         )
         camera, placed = self.camera, self.true_cameras.placed(obstacles)
-        still = not rates.any() or (self.timing.exposure == 0.0 and not self.true_cameras.right_later)
         if isinstance(camera, StatisticalStereoCamera):
             tracker = self._new_tracker()
             if isinstance(tracker, Tracker):
@@ -311,12 +310,8 @@ class Sensor:
             rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
             self._frame += len(at)
             found = tracker.measure_many(camera, camera.exposed(at, rates), camera.placed(placed), rng)
-        elif still:
-            found = MeasuredPoses.of([each.found for each in self._at_rest(camera, at, near, placed)])
         else:
-            found = MeasuredPoses.of_each(
-                measure_moving(camera, self.estimator, at, rates, self._frame_rngs(len(at)), placed)
-            )
+            found = MeasuredPoses.of([each.found for each in self._in_blocks(camera, at, rates, near, placed)])
         return found.without(self._dropout_rng.random(len(at)) < self.timing.dropout)
 
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
@@ -326,7 +321,7 @@ class Sensor:
         """
         at, camera = _rows(poses, "poses are rows of six finite numbers"), self.camera
         if not isinstance(camera, StatisticalStereoCamera):
-            return [one for each in self._at_rest(camera, at, near, {}) for one in each.measurements()]
+            return [one for each in self._in_blocks(camera, at, 0.0 * at, near, {}) for one in each.measurements()]
         found, estimator = [], self.estimator
         for pose, expected in zip(at, expected_at(estimator, np.asarray(near, dtype=float)), strict=True):
             try:
@@ -335,12 +330,17 @@ class Sensor:
                 found.append(lost_measurement(str(error)))
         return found
 
-    def _at_rest(
-        self, camera: VirtualStereoCamera, poses: Array, near: ArrayLike | None, placed: Mapping[str, Array]
+    def _in_blocks(
+        self,
+        camera: VirtualStereoCamera,
+        poses: Array,
+        rates: Array,
+        near: ArrayLike | None,
+        placed: Mapping[str, Array],
     ) -> list[ManySeen]:
-        """The next frames, of a platform at rest at poses (N,6), in blocks."""
+        """The next frames, of a platform at poses (N,6) in motion at rates (N,6), in blocks."""
         around = finite_array(poses if near is None else near, poses.shape, "there is a pose near each pose")
-        return measure_at_rest(camera, self.estimator, poses, around, self._frame_rngs(len(poses)), placed)
+        return measure_frames(camera, self.estimator, poses, rates, around, self._frame_rngs(len(poses)), placed)
 
     def _frame_rngs(self, count: int) -> list[np.random.Generator]:
         """Streams of noise of the next frames."""

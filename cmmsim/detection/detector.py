@@ -1,8 +1,11 @@
 """The contract of all detectors of sticker centres: what they are given, what they hand back, and which is taken."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +42,16 @@ class DetectedCentres:
     shapes: Array | None = None
     shape_covariances: Array | None = None
     misfits: Array | None = None
+
+    def with_others(self, at: NDArray[np.int_], others: DetectedCentres, which: NDArray[np.bool_]) -> Self:
+        """The same, but in windows ``at`` (m,) those of ``which`` (k,) of other windows; states what both state."""
+        changed: dict[str, Any] = {}
+        for name, own in vars(self).items():
+            theirs = getattr(others, name)
+            changed[name] = None if own is None or theirs is None else own.copy()
+            if changed[name] is not None:
+                changed[name][at] = theirs[which]
+        return replace(self, **changed)
 
 
 def no_centres() -> DetectedCentres:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError
-from cmmsim.geometry.pose import Array, apply, pose_to_transform, rigid, transforms_of
+from cmmsim.geometry.pose import Array, apply_each, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.scene import DiscStack
@@ -20,24 +20,29 @@ LARGEST_STEP_PX = 0.3  # between two sub-frames no sticker moves farther
 MOST_SUB_FRAMES = 500
 SUPERSAMPLING = 9
 
+Moments = Sequence[Sequence[Array]]
+"""camera_from_body (b,4,4) of all bodies for the left and the right camera, at each sub-frame of an exposure."""
 
-def sub_frame_poses(pose: Array, pose_rate: Array, exposure: float, sticker_pixels: Callable[[Array], Array]) -> Array:
-    """Poses (m, 6) whose mean image is that of the whole exposure, by the midpoint rule.
 
-    Parameters: pose (6,) in the middle of the exposure; pose_rate (6,) its time derivative, which is constant; exposure
-    s; sticker_pixels: places (..., 2) px of all stickers in the images at a pose. Raises CmmError where the stickers
-    move farther than an image can show.
+def sub_frame_poses(
+    poses: Array, pose_rates: Array, exposure: float, sticker_pixels: Callable[[Array], Array]
+) -> list[Array]:
+    """For each of N exposures poses (m, 6) whose mean image is that of the whole exposure, by the midpoint rule.
+
+    Parameters: poses (N, 6) in the middle of the exposures; pose_rates (N, 6) their time derivatives, which are
+    constant; exposure s; sticker_pixels: places (2, N, n, 2) px of all stickers in the images at poses (N, 6). Raises
+    CmmError where the stickers move farther than an image can show.
     """
-    half = 0.5 * exposure * pose_rate
-    moved = float(np.linalg.norm(sticker_pixels(pose + half) - sticker_pixels(pose - half), axis=-1).max())
-    count = max(1, int(np.ceil(moved / LARGEST_STEP_PX)))
-    if count > MOST_SUB_FRAMES:
+    halves = 0.5 * exposure * pose_rates
+    moved = np.linalg.norm(sticker_pixels(poses + halves) - sticker_pixels(poses - halves), axis=-1).max(axis=(0, 2))
+    counts = np.maximum(1, np.ceil(moved / LARGEST_STEP_PX)).astype(int)
+    for far, rate in zip(moved[counts > MOST_SUB_FRAMES], pose_rates[counts > MOST_SUB_FRAMES], strict=True):
         raise CmmError(
-            f"a sticker moves {moved:.0f} px during the exposure of {exposure:g} s at pose rate "
-            f"{pose_rate.tolist()}, at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn"
+            f"a sticker moves {far:.0f} px during the exposure of {exposure:g} s at pose rate "
+            f"{rate.tolist()}, at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn"
         )
-    share = (2.0 * np.arange(count) + 1.0) / count - 1.0
-    return pose + share[:, None] * half
+    shares = [(2.0 * np.arange(count) + 1.0) / count - 1.0 for count in counts]
+    return [pose + share[:, None] * half for pose, share, half in zip(poses, shares, halves, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -79,17 +84,15 @@ class VirtualStereoCamera:
         ``pose`` (6,) of the platform in the middle of the exposure, ``pose_rate`` (6,) its time derivative; obstacles
         stand still.
         """
-        poses = pose[None]
-        if pose_rate is not None and self.exposure > 0.0:
-            poses = sub_frame_poses(pose, pose_rate, self.exposure, self._sticker_pixels)
-        lag = np.zeros(6) if pose_rate is None else self.right_later * pose_rate
-        return LiveImages(self, self._placed(poses, poses + lag, obstacles or {}), rng, quality or Quality())
+        rates = None if pose_rate is None else pose_rate[None]
+        return LiveImages(self, self._moments(pose[None], rates, obstacles or {})[0], rng, quality or Quality())
 
     def look_many(
-        self, poses: Array, rngs: Sequence[np.random.Generator], obstacles: Mapping[str, Array]
+        self, poses: Array, rngs: Sequence[np.random.Generator], obstacles: Mapping[str, Array], pose_rates: Array
     ) -> "ManyLiveImages":
-        """Exposures of the platform at rest at poses (N,6), each with its own noise, as ``look`` for each of them."""
-        return ManyLiveImages(self, self._placed(poses, poses, obstacles), rngs)
+        """Exposures of the platform at poses (N,6) in motion at pose_rates (N,6), each with its own noise, as ``look``
+        for each of them."""
+        return ManyLiveImages(self, self._moments(poses, pose_rates, obstacles), rngs)
 
     def moved(self, changes: Array) -> "VirtualStereoCamera":
         """The same cameras with changes (24,) of their rig's parameters; their pixels stay what they are."""
@@ -97,24 +100,30 @@ class VirtualStereoCamera:
         camera.__dict__["patterns"] = self.patterns
         return camera
 
-    def radiance(
-        self, placed: Sequence[Array], corners: NDArray[np.int_], size: int, supersampling: int
-    ) -> NDArray[np.float32]:
-        """Radiance (2, n, size, size) of windows at ``corners`` (2, n, 2) in the left and right image.
-
-        ``placed``: camera_from_body (b,4,4) of all bodies for the left and the right camera.
-        """
-        return self.radiances([placed], [corners], size, supersampling)[0]
-
     def radiances(
-        self,
-        placed: Sequence[Sequence[Array]],
-        corners: Sequence[NDArray[np.int_]],
-        size: int,
-        supersampling: int,
+        self, moments: Sequence[Moments], corners: Sequence[NDArray[np.int_]], size: int, supersampling: int
     ) -> list[NDArray[np.float32]]:
-        """As ``radiance`` for each of several exposures. They are drawn together where nothing finer than their pixels
-        is drawn: finer windows of many exposures would not fit into the processor's caches."""
+        """Mean radiance (2, n, size, size) of windows at ``corners`` (2, n, 2) in the left and right image over the
+        moments of an exposure, for each of several exposures.
+
+        One moment of all exposures is drawn after the other: no more is held at once than without motion.
+        """
+        light = self._drawn([first for first, *_ in moments], corners, size, supersampling)
+        for k in range(1, max(map(len, moments))):
+            going = [n for n, own in enumerate(moments) if len(own) > k]
+            drawn = self._drawn([moments[n][k] for n in going], [corners[n] for n in going], size, supersampling)
+            for n, more in zip(going, drawn, strict=True):
+                light[n] += more
+        for mean, own in zip(light, moments, strict=True):
+            if len(own) > 1:
+                mean /= np.float32(len(own))
+        return light
+
+    def _drawn(
+        self, placed: Sequence[Sequence[Array]], corners: Sequence[NDArray[np.int_]], size: int, supersampling: int
+    ) -> list[NDArray[np.float32]]:
+        """As ``radiances``, of one moment each. Exposures are drawn together where nothing finer than their pixels is
+        drawn: finer windows of many exposures would not fit into the processor's caches."""
         sides = [
             Side(*side)
             for at, first in zip(placed, corners, strict=True)
@@ -155,6 +164,18 @@ class VirtualStereoCamera:
         cut = [p.windows(at, size) for p, at in zip(self.patterns, corners, strict=True) if p is not None]
         return FixedPattern(np.stack([c.sensitivity for c in cut]), np.stack([c.offset for c in cut])) if cut else None
 
+    def _moments(self, poses: Array, rates: Array | None, obstacles: Mapping[str, Array]) -> list[Moments]:
+        """The moments of exposures at poses (N,6) in motion at rates (N,6)."""
+        parts, lag = list(poses[:, None]), np.zeros(poses.shape)
+        if rates is not None:
+            lag = self.right_later * rates
+            if self.exposure > 0.0:
+                parts = sub_frame_poses(poses, rates, self.exposure, self._sticker_pixels)
+        counts = [len(part) for part in parts]
+        left = np.concatenate(parts)
+        placed = self._placed(left, left + np.repeat(lag, counts, axis=0), obstacles)
+        return [placed[end - count : end] for count, end in zip(counts, np.cumsum(counts), strict=True)]
+
     def _placed(self, left: Array, right: Array, obstacles: Mapping[str, Array]) -> list[tuple[Array, Array]]:
         """camera_from_body (b,4,4) of all bodies for the left and the right camera, each at its own poses (N,6) of the
         platform, for each of N moments."""
@@ -167,28 +188,28 @@ class VirtualStereoCamera:
             sides.append(list(placed))
         return list(zip(*sides, strict=True))
 
-    def _sticker_pixels(self, pose: Array) -> Array:
-        """Pixels (2, n, 2) of the platform's stickers."""
+    def _sticker_pixels(self, poses: Array) -> Array:
+        """Pixels (2, N, n, 2) of the platform's stickers at poses (N,6)."""
+        return self.rig.project(apply_each(self.camera_from_base @ transforms_of(poses), self._sticker_places))[0]
+
+    @cached_property
+    def _sticker_places(self) -> Array:
+        """Places (n,3) of the platform's stickers, m, in its axes."""
         drawable = self.formation.drawable
-        places = np.array(
+        return np.array(
             [
                 patch.discs[-1].centre
                 for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
                 if body == 0 and isinstance(patch, DiscStack)
             ]
         )
-        return self.rig.project(apply(self.camera_from_base @ pose_to_transform(pose), places))[0]
 
 
 class LiveImages:
-    """One exposure, drawn as far as it is read; moments: the placed bodies at each of its sub-frames."""
+    """One exposure, drawn as far as it is read."""
 
     def __init__(
-        self,
-        camera: VirtualStereoCamera,
-        moments: Sequence[Sequence[Array]],
-        rng: np.random.Generator,
-        quality: Quality,
+        self, camera: VirtualStereoCamera, moments: Moments, rng: np.random.Generator, quality: Quality
     ) -> None:
         self._camera, self._moments, self._rng, self._quality = camera, moments, rng, quality
 
@@ -203,11 +224,7 @@ class LiveImages:
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
         """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""
-        radiance = self._camera.radiance(self._moments[0], corners, size, self._quality.supersampling)
-        for placed in self._moments[1:]:
-            radiance += self._camera.radiance(placed, corners, size, self._quality.supersampling)
-        if len(self._moments) > 1:
-            radiance /= np.float32(len(self._moments))
+        (radiance,) = self._camera.radiances([self._moments], [corners], size, self._quality.supersampling)
         pattern = self._camera.pattern_in(corners, size)
         if self._quality.exposures == 1:
             return self._camera.noise.expose(radiance, self._rng, pattern)
@@ -215,13 +232,12 @@ class LiveImages:
 
 
 class ManyLiveImages:
-    """Exposures of a scene that stands still in each, drawn as far as they are read; placed: camera_from_body (b,4,4)
-    of all bodies for both cameras of each exposure; rngs: of its noise."""
+    """Exposures, drawn as far as they are read, each with noise of its own stream."""
 
     def __init__(
-        self, camera: VirtualStereoCamera, placed: Sequence[Sequence[Array]], rngs: Sequence[np.random.Generator]
+        self, camera: VirtualStereoCamera, moments: Sequence[Moments], rngs: Sequence[np.random.Generator]
     ) -> None:
-        self._camera, self._placed, self._rngs = camera, placed, rngs
+        self._camera, self._moments, self._rngs = camera, moments, rngs
 
     def windows_of(self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int) -> Windows:
         """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2), of ``exposures`` (n,) in
@@ -229,7 +245,7 @@ class ManyLiveImages:
         camera = self._camera
         shown = np.unique(exposures)
         own = np.split(corners, np.searchsorted(exposures, shown[1:]), axis=1)
-        drawn = camera.radiances([self._placed[k] for k in shown], own, size, Quality().supersampling)
+        drawn = camera.radiances([self._moments[k] for k in shown], own, size, Quality().supersampling)
         grey = [
             camera.noise.expose(light, self._rngs[k], camera.pattern_in(at, size))
             for k, light, at in zip(shown, drawn, own, strict=True)

@@ -35,15 +35,6 @@ class MeasuredPoses:
         every = [vars(part).values() for part in (none, *parts)]
         return cls(*(np.concatenate(values) for values in zip(*every, strict=True)))
 
-    @classmethod
-    def of_each(cls, found: Sequence[Measurement]) -> MeasuredPoses:
-        """Those of single frames."""
-        return cls(
-            np.array([one.pose for one in found]).reshape(-1, 6),
-            np.array([one.covariance for one in found]).reshape(-1, 6, 6),
-            np.array([len(one.target_ids) for one in found], dtype=int),
-        )
-
     def without(self, dropped: NDArray[np.bool_]) -> MeasuredPoses:
         """The same frames, of which those that are ``dropped`` (N,) are lost."""
         gone = dropped[:, None]
@@ -89,12 +80,14 @@ class ManySeen:
         )
 
 
-def measure_exposures(estimator: PoseEstimator, images: ManyExposures, expected: Array) -> ManySeen:
-    """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4), as
-    ``PoseEstimator.measure`` does in one."""
+def measure_exposures(
+    estimator: PoseEstimator, images: ManyExposures, expected: Array, swept: tuple[Array, Array]
+) -> ManySeen:
+    """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4), which go from and to
+    those of ``swept`` (N,4,4), as ``PoseEstimator.measure`` does in one."""
     count, stickers = len(expected), len(estimator.taught.platform_places)
     places, normals = estimator.taught.platform_places, estimator.platform.sticker_normals
-    seen = estimator.read(images, expected, places, normals).observed()
+    seen = estimator.read(images, expected, places, normals).observed(swept)
     if estimator.method == "registration" and len(seen.index):
         result, excess = all_consistent(seen, estimator, estimator.platform, places, count)
         base_from_platform = estimator.taught.base_from_camera @ result.transform

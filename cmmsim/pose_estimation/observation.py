@@ -13,7 +13,7 @@ from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, Spot
 from cmmsim.detection.ellipse_fit import MAXIMUM_LIKELIHOOD, SMEAR_STEP_PX, EllipseFits, fit_ellipses
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.disc_image import centre_offset
-from cmmsim.geometry.pose import Array, apply, apply_each
+from cmmsim.geometry.pose import Array, apply_each
 from cmmsim.geometry.stereo_rig import StereoRig, triangulate
 from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.radiometry.images import StereoImages, Windows
@@ -148,7 +148,7 @@ class Observer:
         pixels, valid = self.rig.project(apply_each(camera_from_body, places).reshape(-1, 3))
         facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
         index = np.flatnonzero(np.all(valid & facing, axis=0))
-        size = self.settings.window_size + 2 * self.detector.margin_px
+        exposures, size = index // len(places), self.settings.window_size + 2 * self.detector.margin_px
         corners = np.rint(pixels[:, index] - 0.5 * (size - 1)).astype(int)
         windows: Windows = np.zeros((2, len(index), 0, 0))
         offsets, found = np.zeros((2, 0, 2)), None
@@ -156,7 +156,7 @@ class Observer:
             if isinstance(images, StickerExposure):
                 found = images.detected(corners, size, self)
             elif isinstance(images, ManyExposures):
-                windows = self.evenly_lit(images.windows_of(index // len(places), corners, size), corners)
+                windows = self.evenly_lit(images.windows_of(exposures, corners, size), corners)
             else:
                 windows = self.evenly_lit(images.windows(corners, size), corners)
             offsets = np.stack(
@@ -165,10 +165,8 @@ class Observer:
                     for camera, c, t in zip(self.rig.cameras, centres, turned, strict=True)
                 ]
             )
-        sticker = index % len(places)
-        return StickerWindows(
-            self, index, camera_from_body, places[sticker], normals[sticker], corners, windows, offsets, found
-        )
+        body = camera_from_body, places[index % len(places)], normals[index % len(places)]
+        return StickerWindows(self, index, exposures, *body, corners, windows, offsets, found)
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
         """Windows (2, n, size, size) with the light within each made even: that of its middle.
@@ -193,14 +191,16 @@ class Observer:
 class StickerWindows:
     """Grey values around the k stickers of a body that both cameras of an observer should see.
 
-    index (k,) into the body's stickers; camera_from_body (4,4) or (N,4,4) near which they are expected; places (k,3) m
-    and normals (k,3) in body axes; corners (2,k,2) px of the first pixels of windows (2,k,h,h), evenly lit; offsets
-    (2,k,2) px of the ellipses' centres from those of the stickers (eccentricity). found: what a detector finds in them,
-    where there are no images; then the windows are empty.
+    index (k,) into the body's stickers; exposures (k,) that show them, in rising order, 0 where there is one;
+    camera_from_body (4,4) or (N,4,4) near which they are expected; places (k,3) m and normals (k,3) in body axes;
+    corners (2,k,2) px of the first pixels of windows (2,k,h,h), evenly lit; offsets (2,k,2) px of the ellipses' centres
+    from those of the stickers (eccentricity). found: what a detector finds in them, where there are no images; then the
+    windows are empty.
     """
 
     observer: Observer
     index: NDArray[np.int_]
+    exposures: NDArray[np.int_]
     camera_from_body: Array
     places: Array
     normals: Array
@@ -210,15 +210,14 @@ class StickerWindows:
     found: DetectedCentres | None = None
 
     def observed(self, swept: tuple[Array, Array] | None = None) -> StickerObservation:
-        """The stickers in these windows; ``swept`` as of ``Observer.observe``."""
+        """The stickers in these windows; ``swept`` as of ``Observer.observe``, (N,4,4) each where the expected are."""
         if len(self.index) == 0:
             none = np.zeros((0, 3))
             return StickerObservation(self.index, none[:, :2], none[:, :2], none, np.zeros((0, 3, 3)), none[:, 0])
         rig, settings = self.observer.rig, self.observer.settings
-        smears = None if swept is None else self._smears(swept)
         fits = self.found or self._detected()
-        if smears is not None and self.found is None:
-            fits = _likelier(fits, self._detected(smears))
+        if swept is not None and self.found is None:
+            fits = self._likelier(fits, swept)
         seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
         systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
         spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
@@ -263,27 +262,44 @@ class StickerWindows:
         """Windows (2k,h,h) and corners (2k,2) of both images together."""
         return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
 
-    def _smears(self, swept: tuple[Array, Array]) -> Array | None:
-        """Movement (2k, 2) px of the stickers in both images during the exposure.
+    def _likelier(self, still: DetectedCentres, swept: tuple[Array, Array]) -> DetectedCentres:
+        """What agrees better with the images of each exposure, ``still`` or what is found of a body in motion: the
+        movement is only expected, and the platform may have stopped."""
+        smears, shown = self._smears(swept)
+        if still.misfits is None or not shown.any():
+            return still
+        moving, again = self._selected(shown)._detected(smears[:, shown].reshape(-1, 2)), np.tile(shown, 2)
+        if moving.misfits is None:
+            return still
+        gains = (still.misfits[again] - moving.misfits).reshape(2, -1)
+        _, starts, counts = np.unique(self.exposures[shown], return_index=True, return_counts=True)
+        better = [np.median(own) > 0.0 for own in np.split(gains, starts[1:], axis=1)]
+        taken = np.tile(np.repeat(better, counts), 2)
+        return still.with_others(np.flatnonzero(again)[taken], moving, taken)
 
-        None where it is too short to show beside the point spread, or so long that it cannot be told.
+    def _smears(self, swept: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
+        """Movement (2, k, 2) px of the stickers in both images during the exposure, and where it counts (k,).
+
+        It does not in exposures where it is too short to show beside the point spread, or so long that it cannot be
+        told.
         """
-        first, last = (self.observer.rig.project(apply(pose, self.places))[0] for pose in swept)
+        moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in swept)
+        first, last = (self.observer.rig.project(apply_each(move, self.places[:, None])[:, 0])[0] for move in moves)
         shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * self.observer.settings.optics.psf_px)
-        longest = float(np.linalg.norm(last - first, axis=-1).max())
-        return (last - first).reshape(-1, 2) if shortest < longest < LONGEST_SMEAR_PX else None
+        longest = np.zeros(self.exposures[-1] + 1)
+        np.maximum.at(longest, self.exposures, np.linalg.norm(last - first, axis=-1).max(axis=0))
+        return last - first, ((shortest < longest) & (longest < LONGEST_SMEAR_PX))[self.exposures]
+
+    def _selected(self, keep: NDArray[np.bool_]) -> StickerWindows:
+        """The windows of only some of the stickers."""
+        each = {name: getattr(self, name)[keep] for name in ("index", "exposures", "places", "normals")}
+        both = {name: getattr(self, name)[:, keep] for name in ("corners", "windows", "offsets")}
+        return replace(self, **each, **both)
 
 
 def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
     """Whether a camera sees stickers with centres (n,3) m and normals (n,3), camera axes, not at grazing incidence."""
     return np.asarray(-np.einsum("ni,ni->n", centres, normals) > GRAZING * np.linalg.norm(centres, axis=1))
-
-
-def _likelier(still: DetectedCentres, moving: DetectedCentres) -> DetectedCentres:
-    """What agrees better with the images: the movement is only expected, and the platform may have stopped."""
-    if still.misfits is None or moving.misfits is None:
-        return still
-    return moving if np.median(moving.misfits - still.misfits) < 0.0 else still
 
 
 def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:

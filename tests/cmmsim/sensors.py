@@ -73,7 +73,7 @@ def corners_about(sensor, pose, size):
 def centre_errors(sensor, pose, supersampling=SUPERSAMPLING, size=16):
     """Fitted minus expected ellipse centres (36, 2) px from unrounded noise-free windows."""
     corners, noise = corners_about(sensor, pose, size), replace(sensor.noise, enabled=False)
-    grey = noise.mean_grey(sensor.camera.radiance(placed_at(sensor, pose), corners, size, supersampling))
+    grey = noise.mean_grey(sensor.camera.radiances([[placed_at(sensor, pose)]], [corners], size, supersampling)[0])
     grey = replace(sensor.observer, noise=noise).evenly_lit(grey, corners)
     flat, psf_px = corners.reshape(-1, 2), sensor.optics.psf_px
     fits = fit_ellipses(grey.reshape(-1, size, size), flat, noise, size - 2, psf_px=psf_px)

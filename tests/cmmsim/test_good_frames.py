@@ -64,16 +64,16 @@ def test_good_frames_are_not_lost(taught, monkeypatch, record_property, frames):
     Each pose is drawn once and exposed many times.
     """
     sensor = cmmsim.load_sensor("ctrack780", taught=taught, renderer="analytic")
-    drawn, draw = {}, VirtualStereoCamera.radiance
+    drawn, draw = {}, VirtualStereoCamera.radiances
 
-    def radiance(camera, placed, corners, size, supersampling):
-        key = corners.tobytes()
+    def radiances(camera, moments, corners, size, supersampling):
+        key = corners[0].tobytes()
         if key not in drawn:
             drawn.clear()
-            drawn[key] = draw(camera, placed, corners, size, supersampling)
+            drawn[key] = draw(camera, moments, corners, size, supersampling)
         return drawn[key]
 
-    monkeypatch.setattr(VirtualStereoCamera, "radiance", radiance)
+    monkeypatch.setattr(VirtualStereoCamera, "radiances", radiances)
     estimator, lost, left_out = sensor.estimator, 0, 0
     for pose in poses_about_home(sensor, frames // DRAWS, seed=7):
         images, expected = sensor.look(pose), camera_from(sensor, pose)

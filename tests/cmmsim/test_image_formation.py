@@ -65,7 +65,7 @@ def test_point_spread_is_a_gaussian(psf_px):
     sensor = exact("perfect", {"lens.psf_px": psf_px})
     pose, size, margin = sensor.home, 16, 10
     corners = corners_about(sensor, pose, 16)[:, :4]
-    windows = sensor.camera.radiance(placed_at(sensor, pose), corners, size, 6)
+    windows = sensor.camera.radiances([[placed_at(sensor, pose)]], [corners], size, 6)[0]
     for side in (0, 1):
         for corner, window in zip(corners[side], windows[side], strict=True):
             fine = finely_drawn(sensor, side, pose, corner - margin, size + 2 * margin)
@@ -79,7 +79,7 @@ def test_bent_images_show_what_opencv_says():
     sensor = exact("distorted")
     pose, size, margin = sensor.home, 16, 6
     corners = corners_about(sensor, pose, 16)[:, ::6]
-    windows = sensor.camera.radiance(placed_at(sensor, pose), corners, size, 6)
+    windows = sensor.camera.radiances([[placed_at(sensor, pose)]], [corners], size, 6)[0]
     for side, camera in enumerate(sensor.rig.cameras):
         lens = camera.distortion
         for corner, window in zip(corners[side], windows[side], strict=True):
@@ -102,7 +102,7 @@ def test_vignetting_darkens_windows_and_whole_images_with_the_square_of_the_dist
     dark, bright = (exact("perfect", {"lens.vignetting": share} | BESIDE_THE_MIDDLE) for share in (0.3, 0.0))
     placed = placed_at(dark, dark.home)
     corners = corners_about(dark, dark.home, 16)
-    share = [s.camera.radiance(placed, corners, 16, 6) for s in (dark, bright)]
+    share = [s.camera.radiances([[placed]], [corners], 16, 6)[0] for s in (dark, bright)]
     whole = [s.camera.whole_exposure(1, [placed[1]], 6) for s in (dark, bright)]
     y, x = np.mgrid[:1536, :2048]
     away = (x - 1100.0) ** 2 + (y - 700.0) ** 2

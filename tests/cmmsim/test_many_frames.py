@@ -88,6 +88,41 @@ def test_nothing_depends_on_the_number_of_threads(monkeypatch):
             np.testing.assert_array_equal(value, getattr(other, name))
 
 
+@pytest.mark.parametrize("kind", ["perfect", pytest.param("all", marks=pytest.mark.slow), "centroids"])
+def test_each_in_motion_is_measured_as_alone(kind):
+    """Streaks of up to two pixels beside ones that are too long to be told and frames at rest, behind an obstacle, with
+    one out of sight; the right camera exposes later."""
+    centroids = kind == "centroids"
+    changes = {"timing.exposure": 0.002} | ({"detection.detector": "grey_centroid"} if centroids else {})
+    sensor = exact("perfect" if centroids else kind, changes, seed=3)
+    sensor.move_rig({}, right_later=1e-5)
+    sensor.add_bodies({"rod": cmmsim.rod(0.3, 0.004)})
+    before, aside = sensor.home[:3] + np.array([0.25, 0.0, 0.25]), np.array([0.0, 0.15, 0.0])
+    rod = {"rod": cmmsim.rod_transform(before - aside, before + aside)}
+    count = FRAMES if kind == "perfect" else 7
+    poses, rng = poses_about_home(sensor, count), np.random.default_rng(2)
+    rates = rng.uniform(-1, 1, (count, 6)) * [0.3, 0.3, 0.3, 1.0, 1.0, 1.0] * (np.arange(count) % 3 > 0)[:, None]
+    rates[1], poses[2, 0] = np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.0]), poses[2, 0] + 5.0
+    near = poses + 0.01 * REACH * rng.uniform(-1, 1, poses.shape)
+    plain = []
+    for pose, rate, around in zip(poses, rates, near, strict=True):
+        half, moved = 0.001 * rate, expected(sensor, around) @ invert(pose_to_transform(pose))
+        swept = moved @ pose_to_transform(pose - half), moved @ pose_to_transform(pose + half)
+        images = sensor.look(pose, rod, pose_rate=rate)
+        try:
+            plain.append(sensor.estimator.measure(images, expected(sensor, around), swept)[0])
+        except cmmsim.LostError:
+            plain.append(None)
+    sensor.start_run(3)
+    many = sensor.measure_many(poses, rates, obstacles=rod, near=near)
+    good = [k for k, one in enumerate(plain) if one is not None]
+    assert count - 2 <= len(good) < count
+    assert many.stickers.tolist() == [0 if one is None else len(one.target_ids) for one in plain]
+    assert np.array_equal(np.flatnonzero(np.isfinite(many.poses[:, 0])), good)
+    np.testing.assert_allclose(many.poses[good], [plain[k].pose for k in good], atol=1e-12)
+    np.testing.assert_allclose(many.covariances[good], [plain[k].covariance for k in good], rtol=1e-6)
+
+
 def test_what_moves_is_measured_as_it_moves():
     """Stickers are drawn out over half a pixel, of which the fit is told."""
     sensor = exact(changes={"timing.exposure": 1e-4}, seed=6)

@@ -37,19 +37,21 @@ def rate_of(sensor, pose, longest_px):
 
 
 def test_sub_frames_are_close_and_lie_about_the_middle():
-    def pixels(pose):
-        return 1000.0 * pose[:2]
+    def pixels(poses):
+        return np.tile(1000.0 * poses[:, None, :2], (2, 1, 1, 1))
 
     pose, rate = np.arange(6.0), np.array([3.0, 4.0, 0.0, 0.0, 0.0, 1.0])
-    poses = sub_frame_poses(pose, rate, 1e-3, pixels)
+    (poses,) = sub_frame_poses(pose[None], rate[None], 1e-3, pixels)
     assert len(poses) == np.ceil(5.0 / LARGEST_STEP_PX)
     np.testing.assert_allclose(poses.mean(axis=0), pose, atol=1e-15)
     steps = np.diff(poses, axis=0)
     np.testing.assert_allclose(steps, np.tile(steps[0], (len(steps), 1)), atol=1e-15)
     assert 1000.0 * np.linalg.norm(steps[0, :2]) <= LARGEST_STEP_PX
     np.testing.assert_allclose(steps[0] * len(poses), 1e-3 * rate, atol=1e-15)
-    for still in (sub_frame_poses(pose, 0.0 * rate, 1e-3, pixels), sub_frame_poses(pose, rate, 0.0, pixels)):
+    each = np.array([pose, pose, -pose]), np.array([0.0 * rate, rate, -rate])
+    for still in (sub_frame_poses(*each, 1e-3, pixels)[0], sub_frame_poses(*each, 0.0, pixels)[1]):
         np.testing.assert_array_equal(still, pose[None])
+    np.testing.assert_array_equal(sub_frame_poses(*each, 1e-3, pixels)[2], -poses)
 
 
 @pytest.mark.parametrize(("lens", "longest_px"), [("perfect", 0.5), ("blurred", 1.5), ("all", 1.5)])

@@ -88,7 +88,7 @@ def test_the_whole_image_shows_the_windows(lens, renderer, granted):
     """
     sensor = exact(lens, renderer=renderer)
     placed, corners = placed_at(sensor, sensor.home), corners_about(sensor, sensor.home, 12)
-    windows = sensor.camera.radiance(placed, corners, 12, SUPERSAMPLING)
+    windows = sensor.camera.radiances([[placed]], [corners], 12, SUPERSAMPLING)[0]
     for side in (0, 1):
         image = sensor.camera.whole_exposure(side, [placed[side]], SUPERSAMPLING)
         for (x, y), window in zip(corners[side], windows[side], strict=True):
