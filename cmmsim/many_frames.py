@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, invert, transforms_of
 from cmmsim.imaging.analytic import ANALYTIC
 from cmmsim.imaging.exposure import VirtualStereoCamera
-from cmmsim.pose_estimation.estimator import PoseEstimator
+from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement
 from cmmsim.pose_estimation.many import ManySeen, measure_exposures
+from cmmsim.statistical.exposure import StatisticalStereoCamera
 
 BLOCK = 32  # frames that are drawn and measured together
+
+Frames = tuple[PoseEstimator, Array, Array, Array, Sequence[np.random.Generator], Mapping[str, Array]]
+"""What ``measure_frames`` takes beside the camera."""
 
 
 def measure_frames(
@@ -25,7 +30,7 @@ def measure_frames(
     near: Array,
     rngs: Sequence[np.random.Generator],
     obstacles: Mapping[str, Array],
-) -> list[ManySeen]:
+) -> Iterator[ManySeen]:
     """Exposures of the platform at poses (N,6) in motion at rates (N,6), each with the noise of its own stream,
     measured by stickers that are looked for near poses (N,6), by a movement that is known: block after block of frames.
 
@@ -42,9 +47,29 @@ def measure_frames(
 
     threads = threads_at_most() if camera.formation.renderer is ANALYTIC else 1  # OpenGL draws in one thread only
     if threads == 1 or len(parts) < 2:
-        return [block(part) for part in parts]
+        yield from map(block, parts)
+        return
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(block, parts))
+        yield from pool.map(block, parts)
+
+
+def measure_without_images(
+    camera: StatisticalStereoCamera,
+    estimator: PoseEstimator,
+    poses: Array,
+    rates: Array,
+    near: Array,
+    rngs: Sequence[np.random.Generator],
+    obstacles: Mapping[str, Array],
+) -> list[Measurement]:
+    """As ``measure_frames`` of cameras that draw nothing, one by one."""
+    found = []
+    for pose, rate, expected, rng in zip(poses, rates, expected_at(estimator, near), rngs, strict=True):
+        try:
+            found.append(estimator.measure(camera.look(pose, rng, obstacles, pose_rate=rate), expected)[0])
+        except LostError as error:
+            found.append(lost_measurement(str(error)))
+    return found
 
 
 def expected_at(estimator: PoseEstimator, poses: Array) -> Array:

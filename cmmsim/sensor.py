@@ -18,7 +18,7 @@ from cmmsim.detection.detector import find_detector
 from cmmsim.detection_settings import StickerView
 from cmmsim.drift_watch import DriftWatch
 from cmmsim.drift_watch.watch import CHANCE
-from cmmsim.errors import CmmError, LostError, UnknownOptionError
+from cmmsim.errors import CmmError, UnknownOptionError
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner
@@ -28,10 +28,10 @@ from cmmsim.geometry.pose import Array, checked_pose
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.renderer import choose_renderer
-from cmmsim.many_frames import expected_at, measure_frames
+from cmmsim.many_frames import Frames, measure_frames, measure_without_images
 from cmmsim.plugins import is_own, require_renderer
 from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
-from cmmsim.pose_estimation.many import ManySeen, MeasuredPoses
+from cmmsim.pose_estimation.many import MeasuredPoses
 from cmmsim.pose_estimation.observation import DetectionSettings, Observer
 from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
@@ -294,24 +294,22 @@ class Sensor:
 
         Nothing is searched or tracked: stickers are looked for near poses (N,6), or where they are where that is not
         said, as they move at pose_rates. Each frame has the noise that ``measure`` would have given it. With images,
-        frames are drawn and measured in blocks on all cores; without, 60,000 frames a second and core.
-        Raises CmmError for a sensor without images that measures by planes.
+        frames are drawn and measured in blocks on all cores; without, 60,000 frames a second and core by registration.
         """
         at = _rows(poses, "poses are rows of six finite numbers")
         rates = finite_array(
             0.0 * at if pose_rates is None else pose_rates, at.shape, "there is a pose_rate to each pose"
         )
         camera, placed = self.camera, self.true_cameras.placed(obstacles)
-        if isinstance(camera, StatisticalStereoCamera):
-            tracker = self._new_tracker()
-            if isinstance(tracker, Tracker):
-                able = f"by registration only, not by {self.method}, with renderer {STATISTICAL.name!r}"
-                raise CmmError(f"many poses are measured at once {able}")
+        if isinstance(camera, VirtualStereoCamera):
+            blocks = measure_frames(camera, *self._frames(at, rates, near, placed))
+            found = MeasuredPoses.of([each.found for each in blocks])
+        elif isinstance(tracker := self._new_tracker(), Tracker):
+            found = MeasuredPoses.of_each(measure_without_images(camera, *self._frames(at, rates, near, placed)))
+        else:
             rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
             self._frame += len(at)
             found = tracker.measure_many(camera, camera.exposed(at, rates), camera.placed(placed), rng)
-        else:
-            found = MeasuredPoses.of([each.found for each in self._in_blocks(camera, at, rates, near, placed)])
         return found.without(self._dropout_rng.random(len(at)) < self.timing.dropout)
 
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
@@ -320,33 +318,18 @@ class Sensor:
         Without images, stickers are looked for in windows near poses (N,6), too.
         """
         at, camera = _rows(poses, "poses are rows of six finite numbers"), self.camera
-        if not isinstance(camera, StatisticalStereoCamera):
-            return [one for each in self._in_blocks(camera, at, 0.0 * at, near, {}) for one in each.measurements()]
-        found, estimator = [], self.estimator
-        for pose, expected in zip(at, expected_at(estimator, np.asarray(near, dtype=float)), strict=True):
-            try:
-                found.append(estimator.measure(self.look(pose), expected)[0])
-            except LostError as error:
-                found.append(lost_measurement(str(error)))
-        return found
+        frames = self._frames(at, 0.0 * at, near, {})
+        if isinstance(camera, StatisticalStereoCamera):
+            return measure_without_images(camera, *frames)
+        return [one for each in measure_frames(camera, *frames) for one in each.measurements()]
 
-    def _in_blocks(
-        self,
-        camera: VirtualStereoCamera,
-        poses: Array,
-        rates: Array,
-        near: ArrayLike | None,
-        placed: Mapping[str, Array],
-    ) -> list[ManySeen]:
-        """The next frames, of a platform at poses (N,6) in motion at rates (N,6), in blocks."""
-        around = finite_array(poses if near is None else near, poses.shape, "there is a pose near each pose")
-        return measure_frames(camera, self.estimator, poses, rates, around, self._frame_rngs(len(poses)), placed)
-
-    def _frame_rngs(self, count: int) -> list[np.random.Generator]:
-        """Streams of noise of the next frames."""
+    def _frames(self, at: Array, rates: Array, near: ArrayLike | None, placed: Mapping[str, Array]) -> Frames:
+        """The next frames, of a platform at poses ``at`` (N,6) in motion at rates (N,6)."""
+        around = finite_array(at if near is None else near, at.shape, "there is a pose near each pose")
         first = self._frame
-        self._frame += count
-        return [np.random.default_rng([self._run_seed, RUN_STREAM, first + k]) for k in range(count)]
+        self._frame += len(at)
+        rngs = [np.random.default_rng([self._run_seed, RUN_STREAM, first + k]) for k in range(len(at))]
+        return self.estimator, at, rates, around, rngs, placed
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
         """What measures frame after frame."""

@@ -35,6 +35,15 @@ class MeasuredPoses:
         every = [vars(part).values() for part in (none, *parts)]
         return cls(*(np.concatenate(values) for values in zip(*every, strict=True)))
 
+    @classmethod
+    def of_each(cls, found: Sequence[Measurement]) -> MeasuredPoses:
+        """Those of single frames."""
+        return cls(
+            np.array([one.pose for one in found]).reshape(-1, 6),
+            np.array([one.covariance for one in found]).reshape(-1, 6, 6),
+            np.array([len(one.target_ids) for one in found], dtype=int),
+        )
+
     def without(self, dropped: NDArray[np.bool_]) -> MeasuredPoses:
         """The same frames, of which those that are ``dropped`` (N,) are lost."""
         gone = dropped[:, None]

@@ -159,6 +159,21 @@ def test_many_at_once_are_as_many_one_by_one():
     assert abs(np.mean([len(m.target_ids) for m in alone]) - together.stickers[:500].mean()) < 0.1
 
 
+def test_many_by_planes_are_those_of_frames_alone():
+    """In motion, with one out of sight."""
+    sensor = statistical(changes={"timing.exposure": 0.002}, method="planes")
+    poses, rates = poses_of(sensor, 6) * np.where(np.arange(6) == 3, 5.0, 1.0)[:, None], np.full((6, 6), 0.1)
+    together = sensor.measure_many(poses, rates)
+    sensor.start_run(0)
+    for k, (pose, rate) in enumerate(zip(poses, rates, strict=True)):
+        images = sensor.look(pose, pose_rate=rate)
+        if k == 3:
+            assert np.isnan(together.poses[k]).all()
+        else:
+            alone = sensor.estimator.measure(images, camera_from(sensor, pose))[0]
+            np.testing.assert_allclose(together.poses[k], alone.pose, atol=1e-12)
+
+
 def test_a_run_is_the_same_again_and_drops_frames():
     sensor = statistical(changes={"timing.dropout": 0.2})
     poses, runs = poses_of(sensor, 1500), []
@@ -210,7 +225,6 @@ def test_images_are_refused():
     )
     refused(lambda: sensor.capture(sensor.home), message)
     refused(lambda: sensor.look(sensor.home).windows(np.zeros((2, 1, 2), int), 16), message)
-    refused(lambda: statistical(method="planes").measure_many([sensor.home]), "by registration only, not by planes")
     refused(lambda: sensor.measure_many([sensor.home[:5]]), "rows of six", cmmsim.CmmError)
 
 

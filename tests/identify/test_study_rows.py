@@ -139,6 +139,17 @@ def test_a_row_of_one_picture_is_lost_and_says_why_or_is_that_of_a_sensor_that_l
         static(0, scenario(**{"sensor_changes.stickers.sticker_level": 12}))
 
 
+@pytest.mark.parametrize("renderer", ["analytic", "statistical"])
+def test_a_path_is_measured_in_motion_by_both_methods_as_exactly_as_they_state(renderer):
+    """Over 60 frames of six errors each, whose stickers are drawn out over some tenths of a pixel."""
+    moving = {"renderer": renderer, "timing.exposure_s": 0.01}
+    for method in ("registration", "planes"):
+        path = row("path_pose", 4, scenario(pose_method=method, **moving), stretch_s=1.0)
+        assert (path["frames"], path["lost_frames"]) == (60, 0)
+        for what in ("position_rms_um", "orientation_rms_urad"):
+            assert path[what] == pytest.approx(path[f"stated_{what}"], rel=0.25)
+
+
 @pytest.mark.parametrize(("latency_frames", "expected"), [(0, np.sqrt(1 / 3)), (2, np.sqrt(4 + 2 + 1 / 3))])
 def test_pose_in_use_lags_by_what_its_age_says(latency_frames, expected):
     """A pose that is L old when it arrives and held for T is off by v sqrt(L^2 + L T + T^2 / 3) in the mean."""

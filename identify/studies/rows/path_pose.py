@@ -1,15 +1,15 @@
 """Rows of kind `path_pose`: the sensor alone follows a platform along a random path of the scenario's excitation.
 
 Exposure, latency, its jitter and dropout act as the scenario says. A row is a short stretch from a random instant of
-the path. The first picture is searched as a whole, the others are tracked. A measured pose counts as that in the middle
-of its exposure. Beside its error a row gives that of the pose in use: the last one that had arrived, held until the
-next one arrives. Teaching is exact unless asked for otherwise.
+the path. Its pictures are measured together: stickers are looked for where the path has them, as they move along it,
+and no picture is searched or tracked. A measured pose counts as that in the middle of its exposure. Beside its error a
+row gives that of the pose in use: the last one that had arrived, held until the next one arrives. Teaching is exact
+unless asked for otherwise.
 """
 
 import numpy as np
 from pydantic import Field
 
-import cmmsim
 from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.errors import EstimationError
@@ -18,7 +18,7 @@ from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
 from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, timing
-from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
+from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um, row_sensor
 from identify.trajectory import FourierTrajectory
 
 DRAWN_PATH, SENSOR, LATENCY = 0, 1, 2
@@ -61,31 +61,22 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     start = rng.uniform(0.0, 1.0 / scenario.excitation.fundamental_hz)
     frames = max(2, scenario.timing.frames(options.stretch_s))
     times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)
-    poses, covariances = _measured(eye, path, times)
-    ok = np.isfinite(poses[:, 0])
+    seen = eye.sensor.measure_many(path.pose(times), path.pose_rate(times))
+    ok = np.isfinite(seen.poses[:, 0])
     if ok.sum() < 2:
         raise EstimationError(f"{ok.sum()} of {frames} frames along the path gave a pose, 2 are needed")
-    errors = (poses - path.pose(times))[ok]
+    errors = (seen.poses - path.pose(times))[ok]
     latencies = scenario.timing.drawn_latencies(len(times), np.random.default_rng(stream_seed(seed, LATENCY)))
     arrivals: Array = times + (scenario.timing.latency_s if latencies is None else latencies)
-    used = _used_errors(path, poses[ok], arrivals[ok], scenario.timing.frame_period_s)
+    used = _used_errors(path, seen.poses[ok], arrivals[ok], scenario.timing.frame_period_s)
     return {
         "frames": frames,
         "lost_frames": int(np.sum(~ok)),
         "speed_rms_mm_s": 1e-3 * rms_um(path.pose_rate(times)[:, :3]),
-        **pose_figures(errors, covariances[ok]),
+        **pose_figures(errors, seen.covariances[ok]),
         "used_position_rms_um": rms_um(used[:, :3]),
         "used_orientation_rms_urad": rms_um(used[:, 3:]),
     }
-
-
-def _measured(eye: RowSensor, path: FourierTrajectory, times: Array) -> tuple[Array, Array]:
-    """Measured poses (N, 6) and covariances (N, 6, 6), NaN where a frame was lost."""
-    seen: list[cmmsim.Measurement] = [
-        eye.sensor.measure(pose, pose_rate=rate)
-        for pose, rate in zip(path.pose(times), path.pose_rate(times), strict=True)
-    ]
-    return np.array([one.pose for one in seen]), np.array([one.covariance for one in seen])
 
 
 def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_s: float) -> Array:
