@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,10 +13,13 @@ from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, invert, transforms_of
 from cmmsim.imaging.analytic import ANALYTIC
 from cmmsim.imaging.exposure import VirtualStereoCamera
+from cmmsim.imaging.renderer import Renderer
 from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement
 from cmmsim.pose_estimation.many import ManySeen, measure_exposures
 from cmmsim.statistical.exposure import StatisticalStereoCamera
 
+T = TypeVar("T")
+R = TypeVar("R")
 BLOCK = 32  # frames that are drawn and measured together
 
 Frames = tuple[PoseEstimator, Array, Array, Array, Sequence[np.random.Generator], Mapping[str, Array]]
@@ -45,12 +49,7 @@ def measure_frames(
         images = camera.look_many(poses[part], rngs[part], obstacles, rates[part])
         return measure_exposures(estimator, images, expected[part], (first[part], last[part]))
 
-    threads = threads_at_most() if camera.formation.renderer is ANALYTIC else 1  # OpenGL draws in one thread only
-    if threads == 1 or len(parts) < 2:
-        yield from map(block, parts)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(block, parts)
+    return on_all_cores(block, parts, camera.formation.renderer)
 
 
 def measure_without_images(
@@ -70,6 +69,17 @@ def measure_without_images(
         except LostError as error:
             found.append(lost_measurement(str(error)))
     return found
+
+
+def on_all_cores(work: Callable[[T], R], parts: Sequence[T], renderer: Renderer) -> Iterator[R]:
+    """Results of work on parts that know nothing of each other, in their order; in one thread with a renderer that may
+    need it, as OpenGL does."""
+    threads = threads_at_most() if renderer is ANALYTIC else 1
+    if threads == 1 or len(parts) < 2:
+        yield from map(work, parts)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(work, parts)
 
 
 def expected_at(estimator: PoseEstimator, poses: Array) -> Array:

@@ -1,7 +1,8 @@
 """Latency in the style of ASTM E3124: how long after a motion its pose is reported.
 
 A body goes round and round; a reference with an exact clock knows where it truly is. Each reported pose is compared
-with the true motion at the time of its report: the motion must be set back by the latency to fit the reports.
+with the true motion at the time of its report: the motion must be set back by the latency to fit the reports. Frames
+are tracked one after the other, not measured many at once: the tracker is part of the instrument under test.
 """
 
 from __future__ import annotations

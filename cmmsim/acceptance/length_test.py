@@ -16,6 +16,8 @@ from cmmsim.acceptance.volume import MeasuringLine, MeasuringVolume, seven_lines
 from cmmsim.errors import AcceptanceError
 from cmmsim.files.schema import Platform
 from cmmsim.geometry.pose import Array
+from cmmsim.imaging.renderer import choose_renderer
+from cmmsim.many_frames import on_all_cores
 from cmmsim.sensor import Sensor
 
 STREAM = 1
@@ -92,15 +94,20 @@ def length_test(
     exposures: int = EXPOSURES,
     advance: Callable[[], None] = lambda: None,
 ) -> LengthTest:
-    """Measure five lengths on each of the seven lines of a volume; ``advance`` is called after each line.
+    """Measure five lengths on each of the seven lines of a volume, which share all cores and have noise of their own;
+    ``advance`` is called after each line.
 
     Raises AcceptanceError when a line breaks a rule or a sticker is not measured.
     """
     lines = seven_lines(volume)
     lengths: list[MeasuredLength] = []
-    for number, line in enumerate(lines):
-        sensor = under_test.facing(length_artefact(line), STREAM + number)
-        lengths += measure_line(sensor, volume, line, exposures)
+
+    def measured(number: int) -> list[MeasuredLength]:
+        sensor = under_test.facing(length_artefact(lines[number]), STREAM + number)
+        return measure_line(sensor, volume, lines[number], exposures)
+
+    for found in on_all_cores(measured, range(len(lines)), choose_renderer(under_test.renderer_name())):
+        lengths += found
         advance()
     return LengthTest(volume, lines, tuple(lengths))
 

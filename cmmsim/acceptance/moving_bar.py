@@ -6,7 +6,8 @@ line of sight, where flat stickers cannot be seen, but turned by ``TOWARDS_DEPTH
 it turns smoothly about all its axes.
 
 The sensor measures the poses of the clusters at both ends in the same exposure. What the second is to the first is
-certified; the difference to what was measured is the error, of a bar that stands and of one that moves.
+certified; the difference to what was measured is the error, of a bar that stands and of one that moves. Frames are
+tracked one after the other, not measured many at once: the tracker is part of the instrument under test.
 """
 
 from collections.abc import Callable

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cmmsim import many_frames
 from cmmsim.acceptance import (
     AcceptanceError,
     SensorUnderTest,
@@ -41,6 +42,15 @@ def test_noise_free_lengths_are_right_to_two_microns(volume):
     found = length_test(under_test(changes=NOISE_FREE), volume, exposures=1)
     assert len(found.lengths) == 35
     assert np.abs(found.errors).max() < 2e-6
+
+
+def test_lengths_do_not_depend_on_the_number_of_threads(volume, monkeypatch):
+    found = []
+    for threads in (1, 3):
+        monkeypatch.setattr(many_frames, "threads_at_most", lambda threads=threads: threads)
+        found.append(length_test(under_test(3), volume, exposures=2))
+    np.testing.assert_array_equal(*(one.single_errors for one in found))
+    assert [length.line for length in found[0].lengths] == [line.name for line in seven_lines(volume) for _ in range(5)]
 
 
 @pytest.mark.slow
