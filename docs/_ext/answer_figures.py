@@ -4,16 +4,18 @@ from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from identify.reporting.figures.style import STYLE, panel_grid
+from identify.studies.figures import scale
 
 PANEL, LETTERS = (3.0, 2.4), 24
 """Size of a panel, inches, and how many letters its height has room for."""
 
 WIDE = 30.0
-"""Ratio of the largest to the least value from which an axis is logarithmic."""
+"""Ratio of the largest to the least value from which an axis over names is logarithmic."""
 
 Middle = tuple[float, tuple[float, float] | None]
 """Mean or rms of a figure, and its band if there is one."""
@@ -37,6 +39,10 @@ def picture(points: list[Point], factors: list[str], shown: dict[str, str]) -> F
             for others, own in curves.items():
                 said = ", ".join(str(level) for level in others)
                 _curve(axes, [(setting[along], figures[name]) for setting, figures in own], levels[along], said)
+            if _names(levels[along]):
+                _scale_over_names(axes, levels[along])
+            else:
+                scale(axes, pd.Series(levels[along]))
             axes.set_ylabel(fill(head.replace("`", ""), LETTERS))
             axes.set_xlabel(factors[along])
             if len(curves) > 1:
@@ -46,18 +52,22 @@ def picture(points: list[Point], factors: list[str], shown: dict[str, str]) -> F
 
 def _curve(axes: Axes, values: list[tuple[Any, Any]], levels: list[Any], label: str) -> None:
     """One curve over numbers; points over names."""
-    numbers = all(isinstance(level, float | int) for level in levels)
-    at = [level if numbers else levels.index(level) for level, _ in values]
+    names = _names(levels)
+    at = [levels.index(level) if names else level for level, _ in values]
     middles = [middle for _, (middle, _) in values]
     bands = [band or (middle, middle) for _, (middle, band) in values]
     reach = [[max(middle - low, 0.0) for middle, (low, _) in zip(middles, bands, strict=True)],
              [max(high - middle, 0.0) for middle, (_, high) in zip(middles, bands, strict=True)]]  # fmt: skip
-    axes.errorbar(at, middles, reach, marker="o", markersize=4, capsize=2, ls="-" if numbers else "", label=label)
-    if not numbers:
-        axes.set_xticks(range(len(levels)), [str(level) for level in levels], rotation=30, ha="right")
-    if min(middles) > 0 and max(middles) > WIDE * min(middles):
+    axes.errorbar(at, middles, reach, marker="o", markersize=4, capsize=2, ls="" if names else "-", label=label)
+
+
+def _scale_over_names(axes: Axes, names: list[Any]) -> None:
+    """Shares of 100 % are told apart on a linear axis."""
+    axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
+    low, high = axes.dataLim.intervaly
+    if low > 0 and high > WIDE * low:
         axes.set_yscale("log")
-    if numbers and min(levels) > 0 and max(levels) > WIDE / 10 * min(levels):
-        axes.set_xscale("log")
-        axes.set_xticks(levels, [f"{level:g}" for level in levels], minor=False)
-        axes.minorticks_off()
+
+
+def _names(levels: list[Any]) -> bool:
+    return not all(isinstance(level, float | int) for level in levels)

@@ -125,7 +125,7 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
         law = next((one for one in study.theory if (one.figure, one.per, one.factor) == (name, None, path)), None)
         if law is not None and law.exponent is not None:
             _theory_line(axes, have[path], have[name].to_numpy(dtype=float), law.exponent)
-        _scale(axes, have[path])
+        scale(axes, have[path])
         axes.set_xlabel(axis_label(path, study))
         axes.set_ylabel(axis_label(name, study))
         if any(label != "rows" for label in axes.get_legend_handles_labels()[1]):
@@ -169,7 +169,7 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
             levels = _beside(_levels(study, rows, factor), place, len(curves))
             _curve(axes, levels, law_data(law, rows), label, place)
         _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
-        _scale(axes, _levels(study, have, factor))
+        scale(axes, _levels(study, have, factor))
         axes.set_title(
             f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})", fontsize="medium"
         )
@@ -240,7 +240,7 @@ def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) 
     axes.plot(ends, level * ends**exponent, "--", color="black", linewidth=1, label=f"theory, power {exponent:g}")
 
 
-def _scale(axes: Axes, factor: pd.Series) -> None:
+def scale(axes: Axes, factor: pd.Series) -> None:
     """Logarithmic axes where everything is positive, with numbers that do not touch each other."""
     if pd.api.types.is_numeric_dtype(factor) and (factor > 0).all() and factor.nunique() > 1:
         axes.set_xscale("log")
