@@ -1,5 +1,6 @@
 """The documentation can be followed: its commands exist with their options and settings, its links and files do."""
 
+import json
 import re
 import shlex
 import shutil
@@ -40,7 +41,15 @@ def parsed(words):
     return name, command.make_context(name, list(words)).params if words else {}
 
 
+ANSWERS = ROOT / ".readme" / "answers" / "commands.txt"
+RENEWED = {name: words for name, *words in map(str.split, ANSWERS.read_text(encoding="utf-8").splitlines())}
 FOUND = [(path, words) for path, text in TEXTS.items() for words in commands(text)]
+FOUND += [(ANSWERS, ["study", *words]) for words in RENEWED.values()]
+
+
+def test_every_kept_answer_has_the_command_of_its_study():
+    kept = {path.stem: json.loads(path.read_text(encoding="utf-8"))["name"] for path in ANSWERS.parent.glob("*.json")}
+    assert kept == {name: study for name, (study, *_) in RENEWED.items()}
 
 
 def test_every_command_line_is_one_that_the_program_takes():

@@ -188,18 +188,18 @@ def answers(
             for name, content in contents.items()
             for point in content["points"]
         ]
-        return _table((*heads, *factors.values(), *shown.values()), rows) + _kept_rows(list(contents.values()))
+        return _table((*heads, *factors.values(), *shown.values()), rows) + _kept_rows(folder, contents)
 
     return table
 
 
 def leaderboard(folder: Path) -> str:
     """Median errors of the nine estimators, rms over the kept experiments."""
-    content = kept(folder / "answers", "estimators")
     rows = [
         (f"`{name}`", *(_text(found.get(end)) for end in ESTIMATED)) for (name,), found in leaderboard_points(folder)
     ]
-    return _table(("estimator", *ESTIMATED.values()), rows) + _kept_rows([content])
+    contents = {"estimators": kept(folder / "answers", "estimators")}
+    return _table(("estimator", *ESTIMATED.values()), rows) + _kept_rows(folder, contents)
 
 
 def leaderboard_points(folder: Path) -> list[Point]:
@@ -231,10 +231,14 @@ def _text(figure: Middle | None) -> str:
     return f"{middle:.3g}" if band is None else f"{middle:.3g} ({band[0]:.3g} to {band[1]:.3g})"
 
 
-def _kept_rows(contents: list[dict[str, Any]]) -> str:
-    done, failed = (sum(content["rows"][what] for content in contents) for what in ("done", "failed"))
-    lost = f"; {failed} failed" if failed else ""
-    return f"\n\n{done} experiments{lost}, seed {contents[0]['seed']}; `cmmsim study {contents[0]['name']}`.\n"
+def _kept_rows(folder: Path, contents: dict[str, dict[str, Any]]) -> str:
+    """How many rows answers have, by their names, and with which commands: those of `.ci/answers`."""
+    done, failed = (sum(content["rows"][what] for content in contents.values()) for what in ("done", "failed"))
+    lost, seed = f"; {failed} failed" if failed else "", next(iter(contents.values()))["seed"]
+    lines = (folder / "answers" / "commands.txt").read_text(encoding="utf-8").splitlines()
+    renewed = dict(line.split(" ", 1) for line in lines)
+    commands = ", ".join(f"`cmmsim study {renewed[name]}`" for name in contents)
+    return f"\n\n{done} experiments{lost}, seed {seed}; {commands}.\n"
 
 
 def _faster(value: float) -> str:
