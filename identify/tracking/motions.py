@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from dynamics import Robot
+from dynamics import Robot, workspace
 from dynamics.errors import DynamicsError
 from dynamics.kinematics.chart import POSE_NAMES, Chart
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.design import unseen_trajectories
 from identify.experiment.law_in_loop import NamedMotion
+from identify.loop_parameters import of_actuators
 from identify.scenario import Scenario
 from identify.trajectory import box_of
 
@@ -52,7 +53,7 @@ def motions(robot: Robot, scenario: Scenario, seed: int, own: Path | None = None
     Raises TrajectoryError.
     """
     if own is not None:
-        return [read_motion(own, robot)]
+        return [read_motion(own, robot, of_actuators(robot, scenario.excitation, "max_joint_velocity"))]
     duration = scenario.validation.duration_s
     unseen = unseen_trajectories(robot, scenario, seed)
     found: list[NamedMotion] = [NamedMotion(f"unseen {k}", path, duration) for k, path in enumerate(unseen, start=1)]
@@ -128,12 +129,12 @@ def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
     return AlongCoordinates(robot.geometry.chart, (place, rate, acceleration))
 
 
-def read_motion(path: Path, robot: Robot) -> NamedMotion:
+def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
     """A motion through the poses of a CSV file with the columns t, x, y, z, alpha, beta, gamma, s, m and rad: a spline
-    of fifth degree, at rest and without acceleration at both ends.
+    of fifth degree, at rest and without acceleration at both ends; fastest: a joint may turn or slide, rad/s or m/s.
 
     Raises TrajectoryError: unreadable, columns missing, too few rows, times that do not begin at 0 or do not increase,
-    numbers that are not finite, or poses that the platform cannot have.
+    numbers that are not finite, poses that the platform cannot have, or a jump that asks more speed of a joint.
     """
     try:
         lines = [line.split(",") for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
@@ -164,6 +165,7 @@ def read_motion(path: Path, robot: Robot) -> NamedMotion:
         robot.charted(poses)
     except DynamicsError as error:
         raise TrajectoryError(f"{path}: {error}") from None
+    _check_jumps(path, robot, times, poses, fastest)
     still = [(1, np.zeros(len(robot.coordinate_names))), (2, np.zeros(len(robot.coordinate_names)))]
     spline = make_interp_spline(times, robot.coordinates(poses), k=5, bc_type=(still, still))
     end = float(times[-1])
@@ -173,3 +175,17 @@ def read_motion(path: Path, robot: Robot) -> NamedMotion:
         return lambda t: derivative(np.clip(t, 0.0, end)) * (1.0 if order == 0 else (np.asarray(t) <= end)[:, None])
 
     return NamedMotion(path.stem, AlongCoordinates(robot.geometry.chart, (held(0), held(1), held(2))), end)
+
+
+def _check_jumps(path: Path, robot: Robot, times: Array, poses: Array, fastest: float) -> None:
+    """What is out of reach is left to who follows the motion: it has no joint coordinates."""
+    steps, unit = np.diff(times), robot.layout.joint_unit
+    speeds = np.nan_to_num(np.abs(np.diff(workspace.measure(robot, poses).theta, axis=0)) / steps[:, None])
+    row = int(np.argmax(speeds.max(axis=1) > fastest))
+    joint, jump = int(np.argmax(speeds[row])), np.diff(poses, axis=0)[row]
+    if speeds[row, joint] > fastest:
+        raise TrajectoryError(
+            f"{path}, row {row + 2}: the step from the row before, {np.linalg.norm(jump[:3]):.3g} m and "
+            f"{np.linalg.norm(jump[3:]):.3g} rad in {steps[row]:.3g} s, asks joint {joint + 1} for "
+            f"{speeds[row, joint]:.3g} {unit}/s, limit excitation.max_joint_velocity_{unit}_s = {fastest:g}"
+        )

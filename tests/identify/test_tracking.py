@@ -25,6 +25,7 @@ from tests.identify.synthetic import SIGMA, rss6, trajectory
 NOISE = np.diag(SIGMA**2)
 UNSTABLE = {"control.bandwidth_rad_s": 240.0, "control.damping": 0.1}
 TOO_FAST, BLIND = {"control.bandwidth_rad_s": 400.0}, {"control.observer": False}
+FASTEST = 2.0
 SHORT = {"validation.count": 1, "validation.duration_s": 2.0}
 
 
@@ -71,7 +72,7 @@ def test_rates_and_accelerations_of_a_motion_are_its_derivatives(name, tmp_path)
     """By central differences; it starts at home, at rest."""
     robot = rss6()
     made = {"circle": lambda: circle(robot, 0.005, 1.0), "square": lambda: square(robot, 0.01, 0.5)}
-    made["own"] = lambda: read_motion(own(tmp_path / "own.csv"), robot).motion
+    made["own"] = lambda: read_motion(own(tmp_path / "own.csv"), robot, FASTEST).motion
     motion, t, h = made[name](), np.linspace(0.013, 1.93, 97), 1e-5
     rate = (motion.pose(t + h) - motion.pose(t - h)) / (2 * h)
     acceleration = (motion.pose_rate(t + h) - motion.pose_rate(t - h)) / (2 * h)
@@ -95,28 +96,32 @@ def test_the_jerk_of_the_square_is_bounded():
         ({"to": "0.1,0,0,0.2,0,0,0"}, "row 21: t is 0.1; times must begin at 0 and increase"),
         ({"to": "1.0,0,nan,0.2,0,0,0"}, "row 21: '1.0,0,nan,0.2,0,0,0' are not all finite numbers"),
         ({"at": 0, "to": "0.01,0,0,0.2,0,0,0"}, "row 1: t is 0.01; times must begin at 0"),
+        (
+            {"to": "1.02564,0.05,0,0.2,0,0,0"},
+            "row 21: the step from the row before, 0.0502 m and 0 rad in 0.0513 s, asks",
+        ),
     ],
-    ids=["few", "word", "back", "nan", "late"],
+    ids=["few", "word", "back", "nan", "late", "jump"],
 )
 def test_a_file_that_is_no_motion_is_refused(tmp_path, changes, said):
-    assert said in refusal(TrajectoryError, read_motion, own(tmp_path / "own.csv", **changes), rss6())
+    assert said in refusal(TrajectoryError, read_motion, own(tmp_path / "own.csv", **changes), rss6(), FASTEST)
 
 
 def test_a_file_without_a_column_or_that_the_platform_cannot_follow_is_refused(tmp_path):
     path = own(tmp_path / "own.csv")
     whole = path.read_text()
     path.write_text("\ufeff" + whole, encoding="utf-8")  # as spreadsheets write it
-    assert read_motion(path, rss6()).duration_s == 2.0
+    assert read_motion(path, rss6(), FASTEST).duration_s == 2.0
     path.write_text(whole.replace(",", ";"))
-    assert "by commas, and these by semicolons" in refusal(TrajectoryError, read_motion, path, rss6())
+    assert "by commas, and these by semicolons" in refusal(TrajectoryError, read_motion, path, rss6(), FASTEST)
     path.write_text(whole.replace("gamma", "yaw"))
-    assert "lacks the columns gamma" in refusal(TrajectoryError, read_motion, path, rss6())
+    assert "lacks the columns gamma" in refusal(TrajectoryError, read_motion, path, rss6(), FASTEST)
     tilted = own(tmp_path / "tilted.csv", at=20, to="1.02564103,0,0,0.204,0.01,0,0")
-    assert "alpha" in refusal(TrajectoryError, read_motion, tilted, load_robot("delta3"))
+    assert "alpha" in refusal(TrajectoryError, read_motion, tilted, load_robot("delta3"), FASTEST)
 
 
 def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
-    motion = read_motion(own(tmp_path / "own.csv", height=0.05), rss6())
+    motion = read_motion(own(tmp_path / "own.csv", height=0.05), rss6(), np.inf)
     said = refusal(TrajectoryError, follow, plant(), "pid", rss6().nominal_parameters, motion, seen())
     assert "the robot may not follow own" in said
     assert "of leg" in said
