@@ -75,6 +75,8 @@ def track(
     followed = motions(plant.nominal, scenario, seed, own)
     if run_folder and "identified" not in models:
         raise ScenarioError(f"--run {run_folder} holds the identified model, and only {', '.join(models)} is asked for")
+    if set(laws) == {"pid"}:  # which knows no model, so that none is identified
+        models = ["initial"]
     known = {name: known_model(plant, name, run_folder) for name in models if name != "identified" or run_folder}
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
     true = known_model(plant, "true", None)

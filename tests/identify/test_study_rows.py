@@ -89,10 +89,15 @@ def test_rows_agree_with_the_sensors_own_covariance_and_err_hardly_without_noise
         pytest.param("static_pose", 24, {"poses": 3, "captures": 2}, marks=pytest.mark.slow),
         pytest.param("static_pose", 400, {"poses": 5}, marks=pytest.mark.thorough),
         pytest.param("path_pose", 200, {}, marks=pytest.mark.thorough),
+        pytest.param("identification", 60, {"sensor": "images"}, marks=pytest.mark.thorough),
     ],
 )
 def test_rows_without_images_have_the_means_and_bands_of_rows_with_them(kind, rows, options):
-    """Figures of as many rows of both: their means by Welch's test, their bands by the Kolmogorov-Smirnov test."""
+    """Figures of as many rows of both: their means by Welch's test, their bands by the Kolmogorov-Smirnov test.
+
+    What is stated beforehand hardly differs among rows along one trajectory: of that the mean counts, to the 1 % for
+    which the sensor without images is proved.
+    """
     figures = {}
     for start, renderer in enumerate(("analytic", "statistical")):
         found = [row(kind, 1000 * start + k, scenario(renderer=renderer), **options) for k in range(rows)]
@@ -101,6 +106,9 @@ def test_rows_without_images_have_the_means_and_bands_of_rows_with_them(kind, ro
         said = figures["statistical"][name]
         if np.ptp(drawn) == np.ptp(said) == 0.0:
             assert drawn[0] == said[0], name
+            continue
+        if kind == "identification" and ("_std_" in name or name.startswith(("pose_noise", "stated"))):
+            assert said.mean() == pytest.approx(drawn.mean(), rel=0.01), name
             continue
         assert ttest_ind(drawn, said, equal_var=False).pvalue > 3e-4, (name, drawn.mean(), said.mean())
         assert ks_2samp(drawn, said).pvalue > 3e-4, name
