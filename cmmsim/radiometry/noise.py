@@ -17,7 +17,9 @@ from cmmsim.geometry.pose import Array
 BIT_DEPTHS = (8, 10, 12)
 ROUNDING_TERMS = 50  # of a series, which leave 0.002 of 0.25 without noise
 NO_SWING = 1.5  # grey values squared: beyond, rounding_excess is 1 to 1e-11
+MANY_EXPOSURES = 30  # from here on their mean is drawn at once
 T = TypeVar("T", bound=np.generic)
+Singles = NDArray[np.float32]
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 
@@ -148,10 +150,7 @@ class CameraNoise:
         from cmmsim.radiometry.noise_kernels import expose_pixels  # compiles, so it is loaded where it is first needed
 
         grey = np.empty(radiance.shape, dtype=self.image_type)
-        normal = rng.standard_normal(radiance.shape, dtype=np.float32)
-        none = np.empty(0, dtype=np.float32)
-        differing = (none, none) if pattern is None else (pattern.sensitivity.ravel(), pattern.offset.ravel())
-        expose_pixels(radiance.ravel(), normal.ravel(), self._figures, *differing, grey.ravel())
+        expose_pixels(*self._lit(radiance, rng, pattern), grey.ravel())
         return grey
 
     def mean_of_exposures(
@@ -160,13 +159,28 @@ class CameraNoise:
         """Mean grey values of ``frames`` independent exposures of a scene that stands still (float64).
 
         Without noise it is not rounded: the mean that noisy exposures approach, as their noise dithers the rounding.
+        The mean of 30 and more is drawn at once, one normal number a pixel with the very mean and variance that the
+        mean of rounded, clipped grey values has. What that neglects is its shape: grey values are skewed only where
+        they are clipped, and their mean goes in steps of 1/frames, of which sums over a sticker's pixels show nothing.
         """
         if not self.enabled:
             return np.clip(self.mean_grey(radiance.astype(np.float64)), 0.0, float(self.white_level))
-        total = np.zeros(radiance.shape, dtype=np.int64)
-        for _ in range(frames):
-            total += self.expose(radiance, rng, pattern)
-        return total / frames
+        if frames < MANY_EXPOSURES:
+            return np.mean([self.expose(radiance, rng, pattern) for _ in range(frames)], axis=0)
+        from cmmsim.radiometry.noise_kernels import average_pixels
+
+        mean = np.empty(radiance.shape)
+        average_pixels(*self._lit(radiance, rng, pattern), frames, mean.ravel())
+        return mean
+
+    def _lit(
+        self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None
+    ) -> tuple[Singles, Singles, Singles, Singles, Singles]:
+        """The light on each pixel, a standard normal number each and all else that ``noise_kernels`` ask for."""
+        normal = rng.standard_normal(radiance.shape, dtype=np.float32)
+        none = np.empty(0, dtype=np.float32)
+        differing = (none, none) if pattern is None else (pattern.sensitivity.ravel(), pattern.offset.ravel())
+        return radiance.ravel(), normal.ravel(), self._figures, *differing
 
     @property
     def _figures(self) -> NDArray[np.float32]:

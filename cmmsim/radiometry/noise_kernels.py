@@ -1,10 +1,16 @@
-"""Compiled: from the light on each pixel to its grey value, see ``noise``."""
+"""Compiled: from the light on each pixel to its grey value in one exposure and its mean in many, see ``noise``."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
+
+REACH = 6.0  # standard deviations within which noise is followed: 2e-9 of it lie beyond
+SMOOTH = 1.0  # grey values: with as much noise rounding adds 1/12 to the variance and 1e-9 to the mean
+SQRT_HALF = math.sqrt(0.5)
 
 
 @compiled
@@ -16,14 +22,64 @@ def expose_pixels(
     All is float32, grey the camera's own type. figures (6,): electrons at white, full well, variance in the dark (e-²),
     black level, gain, largest grey value; sensitivity and offset (n,) where pixels differ, else empty.
     """
-    white_electrons, full_well, dark, black, gain, white = figures
+    dark, black, gain, white = figures[2:]
     for k in range(len(radiance)):
-        light = radiance[k] * white_electrons
-        if len(sensitivity):
-            light *= sensitivity[k]
-        electrons = min(light, full_well)
+        electrons = electrons_in(k, radiance, figures, sensitivity)
         noise = normal[k] * np.sqrt(electrons + dark)
         if len(offset):
             noise += offset[k]
         value = black + gain * (electrons + noise)
         grey[k] = np.rint(min(max(value, np.float32(0.0)), white))
+
+
+@compiled
+def average_pixels(
+    radiance: Array, normal: Array, figures: Array, sensitivity: Array, offset: Array, frames: int, grey: Array
+) -> None:
+    """Fill the means (n,), float64, of the grey values that ``expose_pixels`` gives in so many exposures, taken for
+    normal; parameters as there, but one standard normal number for all exposures of a pixel."""
+    dark, black, gain, white = figures[2:]
+    for k in range(len(radiance)):
+        electrons = electrons_in(k, radiance, figures, sensitivity)
+        value = black + gain * (electrons + (offset[k] if len(offset) else np.float32(0.0)))
+        mean, variance = moments_of_rounded(value, gain * np.sqrt(electrons + dark), white)
+        grey[k] = mean + normal[k] * math.sqrt(variance / frames)
+
+
+@compiled
+def electrons_in(k: int, radiance: Array, figures: Array, sensitivity: Array) -> float:
+    """Mean electrons that light sets free in pixel k, at most the full well; parameters as of ``expose_pixels``."""
+    light = radiance[k] * figures[0]
+    if len(sensitivity):
+        light *= sensitivity[k]
+    return min(light, figures[1])
+
+
+@compiled
+def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[float, float]:
+    """Mean and variance of a normal number that is rounded and clipped to 0..white."""
+    if deviation == 0.0 or mean - REACH * deviation > white or mean + REACH * deviation < 0.0:
+        return min(max(np.rint(mean), 0.0), white), 0.0
+    if deviation < SMOOTH:
+        low = max(math.floor(mean - REACH * deviation), 0.0)
+        above, square = moments_above(low - mean, deviation, white - low)
+        return low + above, max(square - above**2, 0.0)
+    over, over_square = moments_above(white - mean, deviation, np.inf)
+    under, under_square = moments_above(mean, deviation, np.inf)
+    lost = over_square + 2.0 * (white - mean) * over + under_square + 2.0 * mean * under
+    return mean + under - over, max(deviation**2 + 1.0 / 12.0 - lost - (under - over) ** 2, 0.0)
+
+
+@compiled
+def moments_above(height: float, deviation: float, most: float) -> tuple[float, float]:
+    """Mean and mean square of by how much, at most ``most``, a rounded normal number exceeds a whole number that lies
+    ``height`` above its mean.
+
+    Each step from one number to the next is taken with the probability that the normal number lies beyond its middle.
+    """
+    steps = squares = 0.0
+    for step in range(math.ceil(min(most, REACH * deviation - height))):
+        taken = 0.5 * math.erfc((height + step + 0.5) / deviation * SQRT_HALF)
+        steps += taken
+        squares += (2.0 * step + 1.0) * taken
+    return steps, squares
