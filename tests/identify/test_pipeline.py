@@ -70,10 +70,10 @@ def test_the_papers_experiment_gives_the_figures_that_are_quoted(tmp_path):
     pipeline.validate(tmp_path, SilentProgress(), taught=taught)
     result = load_result(tmp_path / "result.json")
     position, orientation = worst(result, "true")
-    assert position == pytest.approx(1.117, abs=1e-3)
-    assert orientation == pytest.approx(4.11, abs=1e-2)
-    assert max(result["sensor"]["position_rms_um"]) == pytest.approx(3.175, abs=1e-3)
-    assert max(result["sensor"]["orientation_rms_urad"]) == pytest.approx(11.43, abs=1e-2)
+    assert position == pytest.approx(1.168, abs=1e-3)
+    assert orientation == pytest.approx(4.92, abs=1e-2)
+    assert max(result["sensor"]["position_rms_um"]) == pytest.approx(3.168, abs=1e-3)
+    assert max(result["sensor"]["orientation_rms_urad"]) == pytest.approx(11.65, abs=1e-2)
     assert (len(result["validation"]), read(tmp_path / "experiment.nc").sizes["time"]) == (10, 1200)
     assert missed(result) == []
 
