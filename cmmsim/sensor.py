@@ -293,19 +293,21 @@ class Sensor:
         still: one frame each, with noise and dropout of its own, and without drift.
 
         Nothing is searched or tracked: stickers are looked for near poses (N,6), or where they are where that is not
-        said, as they move at pose_rates. Each frame has the noise that ``measure`` would have given it. With images,
-        frames are drawn and measured in blocks on all cores; without, 60,000 frames a second and core by registration.
+        said, as they move at pose_rates. The noise is as large as that of ``measure``, its numbers are others. With
+        images, frames are drawn and measured in blocks on all cores; without, 60,000 frames a second and core by
+        registration, where ``near`` is only checked, as nothing is looked for. Raises ShapeError for anything else than
+        such rows.
         """
-        at = _rows(poses, "poses are rows of six finite numbers")
-        rates = finite_array(
-            0.0 * at if pose_rates is None else pose_rates, at.shape, "there is a pose_rate to each pose"
-        )
+        at = _rows(poses)
+        wanted = "there is a pose rate to each pose, six finite numbers, m/s and rad/s"
+        rates = finite_array(0.0 * at if pose_rates is None else pose_rates, at.shape, wanted)
+        around = finite_array(at if near is None else near, at.shape, "there is a pose near each pose, finite")
         camera, placed = self.camera, self.true_cameras.placed(obstacles)
         if isinstance(camera, VirtualStereoCamera):
-            blocks = measure_frames(camera, *self._frames(at, rates, near, placed))
+            blocks = measure_frames(camera, *self._frames(at, rates, around, placed))
             found = MeasuredPoses.of([each.found for each in blocks])
         elif isinstance(tracker := self._new_tracker(), Tracker):
-            found = MeasuredPoses.of_each(measure_without_images(camera, *self._frames(at, rates, near, placed)))
+            found = MeasuredPoses.of_each(measure_without_images(camera, *self._frames(at, rates, around, placed)))
         else:
             rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
             self._frame += len(at)
@@ -317,15 +319,15 @@ class Sensor:
 
         Without images, stickers are looked for in windows near poses (N,6), too.
         """
-        at, camera = _rows(poses, "poses are rows of six finite numbers"), self.camera
-        frames = self._frames(at, 0.0 * at, near, {})
+        at, camera = _rows(poses), self.camera
+        around = finite_array(near, at.shape, "there is a pose near each pose, finite")
+        frames = self._frames(at, 0.0 * at, around, {})
         if isinstance(camera, StatisticalStereoCamera):
             return measure_without_images(camera, *frames)
         return [one for each in measure_frames(camera, *frames) for one in each.measurements()]
 
-    def _frames(self, at: Array, rates: Array, near: ArrayLike | None, placed: Mapping[str, Array]) -> Frames:
-        """The next frames, of a platform at poses ``at`` (N,6) in motion at rates (N,6)."""
-        around = finite_array(at if near is None else near, at.shape, "there is a pose near each pose")
+    def _frames(self, at: Array, rates: Array, around: Array, placed: Mapping[str, Array]) -> Frames:
+        """The next frames, of a platform at poses ``at`` in motion at rates, looked for ``around``, (N,6) each."""
         first = self._frame
         self._frame += len(at)
         rngs = [np.random.default_rng([self._run_seed, RUN_STREAM, first + k]) for k in range(len(at))]
@@ -347,9 +349,15 @@ class Sensor:
         return self.true_cameras.at_rest
 
 
-def _rows(poses: ArrayLike, what: str) -> Array:
-    """Poses (N,6), checked."""
-    return finite_array(poses, (len(np.atleast_1d(poses)), 6), what)
+def _rows(poses: ArrayLike) -> Array:
+    """Poses (N,6), checked; an empty list holds none."""
+    if isinstance(poses, list) and not poses:
+        return np.zeros((0, 6))
+    try:
+        count = len(poses)  # type: ignore[arg-type]  # a number has no length
+    except TypeError:
+        count = 1
+    return finite_array(poses, (count, 6), "poses are rows of six finite numbers, m and rad")
 
 
 def load_sensor(

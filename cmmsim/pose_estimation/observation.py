@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.checks import require_kind
 from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, SpotWindows, find_detector
 from cmmsim.detection.ellipse_fit import MAXIMUM_LIKELIHOOD, SMEAR_STEP_PX, EllipseFits, fit_ellipses
 from cmmsim.geometry.camera import Optics
@@ -253,9 +254,10 @@ class StickerWindows:
             fits = self.ellipses_at_rest if smears is None else self.ellipses(smears)
             return fits.within(settings.limits, noise)
         fit_size = settings.fit_size + 2 * detector.margin_px
-        return detector.detect(
-            SpotWindows(*self._flat, noise, fit_size, settings.limits, settings.optics.psf_px, smears)
-        )
+        spots = SpotWindows(*self._flat, noise, fit_size, settings.limits, settings.optics.psf_px, smears)
+        found = detector.detect(spots)
+        require_kind(found, DetectedCentres, f"detector {detector.name!r} must return DetectedCentres")
+        return found
 
     @property
     def _flat(self) -> tuple[Windows, NDArray[np.int_]]:

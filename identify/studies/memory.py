@@ -3,12 +3,12 @@
 import psutil
 
 from identify.errors import StudyError
-from identify.studies.design import prepare
+from identify.studies.design import Case, prepare
 from identify.studies.rows import find_kind
 from identify.studies.study_file import Range, Study
 
-LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz")
-"""Factors that decide how long a record is."""
+LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
+"""Factors that decide how long a record or a stretch of a path is."""
 
 GB = 1e9
 
@@ -23,14 +23,15 @@ def check_memory(study: Study, workers: int) -> None:
         return
     setup = prepare(study)
     longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
-    overrides = {path.removeprefix("scenario."): value for path, value in longest.items()}
-    needed, there = kind.memory(setup.scenario.with_overrides(overrides)), psutil.virtual_memory().total
+    case = Case(0, 0, longest)
+    row = setup.row_scenario(case), kind.checked(setup.row_options(case))
+    needed, there = kind.memory(*row), psutil.virtual_memory().total
     if workers * needed > there:
         fit = int(there // needed)
         raise StudyError(
             f"the longest rows of study {study.name!r} need {needed / GB:.3g} GB each, in {workers} processes "
             f"{workers * needed / GB:.3g} GB, and this machine has {there / GB:.3g} GB: "
-            + (f"--workers {fit} fits" if fit else "shorten scenario.excitation.duration_s")
+            + (f"--workers {fit} fits" if fit else "shorten its rows")
         )
 
 

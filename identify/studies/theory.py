@@ -155,7 +155,8 @@ def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
     needed = [name for name in (law.figure, law.per, law.equals) if name is not None]
     for name in needed:
         if name not in frame.columns:
-            raise StudyError(f"the rows have no figure {name!r}; they have {', '.join(map(str, frame.columns))}")
+            there = ", ".join(map(str, frame.columns)) if len(frame) else "none, as all rows failed"
+            raise StudyError(f"the rows have no figure {name!r}; they have {there}")
     return frame.dropna(subset=needed)
 
 

@@ -158,6 +158,16 @@ def test_a_detector_of_one_s_own_measures_by_its_module_and_name():
     assert (plain.bias_px, plain.margin_px) == (0.0, 0)
 
 
+def nothing(given):
+    """No detector: it returns something else than centres."""
+    return len(given.windows)
+
+
+def test_a_detector_that_returns_something_else_is_named():
+    sensor = exact("perfect", {"detection.detector": f"{__name__}:nothing"})
+    refused(lambda: sensor.measure_many([sensor.home]), "nothing' must return DetectedCentres, got 36 of type int")
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [

@@ -134,9 +134,17 @@ def test_what_moves_is_measured_as_it_moves():
     assert found.stickers.min() >= 14
 
 
-def test_a_pose_near_each_is_asked_for():
-    sensor = exact()
+@pytest.mark.parametrize("renderer", ["analytic", "statistical"])
+def test_rows_of_numbers_are_asked_for_and_may_be_none(renderer):
+    sensor = exact(renderer=renderer)
+    two = [sensor.home] * 2
     with pytest.raises(cmmsim.ShapeError, match="there is a pose near each pose"):
-        sensor.measure_many([sensor.home] * 2, near=sensor.home)
-    empty = sensor.measure_many(np.zeros((0, 6)))
-    assert (empty.poses.shape, empty.covariances.shape, empty.stickers.shape) == ((0, 6), (0, 6, 6), (0,))
+        sensor.measure_many(two, near=sensor.home)
+    with pytest.raises(cmmsim.ShapeError, match="a pose rate to each pose, six finite numbers"):
+        sensor.measure_many(two, two[0])
+    for wrong in ([[1.0, 2.0], [1.0]], None, np.array(1.0)):
+        with pytest.raises(cmmsim.ShapeError, match="poses are rows of six finite numbers"):
+            sensor.measure_many(wrong)
+    for none in ([], np.zeros((0, 6))):
+        empty = sensor.measure_many(none)
+        assert (empty.poses.shape, empty.covariances.shape, empty.stickers.shape) == ((0, 6), (0, 6, 6), (0,))

@@ -188,6 +188,9 @@ def test_rows_that_need_more_memory_than_there_is_are_refused_with_the_workers_t
         words = ("--set", "scenario.excitation.duration_s=[10.0,3600.0]", "--workers", 3, "--out", tmp_path / "a")
         assert command("study", "parameter_groups", *words) == 1
         assert evidence in capsys.readouterr().err
+    words = ("--set", "options.stretch_s=[1.0,3600.0]", "--workers", 3, "--out", tmp_path / "a")
+    assert command("study", "frame_rate", *words) == 1  # of a path: 216,000 frames take some 1.4 GB
+    assert "--workers 2 fits" in capsys.readouterr().err
     assert not (tmp_path / "a").exists()
 
 

@@ -280,7 +280,7 @@ PROCESS, HELD = 0.5e9, 5
 """Bytes of a process before its first row; sensitivities of all poses by all parameters that a row holds at once."""
 
 
-def memory(scenario: Scenario) -> float:
+def memory(scenario: Scenario, options: object = None) -> float:
     """Bytes of a process that identifies from the records of a scenario, as was measured with up to 24,000 frames."""
     parameters = len(robot_named(scenario.robot).layout.names)
     return PROCESS + HELD * 8.0 * 6 * parameters * scenario.timing.frames(scenario.excitation.duration_s)

@@ -184,9 +184,9 @@ class Kind:
     """One kind of row. `compute(scenario, seed, options)` gives a row's figures by name: the same arguments the same
     row, whatever was computed before.
 
-    memory: bytes that a row of a scenario holds at once; None where that is little. A built-in kind also says `what` a
-    row is, its `columns`, the model of its `options` and what it `reads`. A function of one's own says none of this:
-    its rows tell its figures, and it may take any options, or none.
+    memory(scenario, options): bytes that a row holds at once; None where that is little. A built-in kind also says
+    `what` a row is, its `columns`, the model of its `options` and what it `reads`. A function of one's own says none of
+    this: its rows tell its figures, and it may take any options, or none.
     """
 
     name: str
@@ -196,7 +196,7 @@ class Kind:
     options: type[Section] | None = None
     reads: Reads | None = None
     takes_options: bool = True
-    memory: Callable[[Scenario], float] | None = None
+    memory: Callable[[Scenario, Any], float] | None = None
 
     def checked(self, options: Mapping[str, Any]) -> Any:
         """The options as `compute` takes them, with their defaults. Raises StudyError with the valid names."""
