@@ -89,7 +89,7 @@ def test_kept_answers_say_the_same_of_other_robots(timing):
                 assert figures[f"starting_{what}_excess_{unit}"]["mean"] > 0
 
 
-TOO_SMALL = "errors of about a tenth of the sensor's noise, of which the innovations cannot tell"
+TOO_SMALL = "errors of a tenth of the sensor's noise: innovations cannot tell, and joints that turn back count"
 
 
 @pytest.mark.parametrize(
