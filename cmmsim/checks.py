@@ -26,8 +26,12 @@ def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDAr
         numbers = None
     if numbers is None:
         raise ShapeError(f"{wanted}, got {_shown(values)}")
-    if numbers.shape != shape or not np.isfinite(numbers).all():
+    if numbers.shape != shape:
         raise ShapeError(f"{wanted}, got shape {numbers.shape}: {_shown(numbers)}")
+    if not np.isfinite(numbers).all():
+        first = tuple(np.argwhere(~np.isfinite(numbers))[0].tolist())
+        where = f" at {list(first)}: {_shown(numbers)}" if first else ""
+        raise ShapeError(f"{wanted}, got {numbers[first]}{where}")
     return numbers
 
 
