@@ -10,6 +10,9 @@ from identify.studies.study_file import Range, Study
 LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
 """Factors that decide how long a record or a stretch of a path is."""
 
+PROCESS = 0.5e9
+"""Bytes of a process before its first row."""
+
 GB = 1e9
 
 
@@ -25,7 +28,7 @@ def check_memory(study: Study, workers: int) -> None:
     longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
     case = Case(0, 0, longest)
     row = setup.row_scenario(case), kind.checked(setup.row_options(case))
-    needed, there = kind.memory(*row), psutil.virtual_memory().total
+    needed, there = PROCESS + kind.memory(*row), psutil.virtual_memory().total
     if workers * needed > there:
         fit = int(there // needed)
         raise StudyError(

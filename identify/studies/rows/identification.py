@@ -276,14 +276,14 @@ def _designed(scenario_toml: str, seed: int) -> TrajectorySet:
     return design_trajectories(robot_named(scenario.robot), scenario, seed)
 
 
-PROCESS, HELD = 0.5e9, 5
-"""Bytes of a process before its first row; sensitivities of all poses by all parameters that a row holds at once."""
+HELD = 5
+"""Sensitivities of all poses by all parameters that a row holds at once."""
 
 
-def memory(scenario: Scenario, options: object = None) -> float:
-    """Bytes of a process that identifies from the records of a scenario, as was measured with up to 24,000 frames."""
+def memory(scenario: Scenario, options: object) -> float:
+    """Bytes held to identify from the records of a scenario, as was measured with up to 24,000 frames."""
     parameters = len(robot_named(scenario.robot).layout.names)
-    return PROCESS + HELD * 8.0 * 6 * parameters * scenario.timing.frames(scenario.excitation.duration_s)
+    return HELD * 8.0 * 6 * parameters * scenario.timing.frames(scenario.excitation.duration_s)
 
 
 IDENTIFICATION = Kind(

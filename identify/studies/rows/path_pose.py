@@ -88,13 +88,13 @@ def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_
     return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
 
 
-PROCESS, FRAME = 0.5e9, 4.3e3
-"""Bytes of a process before its first row, and of each frame, as was measured with up to 1,800,000 frames."""
+FRAME = 4.3e3
+"""Bytes held of each frame, as was measured with up to 1,800,000 frames."""
 
 
 def memory(scenario: Scenario, options: PathPoseOptions) -> float:
-    """Bytes of a process that follows a stretch of a path."""
-    return PROCESS + FRAME * scenario.timing.frames(options.stretch_s)
+    """Bytes held to follow a stretch of a path."""
+    return FRAME * scenario.timing.frames(options.stretch_s)
 
 
 PATH_POSE = Kind(
