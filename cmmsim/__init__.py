@@ -1,34 +1,40 @@
-"""Synthetic stereo optical CMM: renders a posed platform with stickers, and measures its pose from the images.
+"""Synthetic stereo optical CMM: renders a posed platform with stickers, and measures its pose from
+the images.
 
 Sensor
-    load_sensor(name_or_path, seed) -> Sensor   built in (`built_in_names() -> list[str]`), or a TOML file
-    Sensor.measure(pose) -> Measurement         pose (6,) m, rad and its covariance (6,6); teaches itself on first use
-    Sensor.measure_many(poses) -> MeasuredPoses many poses at once, with images or, "statistical", without
-    Sensor.capture(pose) -> StereoFrame         both whole images
-    Sensor.teach() -> Taught                    what other sensors with the same cameras and bodies may take over
-    require_opengl()                            raises OpenGLMissingError where pyrender cannot draw
+    load_sensor(name_or_path, seed) -> Sensor   built in (`built_in_names() -> list[str]`), or a
+    TOML file Sensor.measure(pose) -> Measurement         pose (6,) m, rad and its covariance (6,6);
+    teaches itself on first use Sensor.measure_many(poses) -> MeasuredPoses many poses at once, with
+    images or, "statistical", without Sensor.capture(pose) -> StereoFrame         both whole images
+    Sensor.teach() -> Taught                    what other sensors with the same cameras and bodies
+    may take over require_opengl()                            raises OpenGLMissingError where
+    pyrender cannot draw
 
 Images from elsewhere
     measure_frame(StereoFrame(left, right), sensor.estimator) -> Measurement    of a PoseEstimator
     Tracker(sensor.estimator).measure(images) -> Measurement                    frame after frame
 
 Cameras that drift
-    Sensor.drift_rig({"right.cx_px": 0.1}, frames)      the true rig moves in each run, and the estimator is not told
-    Sensor.watch_drift() -> DriftWatch                  its `finding` says when the rig ceased to fit, and how it moved
+    Sensor.drift_rig({"right.cx_px": 0.1}, frames)      the true rig moves in each run, and the
+    estimator is not told Sensor.watch_drift() -> DriftWatch                  its `finding` says
+    when the rig ceased to fit, and how it moved
 
 Geometry
     pose_to_transform(pose), transform_to_pose(transform)       poses (6,) and transforms (4,4)
-    PinholeCamera, StereoRig                                    cameras with lenses, as in `sensor.rig`
-    rod(length, radius), rod_transform(start, end)              a body that may hide stickers, and its place
+    PinholeCamera, StereoRig                                    cameras with lenses, as in
+    `sensor.rig` rod(length, radius), rod_transform(start, end)              a body that may hide
+    stickers, and its place
 
 Faults of images
     FaultGenerator(sensor.estimator).draw(kind, pose, rng) -> Fault
     FaultyImages(images, fault, noise, rng)                     images with a fault laid over them
     fault_bodies()                                              the boxes that stand in the way
 
-Every error that a user can cause is a CmmError, but for OpenGLMissingError. Rooms of their own: `cmmsim.calibration`
-and `cmmsim.acceptance`; detectors and renderers of a user's own: `cmmsim.plugins`. Everything else is private.
-Names are imported on first use: the command `cmmsim` begins in this package and must not wait for OpenCV and OpenGL.
+Every error that a user can cause is a CmmError, but for OpenGLMissingError. Rooms of their own:
+`cmmsim.calibration` and `cmmsim.acceptance`; `cmmsim.plugins` for detectors and renderers
+of a user's own, which files may name once `allow_plugin(module)` allows it. Everything else is
+private. Names are imported on first use: the command `cmmsim`
+begins in this package and must not wait for OpenCV and OpenGL.
 """
 
 from importlib import import_module
@@ -48,7 +54,6 @@ from cmmsim.errors import (
 )
 
 if TYPE_CHECKING:
-    from cmmsim.drift_watch import DriftWatch as DriftWatch
     from cmmsim.fault_images import Fault as Fault
     from cmmsim.fault_images import FaultyImages as FaultyImages
     from cmmsim.faults import FaultGenerator as FaultGenerator
@@ -59,34 +64,38 @@ if TYPE_CHECKING:
     from cmmsim.geometry.pose import transform_to_pose as transform_to_pose
     from cmmsim.geometry.stereo_rig import StereoRig as StereoRig
     from cmmsim.imaging.pyrender_renderer import require_opengl as require_opengl
-    from cmmsim.imaging.scene import rod as rod
-    from cmmsim.imaging.scene import rod_transform as rod_transform
-    from cmmsim.pose_estimation.estimator import Measurement as Measurement
-    from cmmsim.pose_estimation.estimator import PoseEstimator as PoseEstimator
-    from cmmsim.pose_estimation.estimator import measure_frame as measure_frame
-    from cmmsim.pose_estimation.taught import Taught as Taught
-    from cmmsim.radiometry.images import StereoFrame as StereoFrame
+    from cmmsim.imaging.scene_bodies import rod as rod
+    from cmmsim.imaging.scene_bodies import rod_transform as rod_transform
+    from cmmsim.loading import load_sensor as load_sensor
+    from cmmsim.measuring.measurement import Measurement as Measurement
+    from cmmsim.measuring.pose_estimator import PoseEstimator as PoseEstimator
+    from cmmsim.measuring.pose_estimator import measure_frame as measure_frame
+    from cmmsim.measuring.taught import Taught as Taught
+    from cmmsim.plugins import allow_plugin as allow_plugin
+    from cmmsim.radiometry.stereo_images import StereoFrame as StereoFrame
     from cmmsim.sensor import Sensor as Sensor
-    from cmmsim.sensor import load_sensor as load_sensor
     from cmmsim.tracker import Tracker as Tracker
+    from cmmsim.uncertainty.drift_watch import DriftWatch as DriftWatch
 
 _HOME = {
-    **dict.fromkeys(("load_sensor", "Sensor"), "cmmsim.sensor"),
+    "load_sensor": "cmmsim.loading",
+    "Sensor": "cmmsim.sensor",
     "built_in_names": "cmmsim.files.sensor_file",
-    "Measurement": "cmmsim.pose_estimation.estimator",
-    "StereoFrame": "cmmsim.radiometry.images",
-    "Taught": "cmmsim.pose_estimation.taught",
+    "Measurement": "cmmsim.measuring.measurement",
+    "StereoFrame": "cmmsim.radiometry.stereo_images",
+    "Taught": "cmmsim.measuring.taught",
     "require_opengl": "cmmsim.imaging.pyrender_renderer",
-    **dict.fromkeys(("measure_frame", "PoseEstimator"), "cmmsim.pose_estimation.estimator"),
+    **dict.fromkeys(("measure_frame", "PoseEstimator"), "cmmsim.measuring.pose_estimator"),
     "Tracker": "cmmsim.tracker",
-    "DriftWatch": "cmmsim.drift_watch",
+    "DriftWatch": "cmmsim.uncertainty.drift_watch",
     **dict.fromkeys(("pose_to_transform", "transform_to_pose"), "cmmsim.geometry.pose"),
     "PinholeCamera": "cmmsim.geometry.camera",
     "StereoRig": "cmmsim.geometry.stereo_rig",
-    **dict.fromkeys(("rod", "rod_transform"), "cmmsim.imaging.scene"),
+    **dict.fromkeys(("rod", "rod_transform"), "cmmsim.imaging.scene_bodies"),
     "FaultGenerator": "cmmsim.faults",
     **dict.fromkeys(("Fault", "FaultyImages"), "cmmsim.fault_images"),
     "fault_bodies": "cmmsim.faults",
+    "allow_plugin": "cmmsim.plugins",
 }
 
 __all__ = [
@@ -106,7 +115,9 @@ if not TYPE_CHECKING:  # a type checker would take every name for one that this 
 
     def __getattr__(name: str) -> Any:
         if name not in _HOME:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+            raise AttributeError(
+                f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}"
+            )
         warn_of_foreign_identify()
         return getattr(import_module(_HOME[name]), name)
 

@@ -1,7 +1,8 @@
-"""The command `cmmsim` from its first line on, and a warning where another `identify` stands in the place of ours.
+"""The command `cmmsim` from its first line on, and a warning where another `identify` stands in the
+place of ours.
 
-A package on PyPI has the same name. Nothing of ours in `identify` can be found then, so that the command begins here,
-the one place of this package that knows of what stands on it.
+A package on PyPI has the same name. Nothing of ours in `identify` can be found then, so that the
+command begins here, the one place of this package that knows of what stands on it.
 """
 
 import sys
@@ -16,13 +17,22 @@ OURS = "IdentifyError"
 
 
 def foreign_identify() -> str:
-    """One line that names another package `identify` and says what to do; empty where ours is found."""
+    """One line that names another package `identify` and says what to do; empty where ours is
+    found.
+    """
     spec = find_spec("identify")
     found = Path(spec.origin) if spec and spec.origin else None
     if found and found.is_file() and OURS in found.read_text(encoding="utf-8", errors="replace"):
         return ""
-    where = f"another package stands in the place of cmmsim's `identify`: {found.parent}" if found else "no `identify`"
-    return f"{where}; install cmmsim alone into a virtual environment of its own (a PyPI package has the same name)"
+    where = (
+        f"another package stands in the place of cmmsim's `identify`: {found.parent}"
+        if found
+        else "no `identify`"
+    )
+    return (
+        f"{where}; install cmmsim alone into a virtual environment of its own (a PyPI package "
+        "has the same name)"
+    )
 
 
 @cache
@@ -38,7 +48,9 @@ def main() -> None:
     said = foreign_identify()
     if said:
         sys.exit(f"error: {said}")
-    import_module("identify.__main__").main()  # by name: nothing else in this package may lean on identify
+    import_module(
+        "identify.__main__"
+    ).main()  # by name: nothing else in this package may lean on identify
 
 
 if __name__ == "__main__":

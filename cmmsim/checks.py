@@ -1,6 +1,10 @@
-"""What users pass as arguments and in TOML files: taken as it is meant, or refused with what was got and wanted."""
+"""Checks of arguments and of entries in TOML files.
+
+They are taken as meant, or refused with what was got and wanted.
+"""
 
 import operator
+import re
 import tomllib
 from copy import deepcopy
 from functools import lru_cache
@@ -14,11 +18,29 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from cmmsim.errors import CmmError, ShapeError
 
 SHOWN_CHARACTERS = 120  # of what is refused
+LARGEST = 500_000  # bytes of a file; far beyond what a person writes, and read within seconds
+DEEPEST = 16  # tables and lists in each other, and parts of a dotted key
+TOO_DEEP = f"keys, tables or lists more than {DEEPEST} deep"
+NAME = r"^\w[\w .+-]*$"  # names of sensors, which become names of files
+LONGEST_NAME = 60  # so that its file has at most 255 bytes in any script
+MOST_COMPLAINTS = 8  # of one file
+_UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
+_TEXTS = re.compile(
+    r"""
+    \"{3} (?: [^"\\] | \\. | "(?!"") )*+ (?: \"{3} | \Z )  # a text over several lines
+    | " (?: [^"\\\n] | \\. )*+ "?
+    | '{3} (?: [^'] | '(?!'') )*+ (?: '{3} | \Z )
+    | ' [^'\n]*+ '?
+    | \# [^\n]*+
+    """,
+    re.DOTALL | re.VERBOSE,
+)
+"""Texts and comments of TOML, each found to its end: a search takes linear time."""
 
 
 def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDArray[np.float64]:
-    """Values as an array of that shape. Raises ShapeError, which says what is ``wanted``, for anything else than
-    finite real numbers."""
+    """Values as an array of that shape. Raises ShapeError, which says what is ``wanted``, for
+    anything else than finite real numbers."""
     try:
         found = np.asarray(values)
         numbers = found.astype(float) if found.dtype.kind in "fiubO" else None
@@ -42,7 +64,9 @@ def require_kind(value: object, kind: type | tuple[type, ...], wanted: str) -> N
 
 
 class Section(BaseModel):
-    """A section of a TOML file: no other keys than its fields, finite numbers, not changed once it is made."""
+    """A section of a TOML file: no other keys than its fields, finite numbers, not changed once it
+    is made.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -50,10 +74,30 @@ class Section(BaseModel):
 M = TypeVar("M", bound=BaseModel)
 
 
+def check_name(name: str) -> str:
+    """The name. Raises ValueError for one that could not be that of a file."""
+    if re.fullmatch(NAME, name) and len(name) <= LONGEST_NAME:
+        return name
+    raise ValueError(
+        f"{name[: LONGEST_NAME + 1]!r} must be at most {LONGEST_NAME} letters, digits, spaces and "
+        ". _ + -, beginning with a letter, a digit or _"
+    )
+
+
 def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
-    """Text of a file. Raises ``refusal`` where it cannot be read; source: how messages call it, as "board file x"."""
+    """Text of a file; source: how messages call it, as "board file x".
+
+    Raises ``refusal`` where it cannot be read, or has more than `LARGEST` bytes.
+    """
     try:
-        return Path(path).read_text(encoding="utf-8")
+        place = Path(path)
+        if place.exists() and not (place.is_file() or place.is_dir()):
+            raise refusal(f"cannot read {source}: it is no regular file")
+        with place.open("rb") as file:
+            content = file.read(LARGEST + 1)
+        if len(content) > LARGEST:
+            raise refusal(f"{source} has more than {LARGEST:,} bytes, which no such file needs")
+        return content.decode("utf-8")
     except OSError as error:
         raise refusal(f"cannot read {source}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -61,37 +105,86 @@ def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
 
 
 def parsed(text: str, source: str, refusal: type[CmmError]) -> dict[str, Any]:
-    """Content of a text, the caller's to change. Raises ``refusal`` where it is not TOML."""
+    """Content of a text, the caller's to change.
+
+    Raises ``refusal``: the text is no TOML, or has tables and lists deeper than `DEEPEST`, integers
+    beyond 64 bits, or control characters in names and strings.
+    """
     try:
         return deepcopy(_parsed(text))
     except tomllib.TOMLDecodeError as error:
         raise refusal(f"{source} is not TOML: {error}") from error
+    except RecursionError:
+        raise refusal(f"{source} has {TOO_DEEP}") from None
+    except ValueError as error:
+        raise refusal(f"{source} has {error}") from error
 
 
 def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[CmmError]) -> M:
-    """Content as a model. Raises ``refusal`` with all that is wrong, and with the valid names of an unknown key."""
+    """Content as a model. Raises ``refusal`` with all that is wrong, and with the valid names of an
+    unknown key.
+    """
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise refusal(f"{source}: {'; '.join(_explain(details, model) for details in error.errors())}") from error
+        found = error.errors()
+        said = [_explain(details, model) for details in found[:MOST_COMPLAINTS]]
+        more = len(found) - len(said)
+        said += [f"and {more} more"] if more else []
+        raise refusal(f"{source}: {'; '.join(said)}") from error
 
 
 @lru_cache(maxsize=8)
 def _parsed(text: str) -> dict[str, Any]:
-    """Kept, for a study reads the same sensor for every row, and parsing it is an eighth of the row's time."""
-    return tomllib.loads(text)
+    """Kept, for a study reads the same sensor for every row, and parsing it is an eighth of the
+    row's time. Raises ValueError, which says what the text has."""
+    bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
+    if any(key.count(".") >= DEEPEST for key in bare):  # tomllib takes their square in time
+        raise ValueError(TOO_DEEP)
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except ValueError:  # of int(), beyond some thousand digits
+        raise ValueError("an integer beyond 64 bits, or a date that is none") from None
+    if found := _fault(content):
+        raise ValueError(found)
+    return content
+
+
+def _fault(content: dict[str, Any]) -> str:
+    """First thing in a content that is beyond the limits, in words; empty where there is none."""
+    left: list[tuple[Any, int]] = [(content, 0)]
+    while left:
+        value, depth = left.pop()
+        if depth > DEEPEST:
+            return TOO_DEEP
+        if isinstance(value, dict):
+            left += [(key, depth) for key in value]
+            left += [(one, depth + 1) for one in value.values()]
+        elif isinstance(value, list):
+            left += [(one, depth + 1) for one in value]
+        elif isinstance(value, str) and _UNWANTED.search(value):
+            return f"a control character in {value[:60]!r}"
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            return "an integer beyond 64 bits"
+        elif not isinstance(value, (str, int, float)):
+            return f"a date or time, {value}, which none needs"
+    return ""
 
 
 def _explain(error: Any, model: type[BaseModel]) -> str:
     """One problem in words."""
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
-        return f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1], model))}"
+        return (
+            f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1], model))}"
+        )
     if error["type"] == "missing":
         return f"{where}: {error['msg']}"  # what was got instead is the whole section
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
-    return f"{where}: {error['msg']} (got {error['input']!r})"
+    return f"{where}: {error['msg']} (got {_shown(repr(error['input']))})"
 
 
 def _valid_keys(section: tuple[Any, ...], model: Any) -> list[str]:

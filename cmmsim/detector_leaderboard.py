@@ -1,7 +1,9 @@
-"""Leaderboard of the detectors: their errors on drawn images of tilted discs, beside the Cramer-Rao bound.
+"""Leaderboard of the detectors: their errors on drawn images of tilted discs, beside the Cramer-Rao
+bound.
 
-The discs are drawn exactly, their centres lie anywhere within a pixel and are known, and the camera adds its noise.
-Error means distance from the ellipse's centre; eccentricity is another matter. Two ways that OpenCV offers run along.
+The discs are drawn exactly, their centres lie anywhere within a pixel and are known, and the camera
+adds its noise. Error means distance from the ellipse's centre; eccentricity is another matter. Two
+ways that OpenCV offers run along.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.detection.cramer_rao import cramer_rao_bound
-from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, SpotWindows, find_detector
+from cmmsim.detection.detector import (
+    DetectedCentres,
+    Detector,
+    FitLimits,
+    SpotWindows,
+    find_detector,
+)
 from cmmsim.errors import CmmError
 from cmmsim.files.schema import NARROWEST_PSF, SensorFile
 from cmmsim.files.setup import marked_body, rig_from_file
@@ -24,21 +32,25 @@ from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.sensor import Sensor
 
 TOGETHER = 100  # discs drawn at once
-SMALLEST_RADIUS_PX, LARGEST_RADIUS_PX = 1.0, 50.0
+SMALLEST_RADIUS_PX = 1.0
+LARGEST_RADIUS_PX = 50.0
 LARGEST_TILT_DEG = 80.0
 FREE_PX = 3  # px between a disc's rim and the side of the part that is looked at
-RESAMPLES, CONFIDENCE = 1000, 0.95
-# The leaderboard is about accuracy. Where the noise is below half a grey value, the rounding of neighbours is not
-# independent, and a misfit that is judged as if it were would turn good windows away.
+RESAMPLES = 1000
+CONFIDENCE = 0.95
+# The leaderboard is about accuracy. Where the noise is below half a grey value, the rounding of
+# neighbours is not independent, and a misfit that is judged as if it were would turn good windows
+# away.
 LIMITS = FitLimits(largest_misfit=np.inf)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """How a disc is seen.
+    """Conditions under which a disc is seen.
 
-    radius_px: long half axis of the disc's image; tilt rad between its normal and the view; noise: standard deviation
-    of a grey value half-way up the edge, as a share of the contrast; psf_px: sigma of the Gaussian point spread.
+    radius_px: long half axis of the disc's image; tilt rad between its normal and the view; noise:
+    standard deviation of a grey value half-way up the edge, as a share of the contrast; psf_px:
+    sigma of the Gaussian point spread.
     """
 
     radius_px: float
@@ -53,27 +65,34 @@ class Condition:
             and 0.0 <= self.tilt <= np.radians(LARGEST_TILT_DEG)
         ):
             raise CmmError(
-                f"a disc of {self} cannot be drawn: radius must be at least {SMALLEST_RADIUS_PX:g} px, tilt "
+                f"a disc of {self} cannot be drawn: radius must be at least "
+                f"{SMALLEST_RADIUS_PX:g} px, tilt "
                 f"0 to {LARGEST_TILT_DEG:g} degrees, noise above 0 and below 100 % of the contrast"
             )
         if not (self.psf_px == 0.0 or NARROWEST_PSF <= self.psf_px < np.inf):
-            raise CmmError(f"a disc of {self} cannot be drawn: psf must be 0 or at least {NARROWEST_PSF:g} px")
+            raise CmmError(
+                f"a disc of {self} cannot be drawn: psf must be 0 or at least {NARROWEST_PSF:g} px"
+            )
         if self.radius_px > LARGEST_RADIUS_PX:
             raise CmmError(
-                f"radius {self.radius_px:g} px is more than {LARGEST_RADIUS_PX:g} px: time and memory grow "
+                f"radius {self.radius_px:g} px is more than {LARGEST_RADIUS_PX:g} px: time and "
+                "memory grow "
                 "with its square, and errors only fall with its root"
             )
 
     def __str__(self) -> str:
         return (
-            f"radius {self.radius_px:g} px, tilt {np.degrees(self.tilt):g} degrees, noise {100.0 * self.noise:g} % "
+            f"radius {self.radius_px:g} px, tilt {np.degrees(self.tilt):g} degrees, noise "
+            f"{100.0 * self.noise:g} % "
             f"of the contrast and psf {self.psf_px:g} px"
         )
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is common to all conditions: the camera's noise, levels 0 to 1 of disc and ground, focal length px."""
+    """Properties that all conditions share: the camera's noise, levels 0 to 1 of disc and ground,
+    and the focal length, px.
+    """
 
     noise: CameraNoise
     bright: float
@@ -93,10 +112,14 @@ class Scene:
     @property
     def edge_noise(self) -> float:
         """Standard deviation of a grey value half-way up the edge, as a share of the contrast."""
-        return float(np.sqrt(self.noise.variance(np.array(self.ground + 0.5 * self.contrast)))) / self.contrast
+        return (
+            float(np.sqrt(self.noise.variance(np.array(self.ground + 0.5 * self.contrast))))
+            / self.contrast
+        )
 
     def with_noise(self, share: float) -> "Scene":
-        """The same camera with more or less light and less or more gain, so that ``edge_noise`` is ``share``.
+        """The same camera with more or less light and less or more gain, so that ``edge_noise`` is
+        ``share``.
 
         Raises CmmError where rounding alone makes more noise.
         """
@@ -108,7 +131,8 @@ class Scene:
                 f"noise of {share:.2%} of the contrast is less than that of rounding, "
                 f"{np.sqrt(rounding) / self.contrast:.2%}"
             )
-        light, noise = analog / wanted, self.noise
+        light = analog / wanted
+        noise = self.noise
         return replace(
             self,
             noise=replace(
@@ -124,20 +148,31 @@ class Scene:
 def scene_of(file: SensorFile) -> Scene:
     """The scene of a sensor file's stickers and left camera."""
     rig = rig_from_file(file.rig)[0]
-    noise = replace(Sensor(file).noise, prnu=0.0, dsnu=0.0)  # a pattern is no noise: it stays from image to image
-    return Scene(noise, file.stickers.sticker_level / 255.0, file.stickers.ring_level / 255.0, rig.left.focal_px)
+    # a pattern is no noise: it stays from image to image
+    noise = replace(Sensor(file).noise, prnu=0.0, dsnu=0.0)
+    return Scene(
+        noise,
+        file.stickers.sticker_level / 255.0,
+        file.stickers.ring_level / 255.0,
+        rig.left.focal_px,
+    )
 
 
 def working_point(file: SensorFile) -> Condition:
-    """What a sensor file's left camera sees of the platform at home: median radius and tilt of the stickers that face
-    it, and the camera's own noise."""
+    """Condition of the platform's stickers at home, in the left camera of a sensor file.
+
+    It has the median radius and tilt of those that face the camera, and the camera's own noise.
+    """
     rig, camera_from_base = rig_from_file(file.rig)
     body = marked_body("platform", file.platform)
     move = camera_from_base @ pose_to_transform(file.platform.home)
-    centres, normals = apply(move, body.nominal), body.sticker_normals @ move[:3, :3].T
+    centres = apply(move, body.nominal)
+    normals = body.sticker_normals @ move[:3, :3].T
     cosine = -np.einsum("ni,ni->n", centres, normals) / np.linalg.norm(centres, axis=1)
     facing = cosine > 0.0
-    shapes = project_discs(rig.left, centres, normals, np.full(len(centres), file.stickers.radius))[1]
+    shapes = project_discs(rig.left, centres, normals, np.full(len(centres), file.stickers.radius))[
+        1
+    ]
     return Condition(
         float(np.median(np.linalg.eigvalsh(shapes[facing])[:, 1])),
         float(np.median(np.arccos(cosine[facing]))),
@@ -149,19 +184,22 @@ def working_point(file: SensorFile) -> Condition:
 def random_ellipses(
     condition: Condition, focal_px: float, size: int, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Images of discs tilted towards random sides, centres (count,2) anywhere in a window's middle pixel, shapes
-    (count,2,2), px."""
+    """Images of discs tilted towards random sides, centres (count,2) anywhere in a window's middle
+    pixel, shapes (count,2,2), px."""
     middle = 0.5 * (size - 1)
     camera = PinholeCamera(focal_px, middle, middle, size, size)
     away = rng.uniform(-0.5, 0.5, (count, 2))
     side = rng.uniform(0.0, 2.0 * np.pi, count)
-    sine, cosine = np.sin(condition.tilt), np.cos(condition.tilt)
+    sine = np.sin(condition.tilt)
+    cosine = np.cos(condition.tilt)
     normals = np.column_stack([sine * np.cos(side), sine * np.sin(side), np.full(count, -cosine)])
     places = np.column_stack([away / focal_px, np.ones(count)])  # at depth 1: only ratios matter
     return project_discs(camera, places, normals, np.full(count, condition.radius_px / focal_px))
 
 
-def draw_discs(scene: Scene, centres: Array, shapes: Array, size: int, psf_px: float) -> NDArray[np.float32]:
+def draw_discs(
+    scene: Scene, centres: Array, shapes: Array, size: int, psf_px: float
+) -> NDArray[np.float32]:
     """Radiance (n, size, size) of bright discs on dark ground."""
     shares = [coverage(*part, size, psf_px)[0] for part in _parts(centres, shapes)]
     return (scene.dark + (scene.bright - scene.dark) * np.concatenate(shares)).astype(np.float32)
@@ -169,13 +207,17 @@ def draw_discs(scene: Scene, centres: Array, shapes: Array, size: int, psf_px: f
 
 def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
     """Centres and shapes of discs that are drawn at once."""
-    return [(centres[k : k + TOGETHER], shapes[k : k + TOGETHER]) for k in range(0, len(centres), TOGETHER)]
+    return [
+        (centres[k : k + TOGETHER], shapes[k : k + TOGETHER])
+        for k in range(0, len(centres), TOGETHER)
+    ]
 
 
 @dataclass(frozen=True)
 class Score:
-    """One detector under one condition, px and per axis: Cramer-Rao bound; rms error of the windows it did not lose,
-    its ratio to the bound with a 95 % interval; bias: rms error without noise; lost: share of windows."""
+    """One detector under one condition, px and per axis: Cramer-Rao bound; rms error of the windows
+    it did not lose, its ratio to the bound with a 95 % interval; bias: rms error without noise;
+    lost: share of windows."""
 
     detector: str
     condition: Condition
@@ -196,13 +238,16 @@ def compete(
     detectors: Sequence[Detector] | None = None,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Score]:
-    """Scores of all detectors (built-in ones and OpenCV's by default) under all conditions, with ``draws`` discs each.
+    """Scores of all detectors (built-in ones and OpenCV's by default) under all conditions, with
+    ``draws`` discs each.
 
     ``report(done, total)`` is called after each condition. Raises CmmError.
     """
     if draws < 2:
         raise CmmError(f"a leaderboard needs at least 2 draws, got {draws}")
-    scenes = [scene.with_noise(condition.noise) for condition in conditions]  # refused before any work is done
+    scenes = [
+        scene.with_noise(condition.noise) for condition in conditions
+    ]  # refused before any work is done
     scores: list[Score] = []
     chosen = detectors or [*map(find_detector, DETECTORS), *PEERS]
     for k, (lit, condition) in enumerate(zip(scenes, conditions, strict=True)):
@@ -212,18 +257,30 @@ def compete(
 
 
 def _round(
-    scene: Scene, condition: Condition, draws: int, rng: np.random.Generator, detectors: Sequence[Detector]
+    scene: Scene,
+    condition: Condition,
+    draws: int,
+    rng: np.random.Generator,
+    detectors: Sequence[Detector],
 ) -> list[Score]:
     fit_size = 2 * int(np.ceil(condition.radius_px + FREE_PX))
     centres, shapes = random_ellipses(condition, scene.focal_px, fit_size + 2, draws, rng)
     radiance = draw_discs(scene, centres, shapes, fit_size + 2, condition.psf_px)
-    noisy, clean = scene.noise.expose(radiance, rng), scene.noise.mean_grey(radiance)
+    noisy = scene.noise.expose(radiance, rng)
+    clean = scene.noise.mean_grey(radiance)
     bounds = _bounds(scene, condition.psf_px, centres, shapes, fit_size + 2)
     scores = []
     for detector in detectors:
         found, without_noise = (
             detector.detect(
-                SpotWindows(w, np.zeros((draws, 2), dtype=int), scene.noise, fit_size, LIMITS, condition.psf_px)
+                SpotWindows(
+                    w,
+                    np.zeros((draws, 2), dtype=int),
+                    scene.noise,
+                    fit_size,
+                    LIMITS,
+                    condition.psf_px,
+                )
             )
             for w in (noisy, clean)
         )
@@ -253,7 +310,9 @@ def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: in
     return 0.5 * np.trace(np.concatenate(parts), axis1=1, axis2=2)
 
 
-def _ratio_interval(squared: Array, bounds: Array, rng: np.random.Generator) -> tuple[float, float, float]:
+def _ratio_interval(
+    squared: Array, bounds: Array, rng: np.random.Generator
+) -> tuple[float, float, float]:
     """Root of mean squared error over mean bound, and the limits of its 95 % bootstrap interval."""
     if len(squared) == 0:
         return np.inf, np.inf, np.inf
@@ -268,8 +327,12 @@ def _root_mean(squared: Array) -> float:
     return float(np.sqrt(squared.mean())) if squared.size else np.inf
 
 
-def _by_window(find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], given: SpotWindows) -> DetectedCentres:
-    """Centres that a function finds in each window alone, in 8 bit; OpenCV states no covariance, so it is zero."""
+def _by_window(
+    find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], given: SpotWindows
+) -> DetectedCentres:
+    """Centres that a function finds in each window alone, in 8 bit; OpenCV states no covariance, so
+    it is zero.
+    """
     grey = np.rint(given.windows * (255.0 / given.noise.white_level)).astype(np.uint8)
     found = [find(window) for window in grey]
     good = np.array([centre is not None for centre in found], dtype=bool)
@@ -278,10 +341,13 @@ def _by_window(find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], 
 
 
 def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
-    """``cv2.SimpleBlobDetector`` with its filters of shape switched off: the largest bright blob."""
+    """``cv2.SimpleBlobDetector`` with its filters of shape switched off: the largest bright
+    blob."""
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
-    settings.blobColor, settings.minArea, settings.maxArea = 255, 4.0, float(given.fit_size**2)
+    settings.blobColor = 255
+    settings.minArea = 4.0
+    settings.maxArea = float(given.fit_size**2)
     blobs = cv2.SimpleBlobDetector.create(settings)
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:
@@ -303,4 +369,7 @@ def detect_by_contour(given: SpotWindows) -> DetectedCentres:
     return _by_window(find, given)
 
 
-PEERS = (Detector("opencv_blob", detect_by_blobs, 0.01), Detector("opencv_fit_ellipse", detect_by_contour, 0.05))
+PEERS = (
+    Detector("opencv_blob", detect_by_blobs, 0.01),
+    Detector("opencv_fit_ellipse", detect_by_contour, 0.05),
+)

@@ -1,10 +1,20 @@
-"""Errors of the sensor package. Each message carries the evidence: the value, the limit, the valid names."""
+"""Errors of the sensor package. Each message carries the evidence: the value, the limit, the valid
+names.
+"""
 
 from collections.abc import Iterable
 
+LONGEST = 4000
+"""Characters of a message."""
+
 
 class CmmError(ValueError):
-    """Base class of everything this package refuses."""
+    """Base class of everything this package refuses. The message is one line."""
+
+    def __str__(self) -> str:
+        """Message on one line of at most `LONGEST` characters, whatever a file had in it."""
+        text = " ".join(super().__str__().splitlines())
+        return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 class UnknownSensorError(CmmError):
@@ -12,7 +22,8 @@ class UnknownSensorError(CmmError):
 
     def __init__(self, name: str, valid_names: Iterable[str]) -> None:
         super().__init__(
-            f"unknown sensor {name!r}: neither a built-in name ({', '.join(sorted(valid_names))}) nor a TOML file"
+            f"unknown sensor {name!r}: neither a built-in name ({', '.join(sorted(valid_names))}) "
+            "nor a TOML file"
         )
 
 
@@ -21,9 +32,13 @@ class SensorFileError(CmmError):
 
 
 class UnknownOptionError(CmmError):
-    """An option has a value that is not on its list; ``own``: where ``module:name`` of a user's own would do, too."""
+    """An option has a value that is not on its list; ``own``: where ``module:name`` of a user's own
+    would do, too.
+    """
 
-    def __init__(self, option: str, value: object, valid_names: Iterable[str], own: bool = False) -> None:
+    def __init__(
+        self, option: str, value: object, valid_names: Iterable[str], own: bool = False
+    ) -> None:
         names = ", ".join(sorted(valid_names)) + (", or module:name of your own" if own else "")
         super().__init__(f"unknown {option} {value!r}: valid are {names}")
 
@@ -41,7 +56,9 @@ class ShapeError(CmmError):
 
 
 class LostError(CmmError):
-    """The stickers in the images do not determine a pose; the message becomes the measurement's reason."""
+    """The stickers in the images do not determine a pose; the message becomes the measurement's
+    reason.
+    """
 
 
 class TeachingError(CmmError):
@@ -54,13 +71,17 @@ class OpenGLMissingError(RuntimeError):
     def __init__(self, cause: BaseException) -> None:
         super().__init__(
             "OpenGL is missing, so no images can be rendered: on Debian install the packages "
-            f"libegl1, libgl1 and libgl1-mesa-dri, or choose the renderer analytic ({type(cause).__name__}: {cause})"
+            "libegl1, libgl1 and libgl1-mesa-dri, or choose the renderer analytic "
+            f"({type(cause).__name__}: {cause})"
         )
 
 
 class CalibrationError(CmmError):
-    """Images, board or poses from which no calibration can be made; the message says which and how to go on."""
+    """Images, board or poses from which no calibration can be made; the message says which and how
+    to go on.
+    """
 
 
 class AcceptanceError(CmmError):
-    """A volume that is not seen, lines that break a rule, or an artefact that cannot be measured."""
+    """A volume that is not seen, lines that break a rule, or an artefact that cannot be
+    measured."""

@@ -1,13 +1,13 @@
 """Faults of stereo images, drawn at random: what a measurement has to survive or to refuse.
 
-    faults = cmmsim.FaultGenerator(sensor.estimator)
-    fault = faults.draw("false_discs", pose, np.random.default_rng(1))
-    tracker = cmmsim.Tracker(sensor.estimator)
-    tracker.measure(cmmsim.FaultyImages(sensor.look(pose), fault, sensor.noise, np.random.default_rng(2)))
+    faults = cmmsim.FaultGenerator(sensor.estimator) fault = faults.draw("false_discs", pose,
+    np.random.default_rng(1)) tracker = cmmsim.Tracker(sensor.estimator)
+    tracker.measure(cmmsim.FaultyImages(sensor.look(pose), fault, sensor.noise,
+    np.random.default_rng(2)))
 
-Faults are laid over grey values, so they can be laid over pictures from anywhere. Only bodies that hide stickers from
-both cameras consistently have to be drawn with the scene: ``sensor.add_bodies(fault_bodies())`` once, then
-``sensor.look(pose, obstacles=fault.obstacles)``.
+Faults are laid over grey values, so they can be laid over pictures from anywhere. Only bodies that
+hide stickers from both cameras consistently have to be drawn with the scene:
+``sensor.add_bodies(fault_bodies())`` once, then ``sensor.look(pose, obstacles=fault.obstacles)``.
 """
 
 from __future__ import annotations
@@ -23,21 +23,43 @@ from cmmsim.errors import UnknownOptionError
 from cmmsim.fault_images import DiscMark, Fault, FillMark, GlintMark, Mark, PlateMark
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, checked_pose, invert, pose_to_transform
-from cmmsim.pose_estimation.estimator import PoseEstimator
+from cmmsim.measuring.pose_estimator import PoseEstimator
 
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
 FEW = 4
 KINDS = (  # each is drawn by the method of its name, as marks or as a whole
-    *("hidden", "half_hidden", "obstacles", "one_camera_dark", "one_camera_covered", "false_discs", "false_points"),
+    *(
+        "hidden",
+        "half_hidden",
+        "obstacles",
+        "one_camera_dark",
+        "one_camera_covered",
+        "false_discs",
+        "false_points",
+    ),
     *("glint", "merging", "swapped", "black", "saturated", "several"),
 )
-STICKER_RADIANCE, DARK_RADIANCE, SATURATING = 228.0 / 255.0, 60.0 / 255.0, 1.5
+STICKER_RADIANCE = 228.0 / 255.0
+DARK_RADIANCE = 60.0 / 255.0
+SATURATING = 1.5
 
 
 def fault_bodies() -> dict[str, trimesh.Trimesh]:
-    """Boxes that hide stickers, by the names that ``Fault.obstacles`` uses, m."""
+    """Return the boxes that hide stickers.
+
+    Returns
+    -------
+    dict of str to trimesh.Trimesh
+        Boxes in m, by the names that ``Fault.obstacles`` uses.
+
+    Examples
+    --------
+    >>> sorted(fault_bodies())[0]
+    'fault box 0'
+    """
     return {
-        f"fault box {k}": trimesh.creation.box(extents=(0.5 * size, size, size)) for k, size in enumerate(BODY_SIZES)
+        f"fault box {k}": trimesh.creation.box(extents=(0.5 * size, size, size))
+        for k, size in enumerate(BODY_SIZES)
     }
 
 
@@ -45,38 +67,55 @@ class FaultGenerator:
     """Draws faults where an estimator's stickers are; ``kinds`` are the names."""
 
     def __init__(self, estimator: PoseEstimator) -> None:
-        require_kind(estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator")
-        self._rig, self._platform, self._taught = estimator.rig, estimator.platform, estimator.taught
+        require_kind(
+            estimator,
+            PoseEstimator,
+            "an estimator must be a PoseEstimator, such as sensor.estimator",
+        )
+        self._rig = estimator.rig
+        self._platform = estimator.platform
+        self._taught = estimator.taught
         self._radius = estimator.settings.radius
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """hidden: stickers covered in one or both images; half_hidden: cut by a straight edge; obstacles: bodies stand
-        before the platform; one_camera_dark, one_camera_covered; false_discs: discs like stickers in single images;
-        false_points: discs in both images where one point in space would show; glint: saturated light with a tail on
-        or beside stickers; merging: discs that touch stickers; swapped: left for right; black, saturated: whole frames;
+        """hidden: stickers covered in one or both images; half_hidden: cut by a straight edge;
+        obstacles: bodies stand before the platform; one_camera_dark, one_camera_covered;
+        false_discs: discs like stickers in single images; false_points: discs in both images where
+        one point in space would show; glint: saturated light with a tail on or beside stickers;
+        merging: discs that touch stickers; swapped: left for right; black, saturated: whole frames;
         several: two or three of those at once that leave something to measure."""
         return KINDS
 
     def draw(self, kind: str, pose: ArrayLike, rng: np.random.Generator) -> Fault:
         """A fault of that kind for the platform at a pose (6,).
 
-        Raises UnknownOptionError with the valid kinds, ShapeError for what is no pose, CmmError for no generator.
+        Raises UnknownOptionError with the valid kinds, ShapeError for what is no pose, CmmError for
+        no generator.
         """
         if kind not in KINDS:
             raise UnknownOptionError("fault", kind, KINDS)
-        require_kind(rng, np.random.Generator, "rng must be a generator, such as numpy.random.default_rng(1)")
+        require_kind(
+            rng, np.random.Generator, "rng must be a generator, such as numpy.random.default_rng(1)"
+        )
         found = getattr(self, f"_{kind}")(checked_pose(pose), rng)
         return found if isinstance(found, Fault) else Fault(kind, tuple(found))
 
-    def _outlines(self, pose: Array, stickers: slice = slice(None), off: Array | float = 0.0) -> tuple[Array, Array]:
-        """Ellipses of n stickers moved by ``off`` (3,) m: centres (2, n, 2) and shapes (2, n, 2, 2), px."""
+    def _outlines(
+        self, pose: Array, stickers: slice = slice(None), off: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Ellipses of n stickers moved by ``off`` (3,) m: centres (2, n, 2) and shapes (2, n, 2,
+        2), px.
+        """
         camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
-        places, normals = self._taught.platform_places[stickers] + off, self._platform.sticker_normals[stickers]
+        places = self._taught.platform_places[stickers] + off
+        normals = self._platform.sticker_normals[stickers]
         return sticker_outlines(self._rig, camera_from_platform, places, normals, self._radius)
 
     def _some(self, rng: np.random.Generator, most: int | None = None) -> NDArray[np.int_]:
-        """Random stickers: as often as not up to FEW of them, else up to all; never more than ``most``."""
+        """Random stickers: as often as not up to FEW of them, else up to all; never more than
+        ``most``.
+        """
         count = len(self._taught.platform_places)
         largest = min(most or count, FEW if rng.random() < 0.5 else count, count)
         return rng.choice(count, rng.integers(1, largest + 1), replace=False)
@@ -86,15 +125,21 @@ class FaultGenerator:
         sides = _one_or_both(rng)
         for k in self._some(rng):
             for side in sides:
-                half = np.linalg.norm(shapes[side, k], 2) + rng.uniform(1.0, 12.0, 2)  # holds the ellipse at any angle
-                yield PlateMark(side, centres[side, k], half, rng.uniform(0.0, np.pi), DARK_RADIANCE)
+                # holds the ellipse at any angle
+                half = np.linalg.norm(shapes[side, k], 2) + rng.uniform(1.0, 12.0, 2)
+                yield PlateMark(
+                    side, centres[side, k], half, rng.uniform(0.0, np.pi), DARK_RADIANCE
+                )
 
     def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """The edge stands anywhere between a sticker's nearest and farthest rim, often close to the nearest one."""
+        """The edge stands anywhere between a sticker's nearest and farthest rim, often close to the
+        nearest one.
+        """
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
         for k in self._some(rng):
-            angle, depth = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, 1.0) ** rng.choice([1, 3])
+            angle = rng.uniform(0.0, 2.0 * np.pi)
+            depth = rng.uniform(0.0, 1.0) ** rng.choice([1, 3])
             normal = np.array([np.cos(angle), np.sin(angle)])
             for side in sides:
                 rim = float(np.linalg.norm(shapes[side, k] @ normal))
@@ -109,7 +154,11 @@ class FaultGenerator:
             sticker = self._taught.platform_places[rng.integers(len(self._taught.platform_places))]
             at = apply(pose_to_transform(pose), sticker)
             middle = 0.5 * (self._taught.base_from_camera[:3, 3] + self._right_eye())
-            at = at + rng.uniform(0.02, 0.5) * (middle - at) + rng.uniform(-0.7, 0.7, 3) * BODY_SIZES[number]
+            at = (
+                at
+                + rng.uniform(0.02, 0.5) * (middle - at)
+                + rng.uniform(-0.7, 0.7, 3) * BODY_SIZES[number]
+            )
             places[names[number]] = pose_to_transform(np.r_[at, rng.uniform(-1.0, 1.0, 3)])
         return Fault("obstacles", obstacles=places)
 
@@ -128,12 +177,15 @@ class FaultGenerator:
         centres, shapes = self._outlines(pose)
         for _ in range(rng.integers(1, 31)):
             side = int(rng.integers(2))
-            near, shape = centres[side, rng.integers(centres.shape[1])], shapes[side, rng.integers(centres.shape[1])]
+            near = centres[side, rng.integers(centres.shape[1])]
+            shape = shapes[side, rng.integers(centres.shape[1])]
             centre = near + rng.choice([2.0, 6.0, 80.0]) * rng.standard_normal(2)
             yield DiscMark(side, centre, rng.uniform(0.7, 1.4) * shape, _radiance(rng))
 
     def _false_points(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Discs in space, on the platform's planes or somewhere around; they hide what is behind them."""
+        """Discs in space, on the platform's planes or somewhere around; they hide what is behind
+        them.
+        """
         for _ in range(rng.integers(1, 21)):
             k = rng.integers(len(self._taught.platform_places))
             off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)
@@ -143,13 +195,20 @@ class FaultGenerator:
                 yield DiscMark(side, centres[side, 0], shapes[side, 0], radiance)
 
     def _glint(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Of one surface, so both cameras see it near the same sticker, in unlike directions and strengths."""
+        """Glint of one surface.
+
+        Both cameras see it near the same sticker, in unlike directions and strengths.
+        """
         centres, shapes = self._outlines(pose)
         for k in self._some(rng, 6):
             for side in _one_or_both(rng):
-                centre = centres[side, k] + rng.uniform(0.0, 4.0) * shapes[side, k] @ _direction(rng)
-                peak, core = 10.0 ** rng.uniform(-1.5, 1.0), rng.uniform(0.5, 3.0)
-                tail_peak, tail = 10.0 ** rng.uniform(-2.5, 0.5), rng.uniform(2.0, 20.0)
+                centre = centres[side, k] + rng.uniform(0.0, 4.0) * shapes[side, k] @ _direction(
+                    rng
+                )
+                peak = 10.0 ** rng.uniform(-1.5, 1.0)
+                core = rng.uniform(0.5, 3.0)
+                tail_peak = 10.0 ** rng.uniform(-2.5, 0.5)
+                tail = rng.uniform(2.0, 20.0)
                 yield GlintMark(side, centre, peak, core, tail_peak, tail, rng.uniform(0.0, np.pi))
 
     def _merging(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
@@ -157,7 +216,9 @@ class FaultGenerator:
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
         for k in self._some(rng):
-            towards, gap, radiance = _direction(rng), rng.uniform(0.2, 2.4), _radiance(rng)
+            towards = _direction(rng)
+            gap = rng.uniform(0.2, 2.4)
+            radiance = _radiance(rng)
             for side in sides:
                 centre = centres[side, k] + gap * shapes[side, k] @ towards
                 yield DiscMark(side, centre, shapes[side, k], radiance)
@@ -172,10 +233,23 @@ class FaultGenerator:
         return (FillMark(side, SATURATING) for side in range(2))
 
     def _several(self, pose: Array, rng: np.random.Generator) -> Fault:
-        kinds = ["hidden", "half_hidden", "obstacles", "false_discs", "false_points", "glint", "merging"]
-        parts = [self.draw(kind, pose, rng) for kind in rng.choice(kinds, rng.integers(2, 4), replace=False)]
+        kinds = [
+            "hidden",
+            "half_hidden",
+            "obstacles",
+            "false_discs",
+            "false_points",
+            "glint",
+            "merging",
+        ]
+        parts = [
+            self.draw(kind, pose, rng)
+            for kind in rng.choice(kinds, rng.integers(2, 4), replace=False)
+        ]
         obstacles = {name: place for part in parts for name, place in part.obstacles.items()}
-        return Fault("several", tuple(mark for part in parts for mark in part.marks), obstacles=obstacles)
+        return Fault(
+            "several", tuple(mark for part in parts for mark in part.marks), obstacles=obstacles
+        )
 
 
 def _one_or_both(rng: np.random.Generator) -> tuple[int, ...]:
@@ -184,7 +258,7 @@ def _one_or_both(rng: np.random.Generator) -> tuple[int, ...]:
 
 
 def _radiance(rng: np.random.Generator) -> float:
-    """That of a sticker, or another bright one."""
+    """Radiance of a sticker, or another bright one."""
     return STICKER_RADIANCE if rng.random() < 0.5 else float(rng.uniform(0.3, 1.3))
 
 

@@ -8,21 +8,26 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from cmmsim.checks import finite_array
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, invert, transforms_of
 from cmmsim.imaging.analytic import ANALYTIC
-from cmmsim.imaging.exposure import VirtualStereoCamera
 from cmmsim.imaging.renderer import Renderer
-from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement
-from cmmsim.pose_estimation.many import ManySeen, measure_exposures
-from cmmsim.statistical.exposure import StatisticalStereoCamera
+from cmmsim.imaging.stereo_camera import VirtualStereoCamera
+from cmmsim.measuring.measured_poses import ManySeen, measure_exposures
+from cmmsim.measuring.measurement import Measurement, lost_measurement
+from cmmsim.measuring.pose_estimator import PoseEstimator
+from cmmsim.without_images.drawn_stickers import StatisticalStereoCamera
 
 T = TypeVar("T")
 R = TypeVar("R")
 BLOCK = 32  # frames that are drawn and measured together
 
-Frames = tuple[PoseEstimator, Array, Array, Array, Sequence[np.random.Generator], Mapping[str, Array]]
+Frames = tuple[
+    PoseEstimator, Array, Array, Array, Sequence[np.random.Generator], Mapping[str, Array]
+]
 """What ``measure_frames`` takes beside the camera."""
 
 
@@ -35,14 +40,17 @@ def measure_frames(
     rngs: Sequence[np.random.Generator],
     obstacles: Mapping[str, Array],
 ) -> Iterator[ManySeen]:
-    """Exposures of the platform at poses (N,6) in motion at rates (N,6), each with the noise of its own stream,
-    measured by stickers that are looked for near poses (N,6), by a movement that is known: block after block of frames.
+    """Exposures of the platform at poses (N,6) in motion at rates (N,6), each with the noise of its
+    own stream, measured by stickers that are looked for near poses (N,6), by a movement that is
+    known: block after block of frames.
 
     How many threads share the blocks changes nothing in the result.
     """
-    expected, half = expected_at(estimator, near), 0.5 * camera.exposure * rates
+    expected = expected_at(estimator, near)
+    half = 0.5 * camera.exposure * rates
     back = expected @ invert(transforms_of(poses))
-    first, last = back @ transforms_of(poses - half), back @ transforms_of(poses + half)
+    first = back @ transforms_of(poses - half)
+    last = back @ transforms_of(poses + half)
     parts = [slice(start, start + BLOCK) for start in range(0, len(poses), BLOCK)]
 
     def block(part: slice) -> ManySeen:
@@ -63,17 +71,21 @@ def measure_without_images(
 ) -> list[Measurement]:
     """As ``measure_frames`` of cameras that draw nothing, one by one."""
     found = []
-    for pose, rate, expected, rng in zip(poses, rates, expected_at(estimator, near), rngs, strict=True):
+    for pose, rate, expected, rng in zip(
+        poses, rates, expected_at(estimator, near), rngs, strict=True
+    ):
         try:
-            found.append(estimator.measure(camera.look(pose, rng, obstacles, pose_rate=rate), expected)[0])
+            found.append(
+                estimator.measure(camera.look(pose, rng, obstacles, pose_rate=rate), expected)[0]
+            )
         except LostError as error:
             found.append(lost_measurement(str(error)))
     return found
 
 
 def on_all_cores(work: Callable[[T], R], parts: Sequence[T], renderer: Renderer) -> Iterator[R]:
-    """Results of work on parts that know nothing of each other, in their order; in one thread with a renderer that may
-    need it, as OpenGL does."""
+    """Results of work on parts that know nothing of each other, in their order; in one thread with
+    a renderer that may need it, as OpenGL does."""
     threads = threads_at_most() if renderer is ANALYTIC else 1
     if threads == 1 or len(parts) < 2:
         yield from map(work, parts)
@@ -93,3 +105,14 @@ def threads_at_most() -> int:
     from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
 
     return min(int(NUMBA_NUM_THREADS), os.cpu_count() or 1)
+
+
+def pose_rows(poses: ArrayLike) -> Array:
+    """Poses (N,6), checked; an empty list holds none."""
+    if isinstance(poses, list) and not poses:
+        return np.zeros((0, 6))
+    try:
+        count = len(poses)  # type: ignore[arg-type]  # a number has no length
+    except TypeError:
+        count = 1
+    return finite_array(poses, (count, 6), "poses are rows of six finite numbers, m and rad")

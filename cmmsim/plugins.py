@@ -1,14 +1,21 @@
-"""Detectors and renderers by name: built in, or ``module:name`` of a user's own.
+"""Parts by name: built-in detectors and renderers, and parts of a user's own as ``module:name``.
 
-A built-in one is a file of its own and one line here; its module is imported when its name is first used. One of a
-user's own is given by its module and its name in there wherever a built-in name would do: a function, a class that is
-made without arguments and called like the function, or a ready ``Detector`` or ``Renderer``. Its folder must be on
-PYTHONPATH, so that other processes find it, too.
+A built-in part is a file of its own and one line here. Its module is imported when its name is
+first used.
+
+A part of a user's own is named by its module and its name in there wherever a built-in name would
+do. The module's folder must be on PYTHONPATH, so that other processes find it. Scenarios, sensor
+files and studies are passed around, so a name in them runs code only where its module is allowed:
+by ``--plugin my_module`` on the command line, in the environment variable ``CMMSIM_PLUGINS``, or by
+`allow_plugin`.
 """
 
 import importlib
-from collections.abc import Mapping
-from dataclasses import fields
+import os
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, TypeVar
 
 from cmmsim.errors import CmmError, UnknownOptionError
@@ -23,50 +30,164 @@ DEFAULT_DETECTOR = "maximum_likelihood"
 RENDERERS = {
     "analytic": "cmmsim.imaging.analytic:ANALYTIC",
     "pyrender": "cmmsim.imaging.pyrender_renderer:PYRENDER",
-    "statistical": "cmmsim.statistical.exposure:STATISTICAL",
+    "statistical": "cmmsim.without_images.drawn_stickers:STATISTICAL",
 }
 AUTO = "auto"  # pyrender where OpenGL works, else analytic
+ALLOWED = "CMMSIM_PLUGINS"  # modules, separated by commas; processes that are started inherit it
+
+
+def allow_plugin(*modules: str) -> None:
+    """Allow parts of these modules to run, in this process and in those that it starts.
+
+    A package allows the modules within it, too.
+
+    Parameters
+    ----------
+    *modules : str
+        Names of modules.
+
+    Returns
+    -------
+    None
+
+    Raises
+    ------
+    CmmError
+        If no module can have a name.
+
+    Examples
+    --------
+    >>> allow_plugin("my_detector")
+    >>> "my_detector" in allowed_plugins()
+    True
+    """
+    for module in modules:
+        if not _is_module(module):
+            raise CmmError(f"{module!r} is no name of a module, such as my_module")
+    os.environ[ALLOWED] = ",".join(dict.fromkeys([*allowed_plugins(), *modules]))
+
+
+def allowed_plugins() -> tuple[str, ...]:
+    """Names of the modules whose parts may run."""
+    names = os.environ.get(ALLOWED, "").split(",")
+    return tuple(name.strip() for name in names if name.strip())
+
+
+def is_own(name: str) -> bool:
+    """Tell whether a name is ``module:name`` of a user's own."""
+    return ":" in name
+
+
+def own_part(option: str, name: str) -> Any:
+    """Part of a user's own, which ``module:name`` names; option: what it is to be, in messages.
+
+    Raises CmmError: the module is not allowed to run (with what to type), it cannot be imported,
+    or it has no such part.
+    """
+    module, _, attribute = name.partition(":")
+    if not (_is_module(module) and attribute.isidentifier()):
+        raise CmmError(f"{option} {name!r} is no module:name, such as my_module:my_part")
+    if not any(f"{module}.".startswith(f"{allowed}.") for allowed in allowed_plugins()):
+        raise CmmError(
+            f"{option} {name!r} is code of the module {module}, which is not allowed to run; where "
+            f"you trust it, add --plugin {module} to the command, set {ALLOWED}={module}, or call "
+            f"cmmsim.allow_plugin({module!r}) in Python"
+        )
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except Exception as error:
+        raise CmmError(
+            f"{option} {name!r} is no importable module:name: {error}; its folder must be on "
+            "PYTHONPATH"
+        ) from error
+
+
+@dataclass(frozen=True)
+class Telling:
+    """Function of a user's own that tells in one line what it raises, and where in its file.
+
+    part: how it is called in messages; refusal: what is raised then; known: errors that pass as
+    they are; check: is given part, what the function returned and what the function was given, and
+    raises what is known where it is not what was to be returned.
+    """
+
+    part: str
+    function: Callable[..., Any]
+    refusal: type[Exception]
+    known: tuple[type[Exception], ...] = ()
+    check: Callable[..., None] | None = None
+
+    def __call__(self, *given: Any) -> Any:
+        """Return what the function returns. Raises `refusal`, or what is known."""
+        try:
+            found = self.function(*given)
+            if self.check is not None:
+                self.check(self.part, found, *given)
+            return found
+        except self.known:
+            raise
+        except Exception as error:
+            at = traceback.extract_tb(error.__traceback__)[:2][-1]
+            place = f"{Path(at.filename).name}, line {at.lineno}"
+            said = f"{self.part} raised {type(error).__name__}: {error} ({place})"
+            raise self.refusal(said) from error
 
 
 def require_detector(name: str) -> str:
-    """The name, which is that of a built-in detector or ``module:name``. Raises UnknownOptionError."""
+    """Name of a built-in detector, or ``module:name``. Raises UnknownOptionError."""
     return _required("detector", name, DETECTORS)
 
 
 def require_renderer(name: str) -> str:
-    """The name, which is "auto", that of a built-in renderer or ``module:name``. Raises UnknownOptionError."""
+    """Name of a built-in renderer, "auto", or ``module:name``. Raises UnknownOptionError."""
     return _required("renderer", name, {AUTO: "", **RENDERERS})
 
 
-def is_own(name: str) -> bool:
-    """Whether a name is ``module:name`` of a user's own."""
-    return ":" in name
+def find(
+    option: str,
+    name: str,
+    built_in: Mapping[str, str],
+    kind: type[K],
+    check: Callable[..., None],
+) -> K:
+    """Detector or Renderer, as ``kind`` says, of a built-in name or of ``module:name``.
 
+    A part of a user's own is a ready one of the kind; a function; or a class that is made without
+    arguments and called like the function. A function becomes one of the kind, with those of the
+    kind's figures that it carries itself. check: of what it returns, see `Telling`.
 
-def find(option: str, name: str, built_in: Mapping[str, str], kind: type[K]) -> K:
-    """The Detector or Renderer, which ``kind`` says, of a built-in name or ``module:name``.
-
-    A class of a user's own is made without arguments; what is called becomes one of the kind with that name, and with
-    those of its figures that it carries itself. Raises UnknownOptionError with the valid names, and CmmError where
-    there is no such module or nothing to be called.
+    Raises UnknownOptionError with the valid names, and CmmError where there is nothing to be
+    called, or a module that is not allowed to run.
     """
-    module, _, attribute = built_in.get(_required(option, name, built_in), name).partition(":")
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise CmmError(
-            f"{option} {name!r} is no importable module:name: {error}; its folder must be on PYTHONPATH"
-        ) from error
-    found = found() if isinstance(found, type) else found
-    if isinstance(found, kind):
-        return found
-    if not callable(found):
-        raise CmmError(f"{option} {name!r} is of type {type(found).__name__}, which cannot be called")
-    figures: list[Any] = [field for field in fields(kind)[2:] if hasattr(found, field.name)]
-    return kind(name, found, **{field.name: type(field.default)(getattr(found, field.name)) for field in figures})
+    name = _required(option, name, built_in)
+    if name in built_in:
+        module, _, attribute = built_in[name].partition(":")
+        return getattr(importlib.import_module(module), attribute)
+    part, said = own_part(option, name), f"{option} {name!r}"
+    found = Telling(said, part, CmmError)() if isinstance(part, type) else part
+    _, does, *figures = fields(kind)
+    function = getattr(found, does.name) if isinstance(found, kind) else found
+    if not callable(function):
+        raise CmmError(f"{said} is of type {type(function).__name__}, which cannot be called")
+    carried = [field for field in figures if hasattr(found, field.name)]
+    values = {field.name: _figure(said, found, field) for field in carried}
+    return kind(name, Telling(said, function, CmmError, (CmmError,), check), **values)
+
+
+def _figure(part: str, owner: Any, field: Any) -> Any:
+    """Figure that a function of a user's own carries, such as its ``bias_px``."""
+    value = getattr(owner, field.name)
+    kind = type(field.default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1000:
+        raise CmmError(f"{part} has {field.name} = {value!r}, must be a number from 0 to 1000")
+    return kind(value)
 
 
 def _required(option: str, name: str, built_in: Mapping[str, str]) -> str:
     if not isinstance(name, str) or not (name in built_in or is_own(name)):
         raise UnknownOptionError(option, name, built_in, own=True)
     return name
+
+
+def _is_module(name: object) -> bool:
+    return isinstance(name, str) and all(part.isidentifier() for part in name.split("."))

@@ -1,16 +1,19 @@
-"""Teaching (paper section 4.2): the frames of base and platform from their sticker planes, once, before measuring.
+"""Teaching (paper section 4.2): the frames of base and platform from their sticker planes, once,
+before measuring.
 
-The base stands still: its stickers are averaged over many exposures. The platform goes through a smooth path; in each
-pose its stickers are observed, all observations are laid onto each other by registration, and the planes are put
-through the mean constellation. Different poses put the stickers on different parts of a pixel, so that what is left of
-the image formation's own error averages out as well.
+The base stands still: its stickers are averaged over many exposures. The platform goes through a
+smooth path; in each pose its stickers are observed, all observations are laid onto each other by
+registration, and the planes are put through the mean constellation. Different poses put the
+stickers on different parts of a pixel, so that what is left of the image formation's own error
+averages out as well.
 
-Whatever detector the sensor measures with, the centres are those of the maximum-likelihood fit, which is the one
-without a bias: the base is seen in one pose only, so that another detector's bias would stay in every pose.
+Whatever detector the sensor measures with, the centres are those of the maximum-likelihood fit,
+which is the one without a bias: the base is seen in one pose only, so that another detector's bias
+would stay in every pose.
 
-The windows in which stickers are looked for are large enough for the largest image of a sticker: that of one in the
-nearest place of work, which is taken for a fifth nearer than the rig's target, or of one that both cameras see on base
-and platform at teaching.
+The windows in which stickers are looked for are large enough for the largest image of a sticker:
+that of one in the nearest place of work, which is taken for a fifth nearer than the rig's target,
+or of one that both cameras see on base and platform at teaching.
 """
 
 from collections.abc import Callable
@@ -27,30 +30,46 @@ from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, apply_each, compose_covariance, invert
 from cmmsim.geometry.registration import register, register_sets
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.imaging.exposure import Quality
-from cmmsim.imaging.scene import placed_stickers
+from cmmsim.imaging.scene_bodies import placed_stickers
+from cmmsim.imaging.stereo_camera import Quality
+from cmmsim.measuring.layout_search import bright_ellipses, candidate_points, find_layout
+from cmmsim.measuring.observation import (
+    Observer,
+    StickerExposure,
+    StickerObservation,
+    faces_camera,
+)
+from cmmsim.measuring.pose_estimator import (
+    FEWEST_NOMINAL,
+    NOMINAL_TOLERANCE,
+    by_planes,
+    frames_by_planes,
+)
+from cmmsim.measuring.taught import Taught, setup_of
 from cmmsim.plugins import DEFAULT_DETECTOR
-from cmmsim.pose_estimation.estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, by_planes, frames_by_planes
-from cmmsim.pose_estimation.observation import Observer, StickerExposure, StickerObservation, faces_camera
-from cmmsim.pose_estimation.search import bright_ellipses, candidate_points, find_layout
-from cmmsim.pose_estimation.taught import Taught, setup_of
-from cmmsim.radiometry.images import StereoImages
+from cmmsim.radiometry.stereo_images import StereoImages
 
 Progress = Callable[[int, int], None]
-SHIFT, TURN = 0.008, 0.03  # m, rad: reach of the teaching path about home
+SHIFT = 0.008
+TURN = 0.03  # m, rad: reach of the teaching path about home
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
 LARGEST_GAP = 1e-4  # m: in averaged exposures a whole sticker is within a few microns of its place
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 ROOM = 1.35  # half the side of what is fitted over a sticker's radius at the rig's target
-SMALLEST_ROOM_PX = 0.7  # on each side of the largest sticker at teaching: half a pixel goes into rounding
-SMALLEST_FIT, SMALLEST_BLURRED_FIT = 12, 14  # px
+SMALLEST_ROOM_PX = (
+    0.7  # on each side of the largest sticker at teaching: half a pixel goes into rounding
+)
+SMALLEST_FIT = 12
+SMALLEST_BLURRED_FIT = 14  # px
 BLUR_ROOM = 1.0  # px on each side, at least, for what point spread and exposure blur
 WINDOW_SHARE = 7 / 6  # side of a window over that of the part that is fitted
 
 
 @dataclass(frozen=True)
 class TeachingPlan:
-    """How much is looked at: base quality; platform poses and quality at each; window sizes px."""
+    """Plan of teaching: quality of the views of the base, number and quality of those of the
+    platform, and window sizes, px.
+    """
 
     base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))
     platform: Quality = field(default_factory=lambda: Quality(supersampling=12, exposures=30))
@@ -69,7 +88,7 @@ class Camera(Protocol):
         """One exposure of the platform at a pose (6,)."""
 
     def centre_error_px(self, quality: Quality) -> float:
-        """What drawing leaves in a sticker's centre, px rms."""
+        """Error of a sticker's centre that drawing leaves, px rms."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +102,11 @@ class Teacher:
     plan: TeachingPlan = field(default_factory=TeachingPlan)
 
     def teach(
-        self, sensor_name: str, home: Array, rng: np.random.Generator, progress: Progress | None = None
+        self,
+        sensor_name: str,
+        home: Array,
+        rng: np.random.Generator,
+        progress: Progress | None = None,
     ) -> Taught:
         """Teach base and platform around the pose ``home`` (6,). Raises TeachingError."""
         steps = self.plan.poses + 2
@@ -99,9 +122,17 @@ class Teacher:
             ]
             report(1, steps)
             base = self._look_at(
-                self.base, start[0], self.base.nominal, path[0], rng, self.plan.base, self.plan.base_window
+                self.base,
+                start[0],
+                self.base.nominal,
+                path[0],
+                rng,
+                self.plan.base,
+                self.plan.base_window,
             )
-            camera_from_base, base_covariance, base = by_planes(base, self.base, _towards(self.base, start[0]))
+            camera_from_base, base_covariance, base = by_planes(
+                base, self.base, _towards(self.base, start[0])
+            )
             report(2, steps)
             seen = self._platform_views(start[1], path, rng, lambda k: report(k + 2, steps))
         except LostError as error:
@@ -140,30 +171,45 @@ class Teacher:
         )
         noise = replace(self.observer.noise, frames=quality.exposures)
         observer = replace(self.observer, noise=noise, settings=settings)
-        seen = observer.observe(self.camera.look(pose, rng, quality=quality), expected, places, body.sticker_normals)
+        seen = observer.observe(
+            self.camera.look(pose, rng, quality=quality), expected, places, body.sticker_normals
+        )
         if len(seen.index) < len(places):
             missing = np.setdiff1d(np.arange(len(places)), seen.index)
             raise LostError(
-                f"{body.name}: stickers {', '.join(body.sticker_ids[missing])} not seen by both cameras"
-                + self._outside(body, missing, apply(expected, places))
+                f"{body.name}: stickers {', '.join(body.sticker_ids[missing])} not seen by both "
+                "cameras" + self._outside(body, missing, apply(expected, places))
             )
         return seen
 
     def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
-        """Which of the missing stickers no window could have found, for they lie beside an image."""
+        """Name the missing stickers that lie beside an image, where no window could find them."""
         outside = missing[~np.all(self.observer.rig.project(points[missing])[1], axis=0)]
-        return f"; {', '.join(body.sticker_ids[outside])} lie outside of an image" if len(outside) else ""
+        return (
+            f"; {', '.join(body.sticker_ids[outside])} lie outside of an image"
+            if len(outside)
+            else ""
+        )
 
     def _platform_views(
         self, rough: Array, path: Array, rng: np.random.Generator, report: Callable[[int], None]
     ) -> list[StickerObservation]:
         """Observations along the teaching path, each expected where the ones before lead to."""
-        places, last, step, seen = self.platform.nominal, rough, np.eye(4), []
+        places = self.platform.nominal
+        last = rough
+        step = np.eye(4)
+        seen = []
         for k, pose in enumerate(path):
             size = self.plan.first_window if k < 2 else self.plan.platform_window
-            seen.append(self._look_at(self.platform, last @ step, places, pose, rng, self.plan.platform, size))
+            seen.append(
+                self._look_at(
+                    self.platform, last @ step, places, pose, rng, self.plan.platform, size
+                )
+            )
             if k == 0:
-                body_from_camera = invert(by_planes(seen[0], self.platform, _towards(self.platform, rough))[0])
+                body_from_camera = invert(
+                    by_planes(seen[0], self.platform, _towards(self.platform, rough))[0]
+                )
                 places = apply(body_from_camera, seen[0].points)
             now = register(places, seen[-1].points, seen[-1].covariances).transform
             self._require_rigid(places, now, seen[-1])
@@ -172,22 +218,28 @@ class Teacher:
             report(k + 1)
         return seen
 
-    def _require_rigid(self, places: Array, camera_from_body: Array, seen: StickerObservation) -> None:
+    def _require_rigid(
+        self, places: Array, camera_from_body: Array, seen: StickerObservation
+    ) -> None:
         """Raise LostError when a sticker has moved against the others: it is partly hidden."""
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
-        depth, focal = np.linalg.norm(seen.points, axis=1).max(), self.observer.rig.left.focal_px
+        depth = np.linalg.norm(seen.points, axis=1).max()
+        focal = self.observer.rig.left.focal_px
         limit = LARGEST_GAP + self.observer.settings.line_error_px * depth / focal
         if gaps.max() > limit:
             worst = self.platform.sticker_ids[gaps.argmax()]
             raise LostError(
-                f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its place, "
+                f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its "
+                "place, "
                 f"at most {limit * 1e6:.0f} um; it may be partly hidden"
             )
 
 
-def platform_frame(platform: MarkedBody, seen: list[StickerObservation]) -> tuple[Array, Array, Array]:
-    """Sticker places (n,3) on the platform, their covariances (n,3,3) and the covariance (6,6) of the platform frame,
-    from observations of all its stickers."""
+def platform_frame(
+    platform: MarkedBody, seen: list[StickerObservation]
+) -> tuple[Array, Array, Array]:
+    """Sticker places (n,3) on the platform, their covariances (n,3,3) and the covariance (6,6) of
+    the platform frame, from observations of all its stickers."""
     views = np.stack([one.points for one in seen]), np.stack([one.covariances for one in seen])
     mean, covariances = mean_constellation(*views)
     towards = _towards(platform, register(platform.nominal, mean, covariances).transform)
@@ -203,32 +255,39 @@ def platform_frame(platform: MarkedBody, seen: list[StickerObservation]) -> tupl
 
 
 def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> Array:
-    """Sticker places (c,n,3) as of ``platform_frame`` that each of c teachings finds, in whose views the stickers are
-    at points (c,v,n,3) with covariances (c,v,n,3,3)."""
+    """Sticker places (c,n,3) as of ``platform_frame`` that each of c teachings finds, in whose
+    views the stickers are at points (c,v,n,3) with covariances (c,v,n,3,3)."""
     mean, covariances = mean_constellation(points, covariances)
     towards = _towards(platform, register_sets(platform.nominal, mean, covariances).transform)
     return apply_each(invert(frames_by_planes(platform, mean, covariances, towards)), mean)
 
 
 def teaching_path(home: Array, count: int) -> Array:
-    """Smooth closed path of poses (count, 6) that starts near ``home`` and visits many sub-pixel positions."""
+    """Smooth closed path of poses (count, 6) that starts near ``home`` and visits many sub-pixel
+    positions.
+    """
     angle = 2.0 * np.pi * np.arange(count)[:, None] / count * CYCLES + PHASES
     return home + np.array([SHIFT] * 3 + [TURN] * 3) * np.sin(angle)
 
 
 def _towards(body: MarkedBody, camera_from_body: Array) -> Array:
-    """Normals (..., 3, 3) of the planes in the camera frame, where camera_from_body is (..., 4, 4)."""
+    """Normals (..., 3, 3) of the planes in the camera frame, where camera_from_body is (...,
+    4, 4)."""
     return np.asarray(body.normals @ camera_from_body[..., :3, :3].swapaxes(-1, -2))
 
 
 def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Weighted mean (..., n, 3) of views (..., v, n, 3) of the same stickers laid onto each other, near the first of
-    them, and its covariances (..., n, 3, 3), from those of the points (..., v, n, 3, 3)."""
+    """Weighted mean (..., n, 3) of views (..., v, n, 3) of the same stickers laid onto each other,
+    near the first of them, and its covariances (..., n, 3, 3), from those of the points (..., v, n,
+    3, 3)."""
     weights = np.linalg.inv(covariances)
-    mean, spread = points[..., 0, :, :], covariances[..., 0, :, :, :]
+    mean = points[..., 0, :, :]
+    spread = covariances[..., 0, :, :, :]
     for _ in range(3):
         sets = np.broadcast_to(mean[..., None, :, :], points.shape).reshape(-1, *points.shape[-2:])
-        found = register_sets(sets, points.reshape(sets.shape), covariances.reshape(*sets.shape, 3)).transform
+        found = register_sets(
+            sets, points.reshape(sets.shape), covariances.reshape(*sets.shape, 3)
+        ).transform
         to_mean = invert(found).reshape(*points.shape[:-2], 4, 4)
         turn = to_mean[..., None, :3, :3]
         turned = turn @ weights @ turn.swapaxes(-1, -2)
@@ -240,8 +299,8 @@ def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]
 
 @dataclass(frozen=True)
 class WindowSizes:
-    """Sides in px of windows and of the part around the bright spot that is fitted; growth: of what is fitted, over
-    what the smallest stickers get."""
+    """Sides in px of windows and of the part around the bright spot that is fitted; growth: of what
+    is fitted, over what the smallest stickers get."""
 
     window: int
     fit: int
@@ -249,32 +308,46 @@ class WindowSizes:
 
     def plan(self) -> TeachingPlan:
         """Teaching with windows that have grown alike."""
-        plan, names = TeachingPlan(), ("base_window", "first_window", "platform_window")
-        return replace(plan, **{name: 2 * round(0.5 * self.growth * getattr(plan, name)) for name in names})
+        plan = TeachingPlan()
+        names = ("base_window", "first_window", "platform_window")
+        return replace(
+            plan, **{name: 2 * round(0.5 * self.growth * getattr(plan, name)) for name in names}
+        )
 
 
 def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bool) -> WindowSizes:
-    """Sizes for stickers whose radius looks ``target_px`` large at the rig's target and ``largest_px`` at teaching.
+    """Sizes for stickers whose radius looks ``target_px`` large at the rig's target and
+    ``largest_px`` at teaching.
 
     Parameters: psf_px: sigma of the point spread; blurred: by it or by a moving platform.
     """
-    smallest, blur = (SMALLEST_BLURRED_FIT, max(BLUR_ROOM, psf_px)) if blurred else (SMALLEST_FIT, 0.0)
+    smallest, blur = (
+        (SMALLEST_BLURRED_FIT, max(BLUR_ROOM, psf_px)) if blurred else (SMALLEST_FIT, 0.0)
+    )
     reach = max(ROOM * target_px, largest_px + SMALLEST_ROOM_PX)
     fit = max(smallest, 2 * int(np.ceil(reach + blur)))
     return WindowSizes(2 * int(0.5 * WINDOW_SHARE * fit), fit, fit / smallest)
 
 
 def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: float) -> float:
-    """Radius in px of a sticker of ``radius`` m that faces the nearer camera at ``target`` (3,) m, base axes."""
-    distances = [float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera]
+    """Radius in px of a sticker of ``radius`` m that faces the nearer camera at ``target`` (3,) m,
+    base axes.
+    """
+    distances = [
+        float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera
+    ]
     return max(
         radius * float(camera.focal_lengths.max()) / distance
         for camera, distance in zip(rig.cameras, distances, strict=True)
     )
 
 
-def largest_radius(rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float) -> float:
-    """Longest half axis in px of the stickers of a body that both cameras see; 0 where there is none."""
+def largest_radius(
+    rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float
+) -> float:
+    """Longest half axis in px of the stickers of a body that both cameras see; 0 where there is
+    none.
+    """
     normals = body.sticker_normals
     seen = np.all(rig.project(apply(camera_from_body, body.nominal))[1], axis=0)
     for move in rig.from_camera:
@@ -285,7 +358,7 @@ def largest_radius(rig: StereoRig, camera_from_body: Array, body: MarkedBody, ra
 
 
 def exactly_taught(file: SensorFile) -> Taught:
-    """What teaching would find without any error: the true frames and sticker places of a sensor file's scene.
+    """Teach without any error: take the true frames and sticker places of a sensor file's scene.
 
     For studies of the observation noise alone: all covariances are zero. Raises SensorFileError.
     """

@@ -1,28 +1,36 @@
-"""Frame after frame: where to look next comes from what was measured last, never from the true pose."""
+"""Frame after frame: where to look next comes from what was measured last, never from the true
+pose.
+"""
 
 from __future__ import annotations
 
 from cmmsim.checks import require_kind
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, invert, rigid, rotation_exp, rotation_log
-from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement, require_fitting
-from cmmsim.radiometry.images import StereoFrame, StereoImages, readable
+from cmmsim.measuring.measurement import Measurement, lost_measurement
+from cmmsim.measuring.pose_estimator import PoseEstimator, require_fitting
+from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 
-# A tracked frame that shows less than this share of the stickers seen before is searched as a whole too: most windows
-# may have been laid beside their stickers.
+# A tracked frame that shows less than this share of the stickers seen before is searched as a whole
+# too: most windows may have been laid beside their stickers.
 EXPECTED_SHARE = 0.7
 
 
 class Tracker:
     """Remembers the last two measured poses.
 
-    A frame in which the prediction fails is searched as a whole at once; where that finds fewer stickers, what the
-    prediction found stands. What moves is fitted as the exposure smears it, as fast as it moved since the last frame;
-    in the first frame of a run, and in the first after a loss, the smear itself tells how far.
+    A frame in which the prediction fails is searched as a whole at once; where that finds fewer
+    stickers, what the prediction found stands. What moves is fitted as the exposure smears it, as
+    fast as it moved since the last frame; in the first frame of a run, and in the first after a
+    loss, the smear itself tells how far.
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
-        require_kind(estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator")
+        require_kind(
+            estimator,
+            PoseEstimator,
+            "an estimator must be a PoseEstimator, such as sensor.estimator",
+        )
         self._estimator = estimator
         self.forget()
 
@@ -33,9 +41,11 @@ class Tracker:
         self._seen = 0
 
     def measure(self, images: StereoImages | StereoFrame) -> Measurement:
-        """Measure one frame, such as ``sensor.look`` returns or a StereoFrame; never raises for what is in the images.
+        """Measure one frame, such as ``sensor.look`` returns or a StereoFrame; never raises for
+        what is in the images.
 
-        Raises ShapeError for a StereoFrame of another size or bit depth, CmmError for what is no image.
+        Raises ShapeError for a StereoFrame of another size or bit depth, CmmError for what is no
+        image.
         """
         if isinstance(images, StereoFrame):
             require_fitting(images, self._estimator)
@@ -49,10 +59,15 @@ class Tracker:
                     self.forget()
                     return lost_measurement(str(error))
             else:
-                best = found if best is None else max(best, found, key=lambda result: len(result[0].target_ids))
+                best = (
+                    found
+                    if best is None
+                    else max(best, found, key=lambda result: len(result[0].target_ids))
+                )
         measurement, measured = best
         self._step_before = None if self._last is None else invert(self._last) @ measured
-        self._last, self._seen = measured, len(measurement.target_ids)
+        self._last = measured
+        self._seen = len(measurement.target_ids)
         return measurement
 
     def miss(self) -> None:
@@ -61,7 +76,9 @@ class Tracker:
             self._last = self._predicted()
 
     def _tracked(self, images: StereoImages) -> tuple[Measurement, Array] | None:
-        """The measurement in the predicted windows; None without a prediction or where it did not hold."""
+        """The measurement in the predicted windows; None without a prediction or where it did not
+        hold.
+        """
         if self._last is None:
             return None
         try:
@@ -75,7 +92,9 @@ class Tracker:
             return None
 
     def _found(self, images: StereoImages) -> tuple[Measurement, Array]:
-        """The measurement after a search of the whole images, with no prior for where the platform is."""
+        """The measurement after a search of the whole images, with no prior for where the platform
+        is.
+        """
         found = self._estimator.locate(images)
         if self._last is None:
             return self._estimator.measure_anew(images, found)

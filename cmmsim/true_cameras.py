@@ -1,4 +1,5 @@
-"""The true side of a sensor: its cameras as they are, what stands before them, and how a camera moves during a run.
+"""The true side of a sensor: its cameras as they are, what stands before them, and how a camera
+moves during a run.
 
 The estimator knows nothing of it.
 """
@@ -17,27 +18,31 @@ from cmmsim.errors import CmmError, UnknownBodyError
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.setup import MarkedBody, rig_from_file
 from cmmsim.geometry.camera import Optics
-from cmmsim.geometry.known_rig import rig_changes
 from cmmsim.geometry.pose import Array, all_rigid, apply, checked_transform, pose_to_transform
-from cmmsim.imaging.exposure import VirtualStereoCamera
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
-from cmmsim.imaging.scene import Mesh, PlacedBodies, scene_body, solid_mesh
+from cmmsim.imaging.scene_bodies import Mesh, PlacedBodies, scene_body, solid_mesh
+from cmmsim.imaging.stereo_camera import VirtualStereoCamera
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.statistical.conditions import Light, require_proved
-from cmmsim.statistical.exposure import STATISTICAL, StatisticalStereoCamera
-from cmmsim.statistical.scene import StickerScene
+from cmmsim.uncertainty.known_rig import rig_changes
+from cmmsim.without_images.conditions import Light, require_proved
+from cmmsim.without_images.drawn_stickers import STATISTICAL, StatisticalStereoCamera
+from cmmsim.without_images.sticker_scene import StickerScene
 
 
 @dataclass(frozen=True)
 class Drift:
-    """changes (24,) of the rig's parameters, which come evenly from the first to the last of so many frames."""
+    """changes (24,) of the rig's parameters, which come evenly from the first to the last of so
+    many frames.
+    """
 
     changes: Array
     frames: int
 
     def after(self, frame: int) -> Array:
-        """Changes (24,) at a frame, counted from 0; the cameras stay where the last one leaves them."""
+        """Changes (24,) at a frame, counted from 0; the cameras stay where the last one leaves
+        them.
+        """
         return min(frame / (self.frames - 1), 1.0) * self.changes
 
 
@@ -52,12 +57,17 @@ class TrueCameras:
         optics: Optics,
         renderer: str,
     ) -> None:
-        self._file, self._noise, self._optics, self._asked_renderer = file, noise, optics, renderer
+        self._file = file
+        self._noise = noise
+        self._optics = optics
+        self._asked_renderer = renderer
         self._bodies = bodies
         self.rig, self.camera_from_base = rig_from_file(file.rig)
         self.scene = [
             scene_body(body, section, file.stickers, stream)
-            for stream, (body, section) in enumerate(zip(bodies, (file.platform, file.base), strict=True))
+            for stream, (body, section) in enumerate(
+                zip(bodies, (file.platform, file.base), strict=True)
+            )
         ]
         self.obstacles: dict[str, Mesh] = {}
         self.right_later = 0.0
@@ -75,32 +85,47 @@ class TrueCameras:
 
     def placed(self, obstacles: Mapping[str, Array] | None) -> Mapping[str, Array]:
         """Obstacles at base_from_body (4,4) each, checked. Raises as ``Sensor.look``."""
-        if isinstance(obstacles, PlacedBodies) and self._are_placed(obstacles):  # a robot's legs, every frame
+        # a robot's legs, every frame
+        if isinstance(obstacles, PlacedBodies) and self._are_placed(obstacles):
             return obstacles
         obstacles = {} if obstacles is None else obstacles
-        require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
+        require_kind(
+            obstacles,
+            Mapping,
+            "obstacles must be transforms by name, as {'link': base_from_body}, or None",
+        )
         for name in obstacles:
             if name not in self.obstacles:
                 raise UnknownBodyError(name, self.obstacles)
-        plain = [place for place in obstacles.values() if isinstance(place, np.ndarray) and place.shape == (4, 4)]
+        plain = [
+            place
+            for place in obstacles.values()
+            if isinstance(place, np.ndarray) and place.shape == (4, 4)
+        ]
         if plain and len(plain) == len(obstacles):
             together = np.array(plain)
             if together.dtype == float and all_rigid(together):
                 return dict(zip(obstacles, together, strict=True))
         return {
-            name: checked_transform(place, f"obstacle {name!r}: base_from_body") for name, place in obstacles.items()
+            name: checked_transform(place, f"obstacle {name!r}: base_from_body")
+            for name, place in obstacles.items()
         }
 
     def _are_placed(self, bodies: PlacedBodies) -> bool:
-        """Whether they are all of the obstacles, in their order, and stand where bodies can."""
+        """Tell whether they are all obstacles, in their order, and stand where bodies can."""
         shape = len(self.obstacles), 4, 4
-        if bodies.names != tuple(self.obstacles) or bodies.together.shape != shape or bodies.together.dtype != float:
+        if (
+            bodies.names != tuple(self.obstacles)
+            or bodies.together.shape != shape
+            or bodies.together.dtype != float
+        ):
             return False
         return all_rigid(bodies.together)
 
     def move(self, changes: Mapping[str, float], right_later: float) -> None:
         """As ``Sensor.move_rig``."""
-        self.rig, self.right_later = self.rig.moved(rig_changes(changes)), right_later
+        self.rig = self.rig.moved(rig_changes(changes))
+        self.right_later = right_later
         self._draw_anew()
 
     def drift(self, changes: Mapping[str, float], frames: int) -> None:
@@ -110,8 +135,12 @@ class TrueCameras:
             self._drift = None
             return
         if frames < 2:
-            raise CmmError(f"cameras drift from the first to the last of some frames, at least 2, got {frames}")
-        self._require_in_sight(drift.changes, ", ".join(f"{name} by {value:g}" for name, value in changes.items()))
+            raise CmmError(
+                f"cameras drift from the first to the last of some frames, at least 2, got {frames}"
+            )
+        self._require_in_sight(
+            drift.changes, ", ".join(f"{name} by {value:g}" for name, value in changes.items())
+        )
         self._drift = drift
 
     def at(self, frame: int) -> VirtualStereoCamera | StatisticalStereoCamera:
@@ -120,12 +149,14 @@ class TrueCameras:
 
     @cached_property
     def renderer(self) -> Renderer:
-        """What draws; decided on first use."""
+        """Renderer that draws; decided on first use."""
         return choose_renderer(self._asked_renderer)
 
     @cached_property
     def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
-        """Both cameras before the scene, without drift. Raises CmmError for a renderer that is not proved for them."""
+        """Both cameras before the scene, without drift. Raises CmmError for a renderer that is not
+        proved for them.
+        """
         return self._without_images() if self.renderer is STATISTICAL else self._drawing()
 
     def _without_images(self) -> StatisticalStereoCamera:
@@ -146,7 +177,9 @@ class TrueCameras:
     def _drawing(self) -> VirtualStereoCamera:
         """Cameras that draw. Stickers are drawn first: what they hide need not be drawn."""
         file = self._file
-        patches = [p for body in self.scene for p in body.stickers] + [body.solid for body in self.scene]
+        patches = [p for body in self.scene for p in body.stickers] + [
+            body.solid for body in self.scene
+        ]
         owners = [k for k, body in enumerate(self.scene) for _ in body.stickers] + [0, 1]
         owners += range(2, 2 + len(self.obstacles))
         distance = float(np.linalg.norm(np.subtract(file.rig.position, file.rig.target)))
@@ -154,7 +187,9 @@ class TrueCameras:
         return VirtualStereoCamera(
             self.rig,
             self.camera_from_base,
-            ImageFormation(self.renderer, drawable, file.stickers.background_level / 255.0, self._optics),
+            ImageFormation(
+                self.renderer, drawable, file.stickers.background_level / 255.0, self._optics
+            ),
             self._noise,
             list(self.obstacles),
             file.timing.exposure,
@@ -167,7 +202,9 @@ class TrueCameras:
         self.__dict__.pop("at_rest", None)
 
     def _require_in_sight(self, changes: Array, what: str) -> None:
-        """Raise CmmError where changes (24,) of the rig take stickers out of an image that shows them at home."""
+        """Raise CmmError where changes (24,) of the rig take stickers out of an image that shows
+        them at home.
+        """
         moved = self.rig.moved(changes)
         places = (pose_to_transform(self._file.platform.home), np.eye(4))
         for body, scene, place in zip(self._bodies, self.scene, places, strict=True):
@@ -178,6 +215,8 @@ class TrueCameras:
                 side, sticker = gone[0]
                 camera, (x, y) = moved.cameras[side], there[side, sticker]
                 raise CmmError(
-                    f"a drift of {what} takes sticker {body.sticker_ids[sticker]} of the {body.name} out of the "
-                    f"{('left', 'right')[side]} image, to ({x:.0f}, {y:.0f}) of {camera.width} x {camera.height} px"
+                    f"a drift of {what} takes sticker {body.sticker_ids[sticker]} of the "
+                    f"{body.name} out of the "
+                    f"{('left', 'right')[side]} image, to ({x:.0f}, {y:.0f}) of {camera.width} x "
+                    f"{camera.height} px"
                 )

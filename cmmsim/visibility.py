@@ -1,7 +1,8 @@
-"""Which of the platform's stickers both cameras can look for at a pose, and what a measurement there would be worth.
+"""Stickers of the platform that both cameras can look for at a pose, and the worth of a measurement
+there.
 
-A sticker can be looked for when it lies in both images, a detection window away from their edges, and neither camera
-sees it at grazing incidence. What stands between it and a camera is not asked.
+A sticker can be looked for when it lies in both images, a detection window away from their edges,
+and neither camera sees it at grazing incidence. What stands between it and a camera is not asked.
 """
 
 from collections.abc import Mapping
@@ -15,18 +16,27 @@ from numpy.typing import ArrayLike, NDArray
 from cmmsim.errors import LostError
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
-from cmmsim.geometry.pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
+from cmmsim.geometry.pose import (
+    Array,
+    apply,
+    compose_covariance,
+    invert,
+    pose_covariance,
+    pose_to_transform,
+)
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.pose_estimation.estimator import by_planes, by_registration
-from cmmsim.pose_estimation.observation import DetectionSettings, faces_camera
-from cmmsim.sensor import Sensor, load_sensor
+from cmmsim.loading import load_sensor
+from cmmsim.measuring.observation import DetectionSettings, faces_camera
+from cmmsim.measuring.pose_estimator import by_planes, by_registration
+from cmmsim.sensor import Sensor
 
 EDGE_PX = DetectionSettings().window_size
 
 
 @dataclass(frozen=True)
 class SightLines:
-    """The geometry of sight: platform with nominal sticker places, rig, and camera_from_base (4,4)."""
+    """The geometry of sight: platform with nominal sticker places, rig, and camera_from_base
+    (4,4)."""
 
     platform: MarkedBody
     rig: StereoRig
@@ -38,19 +48,23 @@ class SightLines:
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     def visible(self, pose: ArrayLike) -> NDArray[np.bool_]:
-        """Whether both cameras can look for each sticker (n,) with the platform at a pose (6,) in the base frame."""
+        """Tell whether both cameras can look for each sticker (n,) with the platform at a pose (6,)
+        in the base frame.
+        """
         base_from_platform = pose_to_transform(pose)
         seen = np.ones(len(self.platform.sticker_ids), dtype=bool)
         for camera, from_base in zip(self.rig.cameras, self.cameras_from_base, strict=True):
             move = from_base @ base_from_platform
-            places, normals = apply(move, self.platform.nominal), self.platform.sticker_normals @ move[:3, :3].T
+            places = apply(move, self.platform.nominal)
+            normals = self.platform.sticker_normals @ move[:3, :3].T
             pixels, ahead = camera.project(places)
             seen &= ahead & camera.shows(pixels, EDGE_PX) & faces_camera(places, normals)
         return seen
 
 
 def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> SightLines:
-    """Geometry of sight of a built-in sensor or a sensor file, with changes to its entries as in `load_sensor`.
+    """Geometry of sight of a built-in sensor or a sensor file, with changes to its entries as in
+    `load_sensor`.
 
     Raises UnknownSensorError, SensorFileError.
     """
@@ -60,22 +74,30 @@ def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> S
 
 
 def expected_covariance(
-    name: str | Path, pose: ArrayLike, method: str = "registration", changes: Mapping[str, Any] | None = None
+    name: str | Path,
+    pose: ArrayLike,
+    method: str = "registration",
+    changes: Mapping[str, Any] | None = None,
 ) -> Array:
-    """Covariance (6,6) that a sensor would state for a pose (6,), m and rad, from one exposure drawn without OpenGL.
+    """Covariance (6,6) that a sensor would state for a pose (6,), m and rad, from one exposure
+    drawn without OpenGL.
 
-    Taken as taught without error. Raises LostError where the stickers do not suffice, and what `load_sensor` raises.
+    Taken as taught without error. Raises LostError where the stickers do not suffice, and what
+    `load_sensor` raises.
     """
     sensor = load_sensor(name, 0, method, renderer="analytic", changes=changes)
     return stated_covariance(sensor, sight_lines(name, changes), pose)
 
 
 def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Array:
-    """Covariance (6,6) that a sensor states for a pose (6,), m and rad, from one exposure whose stickers are where the
-    pose says: nothing is searched, and nothing taught. Raises as `expected_covariance`."""
+    """Covariance (6,6) that a sensor states for a pose (6,), m and rad, from one exposure whose
+    stickers are where the pose says: nothing is searched, and nothing taught. Raises as
+    `expected_covariance`."""
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform
-    seen = sensor.observer.observe(sensor.look(pose), expected, sight.platform.nominal, sight.platform.sticker_normals)
+    seen = sensor.observer.observe(
+        sensor.look(pose), expected, sight.platform.nominal, sight.platform.sticker_normals
+    )
     if sensor.method == "planes":
         covariance = by_planes(seen, sight.platform, sight.platform.normals @ expected[:3, :3].T)[1]
     else:
@@ -83,5 +105,9 @@ def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Arr
         places[seen.index] = apply(invert(expected), seen.points)
         covariance = by_registration(seen, places)[1]
     if not np.isfinite(covariance).all():
-        raise LostError(f"sensor {sensor.name} states no covariance at pose {np.asarray(pose).tolist()}")
-    return pose_covariance(base_from_platform, compose_covariance(invert(sight.camera_from_base), covariance))
+        raise LostError(
+            f"sensor {sensor.name} states no covariance at pose {np.asarray(pose).tolist()}"
+        )
+    return pose_covariance(
+        base_from_platform, compose_covariance(invert(sight.camera_from_base), covariance)
+    )

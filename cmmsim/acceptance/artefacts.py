@@ -1,7 +1,8 @@
-"""Artefacts of the tests, long boards with a ridge and stickers on their three upper sides, and the sensor before them.
+"""Artefacts of the tests, long boards with a ridge and stickers on their three upper sides, and the
+sensor before them.
 
-An artefact's frame has x along it, z out of its front side A and the origin in the middle of that side. Sides B and C
-slope away from A by SLOPE, so that all stickers are seen from the front.
+An artefact's frame has x along it, z out of its front side A and the origin in the middle of that
+side. Sides B and C slope away from A by SLOPE, so that all stickers are seen from the front.
 """
 
 from dataclasses import dataclass, replace
@@ -16,9 +17,9 @@ from cmmsim.files.setup import MarkedBody, rig_from_file
 from cmmsim.geometry.pose import Array, frozen, invert, rigid
 from cmmsim.imaging.pyrender_renderer import require_opengl
 from cmmsim.imaging.renderer import choose_renderer
-from cmmsim.pose_estimation.estimator import PoseEstimator
-from cmmsim.pose_estimation.taught import Taught
-from cmmsim.radiometry.images import StereoImages
+from cmmsim.measuring.pose_estimator import PoseEstimator
+from cmmsim.measuring.taught import Taught
+from cmmsim.radiometry.stereo_images import StereoImages
 from cmmsim.sensor import Sensor
 
 H = TypeVar("H", bound=HalfSpace)
@@ -28,18 +29,23 @@ SIDE = 0.060  # m: width of sides B and C
 END = 0.020  # m: the board goes on beyond the outermost stickers
 OUT_OF_SIGHT = 100.0  # m behind the cameras
 LENGTH = 0.300  # m between the origins of the rigid bar's ends, which lie on its x axis
-HALF_LENGTH, HALF_WIDTH = 0.5 * LENGTH + 0.065, HALF_RIDGE + SIDE
-END_FROM_END = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))  # first_from_second, what is true of the ends
+HALF_LENGTH = 0.5 * LENGTH + 0.065
+HALF_WIDTH = HALF_RIDGE + SIDE
+# first_from_second, what is true of the ends
+END_FROM_END = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
 
 StickerRow = tuple[ArrayLike, ArrayLike]
-"""Stickers of one side: along (n,) m from the middle of the artefact, and across (n,) m from the middle line of side A,
-or on sides B and C away from the edge of A."""
+"""Stickers of one side: along (n,) m from the middle of the artefact, and across (n,) m from the
+middle line of side A, or on sides B and C away from the edge of A."""
 
 
 def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
-    """Section of a sensor file: an artefact with rows of stickers on its sides A, B (towards +y) and C (towards -y)."""
+    """Section of a sensor file: an artefact with rows of stickers on its sides A, B (towards +y)
+    and C (towards -y).
+    """
     reach = max(float(np.abs(along).max()) for along, _ in (a, b, c)) + END
-    sine, cosine = float(np.sin(SLOPE)), float(np.cos(SLOPE))
+    sine = float(np.sin(SLOPE))
+    cosine = float(np.cos(SLOPE))
     sides = {
         "A": _side((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), a, 1.0),
         "B": _side((0.0, sine, cosine), (0.0, HALF_RIDGE, 0.0), b, 1.0),
@@ -65,19 +71,26 @@ def artefact_file(file: SensorFile, artefact: Platform) -> SensorFile:
     The artefact's stickers sit exactly at their places: they are what its certificate states.
     """
     stickers = file.stickers.model_copy(update={"placement": (0.0, 0.0)})
-    return file.model_copy(update={"platform": artefact, "base": _behind(file.base, file.rig), "stickers": stickers})
+    return file.model_copy(
+        update={"platform": artefact, "base": _behind(file.base, file.rig), "stickers": stickers}
+    )
 
 
 def _side(
-    normal: tuple[float, float, float], point: tuple[float, float, float], row: StickerRow, sign: float
+    normal: tuple[float, float, float],
+    point: tuple[float, float, float],
+    row: StickerRow,
+    sign: float,
 ) -> StickerPlane:
-    """u runs along the artefact; v = n x u points to +y on all sides, so that C counts backwards."""
+    """u runs along the artefact; v = n x u points to +y on all sides, so that C counts
+    backwards."""
     stickers = [(float(u), sign * float(v)) for u, v in np.column_stack(row)]
     return StickerPlane(normal=normal, point=point, across=(1.0, 0.0, 0.0), stickers=stickers)
 
 
 def rigid_bar() -> Platform:
-    """The sensor-file section of the bar: at each end a cluster of six stickers, a rigid body of its own to the sensor.
+    """The sensor-file section of the bar: at each end a cluster of six stickers, a rigid body of
+    its own to the sensor.
 
     The clusters differ, so that one cannot be taken for the other.
     """
@@ -89,13 +102,18 @@ def rigid_bar() -> Platform:
 
 
 def bar_ends(bar: MarkedBody) -> tuple[MarkedBody, MarkedBody]:
-    """The clusters at -x and at +x, with their origins on the bar's axis, ``LENGTH`` apart, and axes like the bar's."""
+    """The clusters at -x and at +x, with their origins on the bar's axis, ``LENGTH`` apart, and
+    axes like the bar's.
+    """
     return _end(bar, "first end of the bar", -1.0), _end(bar, "second end of the bar", 1.0)
 
 
 def _end(bar: MarkedBody, name: str, side: float) -> MarkedBody:
-    """The stickers on one side of the bar, as a body whose axes begin half a length from the middle."""
-    keep, origin = np.flatnonzero(side * bar.nominal[:, 0] > 0.0), np.array([0.5 * side * LENGTH, 0.0, 0.0])
+    """The stickers on one side of the bar, as a body whose axes begin half a length from the
+    middle.
+    """
+    keep = np.flatnonzero(side * bar.nominal[:, 0] > 0.0)
+    origin = np.array([0.5 * side * LENGTH, 0.0, 0.0])
     return replace(
         bar,
         name=name,
@@ -111,8 +129,14 @@ def _behind(body: Body, rig: Rig) -> Body:
     """The body moved far behind both cameras."""
     view = np.array(rig.target) - np.array(rig.position)
     shift = -OUT_OF_SIGHT * view / np.linalg.norm(view)
-    planes = Planes(A=_moved(body.planes.A, shift), B=_moved(body.planes.B, shift), C=_moved(body.planes.C, shift))
-    return body.model_copy(update={"planes": planes, "cuts": [_moved(cut, shift) for cut in body.cuts]})
+    planes = Planes(
+        A=_moved(body.planes.A, shift),
+        B=_moved(body.planes.B, shift),
+        C=_moved(body.planes.C, shift),
+    )
+    return body.model_copy(
+        update={"planes": planes, "cuts": [_moved(cut, shift) for cut in body.cuts]}
+    )
 
 
 def _moved(half_space: H, shift: Array) -> H:
@@ -122,20 +146,26 @@ def _moved(half_space: H, shift: Array) -> H:
 
 @dataclass(frozen=True)
 class SensorUnderTest:
-    """file: the sensor file; seed of all its noise; renderer: one of the sensor's, None for what the file says."""
+    """file: the sensor file; seed of all its noise; renderer: one of the sensor's, None for what
+    the file says.
+    """
 
     file: SensorFile
     seed: int = 0
     renderer: str | None = None
 
     def facing(self, artefact: Platform, stream: int) -> Sensor:
-        """The sensor before an artefact instead of its platform; ``stream`` keeps the noise of the tests apart."""
+        """The sensor before an artefact instead of its platform; ``stream`` keeps the noise of the
+        tests apart.
+        """
         sensor = Sensor(artefact_file(self.file, artefact), self.seed, renderer=self.renderer)
         sensor.start_run(self.seed + 1000 * stream)
         return sensor
 
     def renderer_name(self) -> str:
-        """The renderer that will draw. Raises UnknownOptionError, or OpenGLMissingError where it cannot."""
+        """The renderer that will draw. Raises UnknownOptionError, or OpenGLMissingError where it
+        cannot.
+        """
         name = choose_renderer(self.renderer or self.file.renderer).name
         if name == "pyrender":
             require_opengl()
@@ -143,11 +173,13 @@ class SensorUnderTest:
 
     @property
     def base_from_camera(self) -> Array:
-        """Where the rig is said to stand (4,4)."""
+        """Stated place of the rig (4,4)."""
         return invert(rig_from_file(self.file.rig)[1])
 
 
-def estimator_of(sensor: Sensor, body: MarkedBody, base_from_camera: Array | None = None) -> PoseEstimator:
+def estimator_of(
+    sensor: Sensor, body: MarkedBody, base_from_camera: Array | None = None
+) -> PoseEstimator:
     """The sensor's pose estimator for a body whose certificate states its sticker places.
 
     Poses are in the camera frame unless the place of the base is given.
@@ -158,8 +190,11 @@ def estimator_of(sensor: Sensor, body: MarkedBody, base_from_camera: Array | Non
 
 
 def locate(estimator: PoseEstimator, images: StereoImages) -> Array:
-    """Rough camera_from_body (4,4) from whole images. Raises AcceptanceError that names the body."""
+    """Rough camera_from_body (4,4) from whole images. Raises AcceptanceError that names the
+    body."""
     try:
         return estimator.locate(images)
     except LostError as error:
-        raise AcceptanceError(f"the {estimator.platform.name} is not found in the images: {error}") from error
+        raise AcceptanceError(
+            f"the {estimator.platform.name} is not found in the images: {error}"
+        ) from error

@@ -1,8 +1,9 @@
 """Latency in the style of ASTM E3124: how long after a motion its pose is reported.
 
-A body goes round and round; a reference with an exact clock knows where it truly is. Each reported pose is compared
-with the true motion at the time of its report: the motion must be set back by the latency to fit the reports. Frames
-are tracked one after the other, not measured many at once: the tracker is part of the instrument under test.
+A body goes round and round; a reference with an exact clock knows where it truly is. Each reported
+pose is compared with the true motion at the time of its report: the motion must be set back by the
+latency to fit the reports. Frames are tracked one after the other, not measured many at once: the
+tracker is part of the instrument under test.
 """
 
 from __future__ import annotations
@@ -12,7 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmmsim.acceptance.artefacts import HALF_LENGTH, HALF_WIDTH, SensorUnderTest, estimator_of, locate, rigid_bar
+from cmmsim.acceptance.artefacts import (
+    HALF_LENGTH,
+    HALF_WIDTH,
+    SensorUnderTest,
+    estimator_of,
+    locate,
+    rigid_bar,
+)
 from cmmsim.acceptance.statistics import Interval, interval_of_mean
 from cmmsim.acceptance.volume import MeasuringVolume
 from cmmsim.errors import AcceptanceError, ShapeError
@@ -20,7 +28,8 @@ from cmmsim.geometry.pose import Array, apply
 from cmmsim.tracker import Tracker
 
 STREAM = 201
-RADIUS, PERIOD = 0.05, 1.0  # m and s of the circle: 0.31 m/s
+RADIUS = 0.05
+PERIOD = 1.0  # m and s of the circle: 0.31 m/s
 FRAMES = 180
 STEP = 1e-5  # s, of the difference quotient of a motion
 ITERATIONS = 8
@@ -30,8 +39,9 @@ Motion = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Latency:
-    """delays (n,): of each report, s; mean, std and maximum of them, s; interval: 95 % interval of the mean, s;
-    resolution: standard deviation that the noise of the positions alone gives a single delay, s."""
+    """delays (n,): of each report, s; mean, std and maximum of them, s; interval: 95 % interval of
+    the mean, s; resolution: standard deviation that the noise of the positions alone gives a single
+    delay, s."""
 
     delays: Array
     mean: float
@@ -43,7 +53,9 @@ class Latency:
 
 @dataclass(frozen=True)
 class LatencyTest:
-    """latency; reported (n,) times s of the reports; stated: the latency in the sensor's file, s; frame_period s."""
+    """latency; reported (n,) times s of the reports; stated: the latency in the sensor's file, s;
+    frame_period s.
+    """
 
     latency: Latency
     reported: Array
@@ -53,17 +65,24 @@ class LatencyTest:
 
 
 def estimate_latency(
-    reported: Array, positions: Array, motion: Motion, largest: float, covariances: Array | None = None
+    reported: Array,
+    positions: Array,
+    motion: Motion,
+    largest: float,
+    covariances: Array | None = None,
 ) -> Latency:
-    """Delay of each report by least squares: positions(k) = motion(reported(k) - delay(k)) + offset.
+    """Delay of each report by least squares: positions(k) = motion(reported(k) - delay(k)) +
+    offset.
 
-    Parameters: reported (n,) s; positions (n,3) m; motion; largest: latencies from 0 to this are searched, s, at most
-    half the period of the motion; covariances (n,3,3) of the positions. The offset (3,) is constant and not a result.
-    Raises ShapeError for less than four reports or a motion that stands still.
+    Parameters: reported (n,) s; positions (n,3) m; motion; largest: latencies from 0 to this are
+    searched, s, at most half the period of the motion; covariances (n,3,3) of the positions. The
+    offset (3,) is constant and not a result. Raises ShapeError for less than four reports or a
+    motion that stands still.
     """
     if len(reported) < 4 or positions.shape != (len(reported), 3):
         raise ShapeError(
-            f"latency needs four reports or more with positions (n,3), got {len(reported)} and {positions.shape}"
+            f"latency needs four reports or more with positions (n,3), got {len(reported)} and "
+            f"{positions.shape}"
         )
     delays = np.full(len(reported), _coarse_delay(reported, positions, motion, largest))
     offset = np.zeros(3)
@@ -77,9 +96,12 @@ def estimate_latency(
                 f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed"
             )
         residuals = positions - motion(times) - offset
-        if iteration < ITERATIONS // 2:  # one common delay and the offset first, then each delay for itself
+        if (
+            iteration < ITERATIONS // 2
+        ):  # one common delay and the offset first, then each delay for itself
             common, shift = _common_step(residuals, velocity)
-            delays, offset = delays + common, offset + shift
+            delays = delays + common
+            offset = offset + shift
         else:
             delays = delays - np.sum(residuals * velocity, axis=1) / squared
     return Latency(
@@ -97,7 +119,8 @@ def require_room(volume: MeasuringVolume) -> None:
     needed = 2.0 * np.array([HALF_LENGTH + RADIUS, HALF_WIDTH + RADIUS, 0.0])
     if np.any(needed > volume.size):
         raise AcceptanceError(
-            f"latency: the body on its circle needs {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm "
+            f"latency: the body on its circle needs {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} "
+            "mm "
             f"across the line of sight, the volume has {volume}"
         )
 
@@ -108,8 +131,8 @@ def latency_test(
     frames: int = FRAMES,
     advance: Callable[[], None] = lambda: None,
 ) -> LatencyTest:
-    """Move a body on a circle in the middle of the volume and report its measured positions; ``advance`` is called
-    after each frame. Raises AcceptanceError when it is not measured."""
+    """Move a body on a circle in the middle of the volume and report its measured positions;
+    ``advance`` is called after each frame. Raises AcceptanceError when it is not measured."""
     require_room(volume)
     sensor = under_test.facing(rigid_bar(), STREAM)
     estimator = estimator_of(sensor, sensor.platform, under_test.base_from_camera)
@@ -132,12 +155,19 @@ def latency_test(
         advance()
     good = np.array([m.ok for m in measured])
     if good.sum() < 4:
-        raise AcceptanceError(f"latency: {good.sum()} of {frames} frames are measured: {measured[-1].reason}")
-    reported = (taken + sensor.timing.drawn_latencies(frames, np.random.default_rng([under_test.seed, STREAM])))[good]
+        raise AcceptanceError(
+            f"latency: {good.sum()} of {frames} frames are measured: {measured[-1].reason}"
+        )
+    reported = (
+        taken
+        + sensor.timing.drawn_latencies(frames, np.random.default_rng([under_test.seed, STREAM]))
+    )[good]
     positions = np.array([m.pose[:3] for m in measured])[good]
     covariances = np.array([m.covariance[:3, :3] for m in measured])[good]
     latency = estimate_latency(reported, positions, motion, 0.5 * PERIOD, covariances)
-    return LatencyTest(latency, reported, sensor.timing.latency, 1.0 / sensor.timing.frame_rate, int((~good).sum()))
+    return LatencyTest(
+        latency, reported, sensor.timing.latency, 1.0 / sensor.timing.frame_rate, int((~good).sum())
+    )
 
 
 def _circle(times: Array) -> Array:
@@ -163,8 +193,13 @@ def _common_step(residuals: Array, velocity: Array) -> tuple[float, Array]:
 
 
 def _resolution(velocity: Array, covariances: Array | None) -> float:
-    """Standard deviation of a delay from the positions' noise, rms over the reports; 0 without covariances."""
+    """Standard deviation of a delay from the positions' noise, rms over the reports; 0 without
+    covariances.
+    """
     if covariances is None:
         return 0.0
-    along = np.einsum("ni,nij,nj->n", velocity, covariances, velocity) / np.sum(velocity**2, axis=1) ** 2
+    along = (
+        np.einsum("ni,nij,nj->n", velocity, covariances, velocity)
+        / np.sum(velocity**2, axis=1) ** 2
+    )
     return float(np.sqrt(along.mean()))

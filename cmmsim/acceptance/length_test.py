@@ -1,9 +1,9 @@
 """Length measurement error in the style of VDI/VDE 2634-1.
 
-On each measuring line stands an artefact with a row of six stickers; the distances of five of them from the first are
-the test lengths. A length is the mean of a few exposures of the standing artefact; its error is the measured length
-less the certified one, and its magnitude must stay within a limit. Sphere form and spacing are not tested: the targets
-are flat stickers.
+On each measuring line stands an artefact with a row of six stickers; the distances of five of them
+from the first are the test lengths. A length is the mean of a few exposures of the standing
+artefact; its error is the measured length less the certified one, and its magnitude must stay
+within a limit. Sphere form and spacing are not tested: the targets are flat stickers.
 """
 
 from collections.abc import Callable
@@ -22,15 +22,17 @@ from cmmsim.sensor import Sensor
 
 STREAM = 1
 EXPOSURES = 5  # of the standing artefact, whose lengths are averaged
-# irregular stickers by which the artefact is recognised, in shares of the longest length from its middle
-RECOGNITION_B, RECOGNITION_C = (-0.37, -0.08, 0.31), (-0.29, 0.13, 0.4)
+# irregular stickers by which the artefact is recognised, in shares of the longest length from its
+# middle
+RECOGNITION_B = (-0.37, -0.08, 0.31)
+RECOGNITION_C = (-0.29, 0.13, 0.4)
 RECOGNITION_ACROSS = (0.044, 0.025, 0.040)
 
 
 @dataclass(frozen=True)
 class MeasuredLength:
-    """line: its name; true: certified length, m; measured (k,): the length in each of k exposures, m; std: stated
-    standard deviation of one exposure's length, m."""
+    """line: its name; true: certified length, m; measured (k,): the length in each of k exposures,
+    m; std: stated standard deviation of one exposure's length, m."""
 
     line: str
     true: float
@@ -68,7 +70,9 @@ class LengthTest:
 
     @property
     def variance_ratio(self) -> float:
-        """Mean square of single exposures' errors in units of their stated variance; 1 when that one is true."""
+        """Mean square of single exposures' errors in units of their stated variance; 1 when that
+        one is true.
+        """
         stds = np.array([length.std for length in self.lengths])
         return float(np.mean((self.single_errors / stds[:, None]) ** 2))
 
@@ -94,8 +98,8 @@ def length_test(
     exposures: int = EXPOSURES,
     advance: Callable[[], None] = lambda: None,
 ) -> LengthTest:
-    """Measure five lengths on each of the seven lines of a volume, which share all cores and have noise of their own;
-    ``advance`` is called after each line.
+    """Measure five lengths on each of the seven lines of a volume, which share all cores and have
+    noise of their own; ``advance`` is called after each line.
 
     Raises AcceptanceError when a line breaks a rule or a sticker is not measured.
     """
@@ -106,26 +110,33 @@ def length_test(
         sensor = under_test.facing(length_artefact(lines[number]), STREAM + number)
         return measure_line(sensor, volume, lines[number], exposures)
 
-    for found in on_all_cores(measured, range(len(lines)), choose_renderer(under_test.renderer_name())):
+    for found in on_all_cores(
+        measured, range(len(lines)), choose_renderer(under_test.renderer_name())
+    ):
         lengths += found
         advance()
     return LengthTest(volume, lines, tuple(lengths))
 
 
-def measure_line(sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, exposures: int) -> list[MeasuredLength]:
+def measure_line(
+    sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, exposures: int
+) -> list[MeasuredLength]:
     """The lengths of one line, whose artefact the sensor faces, from ``exposures`` pictures."""
     pose = volume.pose(line.direction, 0.5 * (line.start + line.end))
     body = sensor.platform
     estimator = estimator_of(sensor, body)
     expected = locate(estimator, sensor.look(pose))
     count = 1 + len(line.lengths)  # the row comes first among the stickers
-    values, stds = np.empty((exposures, len(line.lengths))), np.empty((exposures, len(line.lengths)))
+    values = np.empty((exposures, len(line.lengths)))
+    stds = np.empty((exposures, len(line.lengths)))
     for k in range(exposures):
         seen = estimator.observe(sensor.look(pose), expected, body.nominal, body.sticker_normals)
         missing = np.setdiff1d(np.arange(count), seen.index)
         if len(missing):
             names = ", ".join(body.sticker_ids[missing])
-            raise AcceptanceError(f"line {line.name}: stickers {names} are not measured by both cameras")
+            raise AcceptanceError(
+                f"line {line.name}: stickers {names} are not measured by both cameras"
+            )
         values[k], stds[k] = lengths_from_first(seen.points[:count], seen.covariances[:count])
     return [
         MeasuredLength(line.name, float(true), value, float(np.sqrt(np.mean(std**2))))
@@ -134,7 +145,9 @@ def measure_line(sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, e
 
 
 def lengths_from_first(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Distances (n-1,) m of points (n,3) from the first, and their standard deviations from covariances (n,3,3)."""
+    """Distances (n-1,) m of points (n,3) from the first, and their standard deviations from
+    covariances (n,3,3).
+    """
     steps = points[1:] - points[0]
     lengths = np.linalg.norm(steps, axis=1)
     directions = steps / lengths[:, None]

@@ -1,13 +1,14 @@
 """Relative pose error of a moving rigid bar in the style of ASTM E3064-16.
 
-The bar moves along two rasters in three orientations, after standing still where each begins. One raster goes to and
-fro along the volume's x axis while it advances along y, the other the other way round. The bar is not held along the
-line of sight, where flat stickers cannot be seen, but turned by ``TOWARDS_DEPTH`` from the image plane. On top of that
-it turns smoothly about all its axes.
+The bar moves along two rasters in three orientations, after standing still where each begins. One
+raster goes to and fro along the volume's x axis while it advances along y, the other the other way
+round. The bar is not held along the line of sight, where flat stickers cannot be seen, but turned
+by ``TOWARDS_DEPTH`` from the image plane. On top of that it turns smoothly about all its axes.
 
-The sensor measures the poses of the clusters at both ends in the same exposure. What the second is to the first is
-certified; the difference to what was measured is the error, of a bar that stands and of one that moves. Frames are
-tracked one after the other, not measured many at once: the tracker is part of the instrument under test.
+The sensor measures the poses of the clusters at both ends in the same exposure. What the second is
+to the first is certified; the difference to what was measured is the error, of a bar that stands
+and of one that moves. Frames are tracked one after the other, not measured many at once: the
+tracker is part of the instrument under test.
 """
 
 from collections.abc import Callable
@@ -38,7 +39,7 @@ from cmmsim.geometry.pose import (
     rotation_log,
     skew,
 )
-from cmmsim.pose_estimation.estimator import Measurement
+from cmmsim.measuring.measurement import Measurement
 from cmmsim.sensor import Sensor
 from cmmsim.tracker import Tracker
 
@@ -51,7 +52,9 @@ STEP = 1e-4  # s, of the difference quotient of a path
 SPEED_SAMPLES = 100
 STREAM = 101
 STANDING = 15  # exposures of the standing bar before each run
-GIVEN_UP = 5  # frames lost in a row end a run: each costs a search of whole images, and the rest would be lost as well
+# frames lost in a row end a run: each costs a search of whole images, and the rest would be lost as
+# well
+GIVEN_UP = 5
 RASTERS = {"x": 0, "y": 1}
 ORIENTATIONS = {
     "along x": np.array([1.0, 0.0, 0.0]),
@@ -70,7 +73,9 @@ class BarPath:
     volume: MeasuringVolume
 
     def pose(self, time: float) -> Array:
-        """Pose (6,) of the bar in the base frame, ``time`` s after it starts to move, at rest there."""
+        """Pose (6,) of the bar in the base frame, ``time`` s after it starts to move, at rest
+        there.
+        """
         phase = 2.0 * np.pi * time / SECONDS
         slow = -np.cos(0.5 * phase) * self.reach
         slow[self.fast] = -np.cos(CYCLES * phase) * self.reach[self.fast]
@@ -89,7 +94,9 @@ class BarPath:
 
     @property
     def reach(self) -> Array:
-        """Largest distance (3,) of the bar's middle from that of the volume, so that the bar stays inside, m."""
+        """Largest distance (3,) of the bar's middle from that of the volume, so that the bar stays
+        inside, m.
+        """
         return 0.5 * self.volume.size - room_of_bar(self.along)
 
 
@@ -109,7 +116,9 @@ def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
     for path in paths:
         if path.reach.min() <= 0.0:
             needed = " x ".join(f"{2e3 * v:.0f}" for v in room_of_bar(path.along))
-            raise AcceptanceError(f"{path.name}: the bar needs {needed} mm, the volume has {volume}")
+            raise AcceptanceError(
+                f"{path.name}: the bar needs {needed} mm, the volume has {volume}"
+            )
     return paths
 
 
@@ -117,10 +126,11 @@ def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
 class BarRun:
     """One run of the bar. Before it moves, time is negative.
 
-    time (n,) s of the measured frames; errors (n,6) of the relative pose, [shift, turn] in axes of the first end, m
-    and rad; distance_errors (n,) of the ends' distance, m; variance_ratios (n,): squared error in units of the stated
-    covariance, over its six dimensions; lost: frames in which an end was not measured; given_up: why the run was ended
-    after GIVEN_UP of them in a row, its other frames being counted as lost too.
+    time (n,) s of the measured frames; errors (n,6) of the relative pose, [shift, turn] in axes of
+    the first end, m and rad; distance_errors (n,) of the ends' distance, m; variance_ratios (n,):
+    squared error in units of the stated covariance, over its six dimensions; lost: frames in which
+    an end was not measured; given_up: why the run was ended after GIVEN_UP of them in a row, its
+    other frames being counted as lost too.
     """
 
     name: str
@@ -133,7 +143,7 @@ class BarRun:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """Which of the frames (n,) show the moving bar."""
+        """Mask of the frames (n,) that show the moving bar."""
         return self.time >= 0.0
 
 
@@ -161,7 +171,8 @@ class BarTest:
         return np.concatenate([run.errors[run.moving == moving] for run in self.runs])
 
     def distance_errors(self, moving: bool) -> Array:
-        """Errors (n,) [m] of the ends' distance of the moving or of the standing bar in all runs."""
+        """Errors (n,) [m] of the ends' distance of the moving or of the standing bar in all
+        runs."""
         return np.concatenate([run.distance_errors[run.moving == moving] for run in self.runs])
 
     @property
@@ -179,18 +190,21 @@ def bar_test(
 ) -> BarTest:
     """Move the bar along the six paths of a volume; ``advance`` is called after each.
 
-    seconds: of motion that are measured, from the start of each path. Raises AcceptanceError when the bar does not
-    find room or is not found in the first images.
+    seconds: of motion that are measured, from the start of each path. Raises AcceptanceError when
+    the bar does not find room or is not found in the first images.
     """
     sensor = under_test.facing(rigid_bar(), STREAM)
     rate = sensor.timing.frame_rate
     times = np.arange(-standing, int(np.ceil(seconds * rate))) / rate
-    paths, runs = bar_paths(volume), []
+    paths = bar_paths(volume)
+    runs = []
     for number, path in enumerate(paths):
         sensor.start_run(under_test.seed + 1000 * (STREAM + number))
         runs.append(bar_run(sensor, path, times))
         advance()
-    return BarTest(volume, tuple(runs), sensor.timing.exposure, max(path.largest_speed for path in paths))
+    return BarTest(
+        volume, tuple(runs), sensor.timing.exposure, max(path.largest_speed for path in paths)
+    )
 
 
 def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
@@ -199,29 +213,38 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
     for estimator in estimators:
         locate(estimator, sensor.look(path.pose(0.0)))
     trackers = [Tracker(estimator) for estimator in estimators]
-    rows, seen = [], []
-    in_a_row, reason = 0, ""
+    rows = []
+    seen = []
+    in_a_row = 0
+    reason = ""
     for time in times:
-        images = sensor.look(path.pose(max(time, 0.0)), pose_rate=path.pose_rate(time) if time > 0.0 else None)
+        images = sensor.look(
+            path.pose(max(time, 0.0)), pose_rate=path.pose_rate(time) if time > 0.0 else None
+        )
         first, second = (tracker.measure(images) for tracker in trackers)
         if first.ok and second.ok:
             in_a_row = 0
             seen.append(time)
             rows.append(relative_error(first, second))
         else:
-            in_a_row, reason = in_a_row + 1, first.reason or second.reason
+            in_a_row = in_a_row + 1
+            reason = first.reason or second.reason
             if in_a_row == GIVEN_UP:
                 break
     if not (seen and seen[0] < 0.0 <= seen[-1]):
-        raise AcceptanceError(f"{path.name}: no frame of the standing or none of the moving bar is measured: {reason}")
+        raise AcceptanceError(
+            f"{path.name}: no frame of the standing or none of the moving bar is measured: {reason}"
+        )
     errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
     given_up = reason if in_a_row == GIVEN_UP else ""
-    return BarRun(path.name, np.array(seen), errors, distances, ratios, len(times) - len(seen), given_up)
+    return BarRun(
+        path.name, np.array(seen), errors, distances, ratios, len(times) - len(seen), given_up
+    )
 
 
 def relative_error(first: Measurement, second: Measurement) -> tuple[Array, float, float]:
-    """Error (6,) of the second end's pose relative to the first one's, in axes of the first; error of their distance;
-    squared error in units of the stated covariance, over six."""
+    """Error (6,) of the second end's pose relative to the first one's, in axes of the first; error
+    of their distance; squared error in units of the stated covariance, over six."""
     measured = invert(pose_to_transform(first.pose)) @ pose_to_transform(second.pose)
     turn = rotation_log(measured[:3, :3] @ END_FROM_END[:3, :3].T)
     error = np.concatenate([measured[:3, 3] - END_FROM_END[:3, 3], turn])
@@ -231,7 +254,9 @@ def relative_error(first: Measurement, second: Measurement) -> tuple[Array, floa
 
 
 def relative_covariance(first: Measurement, second: Measurement) -> Array:
-    """Covariance (6,6) of the small error [shift, turn] of the relative pose, in axes of the first end."""
+    """Covariance (6,6) of the small error [shift, turn] of the relative pose, in axes of the first
+    end.
+    """
     by_first = -np.eye(6)
     by_first[:3, 3:] = skew(second.pose[:3] - first.pose[:3])
     total = by_first @ _small_covariance(first) @ by_first.T + _small_covariance(second)

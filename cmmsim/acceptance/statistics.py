@@ -1,7 +1,7 @@
 """Statistics of errors with 95 % intervals, and the published figures that stand beside ours.
 
-Published figures are those of makers and laboratories for real instruments. Each comes with its own test, volume and
-targets; none of them was measured here.
+Published figures are those of makers and laboratories for real instruments. Each comes with its own
+test, volume and targets; none of them was measured here.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Statistics:
-    """count of values; mean, rms, 95th percentile and maximum, in the unit of the values; interval: 95 % interval of
-    mean, rms and p95 by resampling blocks (a maximum has none)."""
+    """count of values; mean, rms, 95th percentile and maximum, in the unit of the values; interval:
+    95 % interval of mean, rms and p95 by resampling blocks (a maximum has none)."""
 
     count: int
     mean: float
@@ -36,14 +36,18 @@ class Statistics:
 def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statistics:
     """Statistics of magnitudes (n,) of errors.
 
-    block: neighbours that are drawn together, because they are not independent (scipy.stats.bootstrap draws single
-    values only). Raises ShapeError for no values or values that are not finite.
+    block: neighbours that are drawn together, because they are not independent
+    (scipy.stats.bootstrap draws single values only). Raises ShapeError for no values or values that
+    are not finite.
     """
     _require_finite(values)
     starts = rng.integers(0, len(values), (RESAMPLES, -(-len(values) // block)))
-    drawn = ((starts[:, :, None] + np.arange(block)) % len(values)).reshape(RESAMPLES, -1)[:, : len(values)]
+    drawn = ((starts[:, :, None] + np.arange(block)) % len(values)).reshape(RESAMPLES, -1)[
+        :, : len(values)
+    ]
     limits = {
-        k: np.percentile(v, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)]) for k, v in _figures(values[drawn]).items()
+        k: np.percentile(v, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
+        for k, v in _figures(values[drawn]).items()
     }
     found = {name: float(value) for name, value in _figures(values).items()}
     return Statistics(
@@ -68,13 +72,17 @@ def interval_of_mean(values: Array) -> Interval:
     _require_finite(values)
     if len(values) < 2:
         raise ShapeError("the interval of a mean needs at least two values, got 1")
-    half = float(student.ppf(0.5 + 0.5 * LEVEL, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
+    half = float(
+        student.ppf(0.5 + 0.5 * LEVEL, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
+    )
     return float(values.mean()) - half, float(values.mean()) + half
 
 
 def _require_finite(values: Array) -> None:
     if values.ndim != 1 or len(values) == 0 or not np.all(np.isfinite(values)):
-        raise ShapeError(f"statistics need at least one value and finite values (n,), got shape {values.shape}")
+        raise ShapeError(
+            f"statistics need at least one value and finite values (n,), got shape {values.shape}"
+        )
 
 
 @dataclass(frozen=True)
@@ -90,18 +98,34 @@ class PublishedFigure:
 
 C_TRACK_STATIC_MM = 0.05
 PUBLISHED = (
-    PublishedFigure("Creaform C-Track 780", "position, static", C_TRACK_STATIC_MM, "mm", "published as ±"),
+    PublishedFigure(
+        "Creaform C-Track 780", "position, static", C_TRACK_STATIC_MM, "mm", "published as ±"
+    ),
     PublishedFigure("Creaform C-Track 780", "orientation, static", 0.05, "deg", "published as ±"),
     PublishedFigure("Creaform C-Track 780", "position, moving", 0.20, "mm", "published as ±"),
     PublishedFigure("Creaform C-Track 780", "orientation, moving", 0.10, "deg", "published as ±"),
     PublishedFigure("NDI Polaris Vega", "position, static", 0.045, "mm", "published figure"),
     PublishedFigure("NDI Polaris Vega", "latency", 14.2, "ms", "published figure"),
     PublishedFigure("Vicon", "position, static", 0.15, "mm", "published figure"),
-    PublishedFigure("NIST, 12 cameras", "position, static", 0.02, "mm", "published, bar with markers at both ends"),
-    PublishedFigure("NIST, 12 cameras", "position, moving", 0.2, "mm", "published, bar with markers at both ends"),
+    PublishedFigure(
+        "NIST, 12 cameras",
+        "position, static",
+        0.02,
+        "mm",
+        "published, bar with markers at both ends",
+    ),
+    PublishedFigure(
+        "NIST, 12 cameras",
+        "position, moving",
+        0.2,
+        "mm",
+        "published, bar with markers at both ends",
+    ),
 )
 
 
 def published(quantity: str) -> tuple[PublishedFigure, ...]:
-    """Published figures of one quantity, such as "position, static"; none for a quantity that nobody published."""
+    """Published figures of one quantity, such as "position, static"; none for a quantity that
+    nobody published.
+    """
     return tuple(figure for figure in PUBLISHED if figure.quantity == quantity)

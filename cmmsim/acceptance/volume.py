@@ -1,8 +1,10 @@
-"""The measuring volume, a cuboid wholly seen by both cameras, and seven lines in it by the rules of VDI/VDE 2634-1.
+"""The measuring volume, a cuboid wholly seen by both cameras, and seven lines in it by the rules of
+VDI/VDE 2634-1.
 
-Volume axes are x to the right and y downwards as the rig sees them, and z away from it along the line from the middle
-of the baseline to the target; the origin is the target. Of the lines the four space diagonals have an end in every
-corner of the volume; one diagonal of each of three faces that meet in a corner leads along the outside.
+Volume axes are x to the right and y downwards as the rig sees them, and z away from it along the
+line from the middle of the baseline to the target; the origin is the target. Of the lines the four
+space diagonals have an end in every corner of the volume; one diagonal of each of three faces that
+meet in a corner leads along the outside.
 """
 
 from __future__ import annotations
@@ -20,12 +22,17 @@ from cmmsim.geometry.pose import Array, apply, frozen, invert, rigid, transform_
 from cmmsim.geometry.stereo_rig import StereoRig
 
 MARGIN_PX = 40.0  # the corners stay this far inside the images: room for the width of the artefacts
-LARGEST_SHARE = 0.8  # the front face stays beyond a fifth of the way from the baseline to the target
+LARGEST_SHARE = (
+    0.8  # the front face stays beyond a fifth of the way from the baseline to the target
+)
 SMALLEST_SIZE = 0.1  # m; below, the stickers of an artefact do not find room
 CORNERS = frozen(list(product((-0.5, 0.5), repeat=3)))
-FEWEST_LINES, FEWEST_LENGTHS = 7, 5
+FEWEST_LINES = 7
+FEWEST_LENGTHS = 5
 LONGEST_SHARE = 2.0 / 3.0  # of the volume's space diagonal
-USED_SHARE = 0.9  # of a line between the sides of the volume; the rest is room for the ends of the artefact
+USED_SHARE = (
+    0.9  # of a line between the sides of the volume; the rest is room for the ends of the artefact
+)
 LENGTH_SHARES = frozen([0.19, 0.41, 0.6, 0.82, 1.0])  # test lengths of a line, of its longest
 LINES = {  # their ends in half sides of the volume
     "space 1": ((-1, -1, -1), (1, 1, 1)),
@@ -40,17 +47,22 @@ LINES = {  # their ends in half sides of the volume
 
 @dataclass(frozen=True)
 class MeasuringVolume:
-    """base_from_volume (4,4) with the origin in the middle; size (3,) m along x, y, z; distance of the middle from the
-    middle of the baseline, m."""
+    """base_from_volume (4,4) with the origin in the middle; size (3,) m along x, y, z; distance of
+    the middle from the middle of the baseline, m."""
 
     base_from_volume: Array
     size: Array
     distance: float
 
     def __post_init__(self) -> None:
-        if self.size.shape != (3,) or not np.all(np.isfinite(self.size)) or self.size.min() < SMALLEST_SIZE:
+        if (
+            self.size.shape != (3,)
+            or not np.all(np.isfinite(self.size))
+            or self.size.min() < SMALLEST_SIZE
+        ):
             raise AcceptanceError(
-                f"measuring volume {self}: three sides of at least {1e3 * SMALLEST_SIZE:.0f} mm are needed"
+                f"measuring volume {self}: three sides of at least {1e3 * SMALLEST_SIZE:.0f} mm "
+                "are needed"
             )
         self.base_from_volume.setflags(write=False)
         self.size.setflags(write=False)
@@ -59,13 +71,17 @@ class MeasuringVolume:
         return " x ".join(f"{1e3 * side:.0f}" for side in np.ravel(self.size)) + " mm"
 
     def pose(self, along: Array, position: Array, turn: Array | None = None) -> Array:
-        """Pose (6,) in the base frame of an artefact at ``position`` (3,) m in volume axes, its x axis along ``along``
-        (3,), of any length, and its side A towards the rig; then turned by ``turn`` (3,3) in its own axes."""
-        x, towards = along / np.linalg.norm(along), np.array([0.0, 0.0, -1.0])
+        """Pose (6,) in the base frame of an artefact at ``position`` (3,) m in volume axes, its x
+        axis along ``along`` (3,), of any length, and its side A towards the rig; then turned by
+        ``turn`` (3,3) in its own axes."""
+        x = along / np.linalg.norm(along)
+        towards = np.array([0.0, 0.0, -1.0])
         z = towards - (towards @ x) * x
         z = z / np.linalg.norm(z)
         rotation = np.column_stack([x, np.cross(z, x), z])
-        return transform_to_pose(self.base_from_volume @ rigid(rotation if turn is None else rotation @ turn, position))
+        return transform_to_pose(
+            self.base_from_volume @ rigid(rotation if turn is None else rotation @ turn, position)
+        )
 
     @property
     def diagonal(self) -> float:
@@ -79,11 +95,12 @@ class MeasuringVolume:
 
 
 def common_volume(place: Rig) -> MeasuringVolume:
-    """The largest cube around the target of a sensor file's rig that both its cameras see whole, MARGIN_PX from the
-    edges of their images. Raises AcceptanceError when nothing is seen."""
+    """The largest cube around the target of a sensor file's rig that both its cameras see whole,
+    MARGIN_PX from the edges of their images. Raises AcceptanceError when nothing is seen."""
     rig, camera_from_base = rig_from_file(place)
     frame, distance = _volume_frame(rig, camera_from_base, place)
-    low, high = 0.0, 2.0 * LARGEST_SHARE * distance
+    low = 0.0
+    high = 2.0 * LARGEST_SHARE * distance
     for _ in range(40):
         middle = 0.5 * (low + high)
         if _unseen(rig, camera_from_base @ frame, np.full(3, middle), distance) is None:
@@ -110,14 +127,17 @@ def volume_of_size(place: Rig, size: Array) -> MeasuringVolume:
     if hidden is not None:
         largest = 1e3 * common_volume(place).size[0]
         raise AcceptanceError(
-            f"measuring volume {volume} is not wholly visible to both cameras: {hidden}; the largest "
+            f"measuring volume {volume} is not wholly visible to both cameras: {hidden}; the "
+            "largest "
             f"cube that is has sides of {largest:.0f} mm"
         )
     return volume
 
 
 def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[Array, float]:
-    """base_from_volume (4,4), x along the baseline, and the distance of the target from the middle of it, m."""
+    """base_from_volume (4,4), x along the baseline, and the distance of the target from the middle
+    of it, m.
+    """
     centres = [invert(move @ camera_from_base)[:3, 3] for move in rig.from_camera]
     view = np.array(place.target) - 0.5 * (centres[0] + centres[1])
     distance = float(np.linalg.norm(view))
@@ -128,20 +148,25 @@ def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[
 
 
 def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: float) -> str | None:
-    """Which corner of a cuboid which camera does not see, in words; None when both see all of them."""
+    """Name a corner of a cuboid that a camera does not see; None when both see all of them."""
     corners = CORNERS * size
     if 0.5 * size[2] > LARGEST_SHARE * distance:
-        return f"its front face comes within {1e3 * (distance - 0.5 * size[2]):.0f} mm of the cameras"
+        return (
+            f"its front face comes within {1e3 * (distance - 0.5 * size[2]):.0f} mm of the cameras"
+        )
     points = apply(camera_from_volume, corners)
     pixels, valid = rig.project(points)
-    for camera, name, spots, ahead in zip(rig.cameras, ("left", "right"), pixels, valid, strict=True):
+    for camera, name, spots, ahead in zip(
+        rig.cameras, ("left", "right"), pixels, valid, strict=True
+    ):
         inside = ahead & camera.shows(spots, MARGIN_PX)
         if not inside.all():
             k = int(np.flatnonzero(~inside)[0])
             corner = ", ".join(f"{1e3 * v:+.0f}" for v in corners[k])
             x, y = spots[k]
             return (
-                f"the corner ({corner}) mm is at pixel ({x:.0f}, {y:.0f}) of the {name} camera, whose image has "
+                f"the corner ({corner}) mm is at pixel ({x:.0f}, {y:.0f}) of the {name} camera, "
+                "whose image has "
                 f"{camera.width} x {camera.height} px and {MARGIN_PX:.0f} px of margin"
             )
     return None
@@ -149,7 +174,9 @@ def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: fl
 
 @dataclass(frozen=True)
 class MeasuringLine:
-    """name; start and end (3,) of the longest test length in volume axes, m; lengths (k,) m from the start."""
+    """name; start and end (3,) of the longest test length in volume axes, m; lengths (k,) m from
+    the start.
+    """
 
     name: str
     start: Array
@@ -167,31 +194,42 @@ class MeasuringLine:
 
 
 def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
-    """The seven lines of a volume, five test lengths each. Raises AcceptanceError when a rule is broken."""
+    """The seven lines of a volume, five test lengths each. Raises AcceptanceError when a rule is
+    broken.
+    """
     lines = []
     for name, corners in LINES.items():
         start, end = (USED_SHARE * (0.5 * np.array(corner) * volume.size) for corner in corners)
-        lines.append(MeasuringLine(name, start, end, LENGTH_SHARES * float(np.linalg.norm(end - start))))
+        lines.append(
+            MeasuringLine(name, start, end, LENGTH_SHARES * float(np.linalg.norm(end - start)))
+        )
     require_rules(lines, volume)
     return tuple(lines)
 
 
 def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> None:
-    """Raise AcceptanceError naming the rule that measuring lines break, the line, the value and the limit."""
+    """Raise AcceptanceError naming the rule that measuring lines break, the line, the value and the
+    limit.
+    """
     if len(lines) < FEWEST_LINES:
         raise AcceptanceError(f"{len(lines)} measuring lines, at least {FEWEST_LINES} are needed")
     for line in lines:
         different = len(np.unique(np.round(line.lengths, 6)))
         if different < FEWEST_LENGTHS:
             raise AcceptanceError(
-                f"line {line.name}: {different} different test lengths, at least {FEWEST_LENGTHS} are needed"
+                f"line {line.name}: {different} different test lengths, at least {FEWEST_LENGTHS} "
+                "are needed"
             )
-        longest, limit = line.lengths.max(), LONGEST_SHARE * volume.diagonal
+        longest = line.lengths.max()
+        limit = LONGEST_SHARE * volume.diagonal
         if longest < limit:
             raise AcceptanceError(
-                f"line {line.name}: its longest test length of {1e3 * longest:.0f} mm is less than two thirds of the "
+                f"line {line.name}: its longest test length of {1e3 * longest:.0f} mm is less "
+                "than two thirds of the "
                 f"volume's space diagonal, {1e3 * limit:.0f} mm; choose a volume nearer to a cube"
             )
         for point in (line.start, line.end):
             if np.any(np.abs(point) > 0.5 * volume.size + 1e-9):
-                raise AcceptanceError(f"line {line.name} leaves the volume at {np.round(1e3 * point)} mm")
+                raise AcceptanceError(
+                    f"line {line.name} leaves the volume at {np.round(1e3 * point)} mm"
+                )

@@ -1,15 +1,13 @@
 """Calibration of the stereo rig from pictures of a board: rendered ones, or real photographs.
 
-The way: a board description, pairs of image files, the board in each image, OpenCV's calibration as a start, one joint
-adjustment of both cameras with its covariance.
+The way: a board description, pairs of image files, the board in each image, OpenCV's calibration as
+a start, one joint adjustment of both cameras with its covariance.
 """
 
 from cmmsim.calibration.board import Board, read_board
+from cmmsim.calibration.board_detection import BoardView, find_board
 from cmmsim.calibration.calibrate import CalibrationOptions, calibrate
-from cmmsim.calibration.detection import BoardView, find_board
-from cmmsim.calibration.halves import Halves, compare_halves
-from cmmsim.calibration.rendered_boards import board_poses, default_board, render_pairs
-from cmmsim.calibration.result import (
+from cmmsim.calibration.calibrated_rig import (
     Calibration,
     SensorTemplate,
     as_dict,
@@ -17,6 +15,8 @@ from cmmsim.calibration.result import (
     rig_tables,
     sensor_template,
 )
+from cmmsim.calibration.halves import Halves, compare_halves
+from cmmsim.calibration.rendered_boards import board_poses, default_board, render_pairs
 from cmmsim.calibration.sightings import ImagePair, PairView, pair_images, read_grey, view_pairs
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES

@@ -1,12 +1,15 @@
-"""One least-squares adjustment of both cameras, their relative pose and all board poses to all measured pixels.
+"""One least-squares adjustment of both cameras, their relative pose and all board poses to all
+measured pixels.
 
-Nine intrinsics describe a camera: focal lengths fx, fy and principal point cx, cy in px, then k1, k2, p1, p2, k3 of
-Brown and Conrady as OpenCV orders them. Those that a calibration does not set free stay where the adjustment starts.
+Nine intrinsics describe a camera: focal lengths fx, fy and principal point cx, cy in px, then k1,
+k2, p1, p2, k3 of Brown and Conrady as OpenCV orders them. Those that a calibration does not set
+free stay where the adjustment starts.
 
-Levenberg and Marquardt's method on the normal equations. A board pose is seen by its own view only, so that the poses
-are eliminated view by view (Schur complement) and what remains is the reduced normal matrix N of the free intrinsics
-and of right_from_left. All pixels count alike; their variance sigma² is estimated from the residuals, and
-sigma² N^-1 is the covariance of independent errors, enlarged where the points of a view share theirs.
+Levenberg and Marquardt's method on the normal equations. A board pose is seen by its own view only,
+so that the poses are eliminated view by view (Schur complement) and what remains is the reduced
+normal matrix N of the free intrinsics and of right_from_left. All pixels count alike; their
+variance sigma² is estimated from the residuals, and sigma² N^-1 is the covariance of independent
+errors, enlarged where the points of a view share theirs.
 """
 
 from collections.abc import Callable
@@ -27,20 +30,29 @@ DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1",
 DEFAULT_DISTORTION = "brown5"
 MOST_STEPS = 60
 SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration
-SINGULAR = 1e-14  # smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
+SINGULAR = (
+    1e-14  # smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
+)
 POSE = 6
-COMMON, BOARD = slice(None, -POSE), slice(-POSE, None)  # unknowns of all views, and of one
+COMMON = slice(None, -POSE)
+BOARD = slice(-POSE, None)  # unknowns of all views, and of one
 
 
 def free_directions(distortion: str, fix_aspect: bool) -> Array:
     """Matrix (9, k) from the k free numbers of a camera to all nine.
 
-    distortion: which terms are free, a key of DISTORTIONS; fix_aspect: fx = fy. Raises UnknownOptionError.
+    distortion: which terms are free, a key of DISTORTIONS; fix_aspect: fx = fy. Raises
+    UnknownOptionError.
     """
     if distortion not in DISTORTIONS:
         raise UnknownOptionError("distortion", distortion, DISTORTIONS)
     free = np.eye(len(INTRINSIC_NAMES))[
-        :, [k for k, name in enumerate(INTRINSIC_NAMES) if name.endswith("_px") or name in DISTORTIONS[distortion]]
+        :,
+        [
+            k
+            for k, name in enumerate(INTRINSIC_NAMES)
+            if name.endswith("_px") or name in DISTORTIONS[distortion]
+        ],
     ]
     if fix_aspect:
         free[:, 0] += free[:, 1]
@@ -54,16 +66,21 @@ def camera_matrix(values: Array) -> Array:
 
 
 def project(values: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Pixels (n, 2) of points (n, 3) in camera axes, and their derivatives by the intrinsics (n, 2, 9) and by the
-    points (n, 2, 3), px/m. The points must lie before the camera."""
-    pixels, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera_matrix(values), values[4:])
-    by_all = np.asarray(jacobian, dtype=float).reshape(len(points), 2, -1)  # turn 3, shift 3, f 2, c 2, distortion 5
+    """Pixels (n, 2) of points (n, 3) in camera axes, and their derivatives by the intrinsics (n, 2,
+    9) and by the points (n, 2, 3), px/m. The points must lie before the camera."""
+    pixels, jacobian = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), camera_matrix(values), values[4:]
+    )
+    # turn 3, shift 3, f 2, c 2, distortion 5
+    by_all = np.asarray(jacobian, dtype=float).reshape(len(points), 2, -1)
     return np.asarray(pixels, dtype=float).reshape(-1, 2), by_all[:, :, 6:15], by_all[:, :, 3:6]
 
 
 @dataclass(frozen=True)
 class RigState:
-    """intrinsics (2,9) of the left and right camera, right_from_left (4,4), left_from_boards (v,4,4) of the views."""
+    """intrinsics (2,9) of the left and right camera, right_from_left (4,4), left_from_boards
+    (v,4,4) of the views.
+    """
 
     intrinsics: Array
     right_from_left: Array
@@ -76,12 +93,14 @@ class RigState:
         return float(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
 
     def moved(self, intrinsics: Array, right: Array, boards: Array) -> "RigState":
-        """The state after changes of the intrinsics (2,9), and small errors [dt, dphi] of right_from_left (6,) and of
-        the boards (v,6)."""
+        """The state after changes of the intrinsics (2,9), and small errors [dt, dphi] of
+        right_from_left (6,) and of the boards (v,6)."""
         return RigState(
             self.intrinsics + intrinsics,
             _moved(self.right_from_left, right),
-            np.stack([_moved(b, change) for b, change in zip(self.left_from_boards, boards, strict=True)]),
+            np.stack(
+                [_moved(b, change) for b, change in zip(self.left_from_boards, boards, strict=True)]
+            ),
         )
 
 
@@ -94,11 +113,11 @@ def _moved(transform: Array, change: Array) -> Array:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """state; residuals (m,2) px of each camera, measured minus computed; sigma_px: estimated standard deviation of a
-    pixel coordinate; covariance (24,24) of the left and right intrinsics (9 each) and of the small error [dt, dphi] of
-    right_from_left, and independent_covariance that it would be if no points of a view erred alike; condition of N
-    scaled to a unit diagonal; steps; freedom: observations minus unknowns; shared: errors that points of a view
-    share."""
+    """state; residuals (m,2) px of each camera, measured minus computed; sigma_px: estimated
+    standard deviation of a pixel coordinate; covariance (24,24) of the left and right intrinsics (9
+    each) and of the small error [dt, dphi] of right_from_left, and independent_covariance that it
+    would be if no points of a view erred alike; condition of N scaled to a unit diagonal; steps;
+    freedom: observations minus unknowns; shared: errors that points of a view share."""
 
     state: RigState
     residuals: tuple[Array, Array]
@@ -113,8 +132,9 @@ class Adjustment:
 
 @dataclass(frozen=True)
 class _Normal:
-    """Normal equations by view: upper blocks of the matrix (v,s,s) and right-hand side (v,s) of the c common unknowns
-    and, last, of the pose of the view's board, s = c + 6; residuals of both cameras; cost: sum of squares, px²."""
+    """Normal equations by view: upper blocks of the matrix (v,s,s) and right-hand side (v,s) of the
+    c common unknowns and, last, of the pose of the view's board, s = c + 6; residuals of both
+    cameras; cost: sum of squares, px²."""
 
     matrix: Array
     side: Array
@@ -122,32 +142,42 @@ class _Normal:
     cost: float
 
     def blocks(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
-        """Blocks of the common unknowns (v,c,c), mixed (v,c,6) and of the boards (v,6,6), their diagonal enlarged."""
+        """Blocks of the common unknowns (v,c,c), mixed (v,c,6) and of the boards (v,6,6), their
+        diagonal enlarged.
+        """
         damped = self.matrix + damping * self.matrix * np.eye(self.matrix.shape[1])
         return damped[:, COMMON, COMMON], damped[:, COMMON, BOARD], damped[:, BOARD, BOARD]
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array]:
-        """Each view's share of the reduced normal matrix (v,c,c) and of its right-hand side (v,c)."""
+        """Each view's share of the reduced normal matrix (v,c,c) and of its right-hand side
+        (v,c)."""
         common, mixed, boards = self.blocks(damping)
         eliminated = np.linalg.solve(boards, mixed.swapaxes(1, 2)).swapaxes(1, 2)
         matrix = np.asarray(common - eliminated @ mixed.swapaxes(1, 2), dtype=np.float64)
-        return matrix, self.side[:, COMMON] - np.einsum("vci,vi->vc", eliminated, self.side[:, BOARD])
+        return matrix, self.side[:, COMMON] - np.einsum(
+            "vci,vi->vc", eliminated, self.side[:, BOARD]
+        )
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Damped changes of the common unknowns (c,) and of the boards (v,6)."""
         matrix, side = (part.sum(axis=0) for part in self.reduced(damping))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        common = scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
+        common = (
+            scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
+        )
         _, mixed, boards = self.blocks(damping)
         rest = self.side[:, BOARD] - np.einsum("vci,c->vi", mixed, common)
         return common, np.linalg.solve(boards, rest[..., None])[..., 0]
 
 
-def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigState, free: Array) -> Adjustment:
+def adjust(
+    points: Array, sightings: tuple[Sightings, Sightings], start: RigState, free: Array
+) -> Adjustment:
     """Adjust the rig and the board poses.
 
-    Parameters: points (n,3) m of the board; sightings of the left and right camera, each view seen by at least one;
-    start; free (9,k) from ``free_directions``. Raises CalibrationError where the views do not determine the cameras.
+    Parameters: points (n,3) m of the board; sightings of the left and right camera, each view seen
+    by at least one; start; free (9,k) from ``free_directions``. Raises CalibrationError where the
+    views do not determine the cameras.
     """
 
     def build(state: RigState) -> _Normal:
@@ -159,7 +189,8 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
     freedom = sum(2 * len(s.view) for s in sightings) - size - POSE * len(state.left_from_boards)
     if freedom < 1:
         raise CalibrationError(
-            f"too few points: {freedom + size} more observations than board poses, more than {size} needed"
+            f"too few points: {freedom + size} more observations than board poses, more than "
+            f"{size} needed"
         )
     information, scores = normal.reduced()
     reduced = information.sum(axis=0)
@@ -187,7 +218,9 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
     )
 
 
-def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array) -> tuple[RigState, int]:
+def _minimise(
+    build: Callable[[RigState], _Normal], state: RigState, free: Array
+) -> tuple[RigState, int]:
     """Levenberg-Marquardt: the state of least cost and the steps taken."""
     damping = 1e-4
     normal = build(state)
@@ -198,11 +231,18 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
         attempt = build(trial)
         if attempt.cost < normal.cost:
             gain = (normal.cost - attempt.cost) / normal.cost
-            state, normal, damping = trial, attempt, max(0.1 * damping, 1e-12)
+            state = trial
+            normal = attempt
+            damping = max(0.1 * damping, 1e-12)
             if gain < SMALLEST_GAIN:
                 return state, step
-        elif damping > 1e6 or abs(common @ normal.side[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost:
-            return state, step  # what does not help is rounding: it would lower the cost by next to nothing
+        elif (
+            damping > 1e6 or abs(common @ normal.side[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost
+        ):
+            return (
+                state,
+                step,
+            )  # what does not help is rounding: it would lower the cost by next to nothing
         else:
             damping *= 10.0
     rms = np.sqrt(normal.cost / sum(len(r) for r in normal.residuals))
@@ -213,16 +253,22 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
     )
 
 
-def _normal_equations(points: Array, sightings: tuple[Sightings, Sightings], state: RigState, free: Array) -> _Normal:
-    common, views, residuals = 2 * free.shape[1] + POSE, len(state.left_from_boards), []
-    matrix, sides = np.zeros((views, common + POSE, common + POSE)), np.zeros((views, common + POSE))
+def _normal_equations(
+    points: Array, sightings: tuple[Sightings, Sightings], state: RigState, free: Array
+) -> _Normal:
+    common = 2 * free.shape[1] + POSE
+    views = len(state.left_from_boards)
+    residuals = []
+    matrix = np.zeros((views, common + POSE, common + POSE))
+    sides = np.zeros((views, common + POSE))
     for side, seen in enumerate(sightings):
         computed, by_common, by_board = _predict(points, seen, state, side, free)
         error = seen.pixels - computed
         residuals.append(error)
         edges = np.searchsorted(seen.view, np.arange(views + 1))
         for v, (first, last) in enumerate(pairwise(edges)):
-            jc, e = by_common[first:last].reshape(-1, common), error[first:last].ravel()
+            jc = by_common[first:last].reshape(-1, common)
+            e = error[first:last].ravel()
             jb = by_board[first:last].reshape(-1, POSE)
             matrix[v, COMMON, COMMON] += jc.T @ jc
             matrix[v, COMMON, BOARD] += jc.T @ jb
@@ -230,23 +276,33 @@ def _normal_equations(points: Array, sightings: tuple[Sightings, Sightings], sta
             sides[v, COMMON] += jc.T @ e
             sides[v, BOARD] += jb.T @ e
     cost = float(sum(np.sum(r**2) for r in residuals))
-    return _Normal(matrix, sides, (residuals[0], residuals[1]), cost if np.isfinite(cost) else np.inf)
+    return _Normal(
+        matrix, sides, (residuals[0], residuals[1]), cost if np.isfinite(cost) else np.inf
+    )
 
 
-def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: Array) -> tuple[Array, Array, Array]:
-    """Pixels (m,2) of one camera, and their derivatives by the common unknowns (m,2,c) and the view's board (m,2,6)."""
+def _predict(
+    points: Array, seen: Sightings, state: RigState, side: int, free: Array
+) -> tuple[Array, Array, Array]:
+    """Pixels (m,2) of one camera, and their derivatives by the common unknowns (m,2,c) and the
+    view's board (m,2,6).
+    """
     k = free.shape[1]
     moves = state.left_from_boards[seen.view]
     turned = np.einsum("mij,mj->mi", moves[:, :3, :3], points[seen.point])
     places = turned + moves[:, :3, 3]
-    place_by_board = np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(turned)], axis=2)
+    place_by_board = np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(turned)], axis=2
+    )
     if side == 1:
         rotation = state.right_from_left[:3, :3]
         turned = places @ rotation.T
         places = apply(state.right_from_left, places)
         place_by_board = rotation @ place_by_board
     ahead = places[:, 2] > 1e-6
-    pixels, by_intrinsics, by_place = project(state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0]))
+    pixels, by_intrinsics, by_place = project(
+        state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0])
+    )
     pixels[~ahead] = np.inf  # a step that puts a board behind a camera is no improvement
     by_common = np.zeros((len(places), 2, 2 * k + POSE))
     by_common[:, :, side * k : (side + 1) * k] = by_intrinsics @ free

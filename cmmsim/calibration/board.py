@@ -1,7 +1,8 @@
 """Calibration boards: what a board file (TOML) may hold, and where its points are.
 
-Board frame: origin at the first point, x along the columns, y along the rows, z away from who looks at the front; the
-points lie in z = 0. Points run along x first, then row by row, as OpenCV orders them.
+Board frame: origin at the first point, x along the columns, y along the rows, z away from who looks
+at the front; the points lie in z = 0. Points run along x first, then row by row, as OpenCV orders
+them.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ Count = Annotated[int, Field(ge=3, le=200)]
 class Board(Section):
     """A flat board.
 
-    kind        "chessboard", "dots" (rows and columns at right angles) or "asymmetric_dots" (every other row shifted)
-    columns     points along x: inner corners of a chessboard, dots in one row
-    rows        points along y
-    spacing     m between neighbouring points; asymmetric_dots: between rows, dots of one row being twice as far apart
-    radius      m of the dots (dots and asymmetric_dots only)
-    dark        whether dots are darker than the board (dots and asymmetric_dots only)
+    kind        "chessboard", "dots" (rows and columns at right angles) or "asymmetric_dots" (every
+    other row shifted) columns     points along x: inner corners of a chessboard, dots in one row
+    rows        points along y spacing     m between neighbouring points; asymmetric_dots: between
+    rows, dots of one row being twice as far apart radius      m of the dots (dots and
+    asymmetric_dots only) dark        whether dots are darker than the board (dots and
+    asymmetric_dots only)
     """
 
     model_config = ConfigDict(strict=True)
@@ -50,7 +51,8 @@ class Board(Section):
             raise ValueError(f"radius of the dots (m) is missing, {self.kind} need it")
         elif self.radius > 0.4 * self.nearest:
             raise ValueError(
-                f"dots of radius {self.radius:g} m, {self.nearest:g} m from centre to centre, nearly "
+                f"dots of radius {self.radius:g} m, {self.nearest:g} m from centre to centre, "
+                "nearly "
                 f"touch: the largest radius is {0.4 * self.nearest:.4g} m"
             )
         return self
@@ -74,7 +76,8 @@ class Board(Section):
 
     @property
     def symmetries(self) -> list[NDArray[np.int_]]:
-        """Orders (points,) in which the same board may be read: as it is, half a turn, and quarter turns if square.
+        """Orders (points,) in which the same board may be read: as it is, half a turn, and quarter
+        turns if square.
 
         Which of them a picture shows cannot be seen in the picture.
         """
@@ -102,7 +105,8 @@ class Board(Section):
 def read_board(path: str | Path) -> Board:
     """The board of a TOML file.
 
-    Raises CalibrationError with the valid names for an unknown key, and with the value for a wrong one.
+    Raises CalibrationError with the valid names for an unknown key, and with the value for a wrong
+    one.
     """
     source = f"board file {path}"
     content = parsed(read_text(path, source, CalibrationError), source, CalibrationError)

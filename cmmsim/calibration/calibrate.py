@@ -1,4 +1,6 @@
-"""From the views of a board to both cameras: start, adjust, give up what does not fit, correct the dots' centres."""
+"""From the views of a board to both cameras: start, adjust, give up what does not fit, correct the
+dots' centres.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ from cmmsim.calibration.adjustment import (
     free_directions,
 )
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.result import Calibration, UsedView
+from cmmsim.calibration.calibrated_rig import Calibration, UsedView
 from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_of, some, views_of
 from cmmsim.calibration.start_values import start_values
 from cmmsim.calibration.warnings import contradictions, weaknesses
@@ -33,8 +35,9 @@ SETTLED_PX = 1e-4  # change of the dots' correction that ends it
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """distortion: free terms, a key of DISTORTIONS; fix_aspect: fx = fy; min_images: fewest pairs that show the board
-    to both cameras; correct_dots: whether the eccentricity of dots is corrected."""
+    """distortion: free terms, a key of DISTORTIONS; fix_aspect: fx = fy; min_images: fewest pairs
+    that show the board to both cameras; correct_dots: whether the eccentricity of dots is
+    corrected."""
 
     distortion: str = DEFAULT_DISTORTION
     fix_aspect: bool = False
@@ -44,21 +47,29 @@ class CalibrationOptions:
     def __post_init__(self) -> None:
         free_directions(self.distortion, self.fix_aspect)
         if self.min_images < FEWEST_PAIRS:
-            raise CalibrationError(f"at least {FEWEST_PAIRS} pairs are needed, min_images is {self.min_images}")
+            raise CalibrationError(
+                f"at least {FEWEST_PAIRS} pairs are needed, min_images is {self.min_images}"
+            )
 
 
 def calibrate(
-    board: Board, pairs: Sequence[PairView], size: tuple[int, int], options: CalibrationOptions | None = None
+    board: Board,
+    pairs: Sequence[PairView],
+    size: tuple[int, int],
+    options: CalibrationOptions | None = None,
 ) -> Calibration:
     """Calibrate both cameras from what pairs of images of size (width, height) px show.
 
-    Images with the board in one camera only help that camera. Raises CalibrationError with the reasons of all pairs
-    when too few show the board to both, or when the views do not determine the cameras.
+    Images with the board in one camera only help that camera. Raises CalibrationError with the
+    reasons of all pairs when too few show the board to both, or when the views do not determine the
+    cameras.
     """
     options = options or CalibrationOptions()
     _require_pairs(pairs, options)
     free = free_directions(options.distortion, options.fix_aspect)
-    start, read = start_values(board, pairs, size, bool(DISTORTIONS[options.distortion]), options.fix_aspect)
+    start, read = start_values(
+        board, pairs, size, bool(DISTORTIONS[options.distortion]), options.fix_aspect
+    )
     judged, kept, solved, sightings = _without_misfits(board, read, start, free, options)
     if board.dot_radius and options.correct_dots:
         solved, sightings = _with_true_centres(board, sightings, solved, free, size)
@@ -88,25 +99,40 @@ def _require_pairs(pairs: Sequence[PairView], options: CalibrationOptions) -> No
 
 
 def _without_misfits(
-    board: Board, pairs: Sequence[PairView], start: RigState, free: Array, options: CalibrationOptions
+    board: Board,
+    pairs: Sequence[PairView],
+    start: RigState,
+    free: Array,
+    options: CalibrationOptions,
 ) -> tuple[list[PairView], list[PairView], Adjustment, tuple[Sightings, Sightings]]:
-    """Adjusted rig after giving up images that fit far worse than the others: all pairs, and those that are used."""
+    """Adjusted rig after giving up images that fit far worse than the others: all pairs, and those
+    that are used.
+    """
     judged = list(pairs)
     boards = start.left_from_boards.copy()
     for _ in range(ROUNDS):
         _require_pairs(judged, options)
         seen = sorted(views_of(judged, 0).keys() | views_of(judged, 1).keys())
         sightings = sightings_of([judged[k] for k in seen])
-        solved = adjust(board.points, sightings, RigState(start.intrinsics, start.right_from_left, boards[seen]), free)
+        solved = adjust(
+            board.points,
+            sightings,
+            RigState(start.intrinsics, start.right_from_left, boards[seen]),
+            free,
+        )
         rms = _image_rms(solved, sightings)
         usual = float(np.nanmedian(rms))
         worst = np.argwhere(rms > max(LARGEST_RMS_RATIO * usual, ROUNDING_PX))
         if not len(worst):
             break
         for side, k in worst:
-            reason = f"rms {rms[side, k]:.2f} px, more than {LARGEST_RMS_RATIO:g} times the median of {usual:.2f} px"
+            reason = (
+                f"rms {rms[side, k]:.2f} px, more than {LARGEST_RMS_RATIO:g} times the "
+                f"median of {usual:.2f} px"
+            )
             judged[seen[k]] = judged[seen[k]].without(int(side), reason)
-        start, boards[seen] = solved.state, solved.state.left_from_boards
+        start = solved.state
+        boards[seen] = solved.state.left_from_boards
     return judged, [judged[k] for k in seen], solved, sightings
 
 
@@ -121,12 +147,20 @@ def _image_rms(solved: Adjustment, sightings: tuple[Sightings, Sightings]) -> Ar
 
 
 def _with_true_centres(
-    board: Board, measured: tuple[Sightings, Sightings], solved: Adjustment, free: Array, size: tuple[int, int]
+    board: Board,
+    measured: tuple[Sightings, Sightings],
+    solved: Adjustment,
+    free: Array,
+    size: tuple[int, int],
 ) -> tuple[Adjustment, tuple[Sightings, Sightings]]:
-    """Adjusted rig with the eccentricity of the dots' images taken off, which needs the rig: by iteration."""
+    """Adjusted rig with the eccentricity of the dots' images taken off, which needs the rig: by
+    iteration.
+    """
     last = [np.zeros_like(seen.pixels) for seen in measured]
     for _ in range(ROUNDS):
-        offsets = [_offsets(board, seen, solved.state, side, size) for side, seen in enumerate(measured)]
+        offsets = [
+            _offsets(board, seen, solved.state, side, size) for side, seen in enumerate(measured)
+        ]
         corrected = measured[0].shifted(-offsets[0]), measured[1].shifted(-offsets[1])
         solved = adjust(board.points, corrected, solved.state, free)
         change = max(np.abs(now - before).max() for now, before in zip(offsets, last, strict=True))
@@ -136,17 +170,30 @@ def _with_true_centres(
     return solved, corrected
 
 
-def _offsets(board: Board, seen: Sightings, state: RigState, side: int, size: tuple[int, int]) -> Array:
+def _offsets(
+    board: Board, seen: Sightings, state: RigState, side: int, size: tuple[int, int]
+) -> Array:
     """Centre of each dot's image minus the image of its centre (m, 2), px."""
     moves = state.left_from_boards if side == 0 else state.right_from_left @ state.left_from_boards
-    places = np.einsum("mij,mj->mi", moves[seen.view, :3, :3], board.points[seen.point]) + moves[seen.view, :3, 3]
+    places = (
+        np.einsum("mij,mj->mi", moves[seen.view, :3, :3], board.points[seen.point])
+        + moves[seen.view, :3, 3]
+    )
     normals = -moves[seen.view, :3, 2]
-    return centre_offset(camera_from(state.intrinsics[side], *size), places, normals, board.dot_radius)
+    return centre_offset(
+        camera_from(state.intrinsics[side], *size), places, normals, board.dot_radius
+    )
 
 
-def _used(kept: Sequence[PairView], solved: Adjustment, sightings: tuple[Sightings, Sightings]) -> list[UsedView]:
+def _used(
+    kept: Sequence[PairView], solved: Adjustment, sightings: tuple[Sightings, Sightings]
+) -> list[UsedView]:
     rms = _image_rms(solved, sightings)
     return [
-        UsedView(pair.name, k, {side: float(rms[j, k]) for j, side in enumerate(SIDES) if np.isfinite(rms[j, k])})
+        UsedView(
+            pair.name,
+            k,
+            {side: float(rms[j, k]) for j, side in enumerate(SIDES) if np.isfinite(rms[j, k])},
+        )
         for k, pair in enumerate(kept)
     ]

@@ -1,5 +1,7 @@
-"""Whether two halves of the pictures, calibrated each for itself, agree within what they state: the one proof of a
-stated covariance that needs no truth."""
+"""Comparison of two halves of the pictures, each calibrated for itself.
+
+It is the one proof of a stated covariance that needs no truth.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,31 +12,34 @@ from cmmsim.calibration.board import Board
 from cmmsim.calibration.calibrate import FEWEST_PAIRS, CalibrationOptions, calibrate
 from cmmsim.calibration.sightings import PairView
 from cmmsim.errors import CalibrationError
-from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
+from cmmsim.uncertainty.known_rig import KnownRig
 
 
 @dataclass(frozen=True)
 class Halves:
-    """squares (n, p): of n splits, squared differences of the halves' p free parameters, each of independent directions
-    divided by the variance that both state; 1 is expected of each."""
+    """squares (n, p): of n splits, squared differences of the halves' p free parameters, each of
+    independent directions divided by the variance that both state; 1 is expected of each."""
 
     squares: np.ndarray
 
     @property
     def mean_square(self) -> float:
-        """Mean over splits and directions; well above 1 where the stated covariance is too small."""
+        """Mean over splits and directions; well above 1 where the stated covariance is too
+        small."""
         return float(self.squares.mean())
 
     @property
     def chance(self) -> float:
-        """Standard deviation of the mean of one split, were the covariance right; splits of the same pictures are not
-        independent, so that more of them help less than their number says."""
+        """Standard deviation of the mean of one split, were the covariance right; splits of the
+        same pictures are not independent, so that more of them help less than their number says."""
         return float(np.sqrt(2.0 / self.squares.shape[1]))
 
     @property
     def verdict(self) -> str:
-        """What that says of the covariance, where it is beyond two standard deviations of a single split."""
+        """Statement on the covariance, where it is beyond two standard deviations of a single
+        split.
+        """
         if abs(self.mean_square - 1.0) <= 2.0 * self.chance:
             return "they agree as they state"
         return f"the stated covariance is too {'small' if self.mean_square > 1.0 else 'large'}"
@@ -58,14 +63,17 @@ def compare_halves(
     rng: np.random.Generator,
     advance: Callable[[], None] = lambda: None,
 ) -> Halves:
-    """Split pairs of pictures at random into two halves, time and again, and compare what the halves calibrate to.
+    """Split pairs of pictures at random into two halves, time and again, and compare what the
+    halves calibrate to.
 
     Raises CalibrationError where halves are too few pictures, or do not determine the cameras.
     """
     half = len(pairs) // 2
     least = max(options.min_images, FEWEST_PAIRS)
     if half < least:
-        raise CalibrationError(f"halves of {len(pairs)} pairs of pictures are fewer than {least} each")
+        raise CalibrationError(
+            f"halves of {len(pairs)} pairs of pictures are fewer than {least} each"
+        )
     squares = []
     for _ in range(splits):
         order = rng.permutation(len(pairs))
@@ -79,7 +87,9 @@ def compare_halves(
 
 
 def squared_differences(one: KnownRig, other: KnownRig) -> np.ndarray:
-    """Squared differences (p,) of two rigs along independent directions, over the sum of their variances."""
+    """Squared differences (p,) of two rigs along independent directions, over the sum of their
+    variances.
+    """
     covariance = one.covariance + other.covariance
     free = np.flatnonzero(np.diag(covariance) > 0.0)
     std = np.sqrt(np.diag(covariance)[free])

@@ -1,4 +1,5 @@
-"""Rendered calibration images: seeded poses of a board, and what the cameras of a sensor see of it."""
+"""Rendered calibration images: seeded poses of a board, and what the cameras of a sensor see
+of it."""
 
 from __future__ import annotations
 
@@ -16,15 +17,18 @@ from cmmsim.geometry.pose import Array, apply, apply_each, frozen, invert
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import Drawable, Renderer
-from cmmsim.imaging.scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
-from cmmsim.radiometry.images import StereoFrame
+from cmmsim.imaging.scene_bodies import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
 from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.stereo_images import StereoFrame
 
 # The drawn board
-MARGIN = 1.0  # of the spacing: rim of the plate beyond its outermost points; a chessboard's outer squares reach there
+# of the spacing: rim of the plate beyond its outermost points; a chessboard's outer squares reach
+# there
+MARGIN = 1.0
 RIM = 0.35  # of the spacing: bright rim beyond the outer squares of a chessboard
 THICKNESS = 0.008  # m
-BRIGHT, DARK = 0.86, 0.06  # share of white light sent back
+BRIGHT = 0.86
+DARK = 0.06  # share of white light sent back
 FRONT = frozen([0.0, 0.0, -1.0])  # the front looks against the board's z axis
 # Its poses
 LARGEST_TILT = 0.75  # rad between the board's normal and the view from the middle of the baseline
@@ -40,10 +44,15 @@ OUTLINE_POINTS = 15  # along each side of the plate, to know where a bent one re
 
 
 def board_drawable(board: Board, distance: float) -> Drawable:
-    """Everything of a board as one body in the board frame, seen from ``distance`` m; the points lie in z = 0."""
+    """Everything of a board as one body in the board frame, seen from ``distance`` m; the points
+    lie in z = 0.
+    """
     ground, mark = (BRIGHT, DARK) if board.dark else (DARK, BRIGHT)
     dots = [DiscStack((Disc(point, FRONT, board.dot_radius, mark),)) for point in board.points]
-    patches: list[Patch] = [*(_squares(board, mark) if board.kind == "chessboard" else dots), _plate(board, ground)]
+    patches: list[Patch] = [
+        *(_squares(board, mark) if board.kind == "chessboard" else dots),
+        _plate(board, ground),
+    ]
     return Drawable(patches, [0] * len(patches), distance)
 
 
@@ -65,25 +74,35 @@ def _plate(board: Board, level: float) -> Mesh:
 
 def _squares(board: Board, level: float) -> list[Mesh]:
     """The dark squares of a chessboard, its outermost ones included."""
-    corners = board.spacing * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    corners = board.spacing * np.array(
+        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
+    )
     places = [
         np.array([column, row, 0.0]) * board.spacing
         for row in range(-1, board.rows)
         for column in range(-1, board.columns)
         if (row + column) % 2 == 0
     ]
-    return [Mesh(corners + place, np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, level)) for place in places]
+    return [
+        Mesh(corners + place, np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, level))
+        for place in places
+    ]
 
 
 def default_board(rig: StereoRig) -> Board:
-    """A board of 13 x 9 dots whose width is a third of what the left camera sees where the axes meet."""
+    """A board of 13 x 9 dots whose width is a third of what the left camera sees where the axes
+    meet.
+    """
     spacing = round(meeting_depth(rig) * rig.left.width / rig.left.focal_px / 3.0 / 13.0, 3)
     return Board(kind="dots", columns=13, rows=9, spacing=spacing, radius=round(0.25 * spacing, 5))
 
 
 def meeting_depth(rig: StereoRig) -> float:
-    """Depth along the left axis at which the right one comes nearest, m; for parallel axes 1.5 baselines."""
-    right_axis, eye = invert(rig.right_from_left)[:3, 2], _right_eye(rig)
+    """Depth along the left axis at which the right one comes nearest, m; for parallel axes 1.5
+    baselines.
+    """
+    right_axis = invert(rig.right_from_left)[:3, 2]
+    eye = _right_eye(rig)
     across = 1.0 - right_axis[2] ** 2
     depth = (eye[2] - (eye @ right_axis) * right_axis[2]) / across if across > 1e-6 else 0.0
     return float(depth) if depth > 0.0 else 1.5 * float(np.linalg.norm(eye))
@@ -92,19 +111,25 @@ def meeting_depth(rig: StereoRig) -> float:
 def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generator) -> list[Array]:
     """``count`` poses left_from_board (4,4).
 
-    Raises CalibrationError when no such pose is found: the board is too large or too small for the rig.
+    Raises CalibrationError when no such pose is found: the board is too large or too small for the
+    rig.
     """
     return [_draw_pose(rig, board, k, rng) for k in range(count)]
 
 
 def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generator) -> Array:
-    """One pose in the cell whose turn it is, or in any where that cell shows no whole board to both cameras."""
-    corners, depth = plate_corners(board), meeting_depth(rig)
+    """One pose in the cell whose turn it is, or in any where that cell shows no whole board to both
+    cameras.
+    """
+    corners = plate_corners(board)
+    depth = meeting_depth(rig)
     for first in range(0, TRIES, AT_ONCE):
         before = rng.bit_generator.state
         drawn = _drawn_numbers(number, first, AT_ONCE, rng)
         poses = _poses_of(rig, corners.mean(axis=0), depth, number % 2, *drawn)
-        good = rig.project(apply_each(poses, corners))[1].all(axis=(0, 2)) & _front_to_both(rig, poses, corners)
+        good = rig.project(apply_each(poses, corners))[1].all(axis=(0, 2)) & _front_to_both(
+            rig, poses, corners
+        )
         if good.any():
             chosen = int(np.argmax(good))
             rng.bit_generator.state = before  # as if no pose had been drawn beyond the chosen one
@@ -117,8 +142,12 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
     )
 
 
-def _drawn_numbers(number: int, first: int, count: int, rng: np.random.Generator) -> tuple[NDArray[np.int_], Array]:
-    """For each of ``count`` poses from the ``first`` on, the cell (n,) and six numbers (n,6) from 0 to 1."""
+def _drawn_numbers(
+    number: int, first: int, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int_], Array]:
+    """For each of ``count`` poses from the ``first`` on, the cell (n,) and six numbers (n,6) from 0
+    to 1.
+    """
     turn = (4 + 2 * number) % CELLS**2
     if first < TRIES // 2:
         return np.full(count, turn), rng.random((count, 6))
@@ -126,26 +155,32 @@ def _drawn_numbers(number: int, first: int, count: int, rng: np.random.Generator
     return np.array([cell for cell, _ in drawn]), np.array([numbers for _, numbers in drawn])
 
 
-def _poses_of(rig: StereoRig, middle: Array, depth: float, side: int, cells: NDArray[np.int_], numbers: Array) -> Array:
-    """Poses left_from_board (n,4,4) of a board with this middle (3,) that shows in cells (n,) of one camera's image at
-    about this depth; numbers (n,6), 0 to 1, say where exactly and how tilted.
+def _poses_of(
+    rig: StereoRig, middle: Array, depth: float, side: int, cells: NDArray[np.int_], numbers: Array
+) -> Array:
+    """Poses left_from_board (n,4,4) of a board with this middle (3,) that shows in cells (n,) of
+    one camera's image at about this depth; numbers (n,6), 0 to 1, say where exactly and how tilted.
 
-    Its front looks at the middle of the baseline, then it is turned within its plane, then tilted about a random axis
-    in it.
+    Its front looks at the middle of the baseline, then it is turned within its plane, then tilted
+    about a random axis in it.
     """
-    camera, from_left = rig.cameras[side], rig.from_camera[side]
+    camera = rig.cameras[side]
+    from_left = rig.from_camera[side]
     low, high = DEPTH_RANGE
     depths = depth * (low + (high - low) * numbers[:, 0])
     corner = np.column_stack([cells % CELLS, cells // CELLS])
     pixels = (corner + numbers[:, 1:3]) / CELLS * (camera.width, camera.height)
     ideal = np.column_stack([(pixels - camera.centre) / camera.focal_lengths, np.ones(len(cells))])
     places = apply(invert(from_left), depths[:, None] * ideal)
-    about, tilt, turn = 2.0 * np.pi * numbers[:, 3], LARGEST_TILT * numbers[:, 4], np.pi * (2.0 * numbers[:, 5] - 1.0)
+    about = 2.0 * np.pi * numbers[:, 3]
+    tilt = LARGEST_TILT * numbers[:, 4]
+    turn = np.pi * (2.0 * numbers[:, 5] - 1.0)
     axes = np.column_stack([np.cos(about), np.sin(about), np.zeros(len(cells))])
     tilted = Rotation.from_rotvec(tilt[:, None] * axes) * Rotation.from_euler("z", turn[:, None])
     poses = np.zeros((len(cells), 4, 4))
     poses[:, :3, :3] = _facing(0.5 * _right_eye(rig) - places) @ tilted.as_matrix()
-    poses[:, :3, 3], poses[:, 3, 3] = places - poses[:, :3, :3] @ middle, 1.0
+    poses[:, :3, 3] = places - poses[:, :3, :3] @ middle
+    poses[:, 3, 3] = 1.0
     return poses
 
 
@@ -154,8 +189,8 @@ def _right_eye(rig: StereoRig) -> Array:
 
 
 def _facing(towards: Array) -> Array:
-    """Rotations (n,3,3) of boards whose fronts look along ``towards`` (n,3), their x axes horizontal in the left
-    image."""
+    """Rotations (n,3,3) of boards whose fronts look along ``towards`` (n,3), their x axes
+    horizontal in the left image."""
     z = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -163,11 +198,16 @@ def _facing(towards: Array) -> Array:
 
 
 def _front_to_both(rig: StereoRig, poses: Array, corners: Array) -> NDArray[np.bool_]:
-    """Whether both cameras see the fronts of boards at poses (n,4,4), at more than a grazing angle."""
+    """Tell whether both cameras see the fronts of boards at poses (n,4,4), at more than a grazing
+    angle.
+    """
     places = poses[:, :3, :3] @ corners.mean(axis=0) + poses[:, :3, 3]
     views = np.stack([places, places - _right_eye(rig)])
     return np.asarray(
-        (np.einsum("ni,sni->sn", poses[:, :3, 2], views) > GRAZING * np.linalg.norm(views, axis=2)).all(axis=0)
+        (
+            np.einsum("ni,sni->sn", poses[:, :3, 2], views)
+            > GRAZING * np.linalg.norm(views, axis=2)
+        ).all(axis=0)
     )
 
 
@@ -182,10 +222,13 @@ def render_pairs(
 ) -> Iterator[StereoFrame]:
     """Noisy images of both cameras for each pose left_from_board (4,4).
 
-    Raises CalibrationError for a chessboard with the analytic renderer, which draws discs and convex solids only.
+    Raises CalibrationError for a chessboard with the analytic renderer, which draws discs and
+    convex solids only.
     """
     if board.kind == "chessboard" and renderer.name == "analytic":
-        raise CalibrationError("the analytic renderer draws no chessboard: take the renderer pyrender, or a dot board")
+        raise CalibrationError(
+            "the analytic renderer draws no chessboard: take the renderer pyrender, or a dot board"
+        )
     distance = float(np.mean([np.linalg.norm(pose[:3, 3]) for pose in poses]))
     formation = ImageFormation(renderer, board_drawable(board, distance), 0.0, optics)
     for pose in poses:
@@ -200,15 +243,22 @@ def _radiance(
     formation: ImageFormation, camera: PinholeCamera, camera_from_board: Array, board: Board
 ) -> NDArray[np.float32]:
     """Radiance (height, width) of one image; only tiles that the board reaches are drawn."""
-    image = np.zeros((-(-camera.height // TILE_PX) * TILE_PX, -(-camera.width // TILE_PX) * TILE_PX), dtype=np.float32)
+    image = np.zeros(
+        (-(-camera.height // TILE_PX) * TILE_PX, -(-camera.width // TILE_PX) * TILE_PX),
+        dtype=np.float32,
+    )
     corners = _reached_tiles(camera, camera_from_board, board, formation.optics.margin_px)
-    tiles = formation.windows([Side(camera, camera_from_board[None], corners)], TILE_PX, SUPERSAMPLING)[0]
+    tiles = formation.windows(
+        [Side(camera, camera_from_board[None], corners)], TILE_PX, SUPERSAMPLING
+    )[0]
     for (x, y), tile in zip(corners, tiles, strict=True):
         image[y : y + TILE_PX, x : x + TILE_PX] = tile
     return image[: camera.height, : camera.width]
 
 
-def _reached_tiles(camera: PinholeCamera, camera_from_board: Array, board: Board, margin: int) -> NDArray[np.int_]:
+def _reached_tiles(
+    camera: PinholeCamera, camera_from_board: Array, board: Board, margin: int
+) -> NDArray[np.int_]:
     """First pixels (k,2) of the tiles within the bounds of the board's plate."""
     plate = plate_corners(board)
     share = np.linspace(0.0, 1.0, OUTLINE_POINTS)[:, None, None]

@@ -1,22 +1,25 @@
-"""Errors that the points of one view share: found from the views' scores, and the covariance with them.
+"""Errors that the points of one view share: found from the views' scores, and the covariance with
+them.
 
-Independent errors of pixels are an assumption. In photographs a bent board, uneven light or the bias of the corner
-search moves neighbouring points alike, so that a view tells less than its number of points promises. The residuals'
-size does not show it, the scores do: what the residuals of view v still pull at the common unknowns,
-s_v = J_v' r_v with the view's own pose eliminated, whose sum over all views is zero at the solution. With the views'
-reduced normal matrices I_v, which add up to N, independent errors of variance sigma² leave
+Independent errors of pixels are an assumption. In photographs a bent board, uneven light or the
+bias of the corner search moves neighbouring points alike, so that a view tells less than its number
+of points promises. The residuals' size does not show it, the scores do: what the residuals of view
+v still pull at the common unknowns, s_v = J_v' r_v with the view's own pose eliminated, whose sum
+over all views is zero at the solution. With the views' reduced normal matrices I_v, which add up to
+N, independent errors of variance sigma² leave
 
     cov(s_u, s_v) = sigma² (delta_uv I_v - I_u N^-1 I_v),
 
-so that Q = sum s_v' N^-1 s_v / sigma² has the mean c - sum tr(W_v²), W_v = N^-1/2 I_v N^-1/2. Q over its mean estimates
-the mean eigenvalue of the true covariance relative to sigma² N^-1: the mean generalised design effect of Rao and Scott
-(1981, J. Am. Stat. Assoc. 76, 221-230), with the correction for leverage in the mean.
+so that Q = sum s_v' N^-1 s_v / sigma² has the mean c - sum tr(W_v²), W_v = N^-1/2 I_v N^-1/2. Q
+over its mean estimates the mean eigenvalue of the true covariance relative to sigma² N^-1: the mean
+generalised design effect of Rao and Scott (1981, J. Am. Stat. Assoc. 76, 221-230), with the
+correction for leverage in the mean.
 
-Which directions suffer most tells the sandwich of Liang and Zeger (1986, Biometrika 73, 13-22), whitened
-N^-1/2 (sum s_v s_v') N^-1/2. Of 10 to 25 views and 24 unknowns it is singular, its rank being the number of views less
-one. So it is shrunk towards the unit matrix as Ledoit and Wolf (2004, J. Multivar. Anal. 88, 365-411) do, and scaled to
-the mean above.
-An error that all views share, such as one bend of the board, stays hidden from any comparison of views.
+Which directions suffer most tells the sandwich of Liang and Zeger (1986, Biometrika 73, 13-22),
+whitened N^-1/2 (sum s_v s_v') N^-1/2. Of 10 to 25 views and 24 unknowns it is singular, its rank
+being the number of views less one. So it is shrunk towards the unit matrix as Ledoit and Wolf
+(2004, J. Multivar. Anal. 88, 365-411) do, and scaled to the mean above. An error that all views
+share, such as one bend of the board, stays hidden from any comparison of views.
 """
 
 from dataclasses import dataclass
@@ -31,9 +34,10 @@ CHANCE = 1e-3  # of a ratio at the limit where the errors of points are independ
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """ratio: mean eigenvalue of the covariance over that of independent errors, as the views show it; limit: the ratio
-    that independent errors exceed with probability CHANCE; independent and covariance (c,c) of the common unknowns for
-    independent errors, sigma² N^-1, and for those found: the same where the ratio may be chance."""
+    """ratio: mean eigenvalue of the covariance over that of independent errors, as the views show
+    it; limit: the ratio that independent errors exceed with probability CHANCE; independent and
+    covariance (c,c) of the common unknowns for independent errors, sigma² N^-1, and for those
+    found: the same where the ratio may be chance."""
 
     ratio: float
     limit: float
@@ -42,14 +46,18 @@ class SharedErrors:
 
     @property
     def factor(self) -> float:
-        """By how much the covariance is enlarged in the mean of all directions, beside that of independent errors."""
+        """By how much the covariance is enlarged in the mean of all directions, beside that of
+        independent errors.
+        """
         return self.ratio if self.ratio > self.limit else 1.0
 
 
 def shared_errors(scores: Array, information: Array, sigma2: float) -> SharedErrors:
-    """What views whose scores (v,c) and reduced normal matrices (v,c,c) these are share within, at sigma² px².
+    """Errors that views with scores (v,c) and reduced normal matrices (v,c,c) share within, at
+    sigma² px².
 
-    The limit is that of the chi-square distribution with the mean and variance of Q for independent normal errors.
+    The limit is that of the chi-square distribution with the mean and variance of Q for independent
+    normal errors.
     """
     whiten = _whitening(information.sum(axis=0))
     independent = sigma2 * whiten @ whiten.T
@@ -58,8 +66,11 @@ def shared_errors(scores: Array, information: Array, sigma2: float) -> SharedErr
         return SharedErrors(1.0, np.inf, independent, independent)
     pulls = scores @ whiten / np.sqrt(sigma2)
     freedom = 2.0 * mean**2 / variance
-    ratio, limit = float(np.sum(pulls**2)) / mean, float(chi2.isf(CHANCE, freedom) / freedom)
-    covariance = sigma2 * whiten @ _enlargement(pulls, ratio) @ whiten.T if ratio > limit else independent
+    ratio = float(np.sum(pulls**2)) / mean
+    limit = float(chi2.isf(CHANCE, freedom) / freedom)
+    covariance = (
+        sigma2 * whiten @ _enlargement(pulls, ratio) @ whiten.T if ratio > limit else independent
+    )
     return SharedErrors(ratio, limit, independent, covariance)
 
 
@@ -71,16 +82,23 @@ def _whitening(total: Array) -> Array:
 
 
 def _moments(shares: Array) -> tuple[float, float]:
-    """Mean and variance of Q for independent normal errors, from the views' shares W_v (v,c,c) that add up to one."""
+    """Mean and variance of Q for independent normal errors, from the views' shares W_v (v,c,c) that
+    add up to one.
+    """
     squares = shares @ shares
-    traced, all_views = float(np.einsum("vii->", squares)), squares.sum(axis=0)
-    variance = traced - 2.0 * float(np.einsum("vij,vji->", squares, shares)) + float(np.sum(all_views * all_views.T))
+    traced = float(np.einsum("vii->", squares))
+    all_views = squares.sum(axis=0)
+    variance = (
+        traced
+        - 2.0 * float(np.einsum("vij,vji->", squares, shares))
+        + float(np.sum(all_views * all_views.T))
+    )
     return shares.shape[1] - traced, 2.0 * variance
 
 
 def _enlargement(pulls: Array, ratio: float) -> Array:
-    """Covariance (c,c) relative to that of independent errors: the sandwich of whitened scores (v,c), shrunk, of the
-    mean eigenvalue ``ratio``, and in no direction below one."""
+    """Covariance (c,c) relative to that of independent errors: the sandwich of whitened scores
+    (v,c), shrunk, of the mean eigenvalue ``ratio``, and in no direction below one."""
     views, size = pulls.shape
     sandwich = pulls.T @ pulls
     mean = np.trace(sandwich) / size
@@ -89,5 +107,7 @@ def _enlargement(pulls: Array, ratio: float) -> Array:
     outer = views * pulls[:, :, None] * pulls[:, None, :]
     scatter = np.sum((outer - sandwich) ** 2) / views**2
     weight = min(1.0, scatter / apart) if apart > 0.0 else 1.0
-    eigenvalues, vectors = np.linalg.eigh((weight * plain + (1.0 - weight) * sandwich) * (ratio / mean))
+    eigenvalues, vectors = np.linalg.eigh(
+        (weight * plain + (1.0 - weight) * sandwich) * (ratio / mean)
+    )
     return np.asarray((vectors * np.maximum(eigenvalues, 1.0)) @ vectors.T)

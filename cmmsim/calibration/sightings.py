@@ -9,57 +9,74 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.detection import BoardView, find_board
+from cmmsim.calibration.board_detection import BoardView, find_board
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array
 
 SIDES = ("left", "right")
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
-WHITE_SHARE = 99.9  # percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit
+# percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit
+WHITE_SHARE = 99.9
 HOW_PAIRED = "pairs are made in the order of the sorted file names"
 
 
 @dataclass(frozen=True)
 class ImagePair:
-    """Files of one exposure of both cameras; name is the left file's, with the right one's where they differ."""
+    """Files of one exposure of both cameras; name is the left file's, with the right one's where
+    they differ.
+    """
 
     left: Path
     right: Path
 
     @property
     def name(self) -> str:
-        """How the pair is called in results and messages."""
-        return self.left.name if self.left.name == self.right.name else f"{self.left.name} | {self.right.name}"
+        """Name of the pair in results and messages."""
+        return (
+            self.left.name
+            if self.left.name == self.right.name
+            else f"{self.left.name} | {self.right.name}"
+        )
 
 
 def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
     """Pairs of the images in two folders.
 
-    The order of the sorted names makes the pairs; the names may differ throughout (left_01.png, right_01.png), but
-    where some are the same all must be. Raises CalibrationError: a folder is missing or empty, both are one, or
-    numbers or names differ, with names that stand in one folder only.
+    The order of the sorted names makes the pairs; the names may differ throughout (left_01.png,
+    right_01.png), but where some are the same all must be. Raises CalibrationError: a folder is
+    missing or empty, both are one, or numbers or names differ, with names that stand in one folder
+    only.
     """
     if Path(left).resolve() == Path(right).resolve():
-        raise CalibrationError(f"{left} is named for both cameras; name a folder of left and a folder of right images")
+        raise CalibrationError(
+            f"{left} is named for both cameras; name a folder of left and a folder of right images"
+        )
     found = [_image_files(Path(folder)) for folder in (left, right)]
     names = [{path.stem for path in side} for side in found]
     if len(found[0]) != len(found[1]) or (names[0] & names[1] and names[0] != names[1]):
         alone = [sorted(names[0] - names[1]), sorted(names[1] - names[0])]
         raise CalibrationError(
-            f"{left} holds {len(found[0])} images and {right} {len(found[1])}; {HOW_PAIRED}, so each image needs its "
+            f"{left} holds {len(found[0])} images and {right} {len(found[1])}; {HOW_PAIRED}, so "
+            "each image needs its "
             f"partner. Only on the left: {some(alone[0])}; only on the right: {some(alone[1])}"
         )
     return [ImagePair(a, b) for a, b in zip(*found, strict=True)]
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """Grey values (height, width) of an image file as the camera took it: a turn noted beside it is not applied.
+    """Grey values (height, width) of an image file as the camera took it: a turn noted beside it is
+    not applied.
 
-    Colours become grey; more than 8 bit are scaled so that the brightest 0.1 % are white. Raises CalibrationError.
+    Colours become grey; more than 8 bit are scaled so that the brightest 0.1 % are white. Raises
+    CalibrationError.
     """
     try:
         data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+        image = (
+            cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+            if len(data)
+            else None
+        )
     except OSError as error:
         raise CalibrationError(f"cannot read image {path}: {error.strerror or error}") from error
     except cv2.error as error:
@@ -67,9 +84,13 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     if image is None:
         raise CalibrationError(f"cannot read image {path}: it is truncated or not an image")
     if image.ndim == 3 and image.shape[2] in (3, 4):
-        image = cv2.cvtColor(_eight_bit(image), cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
+        image = cv2.cvtColor(
+            _eight_bit(image), cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
+        )
     elif image.ndim == 3:
-        raise CalibrationError(f"cannot read image {path}: it has {image.shape[2]} channels, not 1, 3 or 4")
+        raise CalibrationError(
+            f"cannot read image {path}: it has {image.shape[2]} channels, not 1, 3 or 4"
+        )
     return _eight_bit(image)
 
 
@@ -83,20 +104,27 @@ def _eight_bit(image: NDArray) -> NDArray[np.uint8]:
 
 def _image_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
-        raise CalibrationError(f"no folder {folder}; name a folder of left and a folder of right images")
+        raise CalibrationError(
+            f"no folder {folder}; name a folder of left and a folder of right images"
+        )
     files = sorted(
         path
         for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
     )
     if not files:
-        raise CalibrationError(f"folder {folder} holds no images, which end in {', '.join(SUFFIXES)}")
+        raise CalibrationError(
+            f"folder {folder} holds no images, which end in {', '.join(SUFFIXES)}"
+        )
     return files
 
 
 @dataclass(frozen=True)
 class PairView:
-    """What one pair of images shows; a side is the board or the reason why there is none."""
+    """View of the board in one pair of images.
+
+    A side is the board, or the reason why there is none.
+    """
 
     name: str
     left: BoardView | str
@@ -109,7 +137,7 @@ class PairView:
 
     @property
     def both(self) -> bool:
-        """Whether both cameras see the board."""
+        """True if both cameras see the board."""
         return not isinstance(self.left, str) and not isinstance(self.right, str)
 
     @property
@@ -118,7 +146,9 @@ class PairView:
         if isinstance(self.left, str) and self.left == self.right:
             return f"both: {self.left}"
         return "; ".join(
-            f"{name}: {side}" for name, side in zip(SIDES, self.sides, strict=True) if isinstance(side, str)
+            f"{name}: {side}"
+            for name, side in zip(SIDES, self.sides, strict=True)
+            if isinstance(side, str)
         )
 
     def without(self, side: int, reason: str) -> "PairView":
@@ -129,13 +159,15 @@ class PairView:
 def view_pairs(
     pairs: Sequence[ImagePair], board: Board, advance: Callable[[], None] = lambda: None
 ) -> tuple[list[PairView], tuple[int, int]]:
-    """What each pair shows of the board, and the size (width, height) px that all images have.
+    """Find the board in each pair, and the size (width, height) px that all images have.
 
-    advance is called after each pair. Raises CalibrationError for images that cannot be read or differ in size.
+    advance is called after each pair. Raises CalibrationError for images that cannot be read or
+    differ in size.
     """
     if not pairs:
         raise CalibrationError("no pairs of images")
-    seen, size = [], (0, 0)
+    seen = []
+    size = (0, 0)
     for pair in pairs:
         sides = []
         for path in (pair.left, pair.right):
@@ -144,7 +176,8 @@ def view_pairs(
             size = (width, height) if path is pairs[0].left else size
             if (width, height) != size:
                 raise CalibrationError(
-                    f"{path} is {width} x {height} px, {pairs[0].left} {size[0]} x {size[1]}: all images must have one "
+                    f"{path} is {width} x {height} px, {pairs[0].left} {size[0]} x {size[1]}: all "
+                    "images must have one "
                     "size, unturned and uncropped"
                 )
             sides.append(find_board(grey, board))
@@ -155,7 +188,9 @@ def view_pairs(
 
 @dataclass(frozen=True)
 class Sightings:
-    """Points seen by one camera in all pairs: view (m,) ascending, point (m,) of the board, pixels (m, 2)."""
+    """Points seen by one camera in all pairs: view (m,) ascending, point (m,) of the board, pixels
+    (m, 2).
+    """
 
     view: NDArray[np.int_]
     point: NDArray[np.int_]
@@ -174,7 +209,11 @@ def sightings_of(pairs: Sequence[PairView]) -> tuple[Sightings, Sightings]:
 
 def views_of(pairs: Sequence[PairView], side: int) -> dict[int, BoardView]:
     """The views of one camera by the place of their pair in the list."""
-    return {k: view for k, view in enumerate(pair.sides[side] for pair in pairs) if not isinstance(view, str)}
+    return {
+        k: view
+        for k, view in enumerate(pair.sides[side] for pair in pairs)
+        if not isinstance(view, str)
+    }
 
 
 def _joined(views: dict[int, BoardView]) -> Sightings:

@@ -1,7 +1,8 @@
-"""Where the adjustment starts: OpenCV's calibration of each camera and of the pair.
+"""Start of the adjustment: OpenCV's calibration of each camera and of the pair.
 
-A symmetric board can be read in several orders (half a turn, quarter turns), and each picture is read by itself. Both
-pictures of a pair must be read alike: the right camera then stands in the same place for all pairs, and only then.
+A symmetric board can be read in several orders (half a turn, quarter turns), and each picture is
+read by itself. Both pictures of a pair must be read alike: the right camera then stands in the same
+place for all pairs, and only then.
 """
 
 from collections.abc import Sequence
@@ -12,23 +13,28 @@ from numpy.typing import NDArray
 
 from cmmsim.calibration.adjustment import RigState, camera_matrix
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.detection import BoardView
+from cmmsim.calibration.board_detection import BoardView
 from cmmsim.calibration.sightings import SIDES, PairView, views_of
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array, invert, rigid
 
 FEWEST_VIEWS = 3
 ALIKE_PX = 2.0  # rms distance of the points of two pictures that show the board in one place
-ALIKE_ANGLE, ALIKE_SHARE = 0.06, 0.12  # rad; of the baseline: places of the right camera that count as the same
-MISFIT = "the two places of the board fit no other pair: wrong partner, or moved between the exposures"
+ALIKE_ANGLE = 0.06
+ALIKE_SHARE = 0.12  # rad; of the baseline: places of the right camera that count as the same
+MISFIT = (
+    "the two places of the board fit no other pair: wrong partner, or moved between the exposures"
+)
 
 
 def start_values(
     board: Board, pairs: Sequence[PairView], size: tuple[int, int], bend: bool, fix_aspect: bool
 ) -> tuple[RigState, list[PairView]]:
-    """First state, and the pairs with right images read like the left ones; pairs that do not fit lose both sides.
+    """First state, and the pairs with right images read like the left ones; pairs that do not fit
+    lose both sides.
 
-    bend: whether two radial terms of distortion are estimated; size: (width, height) px. Raises CalibrationError.
+    bend: whether two radial terms of distortion are estimated; size: (width, height) px. Raises
+    CalibrationError.
     """
     left, from_left = _one_camera(board, pairs, 0, size, bend, fix_aspect)
     right, from_right = _one_camera(board, pairs, 1, size, bend, fix_aspect)
@@ -42,12 +48,20 @@ def start_values(
 
 
 def _one_camera(
-    board: Board, pairs: Sequence[PairView], side: int, size: tuple[int, int], bend: bool, fix_aspect: bool
+    board: Board,
+    pairs: Sequence[PairView],
+    side: int,
+    size: tuple[int, int],
+    bend: bool,
+    fix_aspect: bool,
 ) -> tuple[Array, dict[int, Array]]:
-    """Intrinsics (9,) of one camera, and camera_from_board (4,4) of each view by the pair's place."""
+    """Intrinsics (9,) of one camera, and camera_from_board (4,4) of each view by the pair's
+    place."""
     views = views_of(pairs, side)
     if len(views) < FEWEST_VIEWS:
-        raise CalibrationError(f"the {SIDES[side]} camera sees the board in {len(views)} images, {FEWEST_VIEWS} needed")
+        raise CalibrationError(
+            f"the {SIDES[side]} camera sees the board in {len(views)} images, {FEWEST_VIEWS} needed"
+        )
     _require_variety(list(views.values()), board.symmetries, SIDES[side])
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= 0 if bend else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
@@ -55,13 +69,21 @@ def _one_camera(
     points = [board.points[view.index].astype(np.float32) for view in views.values()]
     pixels = [view.pixels.astype(np.float32) for view in views.values()]
     try:
-        _, matrix, terms, turns, shifts = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+        _, matrix, terms, turns, shifts = cv2.calibrateCamera(
+            points, pixels, size, np.eye(3), np.zeros(5), flags=flags
+        )
     except cv2.error as error:
         raise CalibrationError(
-            f"OpenCV finds no {SIDES[side]} camera for these views: {error.err}; show the board tilted to several sides"
+            f"OpenCV finds no {SIDES[side]} camera for these views: {error.err}; show the board "
+            "tilted to several sides"
         ) from error
-    values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(terms)[:5]], dtype=float)
-    places = [rigid(cv2.Rodrigues(turn)[0], np.ravel(shift)) for turn, shift in zip(turns, shifts, strict=True)]
+    values = np.array(
+        [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(terms)[:5]], dtype=float
+    )
+    places = [
+        rigid(cv2.Rodrigues(turn)[0], np.ravel(shift))
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
     if not (np.isfinite(values).all() and values[:2].min() > 0.0 and np.isfinite(places).all()):
         raise CalibrationError(
             f"OpenCV's {SIDES[side]} camera is not finite (focal lengths {values[:2]}): show the "
@@ -70,7 +92,9 @@ def _one_camera(
     return values, dict(zip(views, places, strict=True))
 
 
-def _require_variety(views: Sequence[BoardView], orders: Sequence[NDArray[np.int_]], camera: str) -> None:
+def _require_variety(
+    views: Sequence[BoardView], orders: Sequence[NDArray[np.int_]], camera: str
+) -> None:
     """Raise CalibrationError where the views of a camera show the board in too few places.
 
     orders: the board's symmetries, in any of which a view may be read.
@@ -78,13 +102,16 @@ def _require_variety(views: Sequence[BoardView], orders: Sequence[NDArray[np.int
     different: list[BoardView] = []
     for view in views:
         readings = [view.read_as(order) for order in orders]
-        if not any(_distance(reading, other) < ALIKE_PX for reading in readings for other in different):
+        if not any(
+            _distance(reading, other) < ALIKE_PX for reading in readings for other in different
+        ):
             different.append(view)
     if len(different) < FEWEST_VIEWS:
         places = "one place" if len(different) == 1 else f"{len(different)} places"
         raise CalibrationError(
             f"the {len(views)} pictures of the {camera} camera are alike, they show the board in "
-            f"{places} only (within {ALIKE_PX:g} px), {FEWEST_VIEWS} at the least are needed: move and "
+            f"{places} only (within {ALIKE_PX:g} px), {FEWEST_VIEWS} at the least are needed: "
+            "move and "
             "tilt the board from picture to picture"
         )
 
@@ -97,10 +124,13 @@ def _distance(a: BoardView, b: BoardView) -> float:
 
 
 def _read_alike(
-    board: Board, pairs: Sequence[PairView], from_left: dict[int, Array], from_right: dict[int, Array]
+    board: Board,
+    pairs: Sequence[PairView],
+    from_left: dict[int, Array],
+    from_right: dict[int, Array],
 ) -> tuple[list[PairView], dict[int, Array], Array]:
-    """Pairs whose right images are read in the order that most pairs agree on; the places of the board that the right
-    camera then sees; right_from_left (4,4)."""
+    """Pairs whose right images are read in the order that most pairs agree on; the places of the
+    board that the right camera then sees; right_from_left (4,4)."""
     orders = board.symmetries
     turned = [_renaming_move(board, order) for order in orders]
     names = [(k, j) for k, pair in enumerate(pairs) if pair.both for j in range(len(orders))]
@@ -122,21 +152,29 @@ def _read_alike(
         if pair.both and k not in chosen:
             read[k] = PairView(pair.name, MISFIT, MISFIT)
         elif pair.both and not isinstance(pair.right, str):
-            read[k] = PairView(pair.name, pair.left, pair.right.read_as(orders[names[chosen[k]][1]]))
+            read[k] = PairView(
+                pair.name, pair.left, pair.right.read_as(orders[names[chosen[k]][1]])
+            )
     return read, from_right | {k: places[i] @ from_left[k] for k, i in chosen.items()}, places[best]
 
 
 def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
-    """Rigid move (4,4) in the board's plane that carries points[order] to points: to undo the renaming."""
-    points, renamed = board.points, board.points[order]
-    a, b = renamed[1] - renamed[0], points[1] - points[0]
+    """Rigid move (4,4) in the board's plane that carries points[order] to points: to undo the
+    renaming.
+    """
+    points = board.points
+    renamed = board.points[order]
+    a = renamed[1] - renamed[0]
+    b = points[1] - points[0]
     angle = np.arctan2(b[1], b[0]) - np.arctan2(a[1], a[0])
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]]
+    )
     return rigid(turn, points[0] - turn @ renamed[0])
 
 
 def _alike(places: Array) -> Array:
-    """Which transforms (n,4,4) are about the same: (n,n) bool."""
+    """Mask (n,n) of the transforms (n,4,4) that are about the same."""
     shifts = places[:, :3, 3]
     gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
     near = gap < ALIKE_SHARE * np.linalg.norm(shifts, axis=1)[:, None]
@@ -150,20 +188,31 @@ def _angles(places: Array, rotations: Array) -> Array:
 
 
 def _stereo(
-    board: Board, pairs: Sequence[PairView], cameras: tuple[Array, Array], size: tuple[int, int], guess: Array
+    board: Board,
+    pairs: Sequence[PairView],
+    cameras: tuple[Array, Array],
+    size: tuple[int, int],
+    guess: Array,
 ) -> Array:
-    """right_from_left (4,4) by OpenCV with the cameras as they are, from the points that both see."""
-    points, left, right = [], [], []
-    left_views, right_views = views_of(pairs, 0), views_of(pairs, 1)
+    """right_from_left (4,4) by OpenCV with the cameras as they are, from the points that both
+    see."""
+    points = []
+    left = []
+    right = []
+    left_views = views_of(pairs, 0)
+    right_views = views_of(pairs, 1)
     for k in sorted(left_views.keys() & right_views.keys()):
-        a, b = left_views[k], right_views[k]
+        a = left_views[k]
+        b = right_views[k]
         index, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
         points.append(board.points[index].astype(np.float32))
         left.append(a.pixels[in_a].astype(np.float32))
         right.append(b.pixels[in_b].astype(np.float32))
     lenses = [(camera_matrix(values), values[4:]) for values in cameras]
     try:
-        found = cv2.stereoCalibrate(points, left, right, *lenses[0], *lenses[1], size, flags=cv2.CALIB_FIX_INTRINSIC)
+        found = cv2.stereoCalibrate(
+            points, left, right, *lenses[0], *lenses[1], size, flags=cv2.CALIB_FIX_INTRINSIC
+        )
     except cv2.error:
         return guess
     place = rigid(found[5], np.ravel(found[6]))

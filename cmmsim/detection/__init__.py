@@ -1,1 +1,2 @@
-"""Centres of stickers in images: search, fits, other detectors, and the bound that none can beat."""
+"""Centres of stickers in images: search, fits, other detectors, and the bound that none can
+beat."""

@@ -1,11 +1,14 @@
-"""The Cramer-Rao bound: how well a disc's centre can be known at all from the grey values of its image.
+"""The Cramer-Rao bound: how well a disc's centre can be known at all from the grey values of its
+image.
 
-Mean grey value of a pixel: ground + contrast * its share of light, the exact coverage by the ellipse blurred by a
-Gaussian point spread. Unknown are the centre, the shape, contrast and ground. The grey value is the mean plus normal
-noise, whose variance depends on the mean, rounded and clipped; the Fisher information of such a number is summed over
-the numbers that may come out. Where the noise is below half a grey value, it depends on where the mean lies between two
-numbers, and no estimator is unbiased at each single place of a centre. So it is averaged over one grey value: the bound
-holds on average over places that are not known beforehand. With more noise the average changes nothing.
+Mean grey value of a pixel: ground + contrast * its share of light, the exact coverage by the
+ellipse blurred by a Gaussian point spread. Unknown are the centre, the shape, contrast and ground.
+The grey value is the mean plus normal noise, whose variance depends on the mean, rounded and
+clipped; the Fisher information of such a number is summed over the numbers that may come out. Where
+the noise is below half a grey value, it depends on where the mean lies between two numbers, and no
+estimator is unbiased at each single place of a centre. So it is averaged over one grey value: the
+bound holds on average over places that are not known beforehand. With more noise the average
+changes nothing.
 """
 
 import numpy as np
@@ -17,11 +20,14 @@ from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 
 REACH = 6.0  # standard deviations within which noise is followed
-TABLE_STEPS = 64  # tabulated informations in one grey value; fewer where the noise hides the rounding
+TABLE_STEPS = (
+    64  # tabulated informations in one grey value; fewer where the noise hides the rounding
+)
 
 
 def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
-    """Fisher information about its mean that one rounded and clipped grey value holds, per grey value squared.
+    """Fisher information about its mean that one rounded and clipped grey value holds, per grey
+    value squared.
 
     Raises CmmError for a camera without noise: what it shows is certain, so there is no bound.
     """
@@ -30,10 +36,17 @@ def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
     deviation = np.sqrt(variance)
     reach = int(np.ceil(REACH * deviation.max())) + 1
     numbers = np.rint(mean_grey)[..., None] + np.arange(-reach, reach + 1)
-    low = np.where(numbers <= 0, -np.inf, (numbers - 0.5 - mean_grey[..., None]) / deviation[..., None])
-    high = np.where(numbers >= noise.white_level, np.inf, (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None])
+    low = np.where(
+        numbers <= 0, -np.inf, (numbers - 0.5 - mean_grey[..., None]) / deviation[..., None]
+    )
+    high = np.where(
+        numbers >= noise.white_level,
+        np.inf,
+        (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None],
+    )
     possible = (numbers >= 0) & (numbers <= noise.white_level)
-    # the upper tail is taken from above, where differences of numbers close to one would lose all digits
+    # the upper tail is taken from above, where differences of numbers close to one would lose all
+    # digits
     probability = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
     change = -(_rise(high, slope, variance) - _rise(low, slope, variance)) / deviation[..., None]
     usable = possible & (probability > 1e-30)
@@ -41,22 +54,37 @@ def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
 
 
 def cramer_rao_bound(
-    centres: Array, shapes: Array, size: int, contrast: float, ground: float, noise: CameraNoise, psf_px: float = 0.0
+    centres: Array,
+    shapes: Array,
+    size: int,
+    contrast: float,
+    ground: float,
+    noise: CameraNoise,
+    psf_px: float = 0.0,
 ) -> Array:
-    """Smallest covariance (n,2,2) px² of an unbiased centre, from windows of ``size`` px; contrast, ground grey values.
+    """Smallest covariance (n,2,2) px² of an unbiased centre, from windows of ``size`` px; contrast,
+    ground grey values.
 
     Other parameters as of ``disc_image.coverage``. Raises CmmError.
     """
     shares, derivatives = coverage(centres, shapes, size, psf_px)
-    information = np.interp(ground + contrast * shares, *_information_table(ground, ground + contrast, noise))
-    jacobian = np.concatenate([contrast * derivatives, shares[..., None], np.ones_like(shares)[..., None]], axis=-1)
+    information = np.interp(
+        ground + contrast * shares, *_information_table(ground, ground + contrast, noise)
+    )
+    jacobian = np.concatenate(
+        [contrast * derivatives, shares[..., None], np.ones_like(shares)[..., None]], axis=-1
+    )
     fisher = np.einsum("nyxi,nyxj,nyx->nij", jacobian, jacobian, information, optimize=True)
     return np.linalg.inv(fisher)[:, :2, :2]
 
 
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
-    """Means that reach from ``lowest`` to ``highest``, and the information at each, averaged over one grey value."""
-    least_noise = float(np.sqrt(_analog_variance(np.array([lowest - 1.5, highest + 1.5]), noise)[0].min()))
+    """Means that reach from ``lowest`` to ``highest``, and the information at each, averaged over
+    one grey value.
+    """
+    least_noise = float(
+        np.sqrt(_analog_variance(np.array([lowest - 1.5, highest + 1.5]), noise)[0].min())
+    )
     steps = 2 * int(np.ceil(0.5 * min(TABLE_STEPS, 16.0 / least_noise)))
     count = int(np.ceil((highest - lowest + 2.0) * steps)) + 1
     means = lowest - 1.5 + np.arange(count + steps) / steps
@@ -72,11 +100,15 @@ def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array
     if not noise.enabled or variance.min() <= 0.0:
         raise CmmError(f"without noise there is no Cramer-Rao bound, got {noise}")
     step = 0.5
-    return variance, (noise.variance(mean_grey + step) - noise.variance(mean_grey - step)) / (2.0 * step)
+    return variance, (noise.variance(mean_grey + step) - noise.variance(mean_grey - step)) / (
+        2.0 * step
+    )
 
 
 def _rise(limit: Array, slope: Array, variance: Array) -> Array:
-    """Deviation times the derivative of -ndtr(limit) by the mean, which shifts and widens the noise."""
+    """Deviation times the derivative of -ndtr(limit) by the mean, which shifts and widens the
+    noise.
+    """
     finite = np.where(np.isfinite(limit), limit, 0.0)
     density = np.where(np.isfinite(limit), np.exp(-0.5 * finite**2) / np.sqrt(2.0 * np.pi), 0.0)
     return density * (1.0 + 0.5 * finite * (slope / np.sqrt(variance))[..., None])

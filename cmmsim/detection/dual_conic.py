@@ -1,20 +1,24 @@
-"""Centre of an ellipse from the grey value gradients at all pixels of its edge: the dual conic operator.
+"""Centre of an ellipse from the grey value gradients at all pixels of its edge: the dual conic
+operator.
 
-Each pixel of the edge gives a line l = (a, b, c), c = -(a x + b y), through the pixel and across the gradient (a, b).
-Lines that touch the ellipse fulfil l' C* l = 0 with its dual conic C* = [[A, B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]:
-linear in the five unknowns, and (D/2, E/2) is the centre. The residual of each line of unit length is weighted by
-|gradient|², which is the same as leaving (a, b) unnormalised; so pixels away from the edge need not be sorted out.
-Source: J.-N. Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction, Machine Vision and
-Applications 21 (2009).
+Each pixel of the edge gives a line l = (a, b, c), c = -(a x + b y), through the pixel and across
+the gradient (a, b). Lines that touch the ellipse fulfil l' C* l = 0 with its dual conic C* = [[A,
+B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]: linear in the five unknowns, and (D/2, E/2) is the centre.
+The residual of each line of unit length is weighted by |gradient|², which is the same as leaving
+(a, b) unnormalised; so pixels away from the edge need not be sorted out.
+Source: J.-N. Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction,
+Machine Vision and Applications 21 (2009).
 
-The noise of a pixel enters the gradients around it; its effect on the centre follows from the normal equations
-sum of k (k' u + c²) = 0, k = (a², a b, b², a c, b c), by the implicit function theorem.
+The noise of a pixel enters the gradients around it; its effect on the centre follows from the
+normal equations sum of k (k' u + c²) = 0, k = (a², a b, b², a c, b c), by the implicit function
+theorem.
 
-A line that is missing where the rim comes near the window's edge pulls the centre by up to a tenth of a pixel, so such
-a window is not good; EDGE_PX is what the lines need around the ellipse.
+A line that is missing where the rim comes near the window's edge pulls the centre by up to a tenth
+of a pixel, so such a window is not good; EDGE_PX is what the lines need around the ellipse.
 
-Gradients of a sharp edge are not exact: noise-free and tilted by 45 degrees, the centre is off by about 0.004 px rms at
-radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. This bias is no part of the covariance.
+Gradients of a sharp edge are not exact: noise-free and tilted by 45 degrees, the centre is off by
+about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. This bias is no part of the
+covariance.
 """
 
 import numpy as np
@@ -25,8 +29,14 @@ from cmmsim.detection.grey_centroid import BrightSpots, bright_spots, whole_insi
 from cmmsim.geometry.pose import Array
 
 SLOPE = (-0.5, 0.0, 0.5)
-SMOOTHING = (0.1875, 0.625, 0.1875)  # across the slope (Scharr): the most nearly isotropic of this size
-EDGE_PX = 2  # from the rim to the window's side: a gradient reaches 1.5 px from a sharp rim, the last pixel has none
+SMOOTHING = (
+    0.1875,
+    0.625,
+    0.1875,
+)  # across the slope (Scharr): the most nearly isotropic of this size
+# from the rim to the window's side: a gradient reaches 1.5 px from a sharp rim, the last pixel has
+# none
+EDGE_PX = 2
 SMALLEST_CONDITION = 1e-9  # reciprocal condition below which the lines do not determine an ellipse
 
 
@@ -36,7 +46,9 @@ def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
         return no_centres()
     spots = bright_spots(given)
     lines = _edge_lines(spots)
-    basis = np.stack([lines.a**2, lines.a * lines.b, lines.b**2, lines.a * lines.c, lines.b * lines.c])
+    basis = np.stack(
+        [lines.a**2, lines.a * lines.b, lines.b**2, lines.a * lines.c, lines.b * lines.c]
+    )
     normal = np.einsum("inyx,jnyx->nij", basis, basis)
     determined = np.linalg.cond(normal) < 1.0 / SMALLEST_CONDITION
     normal[~determined] = np.eye(5)
@@ -46,7 +58,11 @@ def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
     variance = given.noise.variance(spots.windows)
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
     squared = _squared_shape(dual) * lines.unit_px[:, None, None] ** 2
-    good = (spots.contrast >= given.limits.smallest_contrast) & determined & (np.linalg.eigvalsh(squared)[:, 0] > 0.0)
+    good = (
+        (spots.contrast >= given.limits.smallest_contrast)
+        & determined
+        & (np.linalg.eigvalsh(squared)[:, 0] > 0.0)
+    )
     good &= whole_inside(centres, 0.25 * squared, given.fit_size, EDGE_PX + given.psf_px)
     return DetectedCentres(centres + spots.corners, covariances, good)
 
@@ -55,11 +71,19 @@ DUAL_CONIC = Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX)
 
 
 class _EdgeLines:
-    """Lines (a, b, c), each (n, h, h), from the centroids and in units of unit_px (n,); x, y of the pixels; scale
-    (n, h, h): one over the contrast where a line counts, within the dark ring with all neighbours in the window."""
+    """Lines (a, b, c), each (n, h, h), from the centroids and in units of unit_px (n,); x, y of the
+    pixels; scale (n, h, h): one over the contrast where a line counts, within the dark ring with
+    all neighbours in the window."""
 
-    def __init__(self, a: Array, b: Array, x: Array, y: Array, unit_px: Array, scale: Array) -> None:
-        self.a, self.b, self.x, self.y, self.unit_px, self.scale = a, b, x, y, unit_px, scale
+    def __init__(
+        self, a: Array, b: Array, x: Array, y: Array, unit_px: Array, scale: Array
+    ) -> None:
+        self.a = a
+        self.b = b
+        self.x = x
+        self.y = y
+        self.unit_px = unit_px
+        self.scale = scale
         self.c = -(a * x + b * y)
 
 
@@ -77,8 +101,12 @@ def _edge_lines(spots: BrightSpots) -> _EdgeLines:
     return _EdgeLines(a, b, x, y, radius, scale)
 
 
-def _filtered(values: Array, along_x: tuple[float, ...], along_y: tuple[float, ...], adjoint: bool = False) -> Array:
-    """Correlation of (n, h, h) with a separable kernel, or its adjoint; nothing lies outside of the window."""
+def _filtered(
+    values: Array, along_x: tuple[float, ...], along_y: tuple[float, ...], adjoint: bool = False
+) -> Array:
+    """Correlation of (n, h, h) with a separable kernel, or its adjoint; nothing lies outside of the
+    window.
+    """
     turn = -1 if adjoint else 1
     across = ndimage.correlate1d(values, along_x[::turn], axis=2, mode="constant")
     return ndimage.correlate1d(across, along_y[::turn], axis=1, mode="constant")
@@ -86,7 +114,12 @@ def _filtered(values: Array, along_x: tuple[float, ...], along_y: tuple[float, .
 
 def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Array) -> Array:
     """Derivative (n, 2, h, h) of the centres by each grey value, px."""
-    a, b, c, x, y, zero = lines.a, lines.b, lines.c, lines.x, lines.y, np.zeros_like(lines.a)
+    a = lines.a
+    b = lines.b
+    c = lines.c
+    x = lines.x
+    y = lines.y
+    zero = np.zeros_like(lines.a)
     rows = np.linalg.inv(normal)[:, 3:]  # of D and E
     residual = np.einsum("ni,inyx->nyx", dual, basis) + c * c
     total = np.zeros((len(a), 2, *a.shape[1:]))
@@ -104,5 +137,7 @@ def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Arra
 def _squared_shape(dual: Array) -> Array:
     """A A' (n,2,2) of the ellipse: centre centre' minus the upper left of C*."""
     centre = 0.5 * dual[:, 3:]
-    upper_left = np.stack([dual[:, 0], 0.5 * dual[:, 1], 0.5 * dual[:, 1], dual[:, 2]], axis=1).reshape(-1, 2, 2)
+    upper_left = np.stack(
+        [dual[:, 0], 0.5 * dual[:, 1], 0.5 * dual[:, 1], dual[:, 2]], axis=1
+    ).reshape(-1, 2, 2)
     return centre[:, :, None] * centre[:, None, :] - upper_left

@@ -1,9 +1,11 @@
-"""Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows at once.
+"""Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows at
+once.
 
-Model of a pixel: ground + contrast * (exact share of the pixel covered by the ellipse, blurred by the point spread and,
-where it is known, by the movement during the exposure).
-Gauss-Newton on the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast, ground], weighted by the camera's noise
-variance at the fitted grey value. The inverse of the normal matrix is the covariance of the parameters.
+Model of a pixel: ground + contrast * (exact share of the pixel covered by the ellipse, blurred by
+the point spread and, where it is known, by the movement during the exposure). Gauss-Newton on the
+seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast, ground], weighted by the camera's noise
+variance at the fitted grey value. The inverse of the normal matrix is the covariance of the
+parameters.
 """
 
 import threading
@@ -23,18 +25,26 @@ from cmmsim.radiometry.noise import CameraNoise
 if TYPE_CHECKING:
     from cmmsim.detection.fit_kernels import FitSettings
 
-RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
+RING_REACH = (
+    2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
+)
 SMALLEST_RADIUS_PX = 0.8
 ELLIPSE_UNKNOWNS = 5  # the first parameters: c_x, c_y, A_xx, A_xy, A_yy
-SMEAR_STEP_PX = 0.2  # or half a point spread: between two places of a moving ellipse whose light is added
+SMEAR_STEP_PX = (
+    0.2  # or half a point spread: between two places of a moving ellipse whose light is added
+)
 CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
-MODEL_ERROR = 0.0025  # of the contrast: rms of what images and the model of a pixel differ by without noise
+MODEL_ERROR = (
+    0.0025  # of the contrast: rms of what images and the model of a pixel differ by without noise
+)
 FEWEST_FOR_A_THREAD = 16  # windows
 
 
 @dataclass(frozen=True)
 class EllipseFits(DetectedCentres):
-    """Result for n windows: all that a detector may state, and contrast and ground (n,), grey values."""
+    """Result for n windows: all that a detector may state, and contrast and ground (n,), grey
+    values.
+    """
 
     shapes: Array = field()  # which takes away the default
     shape_covariances: Array = field()
@@ -45,7 +55,11 @@ class EllipseFits(DetectedCentres):
     def within(self, limits: FitLimits, noise: CameraNoise) -> "EllipseFits":
         """The same fits, of which only those are still good that keep within limits."""
         good = self.good & (self.contrast >= limits.smallest_contrast)
-        return replace(self, good=good & (self.misfits <= largest_misfits(limits, noise, self.contrast, self.ground)))
+        return replace(
+            self,
+            good=good
+            & (self.misfits <= largest_misfits(limits, noise, self.contrast, self.ground)),
+        )
 
 
 def detect_by_maximum_likelihood(spots: SpotWindows) -> DetectedCentres:
@@ -68,17 +82,21 @@ def fit_ellipses(
 ) -> EllipseFits:
     """Fit one ellipse in each window.
 
-    Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first pixel;
-    noise: the camera's noise; fit_size: side in px of the part around the bright spot that is fitted; psf_px:
-    sigma of the Gaussian point spread that blurs the ellipse; smears (n, 2) px: how far each spot moves during the
-    exposure, whose middle the centre is for. Raises CmmError for one too narrow to be followed.
+    Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each
+    window's first pixel; noise: the camera's noise; fit_size: side in px of the part around the
+    bright spot that is fitted; psf_px: sigma of the Gaussian point spread that blurs the ellipse;
+    smears (n, 2) px: how far each spot moves during the exposure, whose middle the centre is for.
+    Raises CmmError for one too narrow to be followed.
     """
     require_psf(psf_px)
     from cmmsim.detection.fit_kernels import UNKNOWNS, fit_windows
 
     n = len(windows)
-    inner, parameters, misfits = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
-    shapes, covariances = np.empty((n, 2, 2)), np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
+    inner = np.empty((n, 2))
+    parameters = np.empty((n, UNKNOWNS))
+    misfits = np.empty(n)
+    shapes = np.empty((n, 2, 2))
+    covariances = np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
     settings = fit_settings(noise, psf_px, iterations)
     moved = np.zeros((n, 2)) if smears is None else np.ascontiguousarray(smears, dtype=float)
     pixels = np.ascontiguousarray(windows, dtype=float)
@@ -102,7 +120,7 @@ def fit_ellipses(
 
 @lru_cache(maxsize=16)
 def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "FitSettings":
-    """How windows with this noise and point spread are fitted."""
+    """Settings of the fit for windows with this noise and point spread."""
     from cmmsim.detection.fit_kernels import FitSettings
 
     scale = noise.white_level / 255.0
@@ -122,10 +140,12 @@ def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "Fit
 
 
 def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
-    """Fit windows 0 to count, which know nothing of each other, half of them in a second thread where that pays.
+    """Fit windows 0 to count, which know nothing of each other, half of them in a second thread
+    where that pays.
 
-    The thread is a new one each time: it costs 50 us, and a lasting one would be missing in forked processes. Where
-    NUMBA_NUM_THREADS or the machine allows one thread only, as with a process a core, there is no second one.
+    The thread is a new one each time: it costs 50 us, and a lasting one would be missing in forked
+    processes. Where NUMBA_NUM_THREADS or the machine allows one thread only, as with a process a
+    core, there is no second one.
     """
     from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
 
@@ -145,15 +165,15 @@ _GREYS = frozen(np.arange(-64.0, 512.0, 0.25))  # at these of 255 the noise vari
 def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, ground: Array) -> Array:
     """Largest reduced chi-square (n,) of good fits with this contrast and ground, grey values.
 
-    The fit takes each grey value's variance for that over all means. With noise below half a grey value that of an even
-    ground differs, and what is left of the model's own error shows.
+    The fit takes each grey value's variance for that over all means. With noise below half a grey
+    value that of an even ground differs, and what is left of the model's own error shows.
     """
     model = (MODEL_ERROR * contrast) ** 2 / noise.variance(ground)
     return limits.largest_misfit * (noise.rounding_excess(ground) + model)
 
 
 def lies_inside(centres: Array, shapes: Array, size: int) -> NDArray[np.bool_]:
-    """Whether the whole ellipse lies inside the window and is larger than the smallest one."""
+    """Tell whether the whole ellipse lies inside the window and is larger than the smallest one."""
     reach = np.linalg.norm(shapes, axis=2)  # half extent along x and y
     inside = np.all((centres - reach > -0.5) & (centres + reach < size - 0.5), axis=1)
     mean = 0.5 * (shapes[:, 0, 0] + shapes[:, 1, 1])

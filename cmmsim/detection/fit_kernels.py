@@ -1,4 +1,6 @@
-"""Compiled: the maximum-likelihood fit of one ellipse to the grey values of one window, see ``ellipse_fit``."""
+"""Compiled: the maximum-likelihood fit of one ellipse to the grey values of one window, see
+``ellipse_fit``.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +9,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cmmsim.compiled import Array, compiled
+from cmmsim.compilation import Array, compiled
 from cmmsim.detection.start_kernels import bound_radii, moments, start_ellipse
 from cmmsim.geometry.disc_kernels import blur_window, inverse_shape
-from cmmsim.geometry.point_kernels import factor, invert_factored, solve_factored
+from cmmsim.geometry.matrix_kernels import factor, invert_factored, solve_factored
 from cmmsim.geometry.rim_kernels import cover_window
 
 UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 
 
 class FitSettings(NamedTuple):
-    """ring_reach: radii of the ellipse within which pixels are fitted; smallest radius px; largest_step (7,);
-    iterations at most, and the step in px below which they end; psf_px of the point spread, or 0; smear_step px between
-    two places of a moving ellipse whose light is added; variances of grey values from ``first_grey`` on,
-    ``entries_a_grey`` for each."""
+    """ring_reach: radii of the ellipse within which pixels are fitted; smallest radius px;
+    largest_step (7,); iterations at most, and the step in px below which they end; psf_px of the
+    point spread, or 0; smear_step px between two places of a moving ellipse whose light is added;
+    variances of grey values from ``first_grey`` on, ``entries_a_grey`` for each."""
 
     ring_reach: float
     smallest: float
@@ -54,12 +56,21 @@ def accumulate(
     normal: Array,
     right: Array,
 ) -> float:
-    """Add up the normal matrix (7,7), lower triangle, and right-hand side (7,); returns the weighted squared misfit.
+    """Add up the normal matrix (7,7), lower triangle, and right-hand side (7,); returns the
+    weighted squared misfit.
 
-    Pixels wholly outside or inside of the ellipse share a mean, and only their residuals' sums are needed.
+    Pixels wholly outside or inside of the ellipse share a mean, and only their residuals' sums are
+    needed.
     """
-    rows, count, misfit = np.empty((window.size, UNKNOWNS + 2)), 0, 0.0
-    outside, outside_sum, outside_squares, inside, inside_sum, inside_squares = 0, 0.0, 0.0, 0, 0.0, 0.0
+    rows = np.empty((window.size, UNKNOWNS + 2))
+    count = 0
+    misfit = 0.0
+    outside = 0
+    outside_sum = 0.0
+    outside_squares = 0.0
+    inside = 0
+    inside_sum = 0.0
+    inside_squares = 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
             if not mask[row, column]:
@@ -76,14 +87,20 @@ def accumulate(
                 inside_sum += residual
                 inside_squares += residual * residual
             else:
-                weight, change, found = 1.0 / variance_at(mean, settings), derivatives[row, column], rows[count]
+                weight = 1.0 / variance_at(mean, settings)
+                change = derivatives[row, column]
+                found = rows[count]
                 misfit += weight * residual * residual
                 for i in range(5):
                     found[i] = contrast * change[i]
-                found[5], found[6], found[7], found[8] = share, 1.0, residual, weight
+                found[5] = share
+                found[6] = 1.0
+                found[7] = residual
+                found[8] = weight
                 count += 1
     add_products(rows[:count], normal, right)
-    dark, bright = 1.0 / variance_at(ground, settings), 1.0 / variance_at(ground + contrast, settings)
+    dark = 1.0 / variance_at(ground, settings)
+    bright = 1.0 / variance_at(ground + contrast, settings)
     normal[6, 6] += dark * outside + bright * inside
     normal[5, 5] += bright * inside
     normal[6, 5] += bright * inside
@@ -94,10 +111,18 @@ def accumulate(
 
 @compiled
 def add_products(rows: Array, normal: Array, right: Array) -> None:
-    """Fill the normal matrix (7,7) and the right-hand side (7,) of rows (n,9): the slopes by seven parameters, the
-    residual, and the weight. Sums that are variables of their own are added in vector lanes."""
+    """Fill the normal matrix (7,7) and the right-hand side (7,) of rows (n,9): the slopes by seven
+    parameters, the residual, and the weight. Sums that are variables of their own are added in
+    vector lanes."""
     for i in range(UNKNOWNS):
-        s_0, s_1, s_2, s_3, s_4, s_5, s_6, s_7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        s_0 = 0.0
+        s_1 = 0.0
+        s_2 = 0.0
+        s_3 = 0.0
+        s_4 = 0.0
+        s_5 = 0.0
+        s_6 = 0.0
+        s_7 = 0.0
         for n in range(len(rows)):
             row = rows[n]
             weighted = row[8] * row[i]
@@ -110,26 +135,36 @@ def add_products(rows: Array, normal: Array, right: Array) -> None:
             s_6 += weighted * row[6]
             s_7 += weighted * row[7]
         sums = normal[i]
-        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], right[i] = (
-            s_0, s_1, s_2, s_3, s_4, s_5, s_6, s_7,
-        )  # fmt: skip
+        sums[0] = s_0
+        sums[1] = s_1
+        sums[2] = s_2
+        sums[3] = s_3
+        sums[4] = s_4
+        sums[5] = s_5
+        sums[6] = s_6
+        right[i] = s_7  # fmt: skip
 
 
 @compiled
 def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int:
     """Mark the pixels within ``reach`` radii of the ellipse; returns their number."""
-    m, count = inverse_shape(shape), 0
+    m = inverse_shape(shape)
+    count = 0
     for row in range(mask.shape[0]):
         for column in range(mask.shape[1]):
-            x, y = column - parameters[0], row - parameters[1]
-            mask[row, column] = ((m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2) < reach * reach
+            x = column - parameters[0]
+            y = row - parameters[1]
+            mask[row, column] = (
+                (m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2
+            ) < reach * reach
             count += mask[row, column]
     return count
 
 
 @compiled
 def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, size: int) -> float:
-    """Add a step (7,), cut to its largest values, and keep the centre in the window and the radii between limits.
+    """Add a step (7,), cut to its largest values, and keep the centre in the window and the radii
+    between limits.
 
     Returns how far the ellipse was to move, px.
     """
@@ -150,7 +185,10 @@ def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, si
 @compiled
 def set_shape(parameters: Array, shape: Array) -> None:
     """The matrix A (2,2) of an ellipse's parameters."""
-    shape[0, 0], shape[0, 1], shape[1, 0], shape[1, 1] = parameters[2], parameters[3], parameters[3], parameters[4]
+    shape[0, 0] = parameters[2]
+    shape[0, 1] = parameters[3]
+    shape[1, 0] = parameters[3]
+    shape[1, 1] = parameters[4]
 
 
 @compiled
@@ -165,8 +203,12 @@ def light_of_still(
 
 
 @compiled
-def add_light(shares: Array, derivatives: Array, weight: float, to_shares: Array, to_derivatives: Array) -> None:
-    """Add shares (h, w) and derivatives (h, w, 5), weighted, to others; whole-array sums would compile for seconds."""
+def add_light(
+    shares: Array, derivatives: Array, weight: float, to_shares: Array, to_derivatives: Array
+) -> None:
+    """Add shares (h, w) and derivatives (h, w, 5), weighted, to others; whole-array sums would
+    compile for seconds.
+    """
     for row in range(shares.shape[0]):
         for column in range(shares.shape[1]):
             to_shares[row, column] += weight * shares[row, column]
@@ -176,15 +218,22 @@ def add_light(shares: Array, derivatives: Array, weight: float, to_shares: Array
 
 @compiled
 def light_of_moving(
-    parameters: Array, shape: Array, smear: Array, settings: FitSettings, shares: Array, derivatives: Array
+    parameters: Array,
+    shape: Array,
+    smear: Array,
+    settings: FitSettings,
+    shares: Array,
+    derivatives: Array,
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly by ``smear`` (2,) px during
-    the exposure, by the midpoint rule; its parameters are those in the middle."""
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly by
+    ``smear`` (2,) px during the exposure, by the midpoint rule; its parameters are those in the
+    middle."""
     count = math.ceil(math.hypot(smear[0], smear[1]) / settings.smear_step)
     if count <= 1:
         light_of_still(parameters[0], parameters[1], shape, settings.psf_px, shares, derivatives)
         return
-    total, changes = np.zeros(shares.shape), np.zeros(derivatives.shape)
+    total = np.zeros(shares.shape)
+    changes = np.zeros(derivatives.shape)
     for k in range(count):
         part = (k + 0.5) / count - 0.5
         light_of_still(
@@ -203,23 +252,33 @@ def light_of_moving(
 
 @compiled
 def fit_window(
-    window: Array, smear: Array, settings: FitSettings, parameters: Array, shape: Array, covariance: Array
+    window: Array,
+    smear: Array,
+    settings: FitSettings,
+    parameters: Array,
+    shape: Array,
+    covariance: Array,
 ) -> float:
     """Gauss-Newton from ``parameters`` (7,), which it moves; returns the reduced chi-square.
 
-    It ends when the ellipse moves by less than ``converged`` px: the normal matrix and the misfit of that last step
-    are those of the result. Fills the ellipse's ``shape`` (2,2) and the ``covariance`` (m,m) of its first m parameters.
+    It ends when the ellipse moves by less than ``converged`` px: the normal matrix and the misfit
+    of that last step are those of the result. Fills the ellipse's ``shape`` (2,2) and the
+    ``covariance`` (m,m) of its first m parameters.
     """
     size = len(window)
     mask = np.empty((size, size), np.bool_)
-    shares, derivatives = np.empty((size, size)), np.empty((size, size, 5))
-    normal, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    shares = np.empty((size, size))
+    derivatives = np.empty((size, size, 5))
+    normal = np.empty((UNKNOWNS, UNKNOWNS))
+    right = np.empty(UNKNOWNS)
     set_shape(parameters, shape)
     freedom = max(mask_ring(parameters, shape, settings.ring_reach, mask) - UNKNOWNS, 1)
     misfit = 0.0
     for iteration in range(settings.iterations + 1):
         light_of_moving(parameters, shape, smear, settings, shares, derivatives)
-        misfit = accumulate(window, mask, shares, derivatives, parameters[5], parameters[6], settings, normal, right)
+        misfit = accumulate(
+            window, mask, shares, derivatives, parameters[5], parameters[6], settings, normal, right
+        )
         for k in range(UNKNOWNS):
             normal[k, k] += 1e-9
         factor(normal)
@@ -246,11 +305,11 @@ def fit_windows(
     covariances: Array,
     misfits: Array,
 ) -> None:
-    """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats, which moved by ``smears``
-    (n,2) px during the exposure.
+    """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats, which
+    moved by ``smears`` (n,2) px during the exposure.
 
-    Fills the corners (n,2) of these parts, and in their px the parameters (n,7), shapes (n,2,2), covariances (n,m,m) of
-    the first m parameters and misfits (n,).
+    Fills the corners (n,2) of these parts, and in their px the parameters (n,7), shapes (n,2,2),
+    covariances (n,m,m) of the first m parameters and misfits (n,).
     """
     for k in range(len(windows)):
         spot = moments(windows[k])
@@ -260,4 +319,5 @@ def fit_windows(
         part = windows[k, top : top + size, left : left + size]
         start_ellipse(moments(part) if room else spot, size, parameters[k])
         misfits[k] = fit_window(part, smears[k], settings, parameters[k], shapes[k], covariances[k])
-        corners[k, 0], corners[k, 1] = left, top
+        corners[k, 0] = left
+        corners[k, 1] = top

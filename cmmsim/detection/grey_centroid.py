@@ -1,12 +1,14 @@
 """Centre of a bright spot as the centroid of its grey values above a threshold.
 
-A pixel weighs what it has above ground + THRESHOLD * contrast, and nothing below: the weight is continuous, so that
-noise at the threshold moves the centroid smoothly. Pixels that may lie beyond the dark ring do not count.
+A pixel weighs what it has above ground + THRESHOLD * contrast, and nothing below: the weight is
+continuous, so that noise at the threshold moves the centroid smoothly. Pixels that may lie beyond
+the dark ring do not count.
 
-The centroid is biased: a pixel's light acts as if it all fell on the pixel's middle, and the threshold takes away more
-on one side of the spot than on the other. The bias depends on where the centre lies within its pixel. Noise-free and
-sharp, tilted by 45 degrees, it is about 0.01 px rms at radius 3.8 px, 0.013 at 2.5 and 0.005 at 10; a point spread of
-0.6 px halves it. It is no part of the covariance.
+The centroid is biased: a pixel's light acts as if it all fell on the pixel's middle, and the
+threshold takes away more on one side of the spot than on the other. The bias depends on where the
+centre lies within its pixel. Noise-free and sharp, tilted by 45 degrees, it is about 0.01 px rms at
+radius 3.8 px, 0.013 at 2.5 and 0.005 at 10; a point spread of 0.6 px halves it. It is no part of
+the covariance.
 """
 
 from dataclasses import dataclass
@@ -26,9 +28,10 @@ CORE_THRESHOLD = 0.4  # the same where only the spot itself is wanted, whatever 
 class BrightSpots:
     """n windows cut down to the surroundings of their bright spots.
 
-    windows (n, h, h) grey values; corners (n, 2) full-image pixel (x, y) of each first pixel; contrast (n,) grey
-    values; weights (n, h, h) of the centroid; within (n, h, h) whether a pixel counts; centroids (n, 2) px in the
-    window; spreads (n, 2, 2) px² second moments of the spot's core.
+    windows (n, h, h) grey values; corners (n, 2) full-image pixel (x, y) of each first pixel;
+    contrast (n,) grey values; weights (n, h, h) of the centroid; within (n, h, h) whether a pixel
+    counts; centroids (n, 2) px in the window; spreads (n, 2, 2) px² second moments of the spot's
+    core.
     """
 
     windows: Array
@@ -46,7 +49,9 @@ def detect_by_centroid(given: SpotWindows) -> DetectedCentres:
         return no_centres()
     spots = bright_spots(given)
     x, y = _offsets(spots.centroids, given.fit_size)
-    influence = (spots.weights > 0.0) / _total(spots.weights)[:, None, None]  # a threshold pixel has derivative 0 or 1
+    influence = (spots.weights > 0.0) / _total(spots.weights)[
+        :, None, None
+    ]  # a threshold pixel has derivative 0 or 1
     jacobian = np.stack([x * influence, y * influence], axis=1)
     variance = given.noise.variance(spots.windows)
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
@@ -61,31 +66,42 @@ GREY_CENTROID = Detector("grey_centroid", detect_by_centroid, 0.009)
 
 def bright_spots(given: SpotWindows) -> BrightSpots:
     """Find the bright spot of each window and keep the part around it that is to be looked at."""
-    values, size = given.windows.astype(float), given.fit_size
+    values = given.windows.astype(float)
+    size = given.fit_size
     rough = _centroids(_weights(values, CORE_THRESHOLD)[0])
     first = np.clip(np.rint(rough - 0.5 * (size - 1)).astype(int), 0, values.shape[1] - size)
     ticks = np.arange(size)
-    rows, columns = first[:, 1, None] + ticks, first[:, 0, None] + ticks
+    rows = first[:, 1, None] + ticks
+    columns = first[:, 0, None] + ticks
     parts = values[np.arange(len(values))[:, None, None], rows[:, :, None], columns[:, None, :]]
     core, contrast = _weights(parts, CORE_THRESHOLD)
     middles = _centroids(core)
     spreads = _spreads(core, middles)
     within = _within_ring(middles, spreads, size)
     weights = _weights(parts, THRESHOLD)[0] * within
-    return BrightSpots(parts, given.corners + first, contrast, weights, within, _centroids(weights), spreads)
+    return BrightSpots(
+        parts, given.corners + first, contrast, weights, within, _centroids(weights), spreads
+    )
 
 
-def whole_inside(centres: Array, spreads: Array, size: int, margin: float = 0.0) -> NDArray[np.bool_]:
-    """Whether ellipses with these centres (n,2) and second moments (n,2,2) lie wholly inside their windows, ``margin``
-    px away from the sides."""
+def whole_inside(
+    centres: Array, spreads: Array, size: int, margin: float = 0.0
+) -> NDArray[np.bool_]:
+    """Tell whether ellipses with these centres (n,2) and second moments (n,2,2) lie wholly inside
+    their windows, ``margin`` px away from the sides.
+    """
     reach = 2.0 * np.sqrt(np.maximum(np.diagonal(spreads, axis1=1, axis2=2), 0.0))
-    return np.all((centres - reach > margin - 0.5) & (centres + reach < size - margin - 0.5) & (reach > 0.0), axis=1)
+    return np.all(
+        (centres - reach > margin - 0.5) & (centres + reach < size - margin - 0.5) & (reach > 0.0),
+        axis=1,
+    )
 
 
 def _weights(windows: Array, threshold: float) -> tuple[Array, Array]:
     """Grey values above the threshold (n, h, h) and contrast (n,).
 
-    Ground and contrast are medians below and above the middle between the darkest and the brightest pixel.
+    Ground and contrast are medians below and above the middle between the darkest and the brightest
+    pixel.
     """
     flat = np.sort(windows.reshape(len(windows), -1), axis=1)
     count = flat.shape[1]
@@ -102,18 +118,26 @@ def _total(weights: Array) -> Array:
 
 def _centroids(weights: Array) -> Array:
     ticks = np.arange(weights.shape[1], dtype=float)
-    return np.stack([weights.sum(axis=1) @ ticks, weights.sum(axis=2) @ ticks], axis=1) / _total(weights)[:, None]
+    return (
+        np.stack([weights.sum(axis=1) @ ticks, weights.sum(axis=2) @ ticks], axis=1)
+        / _total(weights)[:, None]
+    )
 
 
 def _spreads(weights: Array, centroids: Array) -> Array:
     x, y = _offsets(centroids, weights.shape[1])
     cross = (weights * x * y).sum(axis=(1, 2))
-    flat = np.stack([(weights * x * x).sum(axis=(1, 2)), cross, cross, (weights * y * y).sum(axis=(1, 2))], axis=1)
+    flat = np.stack(
+        [(weights * x * x).sum(axis=(1, 2)), cross, cross, (weights * y * y).sum(axis=(1, 2))],
+        axis=1,
+    )
     return (flat / _total(weights)[:, None]).reshape(-1, 2, 2)
 
 
 def _within_ring(centroids: Array, spreads: Array, size: int) -> NDArray[np.bool_]:
-    """Pixels (n, size, size) nearer than the dark ring's rim; an ellipse with radius r has second moment r² / 4."""
+    """Pixels (n, size, size) nearer than the dark ring's rim; an ellipse with radius r has second
+    moment r² / 4.
+    """
     x, y = _offsets(centroids, size)
     inverse = np.linalg.inv(spreads + 1e-3 * np.eye(2))[..., None, None]
     reach = inverse[:, 0, 0] * x * x + 2.0 * inverse[:, 0, 1] * x * y + inverse[:, 1, 1] * y * y
@@ -123,4 +147,6 @@ def _within_ring(centroids: Array, spreads: Array, size: int) -> NDArray[np.bool
 def _offsets(centroids: Array, size: int) -> tuple[Array, Array]:
     """x (n, 1, size) and y (n, size, 1) of all pixels from the centroids, px."""
     ticks = np.arange(size, dtype=float)
-    return ticks[None, None, :] - centroids[:, 0, None, None], ticks[None, :, None] - centroids[:, 1, None, None]
+    return ticks[None, None, :] - centroids[:, 0, None, None], ticks[None, :, None] - centroids[
+        :, 1, None, None
+    ]

@@ -1,4 +1,6 @@
-"""Compiled: where the fit of an ellipse starts, from the ranks and moments of a window's grey values."""
+"""Compiled: where the fit of an ellipse starts, from the ranks and moments of a window's grey
+values.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +8,11 @@ import math
 
 import numpy as np
 
-from cmmsim.compiled import Array, compiled
+from cmmsim.compilation import Array, compiled
 
-CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
+CORE_SHARE = (
+    0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
+)
 SMALLEST_START_PX = 1.2
 RANK_STEPS = 256  # a grey value each at 8 bit
 
@@ -16,11 +20,14 @@ RANK_STEPS = 256  # a grey value each at 8 bit
 @compiled
 def nth_smallest(values: Array, n: int) -> float:
     """The value with ``n`` smaller ones (Hoare's selection); reorders ``values``."""
-    first, last = 0, len(values) - 1
+    first = 0
+    last = len(values) - 1
     if last > 0 and all_alike(values):
         return values[0]
     while first < last:
-        pivot, low, high = values[n], first, last
+        pivot = values[n]
+        low = first
+        high = last
         while low <= high:
             while values[low] < pivot:
                 low += 1
@@ -28,7 +35,8 @@ def nth_smallest(values: Array, n: int) -> float:
                 high -= 1
             if low <= high:
                 values[low], values[high] = values[high], values[low]
-                low, high = low + 1, high - 1
+                low = low + 1
+                high = high - 1
         if high < n:
             first = low
         if n < low:
@@ -38,7 +46,7 @@ def nth_smallest(values: Array, n: int) -> float:
 
 @compiled
 def all_alike(values: Array) -> bool:
-    """Whether all values are the same number."""
+    """Tell whether all values are the same number."""
     different = 0
     for value in values:
         different += value != values[0]
@@ -47,18 +55,24 @@ def all_alike(values: Array) -> bool:
 
 @compiled
 def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
-    """The values of a window (h, w) with ``low_rank`` and with ``high_rank`` smaller ones; all are finite.
+    """The values of a window (h, w) with ``low_rank`` and with ``high_rank`` smaller ones; all are
+    finite.
 
-    They are counted in even steps from the smallest to the largest, and sorted only within the steps that hold these.
+    They are counted in even steps from the smallest to the largest, and sorted only within the
+    steps that hold these.
     """
-    width, smallest, largest = window.shape[1], window[0, 0], window[0, 0]
+    width = window.shape[1]
+    smallest = window[0, 0]
+    largest = window[0, 0]
     for row in range(window.shape[0]):
         for column in range(width):
             value = window[row, column]
-            smallest, largest = value if value < smallest else smallest, value if value > largest else largest
+            smallest = value if value < smallest else smallest
+            largest = value if value > largest else largest
     if smallest == largest:
         return smallest, largest
-    scale, counts = (RANK_STEPS - 1) / (largest - smallest), np.zeros(RANK_STEPS, np.int32)
+    scale = (RANK_STEPS - 1) / (largest - smallest)
+    counts = np.zeros(RANK_STEPS, np.int32)
     steps = np.empty(window.shape, np.int32)
     for row in range(window.shape[0]):
         for column in range(width):
@@ -66,9 +80,11 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
             counts[steps[row, column]] += 1
     low, low_before = step_of_rank(counts, low_rank)
     high, high_before = step_of_rank(counts, high_rank)
-    found, count = np.empty((2, window.size + 1)), np.zeros(2, np.int64)
+    found = np.empty((2, window.size + 1))
+    count = np.zeros(2, np.int64)
     for row in range(window.shape[0]):
-        for column in range(width):  # a place is taken by the next one where the value was none to be kept
+        # a place is taken by the next one where the value was none to be kept
+        for column in range(width):
             found[0, count[0]] = found[1, count[1]] = window[row, column]
             count[0] += steps[row, column] == low
             count[1] += steps[row, column] == high
@@ -81,7 +97,8 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
 @compiled
 def step_of_rank(counts: Array, rank: int) -> tuple:
     """The step in which the value with ``rank`` smaller ones falls, and how many fall before."""
-    step, before = 0, 0
+    step = 0
+    before = 0
     while before + counts[step] <= rank:
         before += counts[step]
         step += 1
@@ -90,10 +107,17 @@ def step_of_rank(counts: Array, rank: int) -> tuple:
 
 @compiled
 def moments(window: Array) -> tuple:
-    """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w) of floats."""
+    """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w)
+    of floats.
+    """
     ground, bright = two_of_rank(window, window.size // 3, window.size - 6)
     contrast = max(bright - ground, 1.0)
-    area, x, y, xx, xy, yy = 1e-300, 0.0, 0.0, 0.0, 0.0, 0.0
+    area = 1e-300
+    x = 0.0
+    y = 0.0
+    xx = 0.0
+    xy = 0.0
+    yy = 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
             if window[row, column] - ground < 0.9 * CORE_SHARE * contrast:
@@ -107,31 +131,82 @@ def moments(window: Array) -> tuple:
                 xx += share * column * column
                 xy += share * column * row
                 yy += share * row * row
-    x, y = x / area, y / area
+    x = x / area
+    y = y / area
     return ground, contrast, x, y, xx / area - x * x, xy / area - x * y, yy / area - y * y
 
 
 @compiled
 def bound_radii(xx: float, xy: float, yy: float, lowest: float, highest: float) -> tuple:
-    """A symmetric (2,2) matrix with its eigenvalues kept between two limits, given and returned as xx, xy, yy."""
-    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-    large, small = mean + half, mean - half
+    """A symmetric (2,2) matrix with its eigenvalues kept between two limits, given and returned as
+    xx, xy, yy.
+    """
+    mean = 0.5 * (xx + yy)
+    half = math.hypot(0.5 * (xx - yy), xy)
+    large = mean + half
+    small = mean - half
     if small >= lowest and large <= highest:
         return xx, xy, yy
-    bounded_large, bounded_small = min(max(large, lowest), highest), min(max(small, lowest), highest)
+    bounded_large = min(max(large, lowest), highest)
+    bounded_small = min(max(small, lowest), highest)
     if half == 0.0:
         return bounded_large, 0.0, bounded_large
-    scale, middle = (bounded_large - bounded_small) / (2.0 * half), 0.5 * (bounded_large + bounded_small)
+    scale = (bounded_large - bounded_small) / (2.0 * half)
+    middle = 0.5 * (bounded_large + bounded_small)
     return middle + scale * (xx - mean), scale * xy, middle + scale * (yy - mean)
 
 
 @compiled
 def start_ellipse(spot: tuple, size: int, parameters: Array) -> None:
-    """First parameters (7,) from the moments of a window of ``size`` px; a uniform ellipse has spread A A / 4."""
+    """First parameters (7,) from the moments of a window of ``size`` px; a uniform ellipse has
+    spread A A / 4.
+    """
     ground, contrast, x, y, xx, xy, yy = spot
     xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * SMALLEST_START_PX) ** 2, (0.25 * size) ** 2)
     root = math.sqrt(xx * yy - xy * xy)
-    scale = 2.0 / math.sqrt(xx + yy + 2.0 * root)  # the root of a matrix M is (M + sqrt(det) 1) / sqrt(...)
-    parameters[0], parameters[1] = x, y
-    parameters[2], parameters[3], parameters[4] = scale * (xx + root), scale * xy, scale * (yy + root)
-    parameters[5], parameters[6] = contrast, ground
+    # the root of a matrix M is (M + sqrt(det) 1) / sqrt(...)
+    scale = 2.0 / math.sqrt(xx + yy + 2.0 * root)
+    parameters[0] = x
+    parameters[1] = y
+    parameters[2] = scale * (xx + root)
+    parameters[3] = scale * xy
+    parameters[4] = scale * (yy + root)
+    parameters[5] = contrast
+    parameters[6] = ground
+
+
+@compiled
+def isolate_dots(
+    windows: Array, centres: Array, inverses: Array, ground_from: float, reach: float
+) -> None:
+    """Set the pixels of windows (n,h,w) beyond ``reach`` dot radii to the median of those from
+    ``ground_from`` radii to there, or to 0 where there are none.
+
+    Parameters: centres (n,2) px of the window; inverses (n,2,2) that carry px to dot radii.
+    """
+    _, height, width = windows.shape
+    distances = np.empty((height, width))
+    around = np.empty(height * width)
+    for n in range(len(windows)):
+        count = 0
+        m = inverses[n]
+        for row in range(height):
+            for column in range(width):
+                x = column - centres[n, 0]
+                y = row - centres[n, 1]
+                distance = math.sqrt(
+                    (m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2
+                )
+                distances[row, column] = distance
+                if ground_from < distance <= reach:
+                    around[count] = windows[n, row, column]
+                    count += 1
+        ground = 0.0
+        if count:
+            ground = nth_smallest(around[:count], count // 2)
+            if count % 2 == 0:
+                ground = 0.5 * (ground + nth_smallest(around[:count], count // 2 - 1))
+        for row in range(height):
+            for column in range(width):
+                if distances[row, column] > reach:
+                    windows[n, row, column] = ground

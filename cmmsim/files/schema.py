@@ -1,4 +1,4 @@
-"""What may stand in a sensor file (TOML), with units."""
+"""Schema of a sensor file (TOML), with units."""
 
 from __future__ import annotations
 
@@ -7,17 +7,34 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from cmmsim.checks import Section
+from cmmsim.checks import Section, check_name
 from cmmsim.errors import SensorFileError
 from cmmsim.geometry.pose import Array
 from cmmsim.plugins import AUTO, DEFAULT_DETECTOR, require_detector, require_renderer
+from cmmsim.quantities import (
+    Angle,
+    Component,
+    Distance,
+    Distortion,
+    Duration,
+    Electrons,
+    Frequency,
+    Grey,
+    GreyPerElectron,
+    ImagePlace,
+    Length,
+    Pixels,
+    Place,
+)
 
-Vector3 = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
+Vector3 = tuple[Place, Place, Place]
+Turn3 = tuple[Angle, Angle, Angle]
+Direction3 = tuple[Component, Component, Component]
 Level = Annotated[int, Field(ge=0, le=255)]
 WIDEST_JITTER = 3.0  # standard deviations: no frame's latency is farther from the mean
-NARROWEST_PSF = 0.1  # px: a narrower point spread is lost between the points that images are drawn on
+NARROWEST_PSF = (
+    0.1  # px: a narrower point spread is lost between the points that images are drawn on
+)
 
 
 def quantity(default: Any, unit: str, what: str) -> Any:
@@ -26,13 +43,23 @@ def quantity(default: Any, unit: str, what: str) -> Any:
 
 
 class Timing(Section):
-    """When the sensor looks, and when its poses can be used; a measured pose is that in the middle of its exposure."""
+    """When the sensor looks, and when its poses can be used; a measured pose is that in the middle
+    of its exposure.
+    """
 
-    frame_rate: Positive = quantity(..., "Hz", "stereo frames a second")
-    exposure: NotNegative = quantity(0.0, "s", "time in which a picture gathers light; 0 is an instant")
-    latency: NotNegative = quantity(0.0, "s", "mean delay from the middle of the exposure to the use of the pose")
-    latency_jitter: NotNegative = quantity(0.0, "s", "standard deviation of the latency from frame to frame")
-    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = quantity(0.0, "", "probability that a frame is lost")
+    frame_rate: Frequency = quantity(..., "Hz", "stereo frames a second")
+    exposure: Duration = quantity(
+        0.0, "s", "time in which a picture gathers light; 0 is an instant"
+    )
+    latency: Duration = quantity(
+        0.0, "s", "mean delay from the middle of the exposure to the use of the pose"
+    )
+    latency_jitter: Duration = quantity(
+        0.0, "s", "standard deviation of the latency from frame to frame"
+    )
+    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = quantity(
+        0.0, "", "probability that a frame is lost"
+    )
 
     @model_validator(mode="after")
     def _possible(self) -> Timing:
@@ -42,7 +69,10 @@ class Timing(Section):
                 f"{1.0 / self.frame_rate:.4g} s"
             )
         if self.latency_jitter > self.latency:
-            raise ValueError(f"latency_jitter {self.latency_jitter:g} s is larger than latency {self.latency:g} s")
+            raise ValueError(
+                f"latency_jitter {self.latency_jitter:g} s is larger than latency "
+                f"{self.latency:g} s"
+            )
         return self
 
     @property
@@ -51,10 +81,12 @@ class Timing(Section):
         return self.latency + self._widest_deviation
 
     def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array:
-        """Latency of each frame (frames,), s, from the middle of its exposure to the use of its pose.
+        """Latency of each frame (frames,), s, from the middle of its exposure to the use of its
+        pose.
 
-        Normal about ``latency`` with standard deviation ``latency_jitter``, clipped on both sides to 3 of those or to
-        the latency itself, whichever is less: none is negative, and the mean stays the stated latency.
+        Normal about ``latency`` with standard deviation ``latency_jitter``, clipped on both sides
+        to 3 of those or to the latency itself, whichever is less: none is negative, and the mean
+        stays the stated latency.
         """
         widest = self._widest_deviation
         return self.latency + np.clip(rng.normal(0.0, self.latency_jitter, frames), -widest, widest)
@@ -67,35 +99,41 @@ class Timing(Section):
 class Calibrated(Section):
     """A camera as calibrated; distortion in OpenCV's order and meaning."""
 
-    focal_px: tuple[Positive, Positive] = quantity(..., "px", "focal lengths along x and y")
-    centre_px: tuple[float, float] = quantity(..., "px", "principal point")
-    distortion: tuple[float, float, float, float, float] = quantity(
+    focal_px: tuple[Pixels, Pixels] = quantity(..., "px", "focal lengths along x and y")
+    centre_px: tuple[ImagePlace, ImagePlace] = quantity(..., "px", "principal point")
+    distortion: tuple[Distortion, Distortion, Distortion, Distortion, Distortion] = quantity(
         (0.0, 0.0, 0.0, 0.0, 0.0), "", "k1, k2, p1, p2, k3 of Brown and Conrady"
     )
 
 
 class RightFromLeft(Section):
-    """Where the right camera stands: x_right = R(rotation_vector) x_left + translation."""
+    """Place of the right camera: x_right = R(rotation_vector) x_left + translation."""
 
-    translation: Vector3 = quantity(..., "m", "place of the left camera's origin in the right camera's frame")
-    rotation_vector: Vector3 = quantity(..., "rad", "rotation from the left camera's frame to the right one's")
+    translation: Vector3 = quantity(
+        ..., "m", "place of the left camera's origin in the right camera's frame"
+    )
+    rotation_vector: Turn3 = quantity(
+        ..., "rad", "rotation from the left camera's frame to the right one's"
+    )
 
 
 class Rig(Section):
     """Both cameras and where they stand.
 
-    distance, where given: the position is moved along its line to the target to stand that far from it.
-    left and right, where given, replace focal_px and the principal point in the middle of the image; right_from_left
-    replaces the baseline and the toe-in towards the target.
+    distance, where given: the position is moved along its line to the target to stand that far from
+    it. left and right, where given, replace focal_px and the principal point in the middle of the
+    image; right_from_left replaces the baseline and the toe-in towards the target.
     """
 
-    baseline: Positive = quantity(..., "m", "distance between the cameras")
-    focal_px: Positive = quantity(..., "px", "focal length")
-    width: Annotated[int, Field(ge=64)] = quantity(..., "px", "width of an image")
-    height: Annotated[int, Field(ge=64)] = quantity(..., "px", "height of an image")
+    baseline: Length = quantity(..., "m", "distance between the cameras")
+    focal_px: Pixels = quantity(..., "px", "focal length")
+    width: Annotated[int, Field(ge=64, le=20_000)] = quantity(..., "px", "width of an image")
+    height: Annotated[int, Field(ge=64, le=20_000)] = quantity(..., "px", "height of an image")
     position: Vector3 = quantity(..., "m", "middle of the baseline in the base frame")
     target: Vector3 = quantity(..., "m", "point at which both cameras look, in the base frame")
-    distance: Positive | None = quantity(None, "m", "distance from the middle of the baseline to the target")
+    distance: Length | None = quantity(
+        None, "m", "distance from the middle of the baseline to the target"
+    )
     left: Calibrated | None = None
     right: Calibrated | None = None
     right_from_left: RightFromLeft | None = None
@@ -104,41 +142,47 @@ class Rig(Section):
     def _at_its_distance(self) -> Rig:
         if self.distance is not None:
             away = unit(np.subtract(self.position, self.target))
-            self.__dict__["position"] = tuple((np.array(self.target) + self.distance * away).tolist())
+            self.__dict__["position"] = tuple(
+                (np.array(self.target) + self.distance * away).tolist()
+            )
         return self
 
 
 class Camera(Section):
     """EMVA 1288 figures.
 
-    noise = false leaves out all noise, the pattern of prnu and dsnu too; pattern_seed makes another specimen.
+    noise = false leaves out all noise, the pattern of prnu and dsnu too; pattern_seed makes another
+    specimen.
     """
 
-    electrons_at_white: Positive = quantity(..., "electrons", "electrons of a white pixel")
-    gain: Positive = quantity(..., "grey values per electron", "grey values per electron")
-    dark_noise: NotNegative = quantity(..., "electrons", "dark noise, rms")
-    full_well: Positive = quantity(..., "electrons", "electrons that a pixel holds")
-    black_level: NotNegative = quantity(0.0, "grey values", "grey value of black")
+    electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a white pixel")
+    gain: GreyPerElectron = quantity(..., "grey values per electron", "grey values per electron")
+    dark_noise: Electrons = quantity(..., "electrons", "dark noise, rms")
+    full_well: Electrons = quantity(..., "electrons", "electrons that a pixel holds")
+    black_level: Grey = quantity(0.0, "grey values", "grey value of black")
     noise: bool = quantity(True, "", "whether pictures have noise")
     bit_depth: Literal[8, 10, 12] = quantity(8, "bit", "bits of a grey value")
     prnu: Annotated[float, Field(ge=0.0, le=0.2)] = quantity(
         0.0, "", "relative differences between the gains of pixels, rms"
     )
-    dsnu: NotNegative = quantity(0.0, "electrons", "differences between the dark levels of pixels, rms")
+    dsnu: Electrons = quantity(
+        0.0, "electrons", "differences between the dark levels of pixels, rms"
+    )
     pattern_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "which specimen of a camera")
 
     @model_validator(mode="after")
     def _black_below_white(self) -> Camera:
         if self.black_level >= 2**self.bit_depth - 1:
             raise ValueError(
-                f"black_level {self.black_level:g} must lie below the largest grey value of bit_depth "
+                f"black_level {self.black_level:g} must lie below the largest grey value of "
+                "bit_depth "
                 f"{self.bit_depth}, {2**self.bit_depth - 1}"
             )
         return self
 
 
 class Lens(Section):
-    """What both lenses do beside the distortion that stands with each camera.
+    """Effects of both lenses beside the distortion that stands with each camera.
 
     The vignetting grows with the square of the distance from the principal point.
     """
@@ -158,9 +202,11 @@ class Lens(Section):
 
 
 class Detection(Section):
-    """detector: which one finds the centres of stickers in windows when poses are measured, see :mod:`cmmsim.plugins`.
+    """detector: which one finds the centres of stickers in windows when poses are measured, see
+    :mod:`cmmsim.plugins`.
 
-    Teaching always takes the maximum-likelihood one, whichever is named here; see :mod:`cmmsim.teaching`.
+    Teaching always takes the maximum-likelihood one, whichever is named here; see
+    :mod:`cmmsim.teaching`.
     """
 
     detector: Annotated[str, AfterValidator(require_detector)] = quantity(
@@ -171,12 +217,13 @@ class Detection(Section):
 class Stickers(Section):
     """Bright discs in dark rings.
 
-    per_plane: that many stickers on each plane of the platform instead of those listed there, evenly on an ellipse.
+    per_plane: that many stickers on each plane of the platform instead of those listed there,
+    evenly on an ellipse.
     """
 
-    radius: Positive = quantity(..., "m", "radius of a sticker")
-    ring_radius: Positive = quantity(..., "m", "radius of the dark ring around a sticker")
-    placement: tuple[NotNegative, NotNegative] = quantity(
+    radius: Length = quantity(..., "m", "radius of a sticker")
+    ring_radius: Length = quantity(..., "m", "radius of the dark ring around a sticker")
+    placement: tuple[Distance, Distance] = quantity(
         (0.0, 0.0), "m", "smallest and largest distance of a sticker from its nominal place"
     )
     placement_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "which places of the stickers")
@@ -185,7 +232,9 @@ class Stickers(Section):
     body_level: Level = quantity(..., "", "grey level of the bodies, of 255")
     obstacle_level: Level = quantity(..., "", "grey level of what stands in the way, of 255")
     background_level: Level = quantity(0, "", "grey level of the background, of 255")
-    per_plane: Annotated[int, Field(ge=3)] | None = quantity(None, "", "stickers on each plane of the platform")
+    per_plane: Annotated[int, Field(ge=3, le=1000)] | None = quantity(
+        None, "", "stickers on each plane of the platform"
+    )
 
     @model_validator(mode="after")
     def _bright_on_dark(self) -> Stickers:
@@ -201,7 +250,8 @@ class Stickers(Section):
             )
         if self.placement[0] > self.placement[1]:
             raise ValueError(
-                f"placement {list(self.placement)} m is the smallest and the largest distance, in this order"
+                f"placement {list(self.placement)} m is the smallest and the largest distance, in "
+                "this order"
             )
         return self
 
@@ -209,15 +259,15 @@ class Stickers(Section):
 class HalfSpace(Section):
     """normal outwards, any length; point on the plane, m."""
 
-    normal: Vector3
+    normal: Direction3
     point: Vector3
 
 
 class StickerPlane(HalfSpace):
     """across gives the u axis; stickers are nominal places [u, v], m from the point."""
 
-    across: Vector3
-    stickers: Annotated[list[tuple[float, float]], Field(min_length=3)]
+    across: Direction3
+    stickers: Annotated[list[tuple[Place, Place]], Field(min_length=3)]
 
 
 class Planes(Section):
@@ -238,20 +288,24 @@ class Body(Section):
 class Platform(Body):
     """The moving body; home is its pose at teaching, [m, rad]."""
 
-    home: tuple[float, float, float, float, float, float] = quantity(..., "m, rad", "pose of the platform at teaching")
+    home: tuple[Place, Place, Place, Angle, Angle, Angle] = quantity(
+        ..., "m, rad", "pose of the platform at teaching"
+    )
 
 
 class SensorFile(Section):
     """A whole sensor file.
 
-    based_on: a built-in sensor, or a file beside this one, whose entries hold where this file has none; note: what a
-    user must know of the figures, such as that they are assumed; renderer: which one draws, see
-    :mod:`cmmsim.plugins`; "auto" takes pyrender where OpenGL works, else analytic.
+    based_on: a built-in sensor, or a file beside this one, whose entries hold where this file has
+    none; note: what a user must know of the figures, such as that they are assumed; renderer: which
+    one draws, see :mod:`cmmsim.plugins`; "auto" takes pyrender where OpenGL works, else analytic.
     """
 
-    name: str = quantity(..., "", "name of the sensor")
+    name: Annotated[str, AfterValidator(check_name)] = quantity(..., "", "name of the sensor")
     based_on: str | None = quantity(
-        None, "", "built-in sensor, or file beside this one, whose entries hold where this file has none"
+        None,
+        "",
+        "built-in sensor, or file beside this one, whose entries hold where this file has none",
     )
     note: str = quantity("", "", "what a user must know of the figures")
     renderer: Annotated[str, AfterValidator(require_renderer)] = quantity(

@@ -1,6 +1,8 @@
-"""Reading sensor files (TOML): how a name becomes a file, and a file with changes a checked content.
+"""Reading sensor files (TOML): how a name becomes a file, and a file with changes a checked
+content.
 
-Changes are other entries than a file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested as in it.
+Changes are other entries than a file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested
+as in it.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ from cmmsim.geometry.pose import Array
 
 
 def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Changes by dotted key, whether given so or as tables in tables; a later one replaces an earlier one."""
+    """Changes by dotted key, whether given so or as tables in tables; a later one replaces an
+    earlier one.
+    """
     found: dict[str, Any] = {}
     for key, value in changes.items():
         path = f"{section}{key}"
@@ -34,25 +38,30 @@ def require_keys(name: str | Path, changes: object) -> None:
         return
     if not isinstance(changes, Mapping):
         raise SensorFileError(
-            f"sensor file {name}: changes = {changes!r} must be given by key, as {{'camera.dark_noise': 40.0}}"
+            f"sensor file {name}: changes = {changes!r} must be given by key, as "
+            f"{{'camera.dark_noise': 40.0}}"
         )
     for key, value in changes.items():
         if not isinstance(key, str):
             raise SensorFileError(
-                f"sensor file {name}: key {key!r} of the changes is no name such as 'camera.dark_noise'"
+                f"sensor file {name}: key {key!r} of the changes is no name such as "
+                "'camera.dark_noise'"
             )
         if isinstance(value, Mapping):
             require_keys(name, value)
 
 
 def change(content: dict[str, Any], changes: Mapping[str, Any], source: str) -> None:
-    """Put changes in their places in a file's content; what is no key of it is found later, with the valid names.
+    """Put changes in their places in a file's content; what is no key of it is found later, with
+    the valid names.
 
     source: what the content is of, for messages. Raises SensorFileError for what no change can be.
     """
     for path, value in dotted(changes).items():
         if path == "based_on":
-            raise SensorFileError(f"{source}: based_on = {value!r} cannot be changed; name another sensor")
+            raise SensorFileError(
+                f"{source}: based_on = {value!r} cannot be changed; name another sensor"
+            )
         _replace(content, path, value, source)
 
 
@@ -63,20 +72,26 @@ def _replace(content: dict[str, Any], path: str, value: Any, source: str) -> Non
         if not isinstance(content, dict):
             raise SensorFileError(f"{source}: {section!r} in {path!r} is a value, not a section")
     if isinstance(content.get(key), dict):
-        raise SensorFileError(f"{source}: {path} = {value!r} is a section; its keys are {', '.join(content[key])}")
+        raise SensorFileError(
+            f"{source}: {path} = {value!r} is a section; its keys are {', '.join(content[key])}"
+        )
     content[key] = value
 
 
 def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array:
-    """Places (count, 2) [u, v], m, on the ellipse one standard deviation around the middle of those listed (n, 2).
+    """Places (count, 2) [u, v], m, on the ellipse one standard deviation around the middle of those
+    listed (n, 2).
 
-    Points evenly spaced in angle on an ellipse have the same mean and the same second moments whatever their number is,
-    from three on: n stickers know a plane or a pose sqrt(n) times better than one would.
+    Points evenly spaced in angle on an ellipse have the same mean and the same second moments
+    whatever their number is, from three on: n stickers know a plane or a pose sqrt(n) times better
+    than one would.
     """
     places = np.asarray(listed, dtype=float)
     reach = np.linalg.cholesky(np.cov(places.T, bias=True))
     angle = 2.0 * np.pi * np.arange(count) / count
-    return np.asarray(places.mean(axis=0) + np.column_stack([np.cos(angle), np.sin(angle)]) @ reach.T, dtype=float)
+    return np.asarray(
+        places.mean(axis=0) + np.column_stack([np.cos(angle), np.sin(angle)]) @ reach.T, dtype=float
+    )
 
 
 def closest(places: Array) -> float:
@@ -85,25 +100,45 @@ def closest(places: Array) -> float:
 
 
 def built_in_names() -> list[str]:
-    """Names of the sensors that come with the package."""
+    """Return the names of the sensors that come with the package.
+
+    Returns
+    -------
+    list of str
+
+    Examples
+    --------
+    >>> "ctrack780" in built_in_names()
+    True
+    """
     return sorted(
-        f.name[:-5] for f in resources.files(__package__).joinpath("sensors").iterdir() if f.name.endswith(".toml")
+        f.name[:-5]
+        for f in resources.files(__package__).joinpath("sensors").iterdir()
+        if f.name.endswith(".toml")
     )
 
 
 def sensor_text(name: str | Path) -> str:
     """Text of the sensor file of a built-in name or a path.
 
-    Raises UnknownSensorError for a name that is neither, SensorFileError for a file that cannot be read, and CmmError
-    for what is neither text nor a path.
+    Raises UnknownSensorError for a name that is neither, SensorFileError for a file that cannot be
+    read, and CmmError for what is neither text nor a path.
     """
-    require_kind(name, (str, PathLike), "a sensor must be a built-in name or the path of a TOML file")
+    require_kind(
+        name, (str, PathLike), "a sensor must be a built-in name or the path of a TOML file"
+    )
     if str(name) in built_in_names():
-        return resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
+        return (
+            resources.files(__package__)
+            .joinpath("sensors", f"{name}.toml")
+            .read_text(encoding="utf-8")
+        )
     try:
         is_file = Path(name).is_file()
     except OSError as error:  # such as a name that is too long
-        raise SensorFileError(f"cannot read sensor file {str(name)[:200]}: {error.strerror or error}") from error
+        raise SensorFileError(
+            f"cannot read sensor file {str(name)[:200]}: {error.strerror or error}"
+        ) from error
     if not is_file:
         raise UnknownSensorError(str(name), built_in_names())
     return read_text(name, f"sensor file {name}", SensorFileError)
@@ -112,9 +147,9 @@ def sensor_text(name: str | Path) -> str:
 def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
     """The sensor file of a built-in name or a path.
 
-    changes: entries that hold instead of the file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested as in
-    the file. Raises UnknownSensorError for a name that is neither, SensorFileError (with the valid names) for a bad
-    content.
+    changes: entries that hold instead of the file's, by dotted key as ``{"camera.dark_noise":
+    40.0}`` or nested as in the file. Raises UnknownSensorError for a name that is neither,
+    SensorFileError (with the valid names) for a bad content.
     """
     require_keys(name, changes)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
@@ -129,7 +164,11 @@ def sensor_schema() -> dict[str, Any]:
     A file that is based on another need have neither all tables nor all entries of one.
     """
     schema = SensorFile.model_json_schema()
-    tables = {name: one["$ref"].rpartition("/")[2] for name, one in schema["properties"].items() if "$ref" in one}
+    tables = {
+        name: one["$ref"].rpartition("/")[2]
+        for name, one in schema["properties"].items()
+        if "$ref" in one
+    }
     needed = {name: schema["$defs"][table].pop("required", []) for name, table in tables.items()}
     whole = {
         "required": schema["required"],
@@ -140,7 +179,8 @@ def sensor_schema() -> dict[str, Any]:
 
 def _with_stickers(file: SensorFile, source: str) -> SensorFile:
     """The file with as many stickers on each plane of the platform as it asks for."""
-    count, room = file.stickers.per_plane, 2.0 * file.stickers.ring_radius
+    count = file.stickers.per_plane
+    room = 2.0 * file.stickers.ring_radius
     if count is None:
         return file
     planes = {}
@@ -148,16 +188,21 @@ def _with_stickers(file: SensorFile, source: str) -> SensorFile:
         places = ring_of_stickers(plane.stickers, count)
         if closest(places) < room:
             raise SensorFileError(
-                f"{source}: stickers.per_plane = {count} puts stickers {closest(places):.4f} m apart "
+                f"{source}: stickers.per_plane = {count} puts stickers {closest(places):.4f} m "
+                "apart "
                 f"on plane {name}, two rings need {room:g} m"
             )
         planes[name] = plane.model_copy(update={"stickers": [(u, v) for u, v in places.tolist()]})
-    platform = file.platform.model_copy(update={"planes": file.platform.planes.model_copy(update=planes)})
+    platform = file.platform.model_copy(
+        update={"planes": file.platform.planes.model_copy(update=planes)}
+    )
     return file.model_copy(update={"platform": platform})
 
 
 def _content(name: str | Path) -> dict[str, Any]:
-    """What a file says, completed by the sensor it is based on: entry by entry in each section, no deeper."""
+    """Content of a file, completed by the sensor it is based on: entry by entry in each section, no
+    deeper.
+    """
     own = _table(name)
     basis = own.get("based_on")
     if not isinstance(basis, str):
@@ -173,7 +218,9 @@ def _content(name: str | Path) -> dict[str, Any]:
             f"{base['based_on']!r}: name a sensor whose file is complete"
         )
     merged = {
-        key: {**base[key], **value} if isinstance(value, dict) and isinstance(base.get(key), dict) else value
+        key: {**base[key], **value}
+        if isinstance(value, dict) and isinstance(base.get(key), dict)
+        else value
         for key, value in own.items()
     }
     return base | merged

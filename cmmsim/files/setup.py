@@ -1,7 +1,9 @@
-"""The instrument that a sensor file describes: its stereo rig, and the bodies that carry stickers, as it knows them.
+"""The instrument that a sensor file describes: its stereo rig, and the bodies that carry stickers,
+as it knows them.
 
-A rig is nominal and toed in, or as calibrated. A body carries its stickers on three machined planes: the planes are
-exact, the sticker places only nominal, since a sticker sits up to about a millimetre beside its place.
+A rig is nominal and toed in, or as calibrated. A body carries its stickers on three machined
+planes: the planes are exact, the sticker places only nominal, since a sticker sits up to about a
+millimetre beside its place.
 """
 
 from dataclasses import dataclass, replace
@@ -18,12 +20,17 @@ from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig
 
 BORDER_POINTS = 65  # along each side of the image, asked whether the distortion model holds there
 SHORTEST_BASELINE = 1e-3  # m
-SMALLEST_CORNER = 0.001  # volume that the unit normals of three planes span: of a cube's corner it is 1
+SMALLEST_CORNER = (
+    0.001  # volume that the unit normals of three planes span: of a cube's corner it is 1
+)
 
 
 def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
-    """The rig and the true camera_from_base (4,4). Raises SensorFileError naming the camera at fault."""
-    position, target = np.array(section.position), np.array(section.target)
+    """The rig and the true camera_from_base (4,4). Raises SensorFileError naming the camera at
+    fault.
+    """
+    position = np.array(section.position)
+    target = np.array(section.target)
     if np.linalg.norm(np.cross(target - position, [0.0, 0.0, 1.0])) < 1e-6:
         raise SensorFileError(
             f"rig.target {list(section.target)} must not stand straight above or below, or at, "
@@ -32,7 +39,11 @@ def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
     middle = (0.5 * (section.width - 1), 0.5 * (section.height - 1))
     nominal = PinholeCamera(section.focal_px, *middle, section.width, section.height)
     rig, camera_from_base = toed_in_rig(nominal, section.baseline, position, target)
-    rig = replace(rig, left=_camera(section.left, nominal, "left"), right=_camera(section.right, nominal, "right"))
+    rig = replace(
+        rig,
+        left=_camera(section.left, nominal, "left"),
+        right=_camera(section.right, nominal, "right"),
+    )
     if section.right_from_left is None:
         return rig, camera_from_base
     rig = replace(rig, right_from_left=_right_from_left(section.right_from_left))
@@ -51,7 +62,8 @@ def _camera(calibrated: Calibrated | None, nominal: PinholeCamera, name: str) ->
 
 def _require_whole_image(camera: PinholeCamera, name: str) -> None:
     """Raise SensorFileError where a part of the image is beyond the fold of the distortion."""
-    x, y = np.linspace(-0.5, camera.width - 0.5, BORDER_POINTS), np.linspace(-0.5, camera.height - 0.5, BORDER_POINTS)
+    x = np.linspace(-0.5, camera.width - 0.5, BORDER_POINTS)
+    y = np.linspace(-0.5, camera.height - 0.5, BORDER_POINTS)
     border = np.concatenate(
         [np.column_stack([x, np.full_like(x, k)]) for k in (y[0], y[-1])]
         + [np.column_stack([np.full_like(y, k), y]) for k in (x[0], x[-1])]
@@ -59,7 +71,8 @@ def _require_whole_image(camera: PinholeCamera, name: str) -> None:
     found = camera.undistort(border)[1]
     if not found.all():
         raise SensorFileError(
-            f"rig.{name}.distortion: the image folds back before pixel {np.round(border[~found][0]).tolist()}, "
+            f"rig.{name}.distortion: the image folds back before pixel "
+            f"{np.round(border[~found][0]).tolist()}, "
             f"{camera.distortion.fold_radius:.4g} focal lengths from the optical axis"
         )
 
@@ -74,7 +87,8 @@ def _right_from_left(section: RightFromLeft) -> Array:
         )
     if right_centre[0] <= 0.0 or right_from_left[2, 2] <= 0.0:
         raise SensorFileError(
-            "rig.right_from_left: the right camera must stand on the right of the left one (translation x below zero "
+            "rig.right_from_left: the right camera must stand on the right of the left one "
+            "(translation x below zero "
             f"where both look the same way) and look its way, got {section.model_dump()}"
         )
     return right_from_left
@@ -84,8 +98,9 @@ def _right_from_left(section: RightFromLeft) -> Array:
 class MarkedBody:
     """Planes and nominal stickers in body axes.
 
-    normals (3,3) by row and offsets (3,) of planes A, B, C (n . p = d, m); sticker_ids (n,) such as "A1"; plane_index
-    (n,); nominal (n,3) m; in_plane (n,3,2) the u and v axes of each sticker's plane.
+    normals (3,3) by row and offsets (3,) of planes A, B, C (n . p = d, m); sticker_ids (n,) such as
+    "A1"; plane_index (n,); nominal (n,3) m; in_plane (n,3,2) the u and v axes of each sticker's
+    plane.
     """
 
     name: str
@@ -98,7 +113,10 @@ class MarkedBody:
 
     def __post_init__(self) -> None:
         if self.nominal.shape != (len(self.sticker_ids), 3) or self.normals.shape != (3, 3):
-            raise ShapeError(f"body {self.name}: {len(self.sticker_ids)} stickers but places {self.nominal.shape}")
+            raise ShapeError(
+                f"body {self.name}: {len(self.sticker_ids)} stickers but places "
+                f"{self.nominal.shape}"
+            )
         for array in (self.normals, self.offsets, self.plane_index, self.nominal, self.in_plane):
             array.setflags(write=False)
 
@@ -115,8 +133,14 @@ def marked_body(name: str, body: Body) -> MarkedBody:
     offsets = np.array([n @ np.array(p.point) for n, p in zip(normals, planes, strict=True)])
     counts = [len(p.stickers) for p in planes]
     axes = [_plane_axes(p) for p in planes]
-    nominal = [np.array(p.point) + np.array(p.stickers) @ a.T for p, a in zip(planes, axes, strict=True)]
-    ids = [f"{plane}{k + 1}" for plane, count in zip(PLANE_NAMES, counts, strict=True) for k in range(count)]
+    nominal = [
+        np.array(p.point) + np.array(p.stickers) @ a.T for p, a in zip(planes, axes, strict=True)
+    ]
+    ids = [
+        f"{plane}{k + 1}"
+        for plane, count in zip(PLANE_NAMES, counts, strict=True)
+        for k in range(count)
+    ]
     return MarkedBody(
         name,
         normals,
@@ -129,11 +153,14 @@ def marked_body(name: str, body: Body) -> MarkedBody:
 
 
 def require_corner(body: MarkedBody) -> None:
-    """Raise TeachingError unless the three planes of a body meet in one point, which its frame hangs on."""
+    """Raise TeachingError unless the three planes of a body meet in one point, which its frame
+    hangs on.
+    """
     volume = abs(float(np.linalg.det(body.normals)))
     if volume < SMALLEST_CORNER:
         raise TeachingError(
-            f"{body.name}: planes A, B and C meet in no point, so no frame can be taught: their unit "
+            f"{body.name}: planes A, B and C meet in no point, so no frame can be taught: their "
+            "unit "
             f"normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is needed"
         )
 

@@ -1,1 +1,3 @@
-"""Poses, cameras, the stereo rig, frames from planes, and the image of a disc. Knows no file and no image."""
+"""Poses, cameras, the stereo rig, frames from planes, and the image of a disc. Knows no file and no
+image.
+"""

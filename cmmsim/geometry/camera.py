@@ -1,16 +1,18 @@
 """A pinhole camera with its lens: the distortion of Brown and Conrady, point spread and vignetting.
 
-Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward. Ideal pixels are those of
-the same camera with a perfect lens: lines are straight there, and epipolar geometry and triangulation hold.
+Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward. Ideal
+pixels are those of the same camera with a perfect lens: lines are straight there, and epipolar
+geometry and triangulation hold.
 
-Distortion has OpenCV's order and meaning of the five coefficients. It acts on normalised image coordinates
-(x, y) = (X/Z, Y/Z); with s = x² + y²:
+Distortion has OpenCV's order and meaning of the five coefficients. It acts on normalised image
+coordinates (x, y) = (X/Z, Y/Z); with s = x² + y²:
 
     x_d = x (1 + k1 s + k2 s² + k3 s³) + 2 p1 x y + p2 (s + 2 x²)
     y_d = y (1 + k1 s + k2 s² + k3 s³) + p1 (s + 2 y²) + 2 p2 x y
 
-The model holds up to the radius where the radial part stops growing: beyond it the image folds back onto itself.
-Source: D. C. Brown, Close-range camera calibration, Photogrammetric Engineering 37 (1971).
+The model holds up to the radius where the radial part stops growing: beyond it the image folds back
+onto itself. Source: D. C. Brown, Close-range camera calibration, Photogrammetric Engineering 37
+(1971).
 """
 
 from __future__ import annotations
@@ -27,8 +29,7 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array, frozen
 
 NDArrayBool = NDArray[np.bool_]
-CONVERGED = 1e-12  # largest distance, in normalised coordinates, between a point and the image of its inverse
-MOST_STEPS = 60
+# largest distance, in normalised coordinates, between a point and the image of its inverse
 FARTHEST_FOLD = 1e3  # focal lengths: a fold beyond is none
 INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 PSF_REACH = 5.0  # standard deviations after which the point spread is cut off
@@ -46,90 +47,72 @@ class Distortion:
 
     def __post_init__(self) -> None:
         if not np.isfinite(astuple(self)).all():
-            raise CmmError(f"distortion needs finite coefficients k1, k2, p1, p2, k3, got {list(astuple(self))}")
+            raise CmmError(
+                "distortion needs finite coefficients k1, k2, p1, p2, k3, got "
+                f"{list(astuple(self))}"
+            )
 
     @property
     def is_zero(self) -> bool:
-        """Whether this lens moves nothing."""
+        """True if this lens moves nothing."""
         return not (self.k1 or self.k2 or self.p1 or self.p2 or self.k3)
 
     @cached_property
     def fold_radius(self) -> float:
-        """Undistorted radius at which the radial part stops growing; infinite where it never does."""
+        """Undistorted radius at which the radial part stops growing; infinite where it never
+        does."""
         roots = np.roots([1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3])  # of the slope, in 1/s
-        turning = roots[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / FARTHEST_FOLD**2)].real
+        turning = roots[
+            (np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / FARTHEST_FOLD**2)
+        ].real
         return float(1.0 / np.sqrt(turning.max())) if len(turning) else np.inf
 
     def distort(self, points: Array) -> Array:
         """Distorted points (..., 2) of undistorted ones (..., 2)."""
-        x, y = points[..., 0], points[..., 1]
-        s = x * x + y * y
-        radial = 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
-        return np.stack(
-            [
-                x * radial + 2.0 * self.p1 * x * y + self.p2 * (s + 2.0 * x * x),
-                y * radial + self.p1 * (s + 2.0 * y * y) + 2.0 * self.p2 * x * y,
-            ],
-            axis=-1,
-        )
+        return self._bent(points)[0]
 
     def jacobian(self, points: Array) -> Array:
         """Derivative (..., 2, 2) of the distorted by the undistorted points (..., 2)."""
-        x, y = points[..., 0], points[..., 1]
-        s = x * x + y * y
-        radial = 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
-        growth = 2.0 * (self.k1 + s * (2.0 * self.k2 + s * 3.0 * self.k3))
-        across = growth * x * y + 2.0 * self.p1 * x + 2.0 * self.p2 * y
-        along_x = radial + growth * x * x + 2.0 * self.p1 * y + 6.0 * self.p2 * x
-        along_y = radial + growth * y * y + 6.0 * self.p1 * y + 2.0 * self.p2 * x
-        return np.stack([along_x, across, across, along_y], axis=-1).reshape(*points.shape[:-1], 2, 2)
+        return self._bent(points)[1]
+
+    def _bent(self, points: Array) -> tuple[Array, Array]:
+        from cmmsim.geometry.camera_kernels import bend_all  # late, as numba takes time to import
+
+        flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
+        bent = np.empty_like(flat)
+        slopes = np.empty((len(flat), 2, 2))
+        bend_all(np.array(astuple(self)), flat, bent, slopes)
+        return bent.reshape(points.shape), slopes.reshape(*points.shape, 2)
 
     def holds(self, points: Array) -> NDArrayBool:
-        """Whether the model is one-to-one at undistorted points (..., 2): within the fold and not turned over."""
+        """Tell whether the model is one-to-one at undistorted points (..., 2): within the fold and
+        not turned over.
+        """
         within = np.sum(points * points, axis=-1) < self.fold_radius**2
         return within & (np.linalg.det(self.jacobian(points)) > 0.0)
 
     def undistort(self, points: Array) -> tuple[Array, NDArrayBool]:
         """Undistorted points (..., 2) of distorted ones (..., 2), and whether each was found.
 
-        Newton's method to 1e-12. A point that no undistorted one within the fold reaches is not found; its value is
-        finite and means nothing.
+        Newton's method to 1e-12. A point that no undistorted one within the fold reaches is not
+        found; its value is finite and means nothing.
         """
-        found = np.array(points, dtype=float)
+        from cmmsim.geometry.camera_kernels import straighten_all  # late: numba takes time
+
+        flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
+        straight = np.empty_like(flat)
+        found = np.empty(len(flat), dtype=bool)
         reach = 0.999999 * self.fold_radius
-        for _ in range(MOST_STEPS):
-            found = _drawn_in(found, reach)
-            gap = points - self.distort(found)
-            if np.abs(gap).max(initial=0.0) <= 0.1 * CONVERGED:
-                break
-            jacobian = self.jacobian(found)
-            determinant = np.linalg.det(jacobian)
-            steady = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
-            step = np.stack(
-                [
-                    jacobian[..., 1, 1] * gap[..., 0] - jacobian[..., 0, 1] * gap[..., 1],
-                    jacobian[..., 0, 0] * gap[..., 1] - jacobian[..., 1, 0] * gap[..., 0],
-                ],
-                axis=-1,
-            )
-            found = found + np.clip(step / steady[..., None], -1.0, 1.0)
-        found = _drawn_in(found, reach)
-        return found, (np.abs(points - self.distort(found)).max(axis=-1) <= CONVERGED) & self.holds(found)
-
-
-def _drawn_in(points: Array, reach: float) -> Array:
-    """Points (..., 2) with those beyond the radius ``reach`` drawn back onto it."""
-    if not np.isfinite(reach):
-        return points
-    radius = np.linalg.norm(points, axis=-1, keepdims=True)
-    return points * np.minimum(1.0, reach / np.maximum(radius, reach))
+        straighten_all(np.array(astuple(self)), flat, reach, straight, found)
+        return straight.reshape(points.shape), found.reshape(points.shape[:-1])
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
     """Focal length and principal point in px, image size in px.
 
-    focal_px is the focal length along x; aspect: the one along y divided by it; distortion of the lens.
+    focal_px is the focal length along x; aspect: the one along y divided by it; distortion of the
+    lens.
     """
 
     focal_px: float
@@ -141,8 +124,19 @@ class PinholeCamera:
     distortion: Distortion = field(default_factory=Distortion)
 
     def __post_init__(self) -> None:
-        figures = (self.focal_px, self.centre_x_px, self.centre_y_px, self.width, self.height, self.aspect)
-        finite_array(figures, (6,), "a camera's focal length, principal point, size and aspect are finite numbers")
+        figures = (
+            self.focal_px,
+            self.centre_x_px,
+            self.centre_y_px,
+            self.width,
+            self.height,
+            self.aspect,
+        )
+        finite_array(
+            figures,
+            (6,),
+            "a camera's focal length, principal point, size and aspect are finite numbers",
+        )
         if self.focal_px <= 0.0 or self.aspect <= 0.0 or self.width < 1 or self.height < 1:
             raise CmmError(f"camera needs a positive focal length, aspect and size, got {self}")
 
@@ -173,7 +167,9 @@ class PinholeCamera:
         return self if self.distortion.is_zero else replace(self, distortion=Distortion())
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
-        """Pixels (..., 2) of points (..., 3) in camera axes, and whether each lies before the camera and inside."""
+        """Pixels (..., 2) of points (..., 3) in camera axes, and whether each lies before the
+        camera and inside.
+        """
         depth = points[..., 2]
         ahead = depth > 1e-6
         scale = self.focal_lengths / np.where(ahead, depth, 1.0)[..., None]
@@ -184,15 +180,24 @@ class PinholeCamera:
         return pixels, ahead & self.shows(pixels)
 
     def shows(self, pixels: Array, margin: float = -0.5) -> NDArrayBool:
-        """Whether pixels (..., 2) lie inside the image, more than ``margin`` px from its outermost pixels' middles."""
-        return np.all((pixels > margin) & (pixels < (self.width - 1 - margin, self.height - 1 - margin)), axis=-1)
+        """Tell whether pixels (..., 2) lie inside the image, more than ``margin`` px from its
+        outermost pixels' middles.
+        """
+        return np.all(
+            (pixels > margin) & (pixels < (self.width - 1 - margin, self.height - 1 - margin)),
+            axis=-1,
+        )
 
     def distort(self, ideal: Array) -> tuple[Array, NDArrayBool]:
-        """Pixels (..., 2) of the image for ideal pixels (..., 2), and whether the distortion model holds there."""
+        """Pixels (..., 2) of the image for ideal pixels (..., 2), and whether the distortion model
+        holds there.
+        """
         if self.distortion.is_zero:
             return ideal, np.ones(ideal.shape[:-1], dtype=bool)
         normalised = (ideal - self.centre) / self.focal_lengths
-        return self.distortion.distort(normalised) * self.focal_lengths + self.centre, self.distortion.holds(normalised)
+        return self.distortion.distort(
+            normalised
+        ) * self.focal_lengths + self.centre, self.distortion.holds(normalised)
 
     def undistort(self, pixels: Array) -> tuple[Array, NDArrayBool]:
         """Ideal pixels (..., 2) for pixels (..., 2) of the image, and whether each has one.
@@ -218,11 +223,11 @@ def camera_from(intrinsics: Array, width: int, height: int) -> PinholeCamera:
 
 @dataclass(frozen=True)
 class Optics:
-    """What a lens does to light beside distortion: it spreads each point, and darkens towards the corners.
+    """Point spread and darkening towards the corners of a lens.
 
-    psf_px: standard deviation of the Gaussian point spread, px of the image; vignetting: share of the light that is
-    missing in the corner farthest from the principal point; the loss grows with the square of the distance from there.
-    Both zero: the image of a pinhole.
+    psf_px: standard deviation of the Gaussian point spread, px of the image; vignetting: share of
+    the light that is missing in the corner farthest from the principal point; the loss grows with
+    the square of the distance from there. Both zero: the image of a pinhole.
     """
 
     psf_px: float = 0.0
@@ -234,17 +239,26 @@ class Optics:
 
     @property
     def margin_px(self) -> int:
-        """How far, in whole px, light from outside of a window reaches into it."""
+        """Distance, in whole px, from which light outside of a window reaches into it."""
         return ceil(PSF_REACH * self.psf_px)
 
     def illumination(self, camera: PinholeCamera, pixels: Array) -> Array:
-        """Relative illumination (...) of pixels (..., 2) of the image, 1 at the principal point, 0 at the least."""
-        corners = np.array([[x, y] for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)])
+        """Relative illumination (...) of pixels (..., 2) of the image, 1 at the principal point, 0
+        at the least.
+        """
+        corners = np.array(
+            [[x, y] for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)]
+        )
         farthest = np.sum((corners - camera.centre) ** 2, axis=1).max()
-        return np.maximum(1.0 - self.vignetting / farthest * np.sum((pixels - camera.centre) ** 2, axis=-1), 0.0)
+        return np.maximum(
+            1.0 - self.vignetting / farthest * np.sum((pixels - camera.centre) ** 2, axis=-1), 0.0
+        )
 
-    def window_illumination(self, camera: PinholeCamera, corners: NDArray[np.int_], size: int) -> Array:
+    def window_illumination(
+        self, camera: PinholeCamera, corners: NDArray[np.int_], size: int
+    ) -> Array:
         """Relative illumination (k, size, size) of windows with first pixels ``corners`` (k, 2)."""
         ticks = np.arange(size)
-        x, y = corners[:, 0, None, None] + ticks, corners[:, 1, None, None] + ticks[:, None]
+        x = corners[:, 0, None, None] + ticks
+        y = corners[:, 1, None, None] + ticks[:, None]
         return self.illumination(camera, np.stack(np.broadcast_arrays(x, y), axis=-1))

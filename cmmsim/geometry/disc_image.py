@@ -1,29 +1,34 @@
-"""The image of a disc: its ellipse, where the ellipse's centre lies, and how much of each pixel it covers.
+"""The image of a disc: its ellipse, where the ellipse's centre lies, and how much of each pixel it
+covers.
 
-**Ellipse.** Exact in perspective: with C the centre, n the unit normal and R the radius in camera axes, D = C C' -
-R² (I - n n') is the dual conic of the rim; carried to pixels by the camera matrix it gives the ellipse's centre and, in
+**Ellipse.** Exact in perspective: with C the centre, n the unit normal and R the radius in camera
+axes, D = C C' - R² (I - n n') is the dual conic of the rim; carried to pixels by the camera matrix
+it gives the ellipse's centre and, in
 its upper left, its shape: a matrix A (2,2), symmetric, that carries the unit disc onto the ellipse.
 
-**Eccentricity.** The centre of a circle's image is not the image of the circle's centre. Through a perfect lens the
-ellipse's centre is f (D13/D33, D23/D33), while the circle's centre projects to f (X/Z, Y/Z). Distortion bends the
-ellipse c + A u, |u| = 1, into a curve, and what is fitted to it is an ellipse again. With J the Jacobian of the
-distortion d at c, the curve is d(c) + J A (u + w) with small w(u). A fit to grey values minimises the squared distance
-between curve and ellipse along its length, which is the integral over the angle of u of (u'w - u'a)² / |J A t|, where t
-is the tangent of the unit circle and a the shift of the ellipse's centre. So
+**Eccentricity.** The centre of a circle's image is not the image of the circle's centre. Through a
+perfect lens the ellipse's centre is f (D13/D33, D23/D33), while the circle's centre projects to f
+(X/Z, Y/Z). Distortion bends the ellipse c + A u, |u| = 1, into a curve, and what is fitted to it is
+an ellipse again. With J the Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with
+small w(u). A fit to grey values minimises the squared distance between curve and ellipse along its
+length, which is the integral over the angle of u of (u'w - u'a)² / |J A t|, where t is the tangent
+of the unit circle and a the shift of the ellipse's centre. So
 
     a = (∫ u u' / |J A t|)^-1 ∫ u (u'w) / |J A t|,    and the fitted centre is d(c) + J A a.
 
 For a round J A and a quadratic w_i = ½ H_ijk u_j u_k this is a_i = (H_ijj + 2 H_jij) / 8.
 
-**Coverage.** By Green's theorem the area of the ellipse in a pixel is the integral of (x - left) dy over the arcs of
-the rim in it, plus the whole rise dy of those arcs of its row that lie right of it. On an arc x = c + A u, where
-u = (cos t, sin t) goes from one crossing of the lines between pixels to the next, and the integrals of u_i du_j follow
-from its ends and its angle. A change of c or A moves the rim with a velocity v = dc + dA u, and changes the share by
-the flux of v through the pixel's own arcs, whose outward normal is (dy, -dx): integrals of the same kind.
+**Coverage.** By Green's theorem the area of the ellipse in a pixel is the integral of (x - left) dy
+over the arcs of the rim in it, plus the whole rise dy of those arcs of its row that lie right of
+it. On an arc x = c
++ A u, where u = (cos t, sin t) goes from one crossing of the lines between pixels to the next, and
+the integrals of u_i du_j follow from its ends and its angle. A change of c or A moves the rim with
+a velocity v = dc + dA u, and changes the share by the flux of v through the pixel's own arcs, whose
+outward normal is (dy, -dx): integrals of the same kind.
 
-**Blurred coverage.** With a Gaussian point spread the share of light in a pixel is the integral over the ellipse of
-g_i(x) g_j(y), where g_i(x) is what the point spread carries from a point x into pixel i. By the divergence theorem it
-is an integral along the rim x(t) = c + A (cos t, sin t),
+**Blurred coverage.** With a Gaussian point spread the share of light in a pixel is the integral
+over the ellipse of g_i(x) g_j(y), where g_i(x) is what the point spread carries from a point x into
+pixel i. By the divergence theorem it is an integral along the rim x(t) = c + A (cos t, sin t),
 
     share = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i,
 
@@ -31,8 +36,8 @@ and a change of the ellipse, which moves the rim by v = dc + dA (cos t, sin t), 
 
     d share = integral of g_i(x) g_j(y) v . n ds.
 
-Both are smooth and periodic in t, so the trapezoidal rule converges exponentially once its points lie closer than the
-point spread is wide.
+Both are smooth and periodic in t, so the trapezoidal rule converges exponentially once its points
+lie closer than the point spread is wide.
 """
 
 from collections.abc import Iterator
@@ -49,15 +54,19 @@ NARROWEST_PX = 0.05  # standard deviation of a point spread that can be followed
 SHAPE_BASIS = frozen([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
 
 
-def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: Array) -> tuple[Array, Array]:
-    """Ellipses of n discs wholly before the camera: ideal centres (n,2) px and shapes A (n,2,2) px, symmetric.
+def project_discs(
+    camera: PinholeCamera, centres: Array, normals: Array, radii: Array
+) -> tuple[Array, Array]:
+    """Ellipses of n discs wholly before the camera: ideal centres (n,2) px and shapes A (n,2,2) px,
+    symmetric.
 
-    Parameters: centres (n,3) m and normals (n,3) unit, in camera axes; radii (n,) m. The ellipse is the image of the
-    unit disc under x -> centre + A x.
+    Parameters: centres (n,3) m and normals (n,3) unit, in camera axes; radii (n,) m. The ellipse is
+    the image of the unit disc under x -> centre + A x.
     """
-    from cmmsim.geometry.disc_kernels import project_all  # compiles, so it is loaded where it is first needed
+    from cmmsim.geometry.disc_kernels import project_all  # late, as numba takes time to import
 
-    pixels, shapes = np.empty((len(centres), 2)), np.empty((len(centres), 2, 2))
+    pixels = np.empty((len(centres), 2))
+    shapes = np.empty((len(centres), 2, 2))
     centres, normals, radii = _contiguous(centres, normals, radii)
     project_all(centres, normals, radii, camera.focal_lengths, camera.centre, pixels, shapes)
     return pixels, shapes
@@ -66,62 +75,63 @@ def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: 
 def sticker_outlines(
     rig: StereoRig, camera_from_body: Array, places: Array, normals: Array, radius: float
 ) -> tuple[Array, Array]:
-    """Centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of n stickers in the images as they are.
+    """Centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of n stickers in the images
+    as they are.
 
-    Parameters: camera_from_body (4,4), or one for each sticker (n,4,4); places (n,3) m and normals (n,3) in body axes;
-    radius m. Distortion is taken as linear across a sticker.
+    Parameters: camera_from_body (4,4), or one for each sticker (n,4,4); places (n,3) m and normals
+    (n,3) in body axes; radius m. Distortion is taken as linear across a sticker.
     """
-    centres, shapes = [], []
+    centres = []
+    shapes = []
     for camera, from_camera in zip(rig.cameras, rig.from_camera, strict=True):
         move = from_camera @ camera_from_body
         centre = np.einsum("...ij,...j->...i", move[..., :3, :3], places) + move[..., :3, 3]
         normal = np.einsum("...ij,...j->...i", move[..., :3, :3], normals)
         middles, shape = project_discs(camera.ideal, centre, normal, np.full(len(places), radius))
-        if not camera.distortion.is_zero:
-            local = camera.distortion_jacobian(middles) @ shape
-            middles, shape = camera.distort(middles)[0], symmetric_root(local @ local.swapaxes(-1, -2))
+        bend_outlines(camera, middles, shape)
         centres.append(middles)
         shapes.append(shape)
     return np.stack(centres), np.stack(shapes)
 
 
-def symmetric_root(matrices: Array) -> Array:
-    """Symmetric positive definite roots (..., 2, 2) of such matrices: (M + d I) / sqrt(trace M + 2 d), d² = det M."""
-    d = np.sqrt(np.linalg.det(matrices))[..., None, None]
-    trace = np.trace(matrices, axis1=-2, axis2=-1)[..., None, None]
-    return (matrices + d * np.eye(2)) / np.sqrt(trace + 2.0 * d)
+def bend_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> None:
+    """Replace ellipses of a perfect lens by those in the camera's image, with ``middles`` (n, 2).
+
+    Distortion is taken as linear across the ``shapes`` (n, 2, 2).
+    """
+    from cmmsim.geometry.disc_kernels import bend_ellipses  # late, as numba takes time to import
+
+    if not camera.distortion.is_zero:
+        bend_ellipses(camera.intrinsics, middles, shapes)
 
 
 def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius: float) -> Array:
-    """Centre of the ellipse fitted to a circle's image, minus the projected circle centre, px of the image (n, 2).
+    """Centre of the ellipse fitted to a circle's image, minus the projected circle centre, px of
+    the image (n, 2).
 
     Parameters: centres (n, 3) m and normals (n, 3) unit, in camera axes; radius in m.
     """
-    if camera.distortion.is_zero:
-        return eccentricity(centres, normals, radius, camera.focal_lengths)
     middles, shapes = project_discs(camera.ideal, centres, normals, np.full(len(centres), radius))
-    return camera.distort(middles)[0] + bending(camera, middles, shapes) - camera.project(centres)[0]
-
-
-def eccentricity(centres: Array, normals: Array, radius: float, focal_px: float | Array) -> Array:
-    """Ellipse centre minus projected circle centre through a perfect lens, px (n, 2).
-
-    Parameters: centres (n, 3) m and normals (n, 3) unit, in camera axes; radius in m; focal length in px, one or (2,).
-    """
-    d13_d23 = centres[:, :2] * centres[:, 2:] + radius**2 * normals[:, :2] * normals[:, 2:]
-    d33 = centres[:, 2:] ** 2 - radius**2 * (1.0 - normals[:, 2:] ** 2)
-    return focal_px * (d13_d23 / d33 - centres[:, :2] / centres[:, 2:])
+    projected = camera.project(centres)[0]
+    if camera.distortion.is_zero:
+        return middles - projected
+    return camera.distort(middles)[0] + bending(camera, middles, shapes) - projected
 
 
 def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
-    """Centre fitted to a distorted ellipse minus the distorted centre of the ellipse, px of the image (n, 2).
+    """Centre fitted to a distorted ellipse minus the distorted centre of the ellipse, px of the
+    image (n, 2).
 
     Parameters: middles (n, 2) and shapes A (n, 2, 2) of the ellipses in ideal px.
     """
     angle = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
-    u, tangent = np.stack([np.cos(angle), np.sin(angle)]), np.stack([-np.sin(angle), np.cos(angle)])
+    u = np.stack([np.cos(angle), np.sin(angle)])
+    tangent = np.stack([-np.sin(angle), np.cos(angle)])
     local = camera.distortion_jacobian(middles) @ shapes
-    rim = camera.distort(middles[:, None] + (shapes @ u).swapaxes(1, 2))[0] - camera.distort(middles)[0][:, None]
+    rim = (
+        camera.distort(middles[:, None] + (shapes @ u).swapaxes(1, 2))[0]
+        - camera.distort(middles)[0][:, None]
+    )
     bulge = np.einsum("kp,nkp->np", u, np.linalg.solve(local, rim.swapaxes(1, 2))) - 1.0  # u'w
     weight = 1.0 / np.linalg.norm(local @ tangent, axis=1)
     normal = np.einsum("np,ip,jp->nij", weight, u, u)
@@ -130,19 +140,21 @@ def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
 
 
 def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
-    """Share of light (n, size, size), 0 to 1, in each pixel, and its derivatives (n, size, size, 5) by
-    [c_x, c_y, A_xx, A_xy, A_yy].
+    """Share of light (n, size, size), 0 to 1, in each pixel, and its derivatives (n, size, size, 5)
+    by [c_x, c_y, A_xx, A_xy, A_yy].
 
-    Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes (n, 2, 2) px,
-    symmetric and positive definite; size: window side in px; psf_px: sigma of the point spread, 0: the covered share.
-    Raises CmmError for a point spread narrower than NARROWEST_PX.
+    Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes
+    (n, 2, 2) px, symmetric and positive definite; size: window side in px; psf_px: sigma of the
+    point spread, 0: the covered share. Raises CmmError for a point spread narrower than
+    NARROWEST_PX.
     """
     from cmmsim.geometry.disc_kernels import blur_windows  # compile, so they are loaded only here
     from cmmsim.geometry.rim_kernels import cover_windows
 
     require_psf(psf_px)
     centres, shapes = _contiguous(centres, shapes)
-    shares, derivatives = np.empty((len(centres), size, size)), np.empty((len(centres), size, size, 5))
+    shares = np.empty((len(centres), size, size))
+    derivatives = np.empty((len(centres), size, size, 5))
     if psf_px == 0.0:
         cover_windows(centres, shapes, shares, derivatives)
     else:
@@ -158,4 +170,7 @@ def _contiguous(*arrays: Array) -> Iterator[Array]:
 def require_psf(psf_px: float) -> None:
     """Raise CmmError for a point spread that is neither 0 nor wide enough to be followed."""
     if not (psf_px == 0.0 or NARROWEST_PX <= psf_px < np.inf):
-        raise CmmError(f"a point spread of {psf_px:g} px cannot be fitted, only 0 or at least {NARROWEST_PX:g} px")
+        raise CmmError(
+            f"a point spread of {psf_px:g} px cannot be fitted, only 0 or at least "
+            f"{NARROWEST_PX:g} px"
+        )

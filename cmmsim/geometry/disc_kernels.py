@@ -1,4 +1,6 @@
-"""Compiled: discs as a camera sees them, and their blurred light in pixels; the formulas stand in ``disc_image``."""
+"""Compiled: discs as a camera sees them, and their blurred light in pixels; the formulas stand in
+``disc_image``.
+"""
 
 from __future__ import annotations
 
@@ -6,44 +8,106 @@ import math
 
 import numpy as np
 
-from cmmsim.compiled import Array, compiled
+from cmmsim.compilation import Array, compiled
+from cmmsim.geometry.camera_kernels import project
+
+
+@compiled
+def disc_ellipse(centre: Array, normal: Array, radius: float, focal: Array) -> tuple:
+    """Return the ellipse of a disc in camera axes, as a perfect lens shows it.
+
+    Its middle x, y is in normalised coordinates. Its matrix xx, xy, yy is A A', px², where A
+    carries the unit disc onto the ellipse.
+    """
+    squared = radius * radius
+    depth = centre[2] * centre[2] - squared * (1.0 - normal[2] * normal[2])
+    x = (centre[0] * centre[2] + squared * normal[0] * normal[2]) / depth
+    y = (centre[1] * centre[2] + squared * normal[1] * normal[2]) / depth
+    dual_xx = (centre[0] * centre[0] - squared * (1.0 - normal[0] * normal[0])) / depth
+    dual_xy = (centre[0] * centre[1] + squared * normal[0] * normal[1]) / depth
+    dual_yy = (centre[1] * centre[1] - squared * (1.0 - normal[1] * normal[1])) / depth
+    return (
+        x,
+        y,
+        focal[0] * focal[0] * (x * x - dual_xx),
+        focal[0] * focal[1] * (x * y - dual_xy),
+        focal[1] * focal[1] * (y * y - dual_yy),
+    )
+
+
+@compiled
+def symmetric_root(xx: float, xy: float, yy: float) -> tuple:
+    """Return the entries xx, xy, yy of the root of a positive definite matrix M.
+
+    It is (M + d I) / sqrt(trace M + 2 d) with d² = det M.
+    """
+    d = math.sqrt(max(xx * yy - xy * xy, 0.0))
+    scale = math.sqrt(xx + yy + 2.0 * d)
+    return (xx + d) / scale, xy / scale, (yy + d) / scale
+
+
+@compiled
+def bent_root(xx: float, xy: float, yy: float, a: float, b: float, c: float, d: float) -> tuple:
+    """Return ``symmetric_root`` of J M J' with the slopes J = [[a, b], [c, d]] of a lens."""
+    return symmetric_root(
+        a * a * xx + 2.0 * a * b * xy + b * b * yy,
+        a * c * xx + (a * d + b * c) * xy + b * d * yy,
+        c * c * xx + 2.0 * c * d * xy + d * d * yy,
+    )
 
 
 @compiled
 def project_all(
-    centres: Array, normals: Array, radii: Array, focal: Array, principal: Array, middles: Array, shapes: Array
-) -> None:
-    """Ellipses of n discs with centres (n,3), normals (n,3) and radii (n,): ``middles`` (n,2) px and ``shapes`` (n,2,2)
-    px, the root of a matrix M: (M + d I) / sqrt(trace M + 2 d), d² = det M."""
-    at = np.empty(2)
+    centres: Array, normals: Array, radii: Array, focal: Array, principal: Array,
+    middles: Array, shapes: Array,
+) -> None:  # fmt: skip
+    """Fill the ellipses of n discs through a perfect lens: middles (n,2) and shapes (n,2,2), px.
+
+    The discs have centres and normals (n,3) in camera axes, and radii (n,).
+    """
     for n in range(len(centres)):
-        centre, normal, radius, middle, shape = centres[n], normals[n], radii[n], middles[n], shapes[n]
-        depth = centre[2] ** 2 - radius**2 * (1.0 - normal[2] ** 2)
-        for i in range(2):
-            at[i] = (centre[i] * centre[2] + radius**2 * normal[i] * normal[2]) / depth
-            middle[i] = focal[i] * at[i] + principal[i]
-        for i in range(2):
-            for j in range(2):
-                across = 1.0 if i == j else 0.0
-                dual = (centre[i] * centre[j] - radius**2 * (across - normal[i] * normal[j])) / depth
-                shape[i, j] = focal[i] * focal[j] * (at[i] * at[j] - dual)
-        d = math.sqrt(shape[0, 0] * shape[1, 1] - shape[0, 1] ** 2)
-        scale = math.sqrt(shape[0, 0] + shape[1, 1] + 2.0 * d)
-        shape[0, 0] += d
-        shape[1, 1] += d
-        for i in range(2):
-            for j in range(2):
-                shape[i, j] /= scale
+        x, y, xx, xy, yy = disc_ellipse(centres[n], normals[n], radii[n], focal)
+        xx, xy, yy = symmetric_root(xx, xy, yy)
+        middles[n, 0] = focal[0] * x + principal[0]
+        middles[n, 1] = focal[1] * y + principal[1]
+        shapes[n, 0, 0] = xx
+        shapes[n, 0, 1] = shapes[n, 1, 0] = xy
+        shapes[n, 1, 1] = yy
 
 
 @compiled
-def place_discs(moves: Array, owners: Array, places: Array, directions: Array, centres: Array, normals: Array) -> None:
-    """Centres and normals (n,3) in camera axes of discs at ``places`` with normals ``directions`` (n,3) in the axes of
-    their ``owners`` (n,); moves (b,4,4) camera from bodies."""
+def bend_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
+    """Replace ellipses of a perfect lens by those in the image of a camera with a lens.
+
+    The lens is taken as linear across each ellipse.
+    """
+    for n in range(len(middles)):
+        x = (middles[n, 0] - camera[2]) / camera[0]
+        y = (middles[n, 1] - camera[3]) / camera[1]
+        u, v, a, b, c, d = project(camera, x, y, 1.0)
+        middles[n, 0] = u
+        middles[n, 1] = v
+        shape = shapes[n]
+        xx = shape[0, 0] ** 2 + shape[0, 1] ** 2
+        xy = shape[0, 1] * (shape[0, 0] + shape[1, 1])
+        yy = shape[0, 1] ** 2 + shape[1, 1] ** 2
+        xx, xy, yy = bent_root(xx, xy, yy, a, b, c, d)
+        shape[0, 0] = xx
+        shape[0, 1] = shape[1, 0] = xy
+        shape[1, 1] = yy
+
+
+@compiled
+def place_discs(
+    moves: Array, owners: Array, places: Array, directions: Array, centres: Array, normals: Array
+) -> None:
+    """Centres and normals (n,3) in camera axes of discs at ``places`` with normals ``directions``
+    (n,3) in the axes of their ``owners`` (n,); moves (b,4,4) camera from bodies."""
     for n in range(len(places)):
         move = moves[owners[n]]
         for i in range(3):
-            centres[n, i], normals[n, i] = move[i, 3], 0.0
+            centres[n, i] = move[i, 3]
+            normals[n, i] = 0.0
             for j in range(3):
                 centres[n, i] += move[i, j] * places[n, j]
                 normals[n, i] += move[i, j] * directions[n, j]
@@ -61,14 +125,21 @@ def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> 
             if abs(normal[i]) < abs(normal[least]):
                 least = i
         length = math.sqrt(1.0 - normal[least] ** 2)
-        i, j = (least + 1) % 3, (least + 2) % 3  # u = normal x e_least / length, which lies in the plane
-        u[least], u[i], u[j] = 0.0, normal[j] / length, -normal[i] / length
+        i = (least + 1) % 3
+        j = (least + 2) % 3  # u = normal x e_least / length, which lies in the plane
+        u[least] = 0.0
+        u[i] = normal[j] / length
+        u[j] = -normal[i] / length
         for k in range(count + 1):
-            angle, distance = 2.0 * math.pi * k / count, 0.0 if k == 0 else radii[n]
+            angle = 2.0 * math.pi * k / count
+            distance = 0.0 if k == 0 else radii[n]
             for a in range(3):
-                b, c = (a + 1) % 3, (a + 2) % 3
+                b = (a + 1) % 3
+                c = (a + 2) % 3
                 v = normal[b] * u[c] - normal[c] * u[b]
-                probes[n, k, a] = centres[n, a] + distance * (math.cos(angle) * u[a] + math.sin(angle) * v)
+                probes[n, k, a] = centres[n, a] + distance * (
+                    math.cos(angle) * u[a] + math.sin(angle) * v
+                )
 
 
 @compiled
@@ -76,20 +147,30 @@ def inverse_shape(shape: Array) -> Array:
     """Inverse (2,2) of a (2,2) matrix."""
     det = shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0]
     m = np.empty((2, 2))
-    m[0, 0], m[0, 1], m[1, 0], m[1, 1] = shape[1, 1] / det, -shape[0, 1] / det, -shape[1, 0] / det, shape[0, 0] / det
+    m[0, 0] = shape[1, 1] / det
+    m[0, 1] = -shape[0, 1] / det
+    m[1, 0] = -shape[1, 0] / det
+    m[1, 1] = shape[0, 0] / det
     return m
 
 
 REACH = 5.5  # standard deviations from the rim beyond which no light is followed: 4e-8 of it
 POINTS_PER_SIGMA = 1.1  # rim points to one standard deviation of the point spread
 FEWEST_POINTS = 24
-SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
+SQRT_HALF = math.sqrt(0.5)
+SQRT_TWO_PI = math.sqrt(2.0 * math.pi)
 
 
 @compiled
-def carried(start: float, first: int, last: int, psf_px: float, across: Array, passed: Array) -> None:
-    """What the point spread carries from ``start``, px along one axis, into pixels first..last: ``across`` g is the
-    share of a point's light, ``passed`` P its integral from -infinity to ``start``."""
+def carried(
+    start: float, first: int, last: int, psf_px: float, across: Array, passed: Array
+) -> None:
+    """Fill the light that the point spread carries from ``start``, px along one axis, into pixels
+    first..last.
+
+    ``across`` g is the share of a point's light, and ``passed`` P its integral from -infinity to
+    ``start``.
+    """
     u = (first - 0.5 - start) / psf_px
     below = 0.5 * (1.0 + math.erf(u * SQRT_HALF))
     integral = u * below + math.exp(-0.5 * u * u) / SQRT_TWO_PI
@@ -99,13 +180,16 @@ def carried(start: float, first: int, last: int, psf_px: float, across: Array, p
         integral_next = u * below_next + math.exp(-0.5 * u * u) / SQRT_TWO_PI
         across[k] = below_next - below
         passed[k] = 1.0 - psf_px * (integral_next - integral)
-        below, integral = below_next, integral_next
+        below = below_next
+        integral = integral_next
 
 
 @compiled
 def rim_points(shape: Array, psf_px: float) -> int:
     """Points on the rim so close that the trapezoidal rule has converged."""
-    extent = math.sqrt(max(shape[0, 0] ** 2 + shape[0, 1] ** 2, shape[1, 0] ** 2 + shape[1, 1] ** 2))
+    extent = math.sqrt(
+        max(shape[0, 0] ** 2 + shape[0, 1] ** 2, shape[1, 0] ** 2 + shape[1, 1] ** 2)
+    )
     return max(FEWEST_POINTS, math.ceil(2.0 * math.pi * extent * POINTS_PER_SIGMA / psf_px))
 
 
@@ -117,18 +201,27 @@ def blur_window(
     height, width = shares.shape
     shares[:] = 0.0
     derivatives[:] = 0.0
-    across_x, passed_x, across_y, passed_y = np.empty(width), np.empty(width), np.empty(height), np.empty(height)
+    across_x = np.empty(width)
+    passed_x = np.empty(width)
+    across_y = np.empty(height)
+    passed_y = np.empty(height)
     whole = np.zeros((height, width + 1))  # what passes all pixels left of a column
-    m, count = inverse_shape(shape), rim_points(shape, psf_px)
+    m = inverse_shape(shape)
+    count = rim_points(shape, psf_px)
     scale = 2.0 * math.pi / count * (shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0])
     reach = REACH * psf_px + 0.5
     for k in range(count):
         angle = 2.0 * math.pi * k / count
-        u, v = math.cos(angle), math.sin(angle)
-        x, y = centre_x + shape[0, 0] * u + shape[0, 1] * v, centre_y + shape[1, 0] * u + shape[1, 1] * v
-        n_x, n_y = scale * (m[0, 0] * u + m[1, 0] * v), scale * (m[0, 1] * u + m[1, 1] * v)
-        left, right = max(0, math.ceil(x - reach)), min(width - 1, math.floor(x + reach))
-        low, high = max(0, math.ceil(y - reach)), min(height - 1, math.floor(y + reach))
+        u = math.cos(angle)
+        v = math.sin(angle)
+        x = centre_x + shape[0, 0] * u + shape[0, 1] * v
+        y = centre_y + shape[1, 0] * u + shape[1, 1] * v
+        n_x = scale * (m[0, 0] * u + m[1, 0] * v)
+        n_y = scale * (m[0, 1] * u + m[1, 1] * v)
+        left = max(0, math.ceil(x - reach))
+        right = min(width - 1, math.floor(x + reach))
+        low = max(0, math.ceil(y - reach))
+        high = min(height - 1, math.floor(y + reach))
         carried(x, left, right, psf_px, across_x, passed_x)
         carried(y, low, high, psf_px, across_y, passed_y)
         for row in range(low, high + 1):
@@ -151,7 +244,11 @@ def blur_window(
 
 
 @compiled
-def blur_windows(centres: Array, shapes: Array, psf_px: float, shares: Array, derivatives: Array) -> None:
-    """``blur_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives (n,h,w,5)."""
+def blur_windows(
+    centres: Array, shapes: Array, psf_px: float, shares: Array, derivatives: Array
+) -> None:
+    """``blur_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives
+    (n,h,w,5).
+    """
     for k in range(len(centres)):
         blur_window(centres[k, 0], centres[k, 1], shapes[k], psf_px, shares[k], derivatives[k])

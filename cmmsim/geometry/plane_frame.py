@@ -1,7 +1,7 @@
 """The frame that three planes define (paper section 4.2).
 
-Origin at the intersection of planes A, B and C, z along A's normal, x along the line A and B share, y = z x x.
-A plane is n . p = d with unit normal n.
+Origin at the intersection of planes A, B and C, z along A's normal, x along the line A and B share,
+y = z x x. A plane is n . p = d with unit normal n.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,9 @@ FEWEST_STICKERS = 3
 
 @dataclass(frozen=True)
 class FittedPlane:
-    """A plane, or several (...): normal (..., 3) unit; offset (...) d, m; tangents (..., 3, 2); covariance (..., 3, 3)
-    of [turn about each tangent..., d]: the normal moves by tangents @ parameters[:2]."""
+    """A plane, or several (...): normal (..., 3) unit; offset (...) d, m; tangents (..., 3, 2);
+    covariance (..., 3, 3) of [turn about each tangent..., d]: the normal moves by tangents @
+    parameters[:2]."""
 
     normal: Array
     offset: Array
@@ -30,15 +31,17 @@ class FittedPlane:
 
 
 def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "") -> FittedPlane:
-    """Weighted least-squares plane through ``points`` (n,3) with covariances (n,3,3), or planes through several sets
-    (..., n, 3) of them.
+    """Weighted least-squares plane through ``points`` (n,3) with covariances (n,3,3), or planes
+    through several sets (..., n, 3) of them.
 
-    ``towards`` (..., 3) is a rough normal that fixes the sign. Raises LostError with fewer than three points off one
-    line.
+    ``towards`` (..., 3) is a rough normal that fixes the sign. Raises LostError with fewer than
+    three points off one line.
     """
     count = points.shape[-2]
     if count < FEWEST_STICKERS:
-        raise LostError(f"plane {name}: {count} visible stickers, at least {FEWEST_STICKERS} needed")
+        raise LostError(
+            f"plane {name}: {count} visible stickers, at least {FEWEST_STICKERS} needed"
+        )
     middle = points.mean(axis=-2)
     arms = points - middle[..., None, :]
     _, spread, axes = np.linalg.svd(arms)
@@ -56,7 +59,9 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
         weights = 1.0 / np.einsum("...i,...nij,...j->...n", normal, covariances, normal)
         covariance = np.linalg.inv(jacobian.swapaxes(-1, -2) @ (weights[..., None] * jacobian))
         residuals = (arms @ normal[..., None])[..., 0] - shift[..., None]
-        change = -(covariance @ (jacobian.swapaxes(-1, -2) @ (weights * residuals)[..., None]))[..., 0]
+        change = -(covariance @ (jacobian.swapaxes(-1, -2) @ (weights * residuals)[..., None]))[
+            ..., 0
+        ]
         shift = shift + change[..., 2]
         normal = normal + (tangents @ change[..., :2, None])[..., 0]
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -69,8 +74,8 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
 
 
 def frame_from_planes(normals: Array, offsets: Array) -> Array:
-    """camera_from_planes (..., 4, 4): the frame of planes A, B, C given as unit normals (..., 3, 3) by row and offsets
-    (..., 3)."""
+    """camera_from_planes (..., 4, 4): the frame of planes A, B, C given as unit normals (..., 3, 3)
+    by row and offsets (..., 3)."""
     first = normals[..., 0, :]
     z = first / np.linalg.norm(first, axis=-1, keepdims=True)
     x = np.cross(first, normals[..., 1, :])
@@ -82,10 +87,11 @@ def frame_from_planes(normals: Array, offsets: Array) -> Array:
 def frame_of_points(
     points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
 ) -> tuple[Array, Array]:
-    """Frame (4,4) of the planes through measured stickers, and the covariance (6,6) of its small error [dt, dphi].
+    """Frame (4,4) of the planes through measured stickers, and the covariance (6,6) of its small
+    error [dt, dphi].
 
-    Parameters: points (n,3) and covariances (n,3,3); plane_index (n,) 0, 1, 2 for A, B, C; towards (3,3) rough normals
-    by row. Raises LostError that names the plane, the count and the limit.
+    Parameters: points (n,3) and covariances (n,3,3); plane_index (n,) 0, 1, 2 for A, B, C; towards
+    (3,3) rough normals by row. Raises LostError that names the plane, the count and the limit.
     """
     frame, planes = frames_of_points(points, covariances, plane_index, towards)
     sensitivity = _frame_sensitivity(
@@ -97,11 +103,15 @@ def frame_of_points(
 def frames_of_points(
     points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
 ) -> tuple[Array, list[FittedPlane]]:
-    """As ``frame_of_points`` for sets of points (..., n, 3): their frames (..., 4, 4), and planes A, B and C."""
+    """As ``frame_of_points`` for sets of points (..., n, 3): their frames (..., 4, 4), and planes
+    A, B and C.
+    """
     planes = []
     for k, name in enumerate(PLANE_NAMES):
         own = plane_index == k
-        planes.append(fit_plane(points[..., own, :], covariances[..., own, :, :], towards[..., k, :], name))
+        planes.append(
+            fit_plane(points[..., own, :], covariances[..., own, :, :], towards[..., k, :], name)
+        )
     normals = np.stack([plane.normal for plane in planes], axis=-2)
     return frame_from_planes(normals, np.stack([plane.offset for plane in planes], axis=-1)), planes
 
@@ -119,10 +129,11 @@ def _tangents(normal: Array) -> Array:
 
 
 def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:
-    """Change (6, 9) of [t, phi] of a frame by two turns and the offset of plane A, of B, and of C, whose tangents are
-    (3, 3, 2): the derivative of `frame_from_planes`."""
+    """Change (6, 9) of [t, phi] of a frame by two turns and the offset of plane A, of B, and of C,
+    whose tangents are (3, 3, 2): the derivative of `frame_from_planes`."""
     x, y, z, origin = frame[:3].T
-    turned, shifted = np.zeros((9, 3, 3)), np.zeros((9, 3))  # changes of all normals and offsets
+    turned = np.zeros((9, 3, 3))
+    shifted = np.zeros((9, 3))  # changes of all normals and offsets
     for plane in range(3):
         turned[3 * plane : 3 * plane + 2, plane] = tangents[plane].T
         shifted[3 * plane + 2, plane] = 1.0
@@ -131,4 +142,6 @@ def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:
     by_z = turned[:, 0]
     by_x = (along - np.outer(along @ x, x)) / np.linalg.norm(np.cross(normals[0], normals[1]))
     by_y = np.cross(by_z, x) + np.cross(z, by_x)
-    return np.vstack([by_origin, 0.5 * (np.cross(x, by_x) + np.cross(y, by_y) + np.cross(z, by_z)).T])
+    return np.vstack(
+        [by_origin, 0.5 * (np.cross(x, by_x) + np.cross(y, by_y) + np.cross(z, by_z)).T]
+    )

@@ -1,9 +1,9 @@
 """Poses and transforms.
 
-A pose is ``[x y z alpha beta gamma]`` in m and rad with R = Rx(alpha) Ry(beta) Rz(gamma) (paper eq. 1). A transform
-is a 4x4 matrix named output-from-input, ``camera_from_base``, so that adjacent names cancel in a product.
-A small error of a transform is ``[dt, dphi]``: the shift of its origin and the rotation vector that is applied on
-the left, both in the axes of the output frame.
+A pose is ``[x y z alpha beta gamma]`` in m and rad with R = Rx(alpha) Ry(beta) Rz(gamma) (paper eq.
+1). A transform is a 4x4 matrix named output-from-input, ``camera_from_base``, so that adjacent
+names cancel in a product. A small error of a transform is ``[dt, dphi]``: the shift of its origin
+and the rotation vector that is applied on the left, both in the axes of the output frame.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from cmmsim.errors import ShapeError
 Array = NDArray[np.float64]
 
 RIGID = 1e-6
-"""By how much entries of what is given as a rigid transform may be off one: single precision passes."""
+"""By how much entries of what is given as a rigid transform may be off one: single precision
+passes.
+"""
 
 
 def frozen(values: ArrayLike) -> Array:
@@ -36,65 +38,112 @@ def checked_pose(pose: ArrayLike) -> Array:
 
 
 def pose_to_transform(pose: ArrayLike) -> Array:
-    """Transform (4,4) of a pose (6,). Raises ShapeError when the pose is not six finite numbers."""
+    """Return the transform of a pose.
+
+    Parameters
+    ----------
+    pose : array_like, shape (6,)
+        Place in m and angles in rad, with R = Rx(alpha) Ry(beta) Rz(gamma).
+
+    Returns
+    -------
+    ndarray, shape (4, 4)
+
+    Raises
+    ------
+    ShapeError
+        If the pose is not six finite numbers.
+
+    Examples
+    --------
+    >>> pose_to_transform([0.1, 0.0, 0.2, 0.0, 0.0, 0.0])[:3, 3]
+    array([0.1, 0. , 0.2])
+    """
     return transforms_of(checked_pose(pose))
 
 
 def transforms_of(poses: Array) -> Array:
     """Transforms (..., 4, 4) of poses (..., 6)."""
-    cosines, sines = np.cos(poses[..., 3:]), np.sin(poses[..., 3:])
-    ca, cb, cg = cosines[..., 0], cosines[..., 1], cosines[..., 2]
-    sa, sb, sg = sines[..., 0], sines[..., 1], sines[..., 2]
-    transforms = np.zeros((*poses.shape[:-1], 4, 4))
-    transforms[..., 0, 0], transforms[..., 0, 1], transforms[..., 0, 2] = cb * cg, -cb * sg, sb
-    transforms[..., 1, 0], transforms[..., 1, 1] = ca * sg + sa * sb * cg, ca * cg - sa * sb * sg
-    transforms[..., 2, 0], transforms[..., 2, 1] = sa * sg - ca * sb * cg, sa * cg + ca * sb * sg
-    transforms[..., 1, 2], transforms[..., 2, 2], transforms[..., 3, 3] = -sa * cb, ca * cb, 1.0
-    transforms[..., :3, 3] = poses[..., :3]
+    from cmmsim.geometry.transform_kernels import pose_transforms  # late: numba takes time
+
+    transforms = np.empty((*poses.shape[:-1], 4, 4))
+    flat = np.ascontiguousarray(poses, dtype=float).reshape(-1, 6)
+    pose_transforms(flat, transforms.reshape(-1, 4, 4))
     return transforms
 
 
 def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
-    """The transform (4,4) as an array of its own. Raises ShapeError, with the ``name``, when it is not 4x4 finite
-    numbers or no rigid motion: transposed, scaled or mirrored."""
+    """The transform (4,4) as an array of its own. Raises ShapeError, with the ``name``, when it is
+    not 4x4 finite numbers or no rigid motion: transposed, scaled or mirrored."""
     values = finite_array(transform, (4, 4), f"{name} must be (4,4) and finite")
-    rotation, last = values[:3, :3], values[3]
+    rotation = values[:3, :3]
+    last = values[3]
     if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > RIGID:
-        raise ShapeError(f"{name} must have the last row [0 0 0 1], got {last.tolist()}; is it transposed?")
+        raise ShapeError(
+            f"{name} must have the last row [0 0 0 1], got {last.tolist()}; is it transposed?"
+        )
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if error > RIGID or np.linalg.det(rotation) < 0.0:
         raise ShapeError(
-            f"{name} must be rigid: its rotation R has |R^T R - I| = {error:.3g} (at most {RIGID:g}) and "
+            f"{name} must be rigid: its rotation R has |R^T R - I| = {error:.3g} (at most "
+            f"{RIGID:g}) and "
             f"determinant {np.linalg.det(rotation):.6g} (1)"
         )
     return values
 
 
 def all_rigid(transforms: Array) -> bool:
-    """Whether ``checked_transform`` passes all of the transforms (k,4,4): asked at once, without naming a wrong one."""
-    from cmmsim.geometry.point_kernels import farthest_from_rigid  # compiles, so it is loaded where it is first needed
+    """Tell whether ``checked_transform`` passes all of the transforms (k,4,4): asked at once,
+    without naming a wrong one.
+    """
+    from cmmsim.geometry.transform_kernels import farthest_from_rigid  # late: numba takes time
 
     return bool(farthest_from_rigid(np.ascontiguousarray(transforms)) <= RIGID)
 
 
 def transform_to_pose(transform: ArrayLike) -> Array:
-    """Pose (6,) of a transform (4,4); beta lies in [-pi/2, pi/2]. Raises ShapeError when it is no rigid transform."""
+    """Return the pose of a transform.
+
+    Parameters
+    ----------
+    transform : array_like, shape (4, 4)
+        Rigid transform.
+
+    Returns
+    -------
+    ndarray, shape (6,)
+        Place in m and angles in rad; beta lies in [-pi/2, pi/2].
+
+    Raises
+    ------
+    ShapeError
+        If the transform is not rigid.
+
+    Examples
+    --------
+    >>> transform = pose_to_transform([0.1, 0.0, 0.2, 0.25, 0.0, 0.0])
+    >>> round(float(transform_to_pose(transform)[3]), 9)
+    0.25
+    """
     return poses_of(checked_transform(transform))
 
 
 def poses_of(transforms: Array) -> Array:
     """Poses (..., 6) of rigid transforms (..., 4, 4)."""
-    r = transforms[..., :3, :3]
-    alpha = np.arctan2(-r[..., 1, 2], r[..., 2, 2])
-    beta = np.arctan2(r[..., 0, 2], np.hypot(r[..., 1, 2], r[..., 2, 2]))
-    gamma = np.arctan2(-r[..., 0, 1], r[..., 0, 0])
-    return np.concatenate([transforms[..., :3, 3], np.stack([alpha, beta, gamma], axis=-1)], axis=-1)
+    from cmmsim.geometry.transform_kernels import transform_poses  # late: numba takes time
+
+    poses = np.empty((*transforms.shape[:-2], 6))
+    flat = np.ascontiguousarray(transforms, dtype=float).reshape(-1, 4, 4)
+    transform_poses(flat, poses.reshape(-1, 6))
+    return poses
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
     """Transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
     transform = np.zeros((*np.shape(rotation)[:-2], 4, 4))
-    transform[..., :3, :3], transform[..., :3, 3], transform[..., 3, 3] = rotation, translation, 1.0
+    transform[..., :3, :3] = rotation
+    transform[..., :3, 3] = translation
+    transform[..., 3, 3] = 1.0
     return transform
 
 
@@ -110,17 +159,25 @@ def apply(transform: Array, points: Array) -> Array:
 
 
 def apply_each(transforms: Array, points: Array) -> Array:
-    """Points (..., n, 3): points (n,3), or a set of them for each (..., n, 3), carried by each of the transforms (...,
-    4, 4)."""
-    return np.asarray(points @ transforms[..., :3, :3].swapaxes(-1, -2) + transforms[..., None, :3, 3])
+    """Points (..., n, 3): points (n,3), or a set of them for each (..., n, 3), carried by each of
+    the transforms (..., 4, 4)."""
+    return np.asarray(
+        points @ transforms[..., :3, :3].swapaxes(-1, -2) + transforms[..., None, :3, 3]
+    )
 
 
 def skew(vectors: Array) -> Array:
     """Cross product matrices (..., 3, 3) of vectors (..., 3)."""
     result = np.zeros((*vectors.shape, 3))
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
-    result[..., 1, 0], result[..., 2, 0], result[..., 2, 1] = z, -y, x
+    x = vectors[..., 0]
+    y = vectors[..., 1]
+    z = vectors[..., 2]
+    result[..., 0, 1] = -z
+    result[..., 0, 2] = y
+    result[..., 1, 2] = -x
+    result[..., 1, 0] = z
+    result[..., 2, 0] = -y
+    result[..., 2, 1] = x
     return result
 
 
@@ -128,13 +185,19 @@ def rotation_exp(vector: Array) -> Array:
     """Rotation (3,3) of a rotation vector (3,) (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     k = skew(vector)
-    return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * k @ k
+    return (
+        np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * k @ k
+    )
 
 
 def rotation_log(rotation: Array) -> Array:
     """Rotation vector (3,) of a rotation (3,3) whose angle is well below pi."""
     axis = 0.5 * np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
     )
     sine = float(np.linalg.norm(axis))
     cosine = 0.5 * (np.trace(rotation) - 1.0)
@@ -142,34 +205,53 @@ def rotation_log(rotation: Array) -> Array:
 
 
 def euler_rates_matrix(pose: Array) -> Array:
-    """Matrix (..., 3, 3) from [d alpha, d beta, d gamma] of poses (..., 6) to the rotation vector, in the axes of the
-    output frame."""
-    ca, sa = np.cos(pose[..., 3]), np.sin(pose[..., 3])
-    cb, sb = np.cos(pose[..., 4]), np.sin(pose[..., 4])
+    """Matrix (..., 3, 3) from [d alpha, d beta, d gamma] of poses (..., 6) to the rotation vector,
+    in the axes of the output frame."""
+    ca = np.cos(pose[..., 3])
+    sa = np.sin(pose[..., 3])
+    cb = np.cos(pose[..., 4])
+    sb = np.sin(pose[..., 4])
     rates = np.zeros((*pose.shape[:-1], 3, 3))
-    rates[..., 0, 0], rates[..., 0, 2] = 1.0, sb
-    rates[..., 1, 1], rates[..., 1, 2] = ca, -sa * cb
-    rates[..., 2, 1], rates[..., 2, 2] = sa, ca * cb
+    rates[..., 0, 0] = 1.0
+    rates[..., 0, 2] = sb
+    rates[..., 1, 1] = ca
+    rates[..., 1, 2] = -sa * cb
+    rates[..., 2, 1] = sa
+    rates[..., 2, 2] = ca * cb
     return rates
 
 
-def pose_jacobian(pose: Array) -> Array:
+def pose_jacobian(poses: Array) -> Array:
     """Change (..., 6, 6) of poses (..., 6) by the small errors [dt, dphi] of their transforms."""
-    jacobian = np.zeros((*pose.shape[:-1], 6, 6))
+    from cmmsim.geometry.transform_kernels import all_angle_rates  # late: numba takes time
+
+    flat = np.ascontiguousarray(poses, dtype=float).reshape(-1, 6)
+    rates = np.empty((len(flat), 3, 3))
+    all_angle_rates(flat, rates)
+    jacobian = np.zeros((*poses.shape[:-1], 6, 6))
     jacobian[..., :3, :3] = np.eye(3)
-    jacobian[..., 3:, 3:] = np.linalg.inv(euler_rates_matrix(pose))
+    jacobian[..., 3:, 3:] = rates.reshape(*poses.shape[:-1], 3, 3)
     return jacobian
 
 
-def pose_covariance(transform: Array, covariance: Array) -> Array:
-    """Covariances (..., 6, 6) of the poses of transforms (..., 4, 4) from those of their small errors [dt, dphi] (first
-    order)."""
-    jacobian = pose_jacobian(poses_of(transform))
-    return np.asarray(jacobian @ covariance @ jacobian.swapaxes(-1, -2))
+def pose_covariance(transforms: Array, covariances: Array) -> Array:
+    """Covariances (..., 6, 6) of the poses of transforms (..., 4, 4), to first order.
+
+    ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi].
+    """
+    from cmmsim.geometry.transform_kernels import pose_covariances  # late: numba takes time
+
+    spreads = np.empty(covariances.shape)
+    poses = poses_of(transforms).reshape(-1, 6)
+    flat = np.ascontiguousarray(covariances, dtype=float).reshape(-1, 6, 6)
+    pose_covariances(poses, flat, spreads.reshape(-1, 6, 6))
+    return spreads
 
 
 def compose_covariance(outer: Array, covariance: Array) -> Array:
-    """Covariance (..., 6, 6) of the error of ``outer @ inner`` from that of ``inner``; ``outer`` (4,4) is exact."""
+    """Covariance (..., 6, 6) of the error of ``outer @ inner`` from that of ``inner``; ``outer``
+    (4,4) is exact.
+    """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = outer[:3, :3]
     return turn @ covariance @ turn.T

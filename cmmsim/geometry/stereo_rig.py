@@ -1,13 +1,14 @@
 """Two cameras held by one rigid bar, and points triangulated from both of their images.
 
-The camera frame C of the sensor is the frame of the left camera. Points come from OpenCV's linear triangulation,
-followed by weighted Gauss-Newton steps.
+The camera frame C of the sensor is the frame of the left camera. Points come from OpenCV's linear
+triangulation, followed by weighted Gauss-Newton steps.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,14 +17,19 @@ from cmmsim.errors import ShapeError
 from cmmsim.geometry.camera import INTRINSIC_NAMES, NDArrayBool, PinholeCamera, camera_from
 from cmmsim.geometry.pose import Array, apply, invert, rigid, rotation_exp, rotation_log
 
+if TYPE_CHECKING:
+    from cmmsim.geometry.camera_kernels import Cameras
+
 PLACE_NAMES = ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")
 PARAMETER_NAMES = (
     *(f"{side}.{name}" for side in ("left", "right") for name in INTRINSIC_NAMES),
     *(f"right_from_left.{name}" for name in PLACE_NAMES),
 )
-"""What a rig is made of: the intrinsics of both cameras, and translation and rotation vector of ``right_from_left``."""
+"""What a rig is made of: the intrinsics of both cameras, and translation and rotation vector of
+``right_from_left``.
+"""
 
-STEPS = 2  # of Gauss-Newton after the linear start
+SETTLED = 1e-8  # m: length of the last step of a triangulation
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,9 @@ class StereoRig:
 
     @property
     def from_camera(self) -> tuple[Array, Array]:
-        """Transforms (4,4) from the camera frame C into the axes of the left and of the right camera."""
+        """Transforms (4,4) from the camera frame C into the axes of the left and of the right
+        camera.
+        """
         return np.eye(4), self.right_from_left
 
     @cached_property
@@ -59,6 +67,17 @@ class StereoRig:
         perfect = all(camera.distortion.is_zero for camera in self.cameras)
         return self if perfect else replace(self, left=self.left.ideal, right=self.right.ideal)
 
+    @cached_property
+    def figures(self) -> Cameras:
+        """Both cameras as compiled functions take them, for points in the camera frame C."""
+        from cmmsim.geometry.camera_kernels import Cameras  # late, as numba takes time to import
+
+        return Cameras(
+            np.array([camera.intrinsics for camera in self.cameras]),
+            np.array([(camera.width, camera.height) for camera in self.cameras], dtype=float),
+            np.stack(self.from_camera),
+        )
+
     @property
     def projection_matrices(self) -> tuple[Array, Array]:
         """Projection matrices (3,4) from the camera frame C to ideal left and right pixels."""
@@ -66,57 +85,55 @@ class StereoRig:
 
     @property
     def fundamental(self) -> Array:
-        """Fundamental matrix F (3,3): right' F left = 0 for homogeneous ideal pixels of the same point."""
-        rotation, shift = self.right_from_left[:3, :3], self.right_from_left[:3, 3]
+        """Fundamental matrix F (3,3): right' F left = 0 for homogeneous ideal pixels of the same
+        point.
+        """
+        rotation = self.right_from_left[:3, :3]
+        shift = self.right_from_left[:3, 3]
         essential = np.cross(np.eye(3), shift) @ rotation
         return np.linalg.inv(self.right.matrix).T @ essential @ np.linalg.inv(self.left.matrix)
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
-        """Pixels (2, n, 2) of points (n, 3) in C for the left and right camera, and their validity (2, n)."""
+        """Pixels (2, n, 2) of points (n, 3) in C for the left and right camera, and their validity
+        (2, n).
+        """
         seen = [
-            camera.project(apply(move, points)) for camera, move in zip(self.cameras, self.from_camera, strict=True)
+            camera.project(apply(move, points))
+            for camera, move in zip(self.cameras, self.from_camera, strict=True)
         ]
         return np.stack([s[0] for s in seen]), np.stack([s[1] for s in seen])
 
     def derivatives(self, points: Array) -> tuple[Array, Array]:
-        """Derivatives (2, n, 2, 3) of both pixels of points (n, 3) in C by the points, and (2, n, 2, 24) by what the
-        rig is made of, in the order of PARAMETER_NAMES."""
-        by_points, by_rig = np.empty((2, len(points), 2, 3)), np.zeros((2, len(points), 2, len(PARAMETER_NAMES)))
+        """Derivatives (2, n, 2, 3) of both pixels of points (n, 3) in C by the points, and (2, n,
+        2, 24) by what the rig is made of, in the order of PARAMETER_NAMES."""
+        by_points = np.empty((2, len(points), 2, 3))
+        by_rig = np.zeros((2, len(points), 2, len(PARAMETER_NAMES)))
         for side, (camera, move) in enumerate(zip(self.cameras, self.from_camera, strict=True)):
             known = rotation_log(move[:3, :3]), move[:3, 3], camera.matrix, camera.intrinsics[4:]
-            found = cv2.projectPoints(np.ascontiguousarray(points), *known)[1].reshape(len(points), 2, -1)
-            by_turn, by_shift, intrinsics = found[..., :3], found[..., 3:6], found[..., 6:]
+            found = cv2.projectPoints(np.ascontiguousarray(points), *known)[1].reshape(
+                len(points), 2, -1
+            )
+            by_turn = found[..., :3]
+            by_shift = found[..., 3:6]
+            intrinsics = found[..., 6:]
             by_points[side] = by_shift @ move[:3, :3]
             by_rig[side, ..., 9 * side : 9 * side + 9] = intrinsics
             if side == 1:
                 by_rig[side, ..., 18:] = np.concatenate([by_shift, by_turn], axis=-1)
         return by_points, by_rig
 
-    def undistort(self, pixels: Array, covariances: Array) -> tuple[Array, Array, NDArrayBool]:
-        """Ideal pixels (2, n, 2) and their covariances (2, n, 2, 2) px² for those of the left and right image.
-
-        Also whether each pixel has an ideal one (2, n); the values of those without one are finite and mean nothing.
-        """
-        if self.ideal is self:
-            return pixels, covariances, np.ones(pixels.shape[:2], dtype=bool)
-        ideal, found = (
-            np.stack(values)
-            for values in zip(
-                *(camera.undistort(side) for camera, side in zip(self.cameras, pixels, strict=True)), strict=True
-            )
-        )
-        jacobian = np.stack([c.distortion_jacobian(side) for c, side in zip(self.cameras, ideal, strict=True)])
-        inverse = np.linalg.inv(np.where(found[..., None, None], jacobian, np.eye(2)))
-        return ideal, inverse @ covariances @ inverse.swapaxes(-1, -2), found
-
     @property
     def parameters(self) -> Array:
-        """What it is made of (24,) in the order of PARAMETER_NAMES."""
+        """Parameters (24,) in the order of PARAMETER_NAMES."""
         place = self.right_from_left
-        return np.concatenate([self.left.intrinsics, self.right.intrinsics, place[:3, 3], rotation_log(place[:3, :3])])
+        return np.concatenate(
+            [self.left.intrinsics, self.right.intrinsics, place[:3, 3], rotation_log(place[:3, :3])]
+        )
 
     def moved(self, changes: Array) -> StereoRig:
-        """The rig with changes (24,) of its parameters; its camera frame C stays that of the left camera."""
+        """The rig with changes (24,) of its parameters; its camera frame C stays that of the left
+        camera.
+        """
         if not changes.any():
             return self
         values = self.parameters + changes
@@ -127,11 +144,13 @@ class StereoRig:
         return StereoRig(left, right, rigid(rotation_exp(values[21:]), values[18:21]))
 
 
-def toed_in_rig(camera: PinholeCamera, baseline: float, position: Array, target: Array) -> tuple[StereoRig, Array]:
+def toed_in_rig(
+    camera: PinholeCamera, baseline: float, position: Array, target: Array
+) -> tuple[StereoRig, Array]:
     """Rig whose cameras look at one point, and the true ``camera_from_base`` (4,4).
 
-    ``position`` (3,) is the middle of the baseline and ``target`` (3,) the point looked at, base frame, m; the
-    baseline is horizontal and perpendicular to the viewing direction.
+    ``position`` (3,) is the middle of the baseline and ``target`` (3,) the point looked at, base
+    frame, m; the baseline is horizontal and perpendicular to the viewing direction.
     """
     forward = target - position
     right_axis = np.cross(forward, [0.0, 0.0, 1.0])
@@ -141,20 +160,25 @@ def toed_in_rig(camera: PinholeCamera, baseline: float, position: Array, target:
 
 
 def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
-    """camera_from_base (4,4) of a rig whose baseline has its middle at ``position`` (3,) and which looks at ``target``.
+    """camera_from_base (4,4) of a rig whose baseline has its middle at ``position`` (3,) and which
+    looks at ``target``.
 
-    The direction of view is the mean of both optical axes, made perpendicular to the baseline. A toed-in rig is put
-    where ``toed_in_rig`` puts it, as long as its baseline is horizontal there.
+    The direction of view is the mean of both optical axes, made perpendicular to the baseline. A
+    toed-in rig is put where ``toed_in_rig`` puts it, as long as its baseline is horizontal there.
     """
     right_centre = invert(rig.right_from_left)[:3, 3]
     x = right_centre / np.linalg.norm(right_centre)
     y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
     y /= np.linalg.norm(y)
-    return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * right_centre) @ _look_at(position, target)
+    return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * right_centre) @ _look_at(
+        position, target
+    )
 
 
 def _look_at(eye: Array, target: Array) -> Array:
-    """camera_from_base (4,4) of a camera at ``eye`` (3,) looking at ``target`` (3,), its x axis horizontal."""
+    """camera_from_base (4,4) of a camera at ``eye`` (3,) looking at ``target`` (3,), its x axis
+    horizontal.
+    """
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
@@ -163,8 +187,8 @@ def _look_at(eye: Array, target: Array) -> Array:
 
 @dataclass(frozen=True)
 class StereoPoints:
-    """points (n,3) and covariances (n,3,3) in the camera frame, m; ray_gap (n,): the squared distance of the two rays
-    in units of the pixel noise (one degree of freedom)."""
+    """points (n,3) and covariances (n,3,3) in the camera frame, m; ray_gap (n,): the squared
+    distance of the two rays in units of the pixel noise (one degree of freedom)."""
 
     points: Array
     covariances: Array
@@ -172,19 +196,33 @@ class StereoPoints:
 
 
 def triangulate(
-    rig: StereoRig, left: Array, right: Array, left_covariances: Array, right_covariances: Array
+    rig: StereoRig,
+    left: Array,
+    right: Array,
+    left_covariances: Array,
+    right_covariances: Array,
+    near: Array | None = None,
+    parted: float = 0.0,
 ) -> StereoPoints:
-    """Points seen at ideal pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2), px²."""
-    if left.shape != right.shape or left.ndim != 2 or left.shape[1] != 2:
-        raise ShapeError(f"left and right pixels must both be (n,2), got {left.shape} and {right.shape}")
-    from cmmsim.geometry.point_kernels import refine_points  # compiles, so it is loaded where it is first needed
+    """Points seen at pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2), px².
 
-    points = np.ascontiguousarray(linear_triangulation(rig, left, right))
-    weights = np.linalg.inv(np.stack([left_covariances, right_covariances], axis=1))
-    covariances, gaps = np.empty((len(points), 3, 3)), np.empty(len(points))
-    refine_points(
-        np.stack(rig.projection_matrices), np.stack([left, right], axis=1), weights, STEPS, points, covariances, gaps
-    )
+    The search starts ``near`` points (n, 3), or where the linear method finds them. ``parted`` px²
+    is added to the covariances while the rays are laid onto each other, but not to the result's.
+    """
+    if left.shape != right.shape or left.ndim != 2 or left.shape[1] != 2:
+        raise ShapeError(
+            f"left and right pixels must both be (n,2), got {left.shape} and {right.shape}"
+        )
+    from cmmsim.geometry.point_kernels import triangulate_all  # late: numba takes time to import
+
+    if near is None:
+        near = linear_triangulation(rig, rig.left.undistort(left)[0], rig.right.undistort(right)[0])
+    points = np.array(near, dtype=float)
+    covariances = np.empty((len(points), 3, 3))
+    gaps = np.empty(len(points))
+    pixels = np.stack([left, right], axis=1)
+    spreads = np.stack([left_covariances, right_covariances], axis=1)
+    triangulate_all(rig.figures, pixels, spreads, parted, SETTLED, points, covariances, gaps)
     return StereoPoints(points, covariances, gaps)
 
 
@@ -194,6 +232,9 @@ def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:
         return np.zeros((0, 3))
     first, second = rig.projection_matrices
     homogeneous = cv2.triangulatePoints(
-        first, second, np.ascontiguousarray(left.T, dtype=np.float64), np.ascontiguousarray(right.T, dtype=np.float64)
+        first,
+        second,
+        np.ascontiguousarray(left.T, dtype=np.float64),
+        np.ascontiguousarray(right.T, dtype=np.float64),
     )
     return (homogeneous[:3] / homogeneous[3]).T

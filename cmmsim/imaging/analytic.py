@@ -1,9 +1,10 @@
 """Drawing without OpenGL: each disc covers exactly its share of each pixel.
 
-Layers are laid over each other: background, solids from far to near, discs. A disc turned away is not drawn. Where a
-solid stands before any of a disc's probed points, the disc shows only outside of that solid's outline. Simplified
-against `pyrender`: solids are convex hulls, ordered by the depth of their middles, and their edges are sampled by scan
-lines; in a pixel with the edges of two layers the covered shares are taken as independent.
+Layers are laid over each other: background, solids from far to near, discs. A disc turned away is
+not drawn. Where a solid stands before any of a disc's probed points, the disc shows only outside of
+that solid's outline. Simplified against `pyrender`: solids are convex hulls, ordered by the depth
+of their middles, and their edges are sampled by scan lines; in a pixel with the edges of two layers
+the covered shares are taken as independent.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.renderer import Drawable, Renderer
-from cmmsim.imaging.scene import TOUCHING, ConvexSolid, DiscStack, Mesh
+from cmmsim.imaging.scene_bodies import TOUCHING, ConvexSolid, DiscStack, Mesh
 from cmmsim.imaging.views import NEAR, View, Views
 
 if TYPE_CHECKING:
@@ -25,8 +26,12 @@ if TYPE_CHECKING:
 def draw_windows(
     drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
 ) -> NDArray[np.float32]:
-    """Radiance (n, h, w) float32, 0 to 1, of n windows of one size; ``supersampling``: scan lines a pixel at edges."""
-    from cmmsim.imaging.view_kernels import draw_view  # compiles, so it is loaded where it is first needed
+    """Radiance (n, h, w) float32, 0 to 1, of n windows of one size; ``supersampling``: scan lines a
+    pixel at edges.
+    """
+    from cmmsim.imaging.view_kernels import (
+        draw_view,
+    )  # compiles, so it is loaded where it is first needed
 
     if drawable not in _SCENES:
         _SCENES[drawable] = scene_of(drawable)
@@ -36,9 +41,12 @@ def draw_windows(
     images = np.full((len(views), height, width), background, dtype=np.float32)
     corners = np.asarray(views.corners, dtype=float)
     for shown in views.exposures:
-        camera, moves = shown.camera, np.ascontiguousarray(shown.camera_from_bodies)
+        camera = shown.camera
+        moves = np.ascontiguousarray(shown.camera_from_bodies)
         figures = camera.focal_lengths, camera.centre, NEAR, TOUCHING
-        draw_view(scene, moves, *figures, images, shown.windows, corners[shown.windows], supersampling)
+        draw_view(
+            scene, moves, *figures, images, shown.windows, corners[shown.windows], supersampling
+        )
     return images
 
 
@@ -47,7 +55,9 @@ ANALYTIC = Renderer("analytic", draw_windows)
 
 def scene_of(drawable: Drawable) -> "Scene":
     """Discs, in the axes of their bodies, and solids of a drawable."""
-    from cmmsim.imaging.view_kernels import Scene  # compiles, so it is loaded where it is first needed
+    from cmmsim.imaging.view_kernels import (
+        Scene,
+    )  # compiles, so it is loaded where it is first needed
 
     rows = [
         (disc, body)

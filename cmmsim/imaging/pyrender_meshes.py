@@ -1,13 +1,17 @@
-"""What pyrender is given: stickers as softened triangles, and patches laid over each other in a known order.
+"""Meshes for pyrender: stickers as softened triangles, and patches laid over each other in a known
+order.
 
-**Soft discs.** The rim of a sharp disc aliases between the samples that a pixel is drawn with. Here the uppermost
-disc's rim falls off to the level around it over RIM_SAMPLES distances of samples, which leaves its centre and its light
-what they are, so that what is drawn comes close to the disc faster with more samples than that of a sharp rim.
+**Soft discs.** The rim of a sharp disc aliases between the samples that a pixel is drawn with. Here
+the uppermost disc's rim falls off to the level around it over RIM_SAMPLES distances of samples,
+which leaves its centre and its light what they are, so that what is drawn comes close to the disc
+faster with more samples than that of a sharp rim.
 
-**Painter's order.** Windows that show one solid and at most one stack of discs that lies on it need no depths: a camera
-before the plane of a disc sees the disc, for all of the solid lies behind that plane. Where the solid is convex and
-fills a window, its level is all that shows of it. A sticker's dark ring, then, is most of the window: it is taken for
-the ground, over which the solid is drawn as a band around the ring, with the same edge, in far fewer drawn pixels.
+**Painter's order.** Windows that show one solid and at most one stack of discs that lies on it need
+no depths: a camera before the plane of a disc sees the disc, for all of the solid lies behind that
+plane. Where the solid is convex and fills a window, its level is all that shows of it. A sticker's
+dark ring, then, is most of the
+window: it is taken for the ground, over which the solid is drawn as a band around the ring, with
+the same edge, in far fewer drawn pixels.
 """
 
 from collections.abc import Sequence
@@ -19,12 +23,13 @@ from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array, frozen
 from cmmsim.imaging.renderer import Drawable
-from cmmsim.imaging.scene import ConvexSolid, Disc, DiscStack, Mesh
+from cmmsim.imaging.scene_bodies import ConvexSolid, Disc, DiscStack, Mesh
 from cmmsim.imaging.views import FAR, NEAR, Exposure, Views
 
 RIM_SAMPLES = 1.8
 LARGEST_SAG = 0.08  # samples by which a side of the polygon may fall short of the rim
-FEWEST_SIDES, GROUND_SIDES = 16, 16
+FEWEST_SIDES = 16
+GROUND_SIDES = 16
 BAND_REACH = 5.0  # radii of a ring to which a band around it reaches
 RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
 CLEARANCE = 1e-6  # m by which a disc must lie over its solid
@@ -37,21 +42,32 @@ CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # of bounds: lowest x, y and highest
 def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
     """Triangles of discs that are drawn with samples ``sample`` m apart.
 
-    The uppermost disc has a soft rim where another one lies below it; the others are coarse and sharp.
+    The uppermost disc has a soft rim where another one lies below it; the others are coarse and
+    sharp.
     """
     *grounds, top = stack.discs
-    uppermost = _soft_disc(top, grounds[-1].level, sample) if grounds else _sharp_disc(top, _sides(top.radius, sample))
+    uppermost = (
+        _soft_disc(top, grounds[-1].level, sample)
+        if grounds
+        else _sharp_disc(top, _sides(top.radius, sample))
+    )
     return _joined([uppermost, *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds))])
 
 
 def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
-    """As ``disc_mesh``, where the lowest of several discs is a window's ground: a band of ``level`` lies around it."""
+    """As ``disc_mesh``, where the lowest of several discs is a window's ground: a band of ``level``
+    lies around it.
+    """
     lowest, *grounds = stack.discs[:-1]
     corners = [_corners(lowest, reach * lowest.radius, GROUND_SIDES) for reach in (1.0, BAND_REACH)]
-    band = Mesh(np.concatenate(corners), _band_triangles(GROUND_SIDES), np.full(2 * GROUND_SIDES, level))
+    band = Mesh(
+        np.concatenate(corners), _band_triangles(GROUND_SIDES), np.full(2 * GROUND_SIDES, level)
+    )
     around = (grounds[-1] if grounds else lowest).level
     uppermost = _soft_disc(stack.discs[-1], around, sample)
-    return _joined([uppermost, *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds)), band])
+    return _joined(
+        [uppermost, *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds)), band]
+    )
 
 
 def _joined(pieces: Sequence[Mesh]) -> Mesh:
@@ -69,13 +85,19 @@ def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
     width = min(RIM_SAMPLES * sample, disc.radius)
     middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # as much light as the sharp disc
     sides = _sides(disc.radius, sample)
-    corners = np.concatenate([_corners(disc, middle - 0.5 * width, sides), _corners(disc, middle + 0.5 * width, sides)])
+    corners = np.concatenate(
+        [_corners(disc, middle - 0.5 * width, sides), _corners(disc, middle + 0.5 * width, sides)]
+    )
     triangles = np.concatenate([_balanced_triangles(sides), _band_triangles(sides)])
-    return Mesh(corners, triangles, np.concatenate([np.full(sides, disc.level), np.full(sides, around)]))
+    return Mesh(
+        corners, triangles, np.concatenate([np.full(sides, disc.level), np.full(sides, around)])
+    )
 
 
 def _sharp_disc(disc: Disc, sides: int) -> Mesh:
-    return Mesh(_corners(disc, disc.radius, sides), _balanced_triangles(sides), np.full(sides, disc.level))
+    return Mesh(
+        _corners(disc, disc.radius, sides), _balanced_triangles(sides), np.full(sides, disc.level)
+    )
 
 
 def _sides(radius: float, sample: float) -> int:
@@ -84,7 +106,8 @@ def _sides(radius: float, sample: float) -> int:
 
 
 def _corners(disc: Disc, radius: float, sides: int) -> Array:
-    """Corners (sides, 3) of the regular polygon in a disc's plane that has the area of the circle."""
+    """Corners (sides, 3) of the regular polygon in a disc's plane that has the area of the
+    circle."""
     u, v = np.linalg.svd(disc.normal[None])[2][1:]
     angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
     fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
@@ -93,14 +116,20 @@ def _corners(disc: Disc, radius: float, sides: int) -> Array:
 
 def _band_triangles(sides: int) -> NDArray[np.int_]:
     """Triangles (2 sides, 3) between ``sides`` corners and as many around them."""
-    here, there = np.arange(sides), np.roll(np.arange(sides), -1)
+    here = np.arange(sides)
+    there = np.roll(np.arange(sides), -1)
     return np.concatenate(
-        [np.column_stack([here, there, sides + here]), np.column_stack([there, sides + there, sides + here])]
+        [
+            np.column_stack([here, there, sides + here]),
+            np.column_stack([there, sides + there, sides + here]),
+        ]
     )
 
 
 def _balanced_triangles(sides: int) -> NDArray[np.int_]:
-    """Triangles (sides - 2, 3) of a convex polygon, large ones inside: faster to draw than a fan of slivers."""
+    """Triangles (sides - 2, 3) of a convex polygon, large ones inside: faster to draw than a fan of
+    slivers.
+    """
     triangles: list[tuple[int, int, int]] = []
     arcs = [(0, sides - 1)]
     while arcs:
@@ -114,8 +143,8 @@ def _balanced_triangles(sides: int) -> NDArray[np.int_]:
 
 @dataclass(frozen=True)
 class Laid:
-    """For each of n windows the patch of its only solid, or -1 where depths are needed; whether that fills it; and the
-    stack whose lowest disc may then be taken for its ground, or -1."""
+    """For each of n windows the patch of its only solid, or -1 where depths are needed; whether
+    that fills it; and the stack whose lowest disc may then be taken for its ground, or -1."""
 
     solid: NDArray[np.int_]
     filled: NDArray[np.bool_]
@@ -129,28 +158,48 @@ class LaidSolids:
     """
 
     def __init__(self, drawable: Drawable) -> None:
-        patches, self._body_index = drawable.patches, drawable.body_index
+        patches = drawable.patches
+        self._body_index = drawable.body_index
         self._solids = {
-            k: ConvexSolid(p.vertices) for k, p in enumerate(patches) if isinstance(p, Mesh) and _is_plain_convex(p)
+            k: ConvexSolid(p.vertices)
+            for k, p in enumerate(patches)
+            if isinstance(p, Mesh) and _is_plain_convex(p)
         }
         self.levels = np.array(
             [
-                p.discs[0].level if isinstance(p, DiscStack) else p.levels[0] if k in self._solids else np.nan
+                p.discs[0].level
+                if isinstance(p, DiscStack)
+                else p.levels[0]
+                if k in self._solids
+                else np.nan
                 for k, p in enumerate(patches)
             ]
         )
-        lowest = [p.discs[0] if isinstance(p, DiscStack) and len(p.discs) > 1 else None for p in patches]
-        self._ring_centres = np.array([np.zeros(3) if ring is None else ring.centre for ring in lowest])
+        lowest = [
+            p.discs[0] if isinstance(p, DiscStack) and len(p.discs) > 1 else None for p in patches
+        ]
+        self._ring_centres = np.array(
+            [np.zeros(3) if ring is None else ring.centre for ring in lowest]
+        )
         inside = BAND_REACH * np.cos(np.pi / GROUND_SIDES)
-        self._ring_reach = np.array([0.0 if ring is None else inside * ring.radius for ring in lowest])
-        self._normals = np.array([p.discs[-1].normal if isinstance(p, DiscStack) else np.zeros(3) for p in patches])
+        self._ring_reach = np.array(
+            [0.0 if ring is None else inside * ring.radius for ring in lowest]
+        )
+        self._normals = np.array(
+            [p.discs[-1].normal if isinstance(p, DiscStack) else np.zeros(3) for p in patches]
+        )
         self._heights = np.array(
-            [p.discs[-1].centre @ p.discs[-1].normal if isinstance(p, DiscStack) else 0.0 for p in patches]
+            [
+                p.discs[-1].centre @ p.discs[-1].normal if isinstance(p, DiscStack) else 0.0
+                for p in patches
+            ]
         )
         self._lying = {
             k: np.array(
                 [
-                    isinstance(p, DiscStack) and body == self._body_index[k] and _lies_over(p, solid.vertices)
+                    isinstance(p, DiscStack)
+                    and body == self._body_index[k]
+                    and _lies_over(p, solid.vertices)
                     for p, body in zip(patches, self._body_index, strict=True)
                 ]
             )
@@ -158,9 +207,12 @@ class LaidSolids:
         }
 
     def laid(self, views: Views, reaching: NDArray[np.bool_]) -> Laid:
-        """Which windows need no depths; ``reaching`` (n views, patches): see Drawable."""
-        laid = Laid(np.full(len(views), -1), np.zeros(len(views), dtype=bool), np.full(len(views), -1))
-        few, bounds = reaching.sum(axis=1) <= 2, views.bounds
+        """Mask of the windows that need no depths; ``reaching`` as of Drawable."""
+        laid = Laid(
+            np.full(len(views), -1), np.zeros(len(views), dtype=bool), np.full(len(views), -1)
+        )
+        few = reaching.sum(axis=1) <= 2
+        bounds = views.bounds
         for shown in views.exposures:
             group = shown.windows
             for k in self._solids:
@@ -176,13 +228,20 @@ class LaidSolids:
                     others = reaching[alone]
                     others[:, k] = False
                     stack = others.argmax(axis=1)
-                    banded = laid.filled[alone] & others.any(axis=1) & self._banded(stack, k, shown, rays)
+                    banded = (
+                        laid.filled[alone]
+                        & others.any(axis=1)
+                        & self._banded(stack, k, shown, rays)
+                    )
                     laid.ringed[alone[banded]] = stack[banded]
         return laid
 
     def carrier(self, stack: int) -> int | None:
         """The solid on which a stack with a lowest disc lies, or None."""
-        return next((k for k in self._solids if self._ring_reach[stack] > 0.0 and self._lying[k][stack]), None)
+        return next(
+            (k for k in self._solids if self._ring_reach[stack] > 0.0 and self._lying[k][stack]),
+            None,
+        )
 
     def _seen_over(self, solid: int, view: Exposure) -> NDArray[np.bool_]:
         """The solid itself, and the stacks of discs on it that show their upper side (patches,)."""
@@ -193,19 +252,26 @@ class LaidSolids:
         return seen
 
     def _fills(self, solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
-        """Whether the solid shows along ``rays`` (n,4,3) to all corners of windows, and so all over them."""
+        """Tell whether the solid shows along ``rays`` (n,4,3) to all corners of windows, and so all
+        over them.
+        """
         move = view.camera_from_bodies[self._body_index[solid]]
         depths = self._solids[solid].vertices @ move[2, :3] + move[2, 3]
         if depths.min() <= NEAR or depths.max() >= FAR:
             return np.zeros(len(rays), dtype=bool)
         return np.asarray(self._solids[solid].hides(move, FAR * rays).all(axis=1))
 
-    def _banded(self, stacks: NDArray[np.int_], solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
-        """Whether a band around the lowest disc of each stack (n,) on the solid covers the corners of its window, along
-        ``rays`` (n,4,3)."""
+    def _banded(
+        self, stacks: NDArray[np.int_], solid: int, view: Exposure, rays: Array
+    ) -> NDArray[np.bool_]:
+        """Tell whether a band around the lowest disc of each stack (n,) on the solid covers the
+        corners of its window, along ``rays`` (n,4,3).
+        """
         move = view.camera_from_bodies[self._body_index[solid]]
-        gaps = self._ring_centres[stacks] + move[:3, 3] @ move[:3, :3]  # from the camera, in the axes of the body
-        along, normals = rays @ move[:3, :3], self._normals[stacks]
+        # from the camera, in the axes of the body
+        gaps = self._ring_centres[stacks] + move[:3, 3] @ move[:3, :3]
+        along = rays @ move[:3, :3]
+        normals = self._normals[stacks]
         slopes = np.einsum("nci,ni->nc", along, normals)
         share = np.einsum("ni,ni->n", normals, gaps)[:, None] / np.minimum(slopes, -SMALLEST_SLOPE)
         beside = share[..., None] * along - gaps[:, None]
@@ -214,16 +280,19 @@ class LaidSolids:
 
 
 def _is_plain_convex(mesh: Mesh) -> bool:
-    """Whether a mesh is the whole surface of a convex solid, of one level."""
+    """Tell whether a mesh is the whole surface of a convex solid, of one level."""
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
     if not solid.is_watertight or np.ptp(mesh.levels) > 0.0:
         return False
     volume = abs(float(solid.volume))
-    return volume > FLATTEST * float(np.max(solid.extents)) ** 3 and volume > (1.0 - 1e-9) * solid.convex_hull.volume
+    return (
+        volume > FLATTEST * float(np.max(solid.extents)) ** 3
+        and volume > (1.0 - 1e-9) * solid.convex_hull.volume
+    )
 
 
 def _lies_over(stack: DiscStack, vertices: Array) -> bool:
-    """Whether discs are parallel, each over the one before, and all above vertices (n,3)."""
+    """Tell whether discs are parallel, each over the one before, and all above vertices (n,3)."""
     normal = stack.discs[0].normal
     heights = np.array([disc.centre @ normal for disc in stack.discs])
     parallel = all(np.allclose(disc.normal, normal, rtol=0.0, atol=1e-9) for disc in stack.discs)

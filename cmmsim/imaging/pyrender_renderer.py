@@ -1,13 +1,14 @@
 """Rendering of many small windows in one pass. The only module that imports pyrender.
 
-pyrender supplies the OpenGL context, the mesh buffers and the flat shader; the frame buffers hold one channel only,
-which draws faster than pyrender's four. Each window is drawn into its own cell of one large frame buffer with its own
-projection, drawn larger by the supersampling factor, and averaged in linear light. Every drawn pixel has one sample:
-several of pyrender's multisampling cost more than they gain on the stickers' soft rims. A cell draws only the patches
-whose bounding box reaches into it. Projection and camera_from_body are multiplied in double precision, so that the
-shader sees one well-scaled matrix. Depths are asked for only where they are needed, and a solid that fills a cell, or
-the dark ring of its sticker, is its ground, see ``LaidSolids``.
-Pieces of the atlas are handed over as they are ready, so that OpenGL fills them while the next ones are prepared.
+pyrender supplies the OpenGL context, the mesh buffers and the flat shader; the frame buffers hold
+one channel only, which draws faster than pyrender's four. Each window is drawn into its own cell of
+one large frame buffer with its own projection, drawn larger by the supersampling factor, and
+averaged in linear light. Every drawn pixel has one sample: several of pyrender's multisampling cost
+more than they gain on the stickers' soft rims. A cell draws only the patches whose bounding box
+reaches into it. Projection and camera_from_body are multiplied in double precision, so that the
+shader sees one well-scaled matrix. Depths are asked for only where they are needed, and a solid
+that fills a cell, or the dark ring of its sticker, is its ground, see ``LaidSolids``. Pieces of the
+atlas are handed over as they are ready, so that OpenGL fills them while the next ones are prepared.
 """
 
 import ctypes
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from cmmsim.errors import CmmError, OpenGLMissingError
 from cmmsim.imaging.pyrender_meshes import LaidSolids, disc_mesh, ringed_mesh
 from cmmsim.imaging.renderer import Drawable, Renderer
-from cmmsim.imaging.scene import DiscStack, Mesh, Patch
+from cmmsim.imaging.scene_bodies import DiscStack, Mesh, Patch
 from cmmsim.imaging.views import View, Views
 
 ATLAS_SIDE_PX = 2048
@@ -37,19 +38,25 @@ def render_windows(
 ) -> NDArray[np.float32]:
     """Radiance (n, h, w) float32, 0 to 1, of n windows of one size.
 
-    Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises OpenGLMissingError.
+    Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises
+    OpenGLMissingError.
     """
-    from cmmsim.imaging.window_kernels import mean_of_cells  # compiles, so it is loaded where it is first needed
+    from cmmsim.imaging.window_kernels import (
+        mean_of_cells,
+    )  # compiles, so it is loaded where it is first needed
 
     views = Views.of(views)
     width, height = views.size
-    cell_w, cell_h = width * supersampling, height * supersampling
+    cell_w = width * supersampling
+    cell_h = height * supersampling
     columns = max(1, min(ATLAS_SIDE_PX // cell_w, int(np.ceil(np.sqrt(len(views))))))
     per_pass = columns * max(1, ATLAS_SIDE_PX // cell_h)
     windows = np.empty((len(views), height, width), dtype=np.float32)
     for first in range(0, len(views), per_pass):
         part = views[first : first + per_pass]
-        atlas = _shared_atlas().draw(drawable, part, (cell_w, cell_h), columns, -(-len(part) // columns), background)
+        atlas = _shared_atlas().draw(
+            drawable, part, (cell_w, cell_h), columns, -(-len(part) // columns), background
+        )
         mean_of_cells(atlas, columns, supersampling, windows[first : first + per_pass])
     return windows
 
@@ -77,8 +84,9 @@ def _shared_atlas() -> "_Atlas":
 
 @dataclass(frozen=True)
 class _Patch:
-    """A patch in OpenGL's memory: ``indices`` of its triangles from the front to the back, then, from ``backwards`` on,
-    as many for the other way, at a place in bytes; solid: whether it is no stack of discs."""
+    """A patch in OpenGL's memory: ``indices`` of its triangles from the front to the back, then,
+    from ``backwards`` on, as many for the other way, at a place in bytes; solid: whether it is no
+    stack of discs."""
 
     vertex_array: int
     indices: int
@@ -88,8 +96,10 @@ class _Patch:
 
 @dataclass(frozen=True)
 class _Uploaded:
-    """What is known of a drawable: its patches by the number of drawn pixels a radian, and those of them that may be
-    drawn around their own lowest disc; what lies over what."""
+    """Uploaded parts of a drawable: its patches by the number of drawn pixels a radian, those of
+    them that may be drawn around their own lowest disc, and the order in which they lie over
+    each other.
+    """
 
     patches: dict[float, list[_Patch]]
     ringed: dict[float, list[_Patch]]
@@ -103,12 +113,17 @@ class _Atlas:
         from OpenGL import GL
         from pyrender.renderer import Renderer
 
-        self._gl, self._pyrender = GL, pyrender
+        self._gl = GL
+        self._pyrender = pyrender
         self._context = pyrender.OffscreenRenderer(64, 64)
         self._viewport = _called("glViewport", *[ctypes.c_int] * 4)
         address = ctypes.c_size_t  # PyOpenGL asks what pointers point to
-        self._draw_elements = _called("glDrawElements", ctypes.c_uint, ctypes.c_int, ctypes.c_uint, address)
-        self._set_matrix = _called("glUniformMatrix4fv", ctypes.c_int, ctypes.c_int, ctypes.c_ubyte, address)
+        self._draw_elements = _called(
+            "glDrawElements", ctypes.c_uint, ctypes.c_int, ctypes.c_uint, address
+        )
+        self._set_matrix = _called(
+            "glUniformMatrix4fv", ctypes.c_int, ctypes.c_int, ctypes.c_ubyte, address
+        )
         self._bind_mesh = _called("glBindVertexArray", ctypes.c_uint)
         self._constants = int(GL.GL_TRIANGLES), int(GL.GL_UNSIGNED_INT)
         self._shaders = Renderer(64, 64)
@@ -129,38 +144,50 @@ class _Atlas:
         rows: int,
         background: float,
     ) -> NDArray[np.uint8]:
-        """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid until the next."""
+        """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid
+        until the next.
+        """
         self._context._platform.make_current()
-        samples = views.exposures[0].camera.focal_px * cell[0] / views.size[0]  # drawn pixels a radian
+        # drawn pixels a radian
+        samples = views.exposures[0].camera.focal_px * cell[0] / views.size[0]
         known = self._uploaded(drawable, samples)
         frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
         frame_buffer.bind()
         reaching = drawable.reaching(views)
         laid = known.solids.laid(views, reaching)
         reaching[np.flatnonzero(laid.filled), laid.solid[laid.filled]] = False
-        places = [((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))]
+        places = [
+            ((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))
+        ]
         grounds = known.solids.levels[np.where(laid.ringed < 0, laid.solid, laid.ringed)]
-        self._clear(np.where(laid.filled, grounds, background), places, bool((laid.solid < 0).any()))
+        self._clear(
+            np.where(laid.filled, grounds, background), places, bool((laid.solid < 0).any())
+        )
         self._program._bind()
         clip_from_bodies = np.ascontiguousarray(views.clip_from_bodies(), dtype=np.float32)
         shown = [np.flatnonzero(row).tolist() for row in reaching]
-        per_piece, address, strides = (
-            -(-rows // PIECES) * columns,
-            clip_from_bodies.ctypes.data,
-            clip_from_bodies.strides,
-        )
-        for k, (place, deep, ringed) in enumerate(zip(places, laid.solid < 0, laid.ringed >= 0, strict=True)):
+        per_piece = -(-rows // PIECES) * columns
+        address = clip_from_bodies.ctypes.data
+        strides = clip_from_bodies.strides
+        for k, (place, deep, ringed) in enumerate(
+            zip(places, laid.solid < 0, laid.ringed >= 0, strict=True)
+        ):
             if k and k % per_piece == 0:
                 self._gl.glFlush()
             self._viewport(*place)
-            matrices = {p: address + k * strides[0] + int(drawable.body_index[p]) * strides[1] for p in shown[k]}
+            matrices = {
+                p: address + k * strides[0] + int(drawable.body_index[p]) * strides[1]
+                for p in shown[k]
+            }
             draw = self._draw_by_depth if deep else self._lay
             draw(matrices, (known.ringed if ringed else known.patches)[samples])
         self._bind_mesh(0)
         return frame_buffer.read()
 
     def _draw_by_depth(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
-        """The patches shown in a cell, the nearest of which is seen; matrices: addresses of theirs by their numbers."""
+        """The patches shown in a cell, the nearest of which is seen; matrices: addresses of theirs
+        by their numbers.
+        """
         gl, (triangles, unsigned) = self._gl, self._constants
         gl.glEnable(gl.GL_DEPTH_TEST)
         for p, matrix in matrices.items():
@@ -170,16 +197,21 @@ class _Atlas:
         gl.glDisable(gl.GL_DEPTH_TEST)
 
     def _lay(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
-        """The patches shown in a cell, all of one body, over each other: the solid, then what lies on it."""
+        """The patches shown in a cell, all of one body, over each other: the solid, then what lies
+        on it.
+        """
         triangles, unsigned = self._constants
         for p in sorted(matrices, key=lambda p: not patches[p].solid):
             self._set_matrix(self._matrix_location, 1, True, matrices[p])
             self._bind_mesh(patches[p].vertex_array)
             self._draw_elements(triangles, patches[p].indices, unsigned, patches[p].backwards)
 
-    def _clear(self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool) -> None:
+    def _clear(
+        self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool
+    ) -> None:
         """Give each cell its ground's level, and the farthest depth where depths are asked for."""
-        gl, level = self._gl, float(grounds[0])
+        gl = self._gl
+        level = float(grounds[0])
         gl.glClearColor(level, level, level, 1.0)
         gl.glClear(gl.GL_COLOR_BUFFER_BIT | (gl.GL_DEPTH_BUFFER_BIT if with_depth else 0))
         others = np.flatnonzero(grounds != level).tolist()
@@ -192,25 +224,35 @@ class _Atlas:
             gl.glDisable(gl.GL_SCISSOR_TEST)
 
     def _uploaded(self, drawable: Drawable, samples: float) -> _Uploaded:
-        """The drawable, with its patches in OpenGL's memory, their discs made for ``samples`` drawn pixels a radian."""
+        """The drawable, with its patches in OpenGL's memory, their discs made for ``samples`` drawn
+        pixels a radian.
+        """
         known = self._known.get(drawable)
         if known is None:
             known = self._known[drawable] = _Uploaded({}, {}, LaidSolids(drawable))
         if samples not in known.patches:
-            sample, solids = drawable.distance / samples, known.solids
-            known.patches[samples], known.ringed[samples] = [], []
+            sample = drawable.distance / samples
+            solids = known.solids
+            known.patches[samples] = []
+            known.ringed[samples] = []
             for k, patch in enumerate(drawable.patches):
-                drawn = self._patch(disc_mesh(patch, sample) if isinstance(patch, DiscStack) else patch, patch)
+                drawn = self._patch(
+                    disc_mesh(patch, sample) if isinstance(patch, DiscStack) else patch, patch
+                )
                 known.patches[samples].append(drawn)
                 carrier = solids.carrier(k)
                 if isinstance(patch, DiscStack) and carrier is not None:
-                    drawn = self._patch(ringed_mesh(patch, sample, float(solids.levels[carrier])), patch)
+                    drawn = self._patch(
+                        ringed_mesh(patch, sample, float(solids.levels[carrier])), patch
+                    )
                 known.ringed[samples].append(drawn)
         return known
 
     def _patch(self, mesh: Mesh, patch: Patch) -> _Patch:
         behind = mesh.faces.size * np.uint32().itemsize
-        return _Patch(int(self._upload(mesh)._vaid), mesh.faces.size, behind, isinstance(patch, Mesh))
+        return _Patch(
+            int(self._upload(mesh)._vaid), mesh.faces.size, behind, isinstance(patch, Mesh)
+        )
 
     def _upload(self, mesh: Mesh) -> Any:
         grey = np.repeat(mesh.levels[:, None], 3, axis=1)
@@ -233,7 +275,7 @@ class _Atlas:
 
     @cached_property
     def _matrix_location(self) -> int:
-        """Where the bound shader takes its matrix from."""
+        """Location of the bound shader's matrix."""
         return int(self._gl.glGetUniformLocation(self._program._program_id, "P"))
 
     @cached_property
@@ -242,7 +284,9 @@ class _Atlas:
         from pyrender.constants import ProgramFlags
 
         anything = self._upload(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros(3)))
-        program = self._shaders._get_primitive_program(anything, self._flags, ProgramFlags.USE_MATERIAL)
+        program = self._shaders._get_primitive_program(
+            anything, self._flags, ProgramFlags.USE_MATERIAL
+        )
         program._bind()
         for name in ("V", "M"):
             program.set_uniform(name, np.eye(4))
@@ -251,7 +295,9 @@ class _Atlas:
 
 
 def _called(name: str, *arguments: type) -> Any:
-    """A function of OpenGL that takes plain numbers and addresses, and is not asked for errors after each call."""
+    """A function of OpenGL that takes plain numbers and addresses, and is not asked for errors
+    after each call.
+    """
     from OpenGL.platform import PLATFORM
 
     return PLATFORM.constructFunction(name, PLATFORM.GL, None, arguments, error_checker=None)
@@ -263,7 +309,9 @@ class _FrameBuffer:
     def __init__(self, gl: Any, width: int, height: int) -> None:
         from OpenGL.raw.GL.VERSION import GL_1_0  # reads into given memory
 
-        self._gl, self._size, self._read_pixels = gl, (width, height), GL_1_0.glReadPixels
+        self._gl = gl
+        self._size = (width, height)
+        self._read_pixels = GL_1_0.glReadPixels
         self._pixels = np.empty((height, width), dtype=np.uint8)
         self._target = self._pixels.ctypes.data_as(ctypes.c_void_p)
         self._name = gl.glGenFramebuffers(1)
@@ -277,12 +325,14 @@ class _FrameBuffer:
             raise CmmError(f"OpenGL cannot draw {self._size} px: frame buffer state {state}")
 
     def bind(self) -> None:
-        """What is drawn from now on goes here, what is read comes from here."""
+        """Draw here from now on, and read from here."""
         self._gl.glBindFramebuffer(self._gl.GL_FRAMEBUFFER, self._name)
 
     def read(self) -> NDArray[np.uint8]:
         """The image (height, width), in memory that the next one takes, too."""
-        self._read_pixels(0, 0, *self._size, self._gl.GL_RED, self._gl.GL_UNSIGNED_BYTE, self._target)
+        self._read_pixels(
+            0, 0, *self._size, self._gl.GL_RED, self._gl.GL_UNSIGNED_BYTE, self._target
+        )
         return self._pixels
 
     def delete(self) -> None:

@@ -7,18 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cmmsim.compiled import Array, compiled
+from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.disc_kernels import place_discs, probe_discs, project_all
-from cmmsim.imaging.kernels import Discs, Solids, enters, lay_layers
+from cmmsim.imaging.layer_kernels import Discs, Solids, enters, lay_layers
 
 PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
 NEAREST = 1e-3  # m: a solid that comes nearer has no outline
 
 
 class Scene(NamedTuple):
-    """Discs at places (m,3) with normals (m,3), radii and levels (m,), in the axes of their owners (m,); convex solids
-    of bodies (s,), with levels (s,), middles (s,3), vertices (v,3) from vertex_starts[k] on, and faces normal . x +
-    offset <= 0 (f,3), (f,) from face_starts[k] on."""
+    """Discs at places (m,3) with normals (m,3), radii and levels (m,), in the axes of their owners
+    (m,); convex solids of bodies (s,), with levels (s,), middles (s,3), vertices (v,3) from
+    vertex_starts[k] on, and faces normal . x + offset <= 0 (f,3), (f,) from face_starts[k] on."""
 
     places: Array
     normals: Array
@@ -37,10 +37,12 @@ class Scene(NamedTuple):
 
 @compiled
 def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) -> None:
-    """Fill base_from_body (k,4,4), zero before, of rods from starts (k,3) to ends (k,3) along their z axes, and their
-    lengths (k,); x is across z and the axis that is farthest from it."""
+    """Fill base_from_body (k,4,4), zero before, of rods from starts (k,3) to ends (k,3) along their
+    z axes, and their lengths (k,); x is across z and the axis that is farthest from it."""
     for k in range(len(starts)):
-        move, squared, aside = transforms[k], 0.0, 0
+        move = transforms[k]
+        squared = 0.0
+        aside = 0
         for i in range(3):
             move[i, 2] = ends[k, i] - starts[k, i]
             move[i, 3] = starts[k, i]
@@ -49,11 +51,13 @@ def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) ->
         for i in range(3):
             move[i, 2] /= lengths[k]
             aside = i if abs(move[i, 2]) < abs(move[aside, 2]) else aside
-        after, before = (aside + 1) % 3, (aside + 2) % 3
+        after = (aside + 1) % 3
+        before = (aside + 2) % 3
         across = math.sqrt(move[after, 2] ** 2 + move[before, 2] ** 2)
         move[after, 0], move[before, 0] = move[before, 2] / across, -move[after, 2] / across
         for i in range(3):
-            j, m = (i + 1) % 3, (i + 2) % 3
+            j = (i + 1) % 3
+            m = (i + 2) % 3
             move[i, 1] = move[j, 2] * move[m, 0] - move[m, 2] * move[j, 0]
         move[3, 3] = 1.0
 
@@ -64,22 +68,26 @@ def convex_hull(points: Array) -> Array:
     n = len(points)
     for i in range(1, n):  # few and never many: sorted by x, then y
         for j in range(i, 0, -1):
-            before, after = points[j - 1], points[j]
+            before = points[j - 1]
+            after = points[j]
             if before[0] < after[0] or (before[0] == after[0] and before[1] <= after[1]):
                 break
             for axis in range(2):
                 before[axis], after[axis] = after[axis], before[axis]
-    hull, count = np.empty((2 * n, 2)), 0
+    hull = np.empty((2 * n, 2))
+    count = 0
     for way in range(2):
         least = count + 1
         for step in range(n):
             point = points[step if way == 0 else n - 1 - step]
             while count > least:
-                a, b = hull[count - 2], hull[count - 1]
+                a = hull[count - 2]
+                b = hull[count - 1]
                 if (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0]) > 0.0:
                     break
                 count -= 1
-            hull[count, 0], hull[count, 1] = point[0], point[1]
+            hull[count, 0] = point[0]
+            hull[count, 1] = point[1]
             count += 1
         count -= 1  # where one chain ends the other begins
     return hull[: max(count, 1)]
@@ -87,18 +95,23 @@ def convex_hull(points: Array) -> Array:
 
 @compiled
 def half_planes_of(corners: Array, half_planes: Array) -> int:
-    """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2); returns their number,
-    sides of no length being left out."""
-    n, count, middle_x, middle_y = len(corners), 0, 0.0, 0.0
+    """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2);
+    returns their number, sides of no length being left out."""
+    n = len(corners)
+    count = 0
+    middle_x = 0.0
+    middle_y = 0.0
     for k in range(n):
         middle_x += corners[k, 0] / n
         middle_y += corners[k, 1] / n
     for k in range(n):
         x, y = corners[k]
-        a, b = corners[(k + 1) % n, 1] - y, x - corners[(k + 1) % n, 0]
+        a = corners[(k + 1) % n, 1] - y
+        b = x - corners[(k + 1) % n, 0]
         if abs(a) + abs(b) > 1e-6:
             outwards = 1.0 if a * (x - middle_x) + b * (y - middle_y) > 0.0 else -1.0
-            half_planes[count, 0], half_planes[count, 1] = outwards * a, outwards * b
+            half_planes[count, 0] = outwards * a
+            half_planes[count, 1] = outwards * b
             half_planes[count, 2] = outwards * (a * x + b * y)
             count += 1
     return count
@@ -106,17 +119,26 @@ def half_planes_of(corners: Array, half_planes: Array) -> int:
 
 @compiled
 def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near: float) -> tuple:
-    """The discs turned towards the camera, far to near and outer before inner: which (m,), the centres (m,2) px, shapes
-    (m,2,2) px and extents (m,2) px of their ellipses, and points (m,k,3) m on them."""
+    """The discs turned towards the camera, far to near and outer before inner: which (m,), the
+    centres (m,2) px, shapes (m,2,2) px and extents (m,2) px of their ellipses, and points (m,k,3) m
+    on them."""
     total = len(scene.radii)
-    places, normals = np.empty((total, 3)), np.empty((total, 3))
+    places = np.empty((total, 3))
+    normals = np.empty((total, 3))
     place_discs(moves, scene.owners, scene.places, scene.normals, places, normals)
-    kept, count = np.empty(total, np.int64), 0
+    kept = np.empty(total, np.int64)
+    count = 0
     for n in range(total):
-        facing = places[n, 0] * normals[n, 0] + places[n, 1] * normals[n, 1] + places[n, 2] * normals[n, 2] < 0.0
+        facing = (
+            places[n, 0] * normals[n, 0]
+            + places[n, 1] * normals[n, 1]
+            + places[n, 2] * normals[n, 2]
+            < 0.0
+        )
         if not (facing and places[n, 2] - scene.radii[n] > near):
             continue
-        depth, at = np.rint(1e3 * places[n, 2]), count
+        depth = np.rint(1e3 * places[n, 2])
+        at = count
         while at > 0:
             other = kept[at - 1]
             ahead = np.rint(1e3 * places[other, 2])
@@ -127,8 +149,13 @@ def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near
         kept[at] = n
         count += 1
     kept = kept[:count]
-    pixels, shapes, extents = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty((count, 2))
-    probes, places, normals, radii = np.empty((count, PROBES + 1, 3)), places[kept], normals[kept], scene.radii[kept]
+    pixels = np.empty((count, 2))
+    shapes = np.empty((count, 2, 2))
+    extents = np.empty((count, 2))
+    probes = np.empty((count, PROBES + 1, 3))
+    places = places[kept]
+    normals = normals[kept]
+    radii = scene.radii[kept]
     project_all(places, normals, radii, focal, principal, pixels, shapes)
     probe_discs(places, normals, radii, probes)
     for n in range(count):
@@ -139,12 +166,21 @@ def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near
 
 @compiled
 def stand_before(
-    scene: Scene, moves: Array, owners: Array, probes: Array, near: float, touching: float, slots: Array
+    scene: Scene,
+    moves: Array,
+    owners: Array,
+    probes: Array,
+    near: float,
+    touching: float,
+    slots: Array,
 ) -> Array:
-    """Whether solids stand before discs (m,h), of each solid that does before any; ``slots`` (s,) is filled with its
-    column, or -1. owners (m,) and probes (m,k,3) of the discs."""
-    behind, hiding = np.zeros((len(owners), len(slots)), np.bool_), 0
-    eye, point = np.empty(3), np.empty(3)
+    """Tell whether solids stand before discs (m,h), of each solid that does before any; ``slots``
+    (s,) is filled with its column, or -1. owners (m,) and probes (m,k,3) of the discs.
+    """
+    behind = np.zeros((len(owners), len(slots)), np.bool_)
+    hiding = 0
+    eye = np.empty(3)
+    point = np.empty(3)
     for k in range(len(slots)):
         slots[k] = -1
         move = moves[scene.bodies[k]]
@@ -161,7 +197,9 @@ def stand_before(
                     point[i] = eye[i]
                     for j in range(3):
                         point[i] += move[j, i] * probes[n, p, j]
-                if enters(eye, point, scene.face_normals[own], scene.face_offsets[own], 0.0, touching):
+                if enters(
+                    eye, point, scene.face_normals[own], scene.face_offsets[own], 0.0, touching
+                ):
                     slots[k] = hiding
                     behind[n, hiding] = True
                     break
@@ -171,35 +209,50 @@ def stand_before(
 
 @compiled
 def outlined(scene: Scene, moves: Array, focal: Array, principal: Array, slots: Array) -> Solids:
-    """The solids wholly before the camera from far to near; ``slots`` (s,): where the cover of each is kept, or -1."""
+    """The solids wholly before the camera from far to near; ``slots`` (s,): where the cover of each
+    is kept, or -1.
+    """
     total = len(slots)
-    depths, half_planes = np.empty(total), np.empty((len(scene.vertices), 3))
+    depths = np.empty(total)
+    half_planes = np.empty((len(scene.vertices), 3))
     for k in range(total):
-        move, middle = moves[scene.bodies[k]], scene.middles[k]
-        depths[k] = move[2, 0] * middle[0] + move[2, 1] * middle[1] + move[2, 2] * middle[2] + move[2, 3]
+        move = moves[scene.bodies[k]]
+        middle = scene.middles[k]
+        depths[k] = (
+            move[2, 0] * middle[0] + move[2, 1] * middle[1] + move[2, 2] * middle[2] + move[2, 3]
+        )
     order = np.argsort(depths)[::-1]
-    starts, boxes, shown, filled = np.zeros(total + 1, np.int64), np.empty((total, 4)), np.empty(total, np.int64), 0
+    starts = np.zeros(total + 1, np.int64)
+    boxes = np.empty((total, 4))
+    shown = np.empty(total, np.int64)
+    filled = 0
     for k in order:
-        move, vertices = moves[scene.bodies[k]], scene.vertices[scene.vertex_starts[k] : scene.vertex_starts[k + 1]]
-        pixels, nearest = np.empty((len(vertices), 2)), np.inf
+        move = moves[scene.bodies[k]]
+        vertices = scene.vertices[scene.vertex_starts[k] : scene.vertex_starts[k + 1]]
+        pixels = np.empty((len(vertices), 2))
+        nearest = np.inf
         for v in range(len(vertices)):
             x, y, z = vertices[v]
             depth = move[2, 0] * x + move[2, 1] * y + move[2, 2] * z + move[2, 3]
             nearest = min(nearest, depth)
             for i in range(2):
                 at = move[i, 0] * x + move[i, 1] * y + move[i, 2] * z + move[i, 3]
-                pixels[v, i] = np.float32(at / depth * focal[i] + principal[i])  # finer edges would not show
+                # finer edges would not show
+                pixels[v, i] = np.float32(at / depth * focal[i] + principal[i])
         if nearest <= NEAREST:
             continue
         hull = convex_hull(pixels)
         for i in range(2):
-            boxes[filled, i], boxes[filled, 2 + i] = hull[:, i].min(), hull[:, i].max()
+            boxes[filled, i] = hull[:, i].min()
+            boxes[filled, 2 + i] = hull[:, i].max()
         first = starts[filled]
         starts[filled + 1] = first + half_planes_of(hull, half_planes[first:])
         shown[filled] = k
         filled += 1
     shown = shown[:filled]
-    return Solids(half_planes, starts[: filled + 1], boxes[:filled], scene.levels[shown], slots[shown])
+    return Solids(
+        half_planes, starts[: filled + 1], boxes[:filled], scene.levels[shown], slots[shown]
+    )
 
 
 @compiled
@@ -215,8 +268,9 @@ def draw_view(
     corners: Array,
     lines: int,
 ) -> None:
-    """Draw the windows ``images[group]`` (h, w) with first pixels ``corners`` (n, 2) of one exposure of a camera with a
-    perfect lens, focal lengths (2,) and principal point (2,) px, at which bodies stand by ``moves`` (b,4,4)."""
+    """Draw the windows ``images[group]`` (h, w) with first pixels ``corners`` (n, 2) of one
+    exposure of a camera with a perfect lens, focal lengths (2,) and principal point (2,) px, at
+    which bodies stand by ``moves`` (b,4,4)."""
     kept, pixels, shapes, extents, probes = shown_discs(scene, moves, focal, principal, near)
     slots = np.empty(len(scene.bodies), np.int64)
     behind = stand_before(scene, moves, scene.owners[kept], probes, near, touching, slots)

@@ -1,7 +1,8 @@
-"""Light over an exposure: of windows, and of a whole image, which is drawn finely only around bright spots.
+"""Light over an exposure: of windows, and of a whole image, which is drawn finely only around
+bright spots.
 
-Most of the scene stands still during an exposure: a window that nothing reaches shows the background and is not drawn,
-one that no moving body reaches is drawn once.
+Most of the scene stands still during an exposure: a window that nothing reaches shows the
+background and is not drawn, one that no moving body reaches is drawn once.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,9 @@ from cmmsim.imaging.views import View
 
 PASTED_SIZE = 24  # px side of the finely drawn window around a bright spot
 LARGEST_PASTED_SIZE = 96  # px: a larger spot is left coarse
-DARK_RIM = 8  # px of the surroundings that are drawn finely with a spot that is longer than a sticker
+DARK_RIM = (
+    8  # px of the surroundings that are drawn finely with a spot that is longer than a sticker
+)
 BRIGHT = 0.4  # radiance above which a spot is drawn finely
 TILE = 64  # px side of the pieces that are bent and blurred at a time
 COARSE = 2  # drawn samples a pixel and axis away from bright spots
@@ -32,7 +35,8 @@ def exposed_windows(
     supersampling: int,
     sub_pixels: int | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean and largest radiance (k, size, size) over moments with bodies (b,4,4) each, without vignetting.
+    """Mean and largest radiance (k, size, size) over moments with bodies (b,4,4) each, without
+    vignetting.
 
     Parameters: corners (k,2) px; supersampling and sub_pixels as of ``ImageFormation.windows``.
     """
@@ -56,7 +60,8 @@ def exposed_windows(
         total += window
         np.maximum(largest, window, out=largest)
     brightest = mean.copy()
-    mean[drawn_often], brightest[drawn_often] = total / np.float32(len(moments)), largest
+    mean[drawn_often] = total / np.float32(len(moments))
+    brightest[drawn_often] = largest
     return mean, brightest
 
 
@@ -68,33 +73,42 @@ def whole_image(
     It is drawn coarsely, and as finely as windows are around each bright spot.
     """
     image, bright = _coarse(formation, camera, moments)
-    corners, size = _spots(bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera]))
+    corners, size = _spots(
+        bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera])
+    )
     if len(corners):
         fine = exposed_windows(formation, camera, moments, corners, size, supersampling)[0]
         for (x, y), window in zip(corners, fine, strict=True):
             image[y : y + size, x : x + size] = window
     if formation.optics.vignetting == 0.0:
         return image
-    pixels = np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
+    pixels = np.stack(
+        np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1
+    )
     return image * formation.optics.illumination(camera, pixels).astype(np.float32)
 
 
 def _coarse(
     formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Mean radiance (height, width) with COARSE² drawn samples a pixel, and where it is bright at any moment."""
+    """Mean radiance (height, width) with COARSE² drawn samples a pixel, and where it is bright at
+    any moment.
+    """
     if len(moments) == 1 and formation.draws_pixels([camera]):
         view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))
         image = formation.renderer.draw(formation.drawable, [view], COARSE, formation.background)[0]
         return image, image > BRIGHT
-    rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
+    rows = -(-camera.height // TILE)
+    columns = -(-camera.width // TILE)
     x, y = np.meshgrid(TILE * np.arange(columns), TILE * np.arange(rows))
     corners = np.column_stack([x.ravel(), y.ravel()])
     mean, brightest = (
         tiles.reshape(rows, columns, TILE, TILE)
         .swapaxes(1, 2)
         .reshape(rows * TILE, columns * TILE)[: camera.height, : camera.width]
-        for tiles in exposed_windows(formation, camera, moments, corners, TILE, COARSE, sub_pixels=1)
+        for tiles in exposed_windows(
+            formation, camera, moments, corners, TILE, COARSE, sub_pixels=1
+        )
     )
     return mean, brightest > BRIGHT
 

@@ -1,35 +1,54 @@
-"""Compiled: which patches reach into windows, and what becomes of drawn windows: means of cells, and bent ones."""
+"""Compiled: which patches reach into windows, and what becomes of drawn windows: means of cells,
+and bent ones.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from cmmsim.compiled import Array, compiled
+from cmmsim.compilation import Array, compiled
 
 
 @compiled
 def boxes_reaching(
-    pixels_from_bodies: Array, body_index: Array, boxes: Array, windows: Array, near: float, reaching: Array
+    pixels_from_bodies: Array,
+    body_index: Array,
+    boxes: Array,
+    windows: Array,
+    near: float,
+    reaching: Array,
 ) -> None:
-    """Fill reaching (n, patches) for windows (n,4) of one exposure: lowest x, y and highest x, y, px.
+    """Fill reaching (n, patches) for windows (n,4) of one exposure: lowest x, y and highest x, y,
+    px.
 
-    Projection matrices pixels_from_bodies (b,3,4); corners of each patch's box as columns boxes (patches,4,8), m and 1.
-    A box not wholly farther than ``near`` may show anywhere, one behind the camera nowhere.
+    Projection matrices pixels_from_bodies (b,3,4); corners of each patch's box as columns boxes
+    (patches,4,8), m and 1. A box not wholly farther than ``near`` may show anywhere, one behind the
+    camera nowhere.
     """
-    box, point = np.empty(4), np.empty(3)
+    box = np.empty(4)
+    point = np.empty(3)
     for p in range(len(boxes)):
         move = pixels_from_bodies[body_index[p]]
-        box[:2], box[2:] = np.inf, -np.inf
-        nearest, farthest = np.inf, -np.inf
+        box[:2] = np.inf
+        box[2:] = -np.inf
+        nearest = np.inf
+        farthest = -np.inf
         for c in range(8):
             for i in range(3):
                 point[i] = (
-                    move[i, 0] * boxes[p, 0, c] + move[i, 1] * boxes[p, 1, c] + move[i, 2] * boxes[p, 2, c] + move[i, 3]
+                    move[i, 0] * boxes[p, 0, c]
+                    + move[i, 1] * boxes[p, 1, c]
+                    + move[i, 2] * boxes[p, 2, c]
+                    + move[i, 3]
                 )
-            nearest, farthest = min(nearest, point[2]), max(farthest, point[2])
+            nearest = min(nearest, point[2])
+            farthest = max(farthest, point[2])
             if point[2] > near:
                 for i in range(2):
-                    box[i], box[2 + i] = min(box[i], point[i] / point[2]), max(box[2 + i], point[i] / point[2])
+                    box[i], box[2 + i] = (
+                        min(box[i], point[i] / point[2]),
+                        max(box[2 + i], point[i] / point[2]),
+                    )
         for n in range(len(windows)):
             if nearest <= near:
                 reaching[n, p] = farthest > 0.0
@@ -44,15 +63,18 @@ def boxes_reaching(
 
 @compiled
 def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array) -> None:
-    """Fill windows (n, h, w) float32, 0 to 1, with the means of ``supersampling``² drawn pixels, 0 to 255.
+    """Fill windows (n, h, w) float32, 0 to 1, with the means of ``supersampling``² drawn pixels, 0
+    to 255.
 
     ``drawn`` holds the cell of each window in reading order, ``columns`` of them a row.
     """
     count, height, width = windows.shape
-    share, white = np.float32(1.0 / (supersampling * supersampling)), np.float32(255.0)
+    share = np.float32(1.0 / (supersampling * supersampling))
+    white = np.float32(255.0)
     sums = np.empty(width * supersampling, dtype=np.uint32)
     for n in range(count):
-        top, left = n // columns * height * supersampling, n % columns * width * supersampling
+        top = n // columns * height * supersampling
+        left = n % columns * width * supersampling
         for y in range(height):
             sums[:] = 0
             for i in range(supersampling):
@@ -68,7 +90,8 @@ def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array
 
 @compiled
 def keys_weights(share: float) -> tuple:
-    """Weights of the four pixels around a place that lies ``share`` (0 to 1) after the second one."""
+    """Weights of the four pixels around a place that lies ``share`` (0 to 1) after the second
+    one."""
     s = min(max(share, 0.0), 1.0)
     return (
         s * (-0.5 + s * (1.0 - 0.5 * s)),
@@ -80,15 +103,18 @@ def keys_weights(share: float) -> tuple:
 
 @compiled
 def mark_plain(drawn: Array, along: Array, plain: Array) -> None:
-    """Mark in ``plain`` (h, w) the pixels of a drawn window (h, w) that are equal to all others from one before to two
-    behind them in both directions; ``along`` (h, w) is overwritten."""
+    """Mark in ``plain`` (h, w) the pixels of a drawn window (h, w) that are equal to all others
+    from one before to two behind them in both directions; ``along`` (h, w) is overwritten."""
     height, width = drawn.shape
     for y in range(height):
         row = drawn[y]
         for x in range(1, width - 2):
             along[y, x] = (row[x - 1] == row[x]) & (row[x] == row[x + 1]) & (row[x] == row[x + 2])
     for y in range(1, height - 2):
-        above, row, below, last = drawn[y - 1], drawn[y], drawn[y + 1], drawn[y + 2]
+        above = drawn[y - 1]
+        row = drawn[y]
+        below = drawn[y + 1]
+        last = drawn[y + 2]
         for x in range(1, width - 2):
             even = along[y - 1, x] & along[y, x] & along[y + 1, x] & along[y + 2, x]
             plain[y, x] = even & (above[x] == row[x]) & (row[x] == below[x]) & (row[x] == last[x])
@@ -96,11 +122,14 @@ def mark_plain(drawn: Array, along: Array, plain: Array) -> None:
 
 @compiled
 def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
-    """Fill windows (n, size, size) from drawn ones (n, h, w) at places given by biquadratic coefficients (n,3,3,2)."""
+    """Fill windows (n, size, size) from drawn ones (n, h, w) at places given by biquadratic
+    coefficients (n,3,3,2).
+    """
     n, height, width = drawn.shape
     size = result.shape[1]
     at = np.empty((3, 2))
-    along, plain = np.empty((height, width), np.bool_), np.empty((height, width), np.bool_)
+    along = np.empty((height, width), np.bool_)
+    plain = np.empty((height, width), np.bool_)
     for k in range(n):
         mark_plain(drawn[k], along, plain)
         for row in range(size):
@@ -126,8 +155,12 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
 
 @compiled
 def interpolated(drawn: Array, x: float, y: float, first_x: int, first_y: int) -> float:
-    """Value of a drawn window (h, w) at a place between pixels, by those from one before the first to two behind it."""
-    weights_x, weights_y, value = keys_weights(x - first_x), keys_weights(y - first_y), 0.0
+    """Value of a drawn window (h, w) at a place between pixels, by those from one before the first
+    to two behind it.
+    """
+    weights_x = keys_weights(x - first_x)
+    weights_y = keys_weights(y - first_y)
+    value = 0.0
     for i in range(4):
         line = 0.0
         for j in range(4):

@@ -1,1 +1,1 @@
-"""What light becomes in a camera: point spread and vignetting, noise after EMVA 1288, and the images."""
+"""Light in a camera: point spread and vignetting, noise after EMVA 1288, and the images."""

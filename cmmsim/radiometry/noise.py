@@ -1,8 +1,8 @@
 """Camera noise after the linear model of EMVA 1288.
 
-Radiance (0 to 1) becomes electrons, shot noise, dark noise and what differs from pixel to pixel are added, the gain K
-turns electrons into grey values, which are clipped and rounded. Shot noise is drawn as a normal variable of the Poisson
-variance.
+Radiance (0 to 1) becomes electrons, shot noise, dark noise and what differs from pixel to pixel are
+added, the gain K turns electrons into grey values, which are clipped and rounded. Shot noise is
+drawn as a normal variable of the Poisson variance.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,8 @@ GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 def cut_windows(image: NDArray[T], corners: NDArray[np.int_], size: int) -> NDArray[T]:
-    """Windows (k, size, size) of an image (height, width) with first pixels ``corners`` (k, 2) as (x, y).
+    """Windows (k, size, size) of an image (height, width) with first pixels ``corners`` (k, 2) as
+    (x, y).
 
     Outside of the image they repeat its edge.
     """
@@ -36,9 +37,11 @@ def cut_windows(image: NDArray[T], corners: NDArray[np.int_], size: int) -> NDAr
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """What differs from pixel to pixel of one camera, the same in every image (EMVA 1288: PRNU and DSNU).
+    """Differences from pixel to pixel of one camera, the same in every image (EMVA 1288: PRNU and
+    DSNU).
 
-    sensitivity of each pixel relative to the mean, and its offset in the dark in e-; arrays of one shape.
+    sensitivity of each pixel relative to the mean, and its offset in the dark in e-; arrays of one
+    shape.
     """
 
     sensitivity: NDArray[np.float32]
@@ -46,11 +49,17 @@ class FixedPattern:
 
     def windows(self, corners: NDArray[np.int_], size: int) -> "FixedPattern":
         """The pattern (k, size, size) in windows as of ``cut_windows``."""
-        return FixedPattern(*(cut_windows(values, corners, size) for values in (self.sensitivity, self.offset)))
+        return FixedPattern(
+            *(cut_windows(values, corners, size) for values in (self.sensitivity, self.offset))
+        )
 
 
-def draw_pattern(shape: tuple[int, int], prnu: float, dsnu: float, rng: np.random.Generator) -> FixedPattern:
-    """Pattern of a camera with ``shape`` (height, width): white, normal, of relative std ``prnu`` and ``dsnu`` e-."""
+def draw_pattern(
+    shape: tuple[int, int], prnu: float, dsnu: float, rng: np.random.Generator
+) -> FixedPattern:
+    """Pattern of a camera with ``shape`` (height, width): white, normal, of relative std ``prnu``
+    and ``dsnu`` e-.
+    """
     sensitivity = 1.0 + np.float32(prnu) * rng.standard_normal(shape, dtype=np.float32)
     offset = np.float32(dsnu) * rng.standard_normal(shape, dtype=np.float32)
     for values in (sensitivity, offset):
@@ -62,16 +71,14 @@ def draw_pattern(shape: tuple[int, int], prnu: float, dsnu: float, rng: np.rando
 class CameraNoise:
     """EMVA 1288 figures of one camera.
 
-    electrons_at_white   electrons at radiance 1 after one exposure, e-
-    gain                 system gain K, grey values per e-
-    dark_noise           temporal noise in the dark, e- rms
-    full_well            saturation capacity, e-
-    black_level          grey value at no light
-    enabled              False: no noise at all; the mean grey value is still rounded
-    bit_depth            of the grey values: 8, 10 or 12; images of more than 8 are uint16
-    prnu                 photo response non-uniformity: std of the pixels' sensitivity, relative to its mean
-    dsnu                 dark signal non-uniformity: std of the pixels' offset, e-
-    frames               exposures averaged in each grey value, which divide the temporal noise but not the pattern
+    electrons_at_white   electrons at radiance 1 after one exposure, e- gain                 system
+    gain K, grey values per e- dark_noise           temporal noise in the dark, e- rms full_well
+    saturation capacity, e- black_level          grey value at no light enabled              False:
+    no noise at all; the mean grey value is still rounded bit_depth            of the grey values:
+    8, 10 or 12; images of more than 8 are uint16 prnu                 photo response
+    non-uniformity: std of the pixels' sensitivity, relative to its mean dsnu                 dark
+    signal non-uniformity: std of the pixels' offset, e- frames               exposures averaged in
+    each grey value, which divide the temporal noise but not the pattern
     """
 
     electrons_at_white: float
@@ -90,7 +97,8 @@ class CameraNoise:
             raise CmmError(f"camera noise needs positive electrons, gain and full well, got {self}")
         if min(self.prnu, self.dsnu) < 0.0 or self.bit_depth not in BIT_DEPTHS or self.frames < 1:
             raise CmmError(
-                f"camera noise needs prnu and dsnu >= 0, bit_depth of {BIT_DEPTHS} and frames >= 1, got {self}"
+                f"camera noise needs prnu and dsnu >= 0, bit_depth of {BIT_DEPTHS} and frames >= "
+                f"1, got {self}"
             )
 
     @property
@@ -109,18 +117,22 @@ class CameraNoise:
         return self.black_level + self.gain * electrons
 
     def variance(self, mean_grey: Array) -> Array:
-        """Variance of a grey value with this mean: shot, dark and pattern noise, rounding (grey values squared)."""
+        """Variance of a grey value with this mean: shot, dark and pattern noise, rounding (grey
+        values squared).
+        """
         electrons = np.maximum((mean_grey - self.black_level) / self.gain, 0.0)
         constant, linear, quadratic = self.variance_coefficients
         return constant + electrons * (linear + electrons * quadratic)
 
     def rounding_excess(self, mean_grey: Array) -> Array:
-        """Largest variance of grey values with about this mean over their usual one, ``variance``: 1 with noise of a
-        grey value, up to 3 with little, where it decides to which of two numbers a mean half-way between is rounded.
+        """Largest variance of grey values with about this mean over their usual one, ``variance``:
+        1 with noise of a grey value, up to 3 with little, where it decides to which of two numbers
+        a mean half-way between is rounded.
 
-        The variance of a rounded normal variable whose mean lies half-way between two numbers, from the Fourier series
-        of the rounding error: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). Over all means it is
-        s² + 1/12, but the pixels of an even ground share theirs.
+        The variance of a rounded normal variable whose mean lies half-way between two numbers, from
+        the Fourier series of the rounding error: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s²
+        + 1 / (pi k)²). Over all means it is s² + 1/12, but the pixels of an even ground share
+        theirs.
         """
         usual = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
         if np.all(usual > NO_SWING):
@@ -132,8 +144,10 @@ class CameraNoise:
 
     @property
     def variance_coefficients(self) -> tuple[float, float, float]:
-        """Variance of a grey value as a polynomial in its electrons: constant, linear, quadratic."""
-        temporal, pattern = self.gain**2 / self.frames, self.gain**2
+        """Variance of a grey value as a polynomial in its electrons: constant, linear,
+        quadratic."""
+        temporal = self.gain**2 / self.frames
+        pattern = self.gain**2
         return (
             temporal * self.dark_noise**2 + pattern * self.dsnu**2 + 1.0 / (12.0 * self.frames),
             temporal,
@@ -141,30 +155,45 @@ class CameraNoise:
         )
 
     def expose(
-        self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None = None
+        self,
+        radiance: NDArray[np.float32],
+        rng: np.random.Generator,
+        pattern: FixedPattern | None = None,
     ) -> GreyImage:
-        """One exposure of a radiance image (float32, 0 to 1); ``pattern`` of the same shape, where pixels differ."""
+        """One exposure of a radiance image (float32, 0 to 1); ``pattern`` of the same shape, where
+        pixels differ.
+        """
         if not self.enabled:
             grey = np.rint(np.clip(self.mean_grey(radiance), 0.0, float(self.white_level)))
             return np.asarray(grey.astype(self.image_type))
-        from cmmsim.radiometry.noise_kernels import expose_pixels  # compiles, so it is loaded where it is first needed
+        from cmmsim.radiometry.noise_kernels import (
+            expose_pixels,
+        )  # compiles, so it is loaded where it is first needed
 
         grey = np.empty(radiance.shape, dtype=self.image_type)
         expose_pixels(*self._lit(radiance, rng, pattern), grey.ravel())
         return grey
 
     def mean_of_exposures(
-        self, radiance: NDArray[np.float32], rng: np.random.Generator, frames: int, pattern: FixedPattern | None = None
+        self,
+        radiance: NDArray[np.float32],
+        rng: np.random.Generator,
+        frames: int,
+        pattern: FixedPattern | None = None,
     ) -> Array:
-        """Mean grey values of ``frames`` independent exposures of a scene that stands still (float64).
+        """Mean grey values of ``frames`` independent exposures of a scene that stands still
+        (float64).
 
-        Without noise it is not rounded: the mean that noisy exposures approach, as their noise dithers the rounding.
-        The mean of 30 and more is drawn at once, one normal number a pixel with the very mean and variance that the
-        mean of rounded, clipped grey values has. What that neglects is its shape: grey values are skewed only where
-        they are clipped, and their mean goes in steps of 1/frames, of which sums over a sticker's pixels show nothing.
+        Without noise it is not rounded: the mean that noisy exposures approach, as their noise
+        dithers the rounding. The mean of 30 and more is drawn at once, one normal number a pixel
+        with the very mean and variance that the mean of rounded, clipped grey values has. What that
+        neglects is its shape: grey values are skewed only where they are clipped, and their mean
+        goes in steps of 1/frames, of which sums over a sticker's pixels show nothing.
         """
         if not self.enabled:
-            return np.clip(self.mean_grey(radiance.astype(np.float64)), 0.0, float(self.white_level))
+            return np.clip(
+                self.mean_grey(radiance.astype(np.float64)), 0.0, float(self.white_level)
+            )
         if frames < MANY_EXPOSURES:
             return np.mean([self.expose(radiance, rng, pattern) for _ in range(frames)], axis=0)
         from cmmsim.radiometry.noise_kernels import average_pixels
@@ -176,15 +205,23 @@ class CameraNoise:
     def _lit(
         self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None
     ) -> tuple[Singles, Singles, Singles, Singles, Singles]:
-        """The light on each pixel, a standard normal number each and all else that ``noise_kernels`` ask for."""
+        """The light on each pixel, a standard normal number each and all else that
+        ``noise_kernels`` ask for.
+        """
         normal = rng.standard_normal(radiance.shape, dtype=np.float32)
         none = np.empty(0, dtype=np.float32)
-        differing = (none, none) if pattern is None else (pattern.sensitivity.ravel(), pattern.offset.ravel())
+        differing = (
+            (none, none)
+            if pattern is None
+            else (pattern.sensitivity.ravel(), pattern.offset.ravel())
+        )
         return radiance.ravel(), normal.ravel(), self._figures, *differing
 
     @property
     def _figures(self) -> NDArray[np.float32]:
-        """Electrons at white, full well, variance in the dark, black level, gain and largest grey value (6,)."""
+        """Electrons at white, full well, variance in the dark, black level, gain and largest grey
+        value (6,).
+        """
         return np.array(
             [
                 self.electrons_at_white,

@@ -1,4 +1,6 @@
-"""Compiled: from the light on each pixel to its grey value in one exposure and its mean in many, see ``noise``."""
+"""Compiled: from the light on each pixel to its grey value in one exposure and its mean in many,
+see ``noise``.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +8,12 @@ import math
 
 import numpy as np
 
-from cmmsim.compiled import Array, compiled
+from cmmsim.compilation import Array, compiled
 
 REACH = 6.0  # standard deviations within which noise is followed: 2e-9 of it lie beyond
-SMOOTH = 1.0  # grey values: with as much noise rounding adds 1/12 to the variance and 1e-9 to the mean
+SMOOTH = (
+    1.0  # grey values: with as much noise rounding adds 1/12 to the variance and 1e-9 to the mean
+)
 SQRT_HALF = math.sqrt(0.5)
 
 
@@ -17,10 +21,12 @@ SQRT_HALF = math.sqrt(0.5)
 def expose_pixels(
     radiance: Array, normal: Array, figures: Array, sensitivity: Array, offset: Array, grey: Array
 ) -> None:
-    """Fill the grey values (n,) of pixels with this radiance (n,) and a standard normal number each (n,).
+    """Fill the grey values (n,) of pixels with this radiance (n,) and a standard normal number each
+    (n,).
 
-    All is float32, grey the camera's own type. figures (6,): electrons at white, full well, variance in the dark (e-²),
-    black level, gain, largest grey value; sensitivity and offset (n,) where pixels differ, else empty.
+    All is float32, grey the camera's own type. figures (6,): electrons at white, full well,
+    variance in the dark (e-²), black level, gain, largest grey value; sensitivity and offset (n,)
+    where pixels differ, else empty.
     """
     dark, black, gain, white = figures[2:]
     for k in range(len(radiance)):
@@ -34,10 +40,17 @@ def expose_pixels(
 
 @compiled
 def average_pixels(
-    radiance: Array, normal: Array, figures: Array, sensitivity: Array, offset: Array, frames: int, grey: Array
+    radiance: Array,
+    normal: Array,
+    figures: Array,
+    sensitivity: Array,
+    offset: Array,
+    frames: int,
+    grey: Array,
 ) -> None:
-    """Fill the means (n,), float64, of the grey values that ``expose_pixels`` gives in so many exposures, taken for
-    normal; parameters as there, but one standard normal number for all exposures of a pixel."""
+    """Fill the means (n,), float64, of the grey values that ``expose_pixels`` gives in so many
+    exposures, taken for normal; parameters as there, but one standard normal number for all
+    exposures of a pixel."""
     dark, black, gain, white = figures[2:]
     for k in range(len(radiance)):
         electrons = electrons_in(k, radiance, figures, sensitivity)
@@ -48,7 +61,9 @@ def average_pixels(
 
 @compiled
 def electrons_in(k: int, radiance: Array, figures: Array, sensitivity: Array) -> float:
-    """Mean electrons that light sets free in pixel k, at most the full well; parameters as of ``expose_pixels``."""
+    """Mean electrons that light sets free in pixel k, at most the full well; parameters as of
+    ``expose_pixels``.
+    """
     light = radiance[k] * figures[0]
     if len(sensitivity):
         light *= sensitivity[k]
@@ -72,10 +87,11 @@ def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[flo
 
 @compiled
 def moments_above(height: float, deviation: float, most: float) -> tuple[float, float]:
-    """Mean and mean square of by how much, at most ``most``, a rounded normal number exceeds a whole number that lies
-    ``height`` above its mean.
+    """Mean and mean square of by how much, at most ``most``, a rounded normal number exceeds a
+    whole number that lies ``height`` above its mean.
 
-    Each step from one number to the next is taken with the probability that the normal number lies beyond its middle.
+    Each step from one number to the next is taken with the probability that the normal number lies
+    beyond its middle.
     """
     steps = squares = 0.0
     for step in range(math.ceil(min(most, REACH * deviation - height))):

@@ -1,4 +1,6 @@
-"""One taught sensor for all tests; the tests that need images are skipped nowhere: without OpenGL they fail."""
+"""One taught sensor for all tests; the tests that need images are skipped nowhere: without OpenGL
+they fail.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""Sensors with real lenses and other changes of their file, taught without error; ellipses in windows; statistics."""
+"""Sensors with real lenses and other changes of their file, taught without error; ellipses in
+windows; statistics.
+"""
 
 from dataclasses import replace
 
@@ -12,15 +14,24 @@ from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
-from cmmsim.imaging.exposure import SUPERSAMPLING
+from cmmsim.imaging.stereo_camera import SUPERSAMPLING
 from cmmsim.radiometry.noise import CameraNoise
 
 CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
-NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
+NOISE = CameraNoise(
+    electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0
+)
 
-LEFT = {"focal_px": [2295.0, 2301.5], "centre_px": [1017.2, 771.9], "distortion": [-0.11, 0.07, 4e-4, -3e-4, 0.0]}
+LEFT = {
+    "focal_px": [2295.0, 2301.5],
+    "centre_px": [1017.2, 771.9],
+    "distortion": [-0.11, 0.07, 4e-4, -3e-4, 0.0],
+}
 RIGHT = {"focal_px": [2306.0, 2304.0], "centre_px": [1030.1, 760.4]}
-DISTORTED = {"rig.left": LEFT, "rig.right": RIGHT | {"distortion": [-0.15, 0.05, -6e-4, 5e-4, 0.01]}}
+DISTORTED = {
+    "rig.left": LEFT,
+    "rig.right": RIGHT | {"distortion": [-0.15, 0.05, -6e-4, 5e-4, 0.01]},
+}
 LENSES = {
     "perfect": {},
     "distorted": DISTORTED,
@@ -30,18 +41,26 @@ LENSES = {
 }
 NOISE_FREE = {"camera.noise": False}
 TWELVE_BIT = {"camera.bit_depth": 12, "camera.gain": 2.08, "camera.black_level": 256.0}
-CROPPED = {"rig.width": 800, "rig.height": 640, "rig.target": [0.02, 0.0, 0.29]}  # whole images six times smaller
+CROPPED = {
+    "rig.width": 800,
+    "rig.height": 640,
+    "rig.target": [0.02, 0.0, 0.29],
+}  # whole images six times smaller
 REACH = np.array([0.009] * 3 + [0.035] * 3)  # m, rad: of the poses
 
 
 def exact(lens="perfect", changes=None, renderer="analytic", seed=0, method="registration"):
-    """The built-in sensor with another lens and other entries of its file, by dotted key; taught without error."""
+    """The built-in sensor with another lens and other entries of its file, by dotted key; taught
+    without error.
+    """
     file = read_sensor_file("ctrack780", LENSES[lens] | (changes or {}))
     return cmmsim.Sensor(file, seed, method, cmmsim.Sensor(file).truth, renderer=renderer)
 
 
 def poses_about_home(sensor, count, seed=0):
-    return sensor.home + np.random.default_rng(seed).uniform(-1, 1, (count, 6)) * ([0.009] * 3 + [0.03] * 3)
+    return sensor.home + np.random.default_rng(seed).uniform(-1, 1, (count, 6)) * (
+        [0.009] * 3 + [0.03] * 3
+    )
 
 
 def camera_from(sensor, pose):
@@ -50,9 +69,13 @@ def camera_from(sensor, pose):
 
 
 def placed_at(sensor, pose, *others):
-    """Transforms (b,4,4) of platform, base and others, base_from_body (4,4), into the axes of each camera."""
+    """Transforms (b,4,4) of platform, base and others, base_from_body (4,4), into the axes of each
+    camera.
+    """
     bodies = np.stack([pose_to_transform(pose), np.eye(4), *others])
-    return [move @ invert(sensor.truth.base_from_camera) @ bodies for move in sensor.rig.from_camera]
+    return [
+        move @ invert(sensor.truth.base_from_camera) @ bodies for move in sensor.rig.from_camera
+    ]
 
 
 def expected_centres(sensor, pose):
@@ -73,7 +96,9 @@ def corners_about(sensor, pose, size):
 def centre_errors(sensor, pose, supersampling=SUPERSAMPLING, size=16):
     """Fitted minus expected ellipse centres (36, 2) px from unrounded noise-free windows."""
     corners, noise = corners_about(sensor, pose, size), replace(sensor.noise, enabled=False)
-    grey = noise.mean_grey(sensor.camera.radiances([[placed_at(sensor, pose)]], [corners], size, supersampling)[0])
+    grey = noise.mean_grey(
+        sensor.camera.radiances([[placed_at(sensor, pose)]], [corners], size, supersampling)[0]
+    )
     grey = replace(sensor.observer, noise=noise).evenly_lit(grey, corners)
     flat, psf_px = corners.reshape(-1, 2), sensor.optics.psf_px
     fits = fit_ellipses(grey.reshape(-1, size, size), flat, noise, size - 2, psf_px=psf_px)
@@ -83,7 +108,10 @@ def centre_errors(sensor, pose, supersampling=SUPERSAMPLING, size=16):
 
 def pose_errors(sensor, poses, **look):
     """Errors (n, 6) of the poses measured near the true ones, um and urad, and the measurements."""
-    found = [sensor.estimator.measure(sensor.look(pose, **look), camera_from(sensor, pose))[0] for pose in poses]
+    found = [
+        sensor.estimator.measure(sensor.look(pose, **look), camera_from(sensor, pose))[0]
+        for pose in poses
+    ]
     return 1e6 * (np.array([m.pose for m in found]) - poses), found
 
 
@@ -102,15 +130,21 @@ def squared_errors(found, poses):
 
 
 def require_true(squared, freedom=6):
-    """The mean of independent chi-square numbers lies where it does but for 27 in 10,000 times (three deviations)."""
+    """The mean of independent chi-square numbers lies where it does but for 27 in 10,000 times
+    (three deviations).
+    """
     low, high = chi2.ppf([0.00135, 0.99865], freedom * np.size(squared)) / np.size(squared)
     assert low < np.mean(squared) < high, (low, np.mean(squared), high)
 
 
 def require_regions(squared, freedom=6):
-    """The 95 % regions hold as many of independent chi-square numbers as 99 of 100 such series let them."""
+    """The 95 % regions hold as many of independent chi-square numbers as 99 of 100 such series let
+    them.
+    """
     low, high = binom.interval(0.99, len(squared), 0.95)
-    assert low <= np.sum(squared < chi2.ppf(0.95, freedom)) <= high, np.mean(squared < chi2.ppf(0.95, freedom))
+    assert low <= np.sum(squared < chi2.ppf(0.95, freedom)) <= high, np.mean(
+        squared < chi2.ppf(0.95, freedom)
+    )
 
 
 def refused(call, message, kind=cmmsim.CmmError):
@@ -122,8 +156,16 @@ def refused(call, message, kind=cmmsim.CmmError):
 
 
 def random_ellipses(rng, count, size, radii=(3.8, 2.4)):
-    """Centres (count, 2) within 1 px of the middle of windows of ``size`` px, and shapes (count, 2, 2), turned at
-    random."""
+    """Centres (count, 2) within 1 px of the middle of windows of ``size`` px, and shapes (count, 2,
+    2), turned at random."""
     angle = rng.uniform(0.0, np.pi, count)
-    turn = np.stack([np.stack([np.cos(angle), -np.sin(angle)], -1), np.stack([np.sin(angle), np.cos(angle)], -1)], 1)
-    return 0.5 * (size - 1) + rng.uniform(-1.0, 1.0, (count, 2)), turn @ np.diag(radii) @ turn.transpose(0, 2, 1)
+    turn = np.stack(
+        [
+            np.stack([np.cos(angle), -np.sin(angle)], -1),
+            np.stack([np.sin(angle), np.cos(angle)], -1),
+        ],
+        1,
+    )
+    return 0.5 * (size - 1) + rng.uniform(-1.0, 1.0, (count, 2)), turn @ np.diag(
+        radii
+    ) @ turn.transpose(0, 2, 1)

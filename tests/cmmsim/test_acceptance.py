@@ -1,4 +1,6 @@
-"""Volume, lines and paths of the acceptance tests by geometry; statistics and latency of series of known truth."""
+"""Volume, lines and paths of the acceptance tests by geometry; statistics and latency of series of
+known truth.
+"""
 
 from dataclasses import replace
 
@@ -32,7 +34,9 @@ RIG = read_sensor_file("ctrack780").rig
 def test_volume_is_the_largest_that_both_cameras_see_along_their_axes(volume):
     """x goes right and y down in both images, and what is further away is smaller."""
     rig, camera_from_base = rig_from_file(RIG)
-    pixels = rig.project(apply(camera_from_base @ volume.base_from_volume, CORNERS * volume.size))[0]
+    pixels = rig.project(apply(camera_from_base @ volume.base_from_volume, CORNERS * volume.size))[
+        0
+    ]
     room = np.minimum(pixels, np.array([RIG.width, RIG.height]) - 1 - pixels)
     assert room.min() >= MARGIN_PX
     assert room.min() < MARGIN_PX + 3.0  # a millimetre more would be too much
@@ -40,7 +44,9 @@ def test_volume_is_the_largest_that_both_cameras_see_along_their_axes(volume):
     np.testing.assert_allclose(place, RIG.target)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
     distance = np.linalg.norm(np.subtract(RIG.target, RIG.position))
-    assert volume.depth_range == pytest.approx((distance - volume.size[2] / 2, distance + volume.size[2] / 2))
+    assert volume.depth_range == pytest.approx(
+        (distance - volume.size[2] / 2, distance + volume.size[2] / 2)
+    )
     for side in pixels:
         at = dict(zip(map(tuple, CORNERS), side, strict=True))
         assert at[0.5, 0.5, -0.5][0] > at[-0.5, 0.5, -0.5][0]
@@ -63,9 +69,15 @@ def sized(*sides):
         (lambda: sized(0.5, 0.05, 0.5), "at least 100 mm"),
         (lambda: sized(0.5, np.nan, 0.5), "three sides"),
         # cameras that look away from each other, so that no point is in both images
-        (lambda: common_volume(RIG.model_copy(update={"focal_px": 6e4})), "nothing is visible to both cameras"),
+        (
+            lambda: common_volume(RIG.model_copy(update={"focal_px": 6e4})),
+            "nothing is visible to both cameras",
+        ),
         (lambda: seven_lines(sized(0.6, 0.3, 0.3)), r"two thirds.*nearer to a cube"),
-        (lambda: bar_paths(sized(0.3, 0.3, 0.3)), r"raster x, bar along x: the bar needs .* the volume has 300 x 300"),
+        (
+            lambda: bar_paths(sized(0.3, 0.3, 0.3)),
+            r"raster x, bar along x: the bar needs .* the volume has 300 x 300",
+        ),
         (lambda: require_room(sized(0.3, 0.3, 0.3)), "body on its circle needs"),
     ],
 )
@@ -75,7 +87,9 @@ def test_volumes_that_cannot_be_or_hold_too_little_are_refused(ask, message):
 
 
 def test_seven_lines_keep_the_rules(volume):
-    """Seven lines, five lengths each, the longest of every line at least two thirds of the space diagonal."""
+    """Seven lines, five lengths each, the longest of every line at least two thirds of the space
+    diagonal.
+    """
     lines = seven_lines(volume)
     diagonal = np.sqrt((volume.size**2).sum())
     assert len({line.name for line in lines}) == len(lines) == 7
@@ -97,8 +111,14 @@ def test_broken_rules_are_named(volume):
     long = others[1]
     for changed, message in (
         ([], "6 measuring lines, at least 7"),
-        ([replace(first, lengths=first.lengths[[0, 1, 2, 4]])], "line space 1: 4 different test lengths"),
-        ([MeasuringLine("short", long.start / 2, long.end / 2, long.lengths / 2)], "line short: its longest .* two th"),
+        (
+            [replace(first, lengths=first.lengths[[0, 1, 2, 4]])],
+            "line space 1: 4 different test lengths",
+        ),
+        (
+            [MeasuringLine("short", long.start / 2, long.end / 2, long.lengths / 2)],
+            "line short: its longest .* two th",
+        ),
         ([replace(first, start=2.0 * first.start)], "leaves the volume"),
     ):
         with pytest.raises(AcceptanceError, match=message):
@@ -108,7 +128,9 @@ def test_broken_rules_are_named(volume):
 def test_ends_of_the_bar_are_bodies_of_their_own():
     for end in bar_ends(marked_body("bar", rigid_bar())):
         assert len(end.nominal) == 6
-        on_planes = np.einsum("ni,ni->n", end.sticker_normals, end.nominal) - end.offsets[end.plane_index]
+        on_planes = (
+            np.einsum("ni,ni->n", end.sticker_normals, end.nominal) - end.offsets[end.plane_index]
+        )
         np.testing.assert_allclose(on_planes, 0.0, atol=1e-12)
 
 
@@ -134,13 +156,15 @@ def test_bar_stays_in_the_volume_starts_at_rest_and_moves_at_its_rate(volume):
 
 
 def test_statistics_of_known_values_and_of_none():
-    """1 to 100: mean 50.5, mean square 101 * 201 / 6, largest 100; Student's t with two values: 12.706 times half of
-    their distance."""
+    """1 to 100: mean 50.5, mean square 101 * 201 / 6, largest 100; Student's t with two values:
+    12.706 times half of their distance."""
     found = summarise(np.arange(1.0, 101.0), np.random.default_rng(0))
     assert (found.count, found.mean, found.maximum) == (100, 50.5, 100.0)
     assert found.rms == pytest.approx(np.sqrt(101 * 201 / 6))
     assert found.p95 == pytest.approx(95.05)
-    assert interval_of_mean(np.array([1.0, 3.0])) == pytest.approx((2.0 - 12.7062, 2.0 + 12.7062), rel=1e-5)
+    assert interval_of_mean(np.array([1.0, 3.0])) == pytest.approx(
+        (2.0 - 12.7062, 2.0 + 12.7062), rel=1e-5
+    )
     with pytest.raises(cmmsim.ShapeError, match="two values"):
         interval_of_mean(np.array([1.0]))
     for values in (np.zeros(0), np.array([1.0, np.nan]), np.zeros((2, 2))):
@@ -149,7 +173,9 @@ def test_statistics_of_known_values_and_of_none():
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say():
-    """Half-normal errors: mean sqrt(2/pi), rms 1, 95th percentile the 97.5 % point of the normal distribution."""
+    """Half-normal errors: mean sqrt(2/pi), rms 1, 95th percentile the 97.5 % point of the normal
+    distribution.
+    """
     truth = {"mean": np.sqrt(2.0 / np.pi), "rms": 1.0, "p95": norm.ppf(0.975)}
     rng = np.random.default_rng(1)
     held = dict.fromkeys(truth, 0)
@@ -161,7 +187,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 
 
 def test_blocks_widen_the_interval_of_dependent_values():
-    """Each value ten times in a row: the interval must be that of the different values, sqrt(10) times wider."""
+    """Each value ten times in a row: the interval must be that of the different values, sqrt(10)
+    times wider.
+    """
     rng = np.random.default_rng(2)
     values = np.abs(rng.standard_normal(200))
     widths = []
@@ -184,11 +212,17 @@ def reports(delays, noise, rng, shift=(0.0, 0.0, 0.0)):
 
 
 def test_known_latency_is_found_within_its_interval():
-    """14.2 ms under 10 um of noise and a constant offset: in the interval in 95 of 100 series, exact on average."""
+    """14.2 ms under 10 um of noise and a constant offset: in the interval in 95 of 100 series,
+    exact on average.
+    """
     means, held = [], 0
     for seed in range(100):
-        reported, positions = reports(np.full(120, 0.0142), 1e-5, np.random.default_rng(seed), (1e-3, -2e-3, 5e-4))
-        found = estimate_latency(reported, positions, ellipse, 0.5, np.tile(1e-10 * np.eye(3), (120, 1, 1)))
+        reported, positions = reports(
+            np.full(120, 0.0142), 1e-5, np.random.default_rng(seed), (1e-3, -2e-3, 5e-4)
+        )
+        found = estimate_latency(
+            reported, positions, ellipse, 0.5, np.tile(1e-10 * np.eye(3), (120, 1, 1))
+        )
         means.append(found.mean)
         held += found.interval[0] <= 0.0142 <= found.interval[1]
         assert found.std == pytest.approx(found.resolution, rel=0.35)
@@ -200,7 +234,9 @@ def test_known_latency_is_found_within_its_interval():
 
 def test_noise_free_latency_is_exact_and_needs_a_motion():
     for latency in (0.0, 0.004, 0.1, 0.45):
-        found = estimate_latency(*reports(np.full(60, latency), 0.0, np.random.default_rng(0)), ellipse, 0.5)
+        found = estimate_latency(
+            *reports(np.full(60, latency), 0.0, np.random.default_rng(0)), ellipse, 0.5
+        )
         assert found.mean == pytest.approx(latency, abs=1e-9)
         assert found.std < 1e-9
     times = np.arange(10) / 60.0

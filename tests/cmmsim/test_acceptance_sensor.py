@@ -1,4 +1,5 @@
-"""The tests on rendered images: what they find against closed forms and against the stated noise."""
+"""The tests on rendered images: what they find against closed forms and against the stated
+noise."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,7 +22,7 @@ from cmmsim.acceptance.moving_bar import bar_run, relative_covariance, relative_
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import apply, rotation_exp, transform_to_pose
-from cmmsim.pose_estimation.estimator import lost_measurement
+from cmmsim.measuring.measurement import lost_measurement
 from tests.cmmsim.sensors import NOISE_FREE
 
 RIG = read_sensor_file("ctrack780").rig
@@ -50,21 +51,27 @@ def test_lengths_do_not_depend_on_the_number_of_threads(volume, monkeypatch):
         monkeypatch.setattr(many_frames, "threads_at_most", lambda threads=threads: threads)
         found.append(length_test(under_test(3), volume, exposures=2))
     np.testing.assert_array_equal(*(one.single_errors for one in found))
-    assert [length.line for length in found[0].lengths] == [line.name for line in seven_lines(volume) for _ in range(5)]
+    assert [length.line for length in found[0].lengths] == [
+        line.name for line in seven_lines(volume) for _ in range(5)
+    ]
 
 
 @pytest.mark.slow
 def test_length_errors_are_as_large_as_stated(volume):
-    """105 lengths of three exposures: their squares against the stated variances, and the mean is no bias."""
+    """105 lengths of three exposures: their squares against the stated variances, and the mean is
+    no bias.
+    """
     found = length_test(under_test(1), volume, exposures=3)
     assert 0.65 < found.variance_ratio < 1.4
     errors, stds = found.errors, np.array([length.std for length in found.lengths]) / np.sqrt(3.0)
-    assert abs(errors.mean()) < 4.0 * np.sqrt(np.mean(stds**2) / 7.0)  # the lengths of a line share a sticker
+    # the lengths of a line share a sticker
+    assert abs(errors.mean()) < 4.0 * np.sqrt(np.mean(stds**2) / 7.0)
     assert abs(found.largest.error) == np.abs(errors).max() < 50e-6
 
 
 def test_shifted_camera_gives_the_lengths_that_linearised_triangulation_predicts(volume):
-    """0.1 px in the right image: the points move by the pseudo-inverse of the projection's derivative.
+    """0.1 px in the right image: the points move by the pseudo-inverse of the projection's
+    derivative.
 
     On the front face the stickers look at the rig, so that all pixels weigh the same.
     """
@@ -75,7 +82,10 @@ def test_shifted_camera_gives_the_lengths_that_linearised_triangulation_predicts
     points = apply(camera_from_base @ volume.base_from_volume, row)
     steps = []
     for point in points:
-        slopes = [(rig.project(point + h)[0] - rig.project(point - h)[0]).ravel() / 2e-6 for h in 1e-6 * np.eye(3)]
+        slopes = [
+            (rig.project(point + h)[0] - rig.project(point - h)[0]).ravel() / 2e-6
+            for h in 1e-6 * np.eye(3)
+        ]
         steps.append(np.linalg.pinv(np.column_stack(slopes)) @ [0.0, 0.0, shift, 0.0])
     towards = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
     predicted = (np.array(steps[1:]) - steps[0]) @ towards
@@ -94,7 +104,11 @@ def test_lengths_and_their_deviations_by_hand():
 def pose_measurement(transform, covariance=None):
     covariance = np.eye(6) if covariance is None else covariance
     return replace(
-        lost_measurement("made up"), pose=transform_to_pose(transform), covariance=covariance, ok=True, reason=""
+        lost_measurement("made up"),
+        pose=transform_to_pose(transform),
+        covariance=covariance,
+        ok=True,
+        reason="",
     )
 
 
@@ -114,13 +128,17 @@ def test_relative_covariance_against_sampling():
     rng, first, along = np.random.default_rng(5), np.eye(4), np.eye(4)
     first[:3, :3], first[:3, 3] = rotation_exp(np.array([0.2, 0.4, -0.3])), [0.1, 0.2, 1.4]
     along[0, 3] = 0.3
-    root = np.diag([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4]) @ (np.eye(6) + 0.3 * rng.standard_normal((6, 6)))
+    root = np.diag([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4]) @ (
+        np.eye(6) + 0.3 * rng.standard_normal((6, 6))
+    )
     measured = [pose_measurement(transform, root @ root.T) for transform in (first, first @ along)]
     draws = []
     for _ in range(2000):
         drawn = [replace(m, pose=m.pose + root @ rng.standard_normal(6)) for m in measured]
         draws.append(relative_error(*drawn)[0])
-    whitened = np.linalg.solve(np.linalg.cholesky(relative_covariance(*measured)), np.array(draws).T)
+    whitened = np.linalg.solve(
+        np.linalg.cholesky(relative_covariance(*measured)), np.array(draws).T
+    )
     np.testing.assert_allclose(np.cov(whitened), np.eye(6), atol=0.15)
 
 
@@ -137,13 +155,16 @@ def test_standing_and_moving_bar_have_the_stated_errors(volume):
 
 @pytest.mark.slow
 def test_motion_blur_reaches_the_moving_bar_only(volume):
-    """With 1 ms of exposure a standing bar gives the frames it gives with 1 ns, and others once it moves fast."""
+    """With 1 ms of exposure a standing bar gives the frames it gives with 1 ns, and others once it
+    moves fast.
+    """
     path, times = bar_paths(volume)[3], np.arange(-2, 16) / 60.0
     sharp, blurred = (
         bar_run(under_test(3, {"timing.exposure": exposure}).facing(rigid_bar(), 1), path, times)
         for exposure in (1e-9, 1e-3)
     )
-    np.testing.assert_array_equal(sharp.errors[:3], blurred.errors[:3])  # the bar starts to move at time 0
+    # the bar starts to move at time 0
+    np.testing.assert_array_equal(sharp.errors[:3], blurred.errors[:3])
     assert np.all(np.any(sharp.errors[-6:] != blurred.errors[-6:], axis=1))
     assert np.abs(blurred.distance_errors).max() < 30e-6
 
@@ -154,7 +175,9 @@ def test_a_run_that_loses_the_bar_is_given_up(volume):
     path = bar_paths(volume)[0]
     gone = path.pose(0.0) + np.array([0.0, 0.0, -5.0, 0.0, 0.0, 0.0])
     hidden = SimpleNamespace(
-        name="hidden", pose=lambda time: gone if time > 0.02 else path.pose(0.0), pose_rate=lambda time: np.zeros(6)
+        name="hidden",
+        pose=lambda time: gone if time > 0.02 else path.pose(0.0),
+        pose_rate=lambda time: np.zeros(6),
     )
     sensor = under_test().facing(rigid_bar(), 1)
     found = bar_run(sensor, hidden, np.arange(-2, 30) / 60.0)
@@ -165,7 +188,9 @@ def test_a_run_that_loses_the_bar_is_given_up(volume):
 
 
 def test_same_seed_same_numbers(volume):
-    first, same, other = (errors_along(volume, seven_lines(volume)[4], seed).tolist() for seed in (0, 0, 1))
+    first, same, other = (
+        errors_along(volume, seven_lines(volume)[4], seed).tolist() for seed in (0, 0, 1)
+    )
     assert first == same != other
 
 

@@ -1,4 +1,5 @@
-"""The joint adjustment against synthetic truth: exact without noise, honest with it, and what contradicts is named.
+"""The joint adjustment against synthetic truth: exact without noise, honest with it, and what
+contradicts is named.
 
 Pixels come from a projection written here from Brown's formula, not from the code under test.
 """
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from cmmsim.calibration import CalibrationError, CalibrationOptions, PairView, calibrate
 from cmmsim.calibration.adjustment import project
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.detection import BoardView
+from cmmsim.calibration.board_detection import BoardView
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from tests.cmmsim.sensors import refused
 
@@ -92,7 +93,8 @@ def test_noise_free_points_give_the_truth_from_opencvs_start():
 
 
 @pytest.mark.parametrize(
-    ("distortion", "fix_aspect", "free"), [("none", False, 4), ("radial2", True, 5), ("brown5", False, 9)]
+    ("distortion", "fix_aspect", "free"),
+    [("none", False, 4), ("radial2", True, 5), ("brown5", False, 9)],
 )
 def test_what_is_not_free_stays(distortion, fix_aspect, free):
     values = []
@@ -100,7 +102,9 @@ def test_what_is_not_free_stays(distortion, fix_aspect, free):
         own[4:] = own[4:] * {"none": 0, "radial2": [1, 1, 0, 0, 0], "brown5": 1}[distortion]
         own[1] = own[0] if fix_aspect else own[1]
         values.append(own)
-    pairs = seen_pairs(board_poses(10, np.random.default_rng(2)), 0.05, np.random.default_rng(3), values)
+    pairs = seen_pairs(
+        board_poses(10, np.random.default_rng(2)), 0.05, np.random.default_rng(3), values
+    )
     found = calibrate(BOARD, pairs, SIZE, CalibrationOptions(distortion, fix_aspect))
     error, std = found.values - np.concatenate([*values, SHIFT, TURN]), found.std
     assert np.count_nonzero(std[:9]) == free + fix_aspect
@@ -126,7 +130,10 @@ def test_each_picture_may_be_read_in_any_order_of_a_symmetric_board():
     board, rng = Board(kind="chessboard", columns=7, rows=7, spacing=0.05), np.random.default_rng(8)
     pairs = noisy_pairs(8, 10, board=board)
     plain = calibrate(board, pairs, SIZE)
-    mixed = [PairView(p.name, *(view.read_as(board.symmetries[rng.integers(4)]) for view in p.sides)) for p in pairs]
+    mixed = [
+        PairView(p.name, *(view.read_as(board.symmetries[rng.integers(4)]) for view in p.sides))
+        for p in pairs
+    ]
     assert np.abs((calibrate(board, mixed, SIZE).values - plain.values) / plain.std).max() < 0.01
 
 
@@ -139,7 +146,9 @@ def test_wrong_partner_and_bad_image_are_given_up_with_their_reasons():
     found = calibrate(BOARD, worse, SIZE)
     assert set(found.rejected) == {"03.png", "07.png"}
     assert "fit no other pair" in found.rejected["03.png"]
-    assert re.fullmatch(r"left: rms 2\.\d\d px, more than 4 times the median of 0\.0\d px", found.rejected["07.png"])
+    assert re.fullmatch(
+        r"left: rms 2\.\d\d px, more than 4 times the median of 0\.0\d px", found.rejected["07.png"]
+    )
     assert np.abs((found.values - plain.values) / plain.std).max() < 3.0
 
 
@@ -164,23 +173,37 @@ MIXED = [PairView(a.name, a.left, b.right) for a, b in zip(PLAIN, noisy_pairs(13
         (PLAIN[:5], 12, "12 needed"),
         (UNSEEN, 3, r"02.png \(both: no chessboard of 8 x 7 found\) and 9 more$"),
         (
-            [PairView(a.name, a.left, b.right) for a, b in zip(PLAIN, noisy_pairs(13), strict=True)],
+            [
+                PairView(a.name, a.left, b.right)
+                for a, b in zip(PLAIN, noisy_pairs(13), strict=True)
+            ],
             3,
             "pairs agree on where",
         ),
     ],
 )
-def test_too_few_pairs_and_those_not_taken_together_are_refused_in_one_short_line(pairs, least, message):
-    refused(lambda: calibrate(BOARD, pairs, SIZE, CalibrationOptions(min_images=least)), message, CalibrationError)
+def test_too_few_pairs_and_those_not_taken_together_are_refused_in_one_short_line(
+    pairs, least, message
+):
+    refused(
+        lambda: calibrate(BOARD, pairs, SIZE, CalibrationOptions(min_images=least)),
+        message,
+        CalibrationError,
+    )
 
 
 @pytest.mark.parametrize(("count", "said"), [(1, "in one place only"), (2, "in 2 places only")])
 def test_pictures_alike_are_refused_as_such_in_whichever_order_they_are_read(count, said):
     rng = np.random.default_rng(21)
     same = seen_pairs(board_poses(count, rng)[np.arange(10) % count], 0.05, rng)
-    turned = [PairView(p.name, *(v.read_as(BOARD.symmetries[k % 2]) for v in p.sides)) for k, p in enumerate(same)]
+    turned = [
+        PairView(p.name, *(v.read_as(BOARD.symmetries[k % 2]) for v in p.sides))
+        for k, p in enumerate(same)
+    ]
     for pairs in (same, turned):
-        with pytest.raises(CalibrationError, match=f"the 10 pictures of the left .* alike.* {said}.*move and tilt"):
+        with pytest.raises(
+            CalibrationError, match=f"the 10 pictures of the left .* alike.* {said}.*move and tilt"
+        ):
             calibrate(BOARD, pairs, SIZE)
 
 
@@ -201,19 +224,27 @@ def test_good_pairs_are_not_warned_of_and_parallel_boards_are_or_are_refused():
 
 
 def test_swapped_folders_are_named_with_the_place_of_the_right_camera():
-    (line,) = lines_with("swap the folders", pairs=[PairView(p.name, p.right, p.left) for p in PLAIN])
+    (line,) = lines_with(
+        "swap the folders", pairs=[PairView(p.name, p.right, p.left) for p in PLAIN]
+    )
     assert f"({SHIFT[0]:.2g}" in line  # of the left camera in the axes of the right one
 
 
-@pytest.mark.parametrize(("unit", "size"), [(1e3, "400 x 300 m"), (1e2, "40 x 30 m"), (1e-3, "0.0004 x 0.0003 m")])
+@pytest.mark.parametrize(
+    ("unit", "size"), [(1e3, "400 x 300 m"), (1e2, "40 x 30 m"), (1e-3, "0.0004 x 0.0003 m")]
+)
 def test_lengths_that_are_no_metres_are_named(unit, size):
     (line,) = lines_with("other units", BOARD.model_copy(update={"spacing": unit * BOARD.spacing}))
     assert size in line
-    assert float(line.split("cameras ")[1].split()[0]) == pytest.approx(unit * np.linalg.norm(SHIFT), rel=0.01)
+    assert float(line.split("cameras ")[1].split()[0]) == pytest.approx(
+        unit * np.linalg.norm(SHIFT), rel=0.01
+    )
 
 
 def test_many_pairs_not_used_are_warned_of_with_the_board_of_the_file():
-    fewer = [[p.without(1, NONE) if k < count else p for k, p in enumerate(PLAIN)] for count in (4, 5)]
+    fewer = [
+        [p.without(1, NONE) if k < count else p for k, p in enumerate(PLAIN)] for count in (4, 5)
+    ]
     assert not lines_with("not used", pairs=fewer[0])
     (line,) = lines_with("not used", pairs=fewer[1])
     assert line.startswith(f"5 of 12 pairs are not used, the first is 00.png (right: {NONE})")
@@ -224,4 +255,9 @@ def test_many_pairs_not_used_are_warned_of_with_the_board_of_the_file():
 def test_wrong_radius_of_dots_is_warned_of_with_both(measured, warned):
     board = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.014)
     seen = [PairView(p.name, *(replace(v, radius=measured) for v in p.sides)) for p in PLAIN]
-    assert bool(lines_with(f"radius 0.014 m, in the pictures they measure {measured:g} m", board, seen)) == warned
+    assert (
+        bool(
+            lines_with(f"radius 0.014 m, in the pictures they measure {measured:g} m", board, seen)
+        )
+        == warned
+    )

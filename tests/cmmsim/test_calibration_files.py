@@ -1,10 +1,18 @@
-"""Board files and image files: what they hold is read as it is, and what is wrong in them is named."""
+"""Board files and image files: what they hold is read as it is, and what is wrong in them is
+named."""
 
 import cv2
 import numpy as np
 import pytest
 
-from cmmsim.calibration import CalibrationError, ImagePair, pair_images, read_board, read_grey, view_pairs
+from cmmsim.calibration import (
+    CalibrationError,
+    ImagePair,
+    pair_images,
+    read_board,
+    read_grey,
+    view_pairs,
+)
 from tests.cmmsim.test_calibration_images import ASYMMETRIC, CHESSBOARD, DOTS
 
 # --- board files
@@ -19,7 +27,10 @@ def test_board_file_is_read_back(tmp_path, board):
 @pytest.mark.parametrize(
     ("text", "evidence"),
     [
-        ("colums = 9", "unknown key 'colums', valid are columns, dark, kind, radius, rows, spacing"),
+        (
+            "colums = 9",
+            "unknown key 'colums', valid are columns, dark, kind, radius, rows, spacing",
+        ),
         ("columns = 9.5", r"columns: .*integer.*\(got 9.5\)"),
         ("columns = 2", "columns: .*greater than or equal to 3"),
         ('kind = "aruco"', "kind: .*'chessboard', 'dots' or 'asymmetric_dots'"),
@@ -47,7 +58,13 @@ def test_dots_without_a_radius_are_refused(tmp_path):
 
 @pytest.mark.parametrize(
     "board",
-    [DOTS, ASYMMETRIC, CHESSBOARD, DOTS.model_copy(update={"columns": 7}), ASYMMETRIC.model_copy(update={"rows": 8})],
+    [
+        DOTS,
+        ASYMMETRIC,
+        CHESSBOARD,
+        DOTS.model_copy(update={"columns": 7}),
+        ASYMMETRIC.model_copy(update={"rows": 8}),
+    ],
 )
 def test_symmetries_carry_the_board_onto_itself(board):
     """All distances stay, which a rigid turn of the same points needs."""
@@ -57,7 +74,9 @@ def test_symmetries_carry_the_board_onto_itself(board):
 
     assert len({tuple(order) for order in board.symmetries}) == len(board.symmetries)
     for order in board.symmetries:
-        np.testing.assert_allclose(distances(board.points[order]), distances(board.points), atol=1e-12)
+        np.testing.assert_allclose(
+            distances(board.points[order]), distances(board.points), atol=1e-12
+        )
     if board.kind == "asymmetric_dots" and board.rows % 2:
         assert len(board.symmetries) == 1
 
@@ -89,9 +108,15 @@ def files(folder, names):
 
 
 def test_pairs_are_made_in_the_order_of_the_names(tmp_path):
-    left, right = files(tmp_path / "a", ["l2.png", "l1.png"]), files(tmp_path / "b", ["r1.png", "r2.png"])
+    left, right = (
+        files(tmp_path / "a", ["l2.png", "l1.png"]),
+        files(tmp_path / "b", ["r1.png", "r2.png"]),
+    )
     (left / "notes.txt").touch()
-    assert [pair.name for pair in pair_images(left, right)] == ["l1.png | r1.png", "l2.png | r2.png"]
+    assert [pair.name for pair in pair_images(left, right)] == [
+        "l1.png | r1.png",
+        "l2.png | r2.png",
+    ]
 
 
 def test_folders_that_make_no_pairs_are_refused(tmp_path):
@@ -99,8 +124,14 @@ def test_folders_that_make_no_pairs_are_refused(tmp_path):
     for right, message in (
         (tmp_path / "missing", r"no folder .*missing"),
         (files(tmp_path / "empty", []), r"holds no images, which end in \.bmp"),
-        (files(tmp_path / "b", ["1.png", "2.png"]), r"holds 3 images and .* 2; .*left: 4; only on the right: none"),
-        (files(tmp_path / "c", ["1.png", "2.png", "3.png"]), "Only on the left: 4; only on the right: 3"),
+        (
+            files(tmp_path / "b", ["1.png", "2.png"]),
+            r"holds 3 images and .* 2; .*left: 4; only on the right: none",
+        ),
+        (
+            files(tmp_path / "c", ["1.png", "2.png", "3.png"]),
+            "Only on the left: 4; only on the right: 3",
+        ),
         (left, "named for both cameras"),
     ):
         with pytest.raises(CalibrationError, match=message):
@@ -108,10 +139,15 @@ def test_folders_that_make_no_pairs_are_refused(tmp_path):
 
 
 def test_images_that_cannot_be_read_or_differ_in_size_are_refused(tmp_path):
-    left, right = files(tmp_path / "a", ["1.png"]) / "1.png", files(tmp_path / "b", ["1.png"]) / "1.png"
+    left, right = (
+        files(tmp_path / "a", ["1.png"]) / "1.png",
+        files(tmp_path / "b", ["1.png"]) / "1.png",
+    )
     for content in (b"", b"no image"):
         right.write_bytes(content)
-        with pytest.raises(CalibrationError, match=r"cannot read image .*b.1\.png: it is truncated or not"):
+        with pytest.raises(
+            CalibrationError, match=r"cannot read image .*b.1\.png: it is truncated or not"
+        ):
             view_pairs([ImagePair(left, right)], DOTS)
     cv2.imwrite(str(right), np.zeros((8, 10), np.uint8))
     with pytest.raises(CalibrationError, match=r"b.1\.png is 10 x 8 px, .*a.1\.png 8 x 8"):

@@ -1,4 +1,6 @@
-"""The board in rendered and photograph-like images, and the cameras found from them, against the projected truth."""
+"""The board in rendered and photograph-like images, and the cameras found from them, against the
+projected truth.
+"""
 
 from dataclasses import replace
 
@@ -22,7 +24,7 @@ from cmmsim.calibration import (
     rendered_boards,
     sensor_template,
 )
-from cmmsim.calibration.dot_kernels import isolate_dots
+from cmmsim.detection.start_kernels import isolate_dots
 from cmmsim.files.sensor_file import sensor_text
 from cmmsim.geometry.camera import Distortion, Optics, PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
@@ -35,7 +37,9 @@ from tests.cmmsim.sensors import NOISE
 DOTS = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.0125)
 ASYMMETRIC = Board(kind="asymmetric_dots", columns=4, rows=9, spacing=0.04, radius=0.014)
 CHESSBOARD = Board(kind="chessboard", columns=8, rows=6, spacing=0.05)
-PERFECT = toed_in_rig(PinholeCamera(1000.0, 399.5, 299.5, 800, 600), 0.5, np.array([0.0, -1.6, 0.0]), np.zeros(3))[0]
+PERFECT = toed_in_rig(
+    PinholeCamera(1000.0, 399.5, 299.5, 800, 600), 0.5, np.array([0.0, -1.6, 0.0]), np.zeros(3)
+)[0]
 BENT = StereoRig(
     PinholeCamera(1000.0, 404.0, 296.0, 800, 600, 1.002, Distortion(-0.15, 0.08, 6e-4, -4e-4)),
     PinholeCamera(1010.0, 395.0, 303.0, 800, 600, 0.999, Distortion(-0.12, 0.05, -3e-4, 5e-4)),
@@ -68,7 +72,9 @@ def pixel_errors(rig, board, poses, frames):
     """Errors (n, 2) px of all found points, each board read in the order that fits."""
     errors = []
     for pose, frame in zip(poses, frames, strict=True):
-        for image, camera, move in zip((frame.left, frame.right), rig.cameras, rig.from_camera, strict=True):
+        for image, camera, move in zip(
+            (frame.left, frame.right), rig.cameras, rig.from_camera, strict=True
+        ):
             view = find_board(image, board)
             assert not isinstance(view, str), view
             truth = expected_pixels(camera, move @ pose, board)
@@ -78,11 +84,16 @@ def pixel_errors(rig, board, poses, frames):
 
 
 def normalised_errors(found, rig):
-    """Estimate minus truth over reported std, of what was free, [dt, dphi] for the place of the right camera."""
+    """Estimate minus truth over reported std, of what was free, [dt, dphi] for the place of the
+    right camera.
+    """
     errors = []
     for camera, values in zip(rig.cameras, found.adjustment.state.intrinsics, strict=True):
         lens = camera.distortion
-        errors += list(values - [*camera.focal_lengths, *camera.centre, lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
+        errors += list(
+            values
+            - [*camera.focal_lengths, *camera.centre, lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]
+        )
     place = found.rig.right_from_left
     turn = rotation_log(place[:3, :3] @ rig.right_from_left[:3, :3].T)
     errors += [*(place[:3, 3] - rig.right_from_left[:3, 3]), *turn]
@@ -98,7 +109,8 @@ def errors_beside_independent_ones(found, rig):
 
 def views_of(frames, board):
     return [
-        PairView(f"{k:02d}.png", find_board(f.left, board), find_board(f.right, board)) for k, f in enumerate(frames)
+        PairView(f"{k:02d}.png", find_board(f.left, board), find_board(f.right, board))
+        for k, f in enumerate(frames)
     ]
 
 
@@ -108,7 +120,10 @@ def views_of(frames, board):
 @pytest.mark.parametrize(
     ("rig", "board", "count", "seed", "psf_px"),
     [
-        *((PERFECT, board, 2, 0, 0.0) for board in (DOTS, ASYMMETRIC, DOTS.model_copy(update={"dark": False}))),
+        *(
+            (PERFECT, board, 2, 0, 0.0)
+            for board in (DOTS, ASYMMETRIC, DOTS.model_copy(update={"dark": False}))
+        ),
         (PERFECT, DOTS, 1, 0, 0.8),  # fits of sharp ellipses would be off by 0.05 px rms
         pytest.param(BENT, DOTS, 10, 3, 0.4, marks=pytest.mark.slow),
     ],
@@ -134,21 +149,38 @@ def test_chessboard_corners_are_found_to_a_tenth_of_a_pixel_by_the_older_search_
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", [PERFECT, BENT])
 def test_one_threshold_finds_the_dots_that_opencv_finds(rig):
-    """Turned round, too; what it cannot read is left to OpenCV: a dot too many, one too few, nothing at all."""
+    """Turned round, too; what it cannot read is left to OpenCV: a dot too many, one too few,
+    nothing at all.
+    """
     for k, board in enumerate((DOTS, DOTS.model_copy(update={"dark": False, "columns": 7}))):
         picture = rendered(rig, board, 2, seed=k)[1][k].left
         bright = 255 - picture if board.dark else picture
         for shown in (bright, np.ascontiguousarray(np.rot90(bright, 1 + k))):
-            quick, thorough = dot_search.read_at_once(shown, board), dot_search.found_by_opencv(shown, board, 1.0)
-            mirrored = np.arange(len(quick)).reshape(board.rows, -1)[:, ::-1].ravel()  # which OpenCV cannot tell
-            orders = [order[way] for order in board.symmetries for way in (mirrored, np.sort(mirrored))]
+            quick, thorough = (
+                dot_search.read_at_once(shown, board),
+                dot_search.found_by_opencv(shown, board, 1.0),
+            )
+            # which OpenCV cannot tell
+            mirrored = np.arange(len(quick)).reshape(board.rows, -1)[:, ::-1].ravel()
+            orders = [
+                order[way] for order in board.symmetries for way in (mirrored, np.sort(mirrored))
+            ]
             assert min(np.abs(quick[order] - thorough).max() for order in orders) < 0.3
         x, y = np.rint(quick[0]).astype(int)
         reach = int(0.35 * np.linalg.norm(quick[1] - quick[0]))
         fewer, more = shown.copy(), shown.copy()
         fewer[y - reach : y + reach, x - reach : x + reach] = shown[y - reach, x - reach]
-        cv2.circle(more, tuple(np.rint(0.5 * (quick[0] + quick[board.columns + 1])).astype(int)), 4, 255, -1)
-        assert all(dot_search.read_at_once(changed, board) is None for changed in (fewer, more, np.zeros_like(shown)))
+        cv2.circle(
+            more,
+            tuple(np.rint(0.5 * (quick[0] + quick[board.columns + 1])).astype(int)),
+            4,
+            255,
+            -1,
+        )
+        assert all(
+            dot_search.read_at_once(changed, board) is None
+            for changed in (fewer, more, np.zeros_like(shown))
+        )
 
 
 def test_both_shapes_of_opencvs_answer_are_one(monkeypatch):
@@ -176,7 +208,9 @@ def test_no_board_is_a_reason_and_not_an_error():
 
 @pytest.mark.slow
 def test_poses_do_not_depend_on_how_many_are_looked_at_together(monkeypatch):
-    """Nor does what is drawn after them; one pose at a time is the plain way. Large boards take thousands of tries."""
+    """Nor does what is drawn after them; one pose at a time is the plain way. Large boards take
+    thousands of tries.
+    """
     board = DOTS.model_copy(update={"spacing": 0.08})
     found = []
     for count in (1, rendered_boards.AT_ONCE):
@@ -189,7 +223,10 @@ def test_poses_do_not_depend_on_how_many_are_looked_at_together(monkeypatch):
 
 def test_a_dot_alone_has_the_median_of_its_ground_for_neighbours():
     rng = np.random.default_rng(0)
-    windows, centres = rng.integers(0, 255, (20, 30, 30)).astype(float), rng.uniform(13.0, 17.0, (20, 2))
+    windows, centres = (
+        rng.integers(0, 255, (20, 30, 30)).astype(float),
+        rng.uniform(13.0, 17.0, (20, 2)),
+    )
     inverses = np.linalg.inv(rng.uniform(-1.5, 1.5, (20, 2, 2)) + 5.0 * np.eye(2))
     alone, ticks = windows.copy(), np.arange(30.0)
     isolate_dots(alone, centres, inverses, 1.2, 2.0)
@@ -207,7 +244,9 @@ def test_boards_that_cannot_be_drawn_are_refused():
         board_poses(PERFECT, DOTS.model_copy(update={"spacing": 0.25}), 1, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize(("rig", "board", "psf"), [(PERFECT, DOTS, 0.0), (BENT, DOTS, 1.0), (PERFECT, ASYMMETRIC, 0.4)])
+@pytest.mark.parametrize(
+    ("rig", "board", "psf"), [(PERFECT, DOTS, 0.0), (BENT, DOTS, 1.0), (PERFECT, ASYMMETRIC, 0.4)]
+)
 @pytest.mark.parametrize("claimed", [1.0, 1.4])
 def test_radius_of_dots_is_measured_whatever_the_board_file_says(rig, board, psf, claimed):
     claim = board.model_copy(update={"radius": min(claimed * board.radius, 0.39 * board.nearest)})
@@ -218,7 +257,10 @@ def test_radius_of_dots_is_measured_whatever_the_board_file_says(rig, board, psf
 def test_far_too_small_a_radius_is_the_reason_given():
     _, frames = rendered(PERFECT, DOTS, 1)
     said = find_board(frames[0].left, DOTS.model_copy(update={"radius": 0.002}))
-    assert said == "only 0 of 63 points are sharp and whole, its dots measure 0.0125 m in radius, not 0.002"
+    assert (
+        said
+        == "only 0 of 63 points are sharp and whole, its dots measure 0.0125 m in radius, not 0.002"
+    )
 
 
 # --- from images to cameras
@@ -242,9 +284,15 @@ def test_rendered_boards_give_the_true_cameras(rig, board, count, seed, renderer
 
 def test_calibrated_sensor_file_is_one(tmp_path):
     found = calibrate(DOTS, views_of(rendered(PERFECT, DOTS, 8, seed=3)[1], DOTS), (800, 600))
-    with pytest.raises(CalibrationError, match="800 x 600 px, those of the sensor file ctrack780 2048 x 1536"):
+    with pytest.raises(
+        CalibrationError, match="800 x 600 px, those of the sensor file ctrack780 2048 x 1536"
+    ):
         sensor_template("ctrack780", tmp_path).filled(found)
-    text = sensor_text("ctrack780").replace("width = 2048", "width = 800").replace("height = 1536", "height = 600")
+    text = (
+        sensor_text("ctrack780")
+        .replace("width = 2048", "width = 800")
+        .replace("height = 1536", "height = 600")
+    )
     (tmp_path / "nominal.toml").write_text(text)
     once = sensor_template(tmp_path / "nominal.toml", tmp_path).filled(found)
     (tmp_path / "mine.toml").write_text(once)
@@ -258,13 +306,17 @@ def test_calibrated_sensor_file_is_one(tmp_path):
 
 
 def test_eccentricity_correction_removes_the_bias_of_large_dots():
-    """Centres of dots with 19 px radius as an exact detector gives them, from the closed form of the ellipse."""
+    """Centres of dots with 19 px radius as an exact detector gives them, from the closed form of
+    the ellipse.
+    """
     board = Board(kind="dots", columns=7, rows=6, spacing=0.08, radius=0.031)
     rng = np.random.default_rng(5)
     pairs = []
     for k, pose in enumerate(board_poses(BENT, board, 12, rng)):
         sides = [
-            BoardView(np.arange(42), expected_pixels(c, m @ pose, board) + rng.normal(0, 0.005, (42, 2)))
+            BoardView(
+                np.arange(42), expected_pixels(c, m @ pose, board) + rng.normal(0, 0.005, (42, 2))
+            )
             for c, m in zip(BENT.cameras, BENT.from_camera, strict=True)
         ]
         pairs.append(PairView(f"{k}", *sides))
@@ -273,7 +325,9 @@ def test_eccentricity_correction_removes_the_bias_of_large_dots():
     assert np.abs(normalised_errors(on, BENT)).max() < 4.0
     assert np.abs(errors_beside_independent_ones(off, BENT)).max() > 8.0
     assert on.adjustment.shared.factor == 1.0
-    assert off.adjustment.shared.factor > 4.0  # the eccentricity is an error that the dots of a view share
+    assert (
+        off.adjustment.shared.factor > 4.0
+    )  # the eccentricity is an error that the dots of a view share
     assert np.abs(normalised_errors(off, BENT)).max() < 4.0
     assert on.adjustment.sigma_px == pytest.approx(0.005, rel=0.06)
     assert off.adjustment.sigma_px > 1.1 * on.adjustment.sigma_px
@@ -283,9 +337,14 @@ def test_eccentricity_correction_removes_the_bias_of_large_dots():
 def test_large_rendered_dots_are_unbiased_with_the_correction_only():
     board = Board(kind="dots", columns=7, rows=6, spacing=0.08, radius=0.031)
     views = views_of(rendered(PERFECT, board, 14, seed=6)[1], board)
-    options = {correct: CalibrationOptions("none", correct_dots=correct) for correct in (True, False)}
+    options = {
+        correct: CalibrationOptions("none", correct_dots=correct) for correct in (True, False)
+    }
     found = {correct: calibrate(board, views, (800, 600), o) for correct, o in options.items()}
-    worst = {correct: np.abs(errors_beside_independent_ones(f, PERFECT)).max() for correct, f in found.items()}
+    worst = {
+        correct: np.abs(errors_beside_independent_ones(f, PERFECT)).max()
+        for correct, f in found.items()
+    }
     assert worst[True] < 4.0 < worst[False]
     assert found[True].adjustment.shared.factor == 1.0
 
@@ -294,8 +353,12 @@ def as_photograph(image, rng):
     """Uneven light, a blurred lens, noise and JPEG."""
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     light = 1.0 - 0.45 * np.hypot(x - 150, y - 100) / 1000.0
-    soft = cv2.GaussianBlur(image.astype(np.float32) * light, (0, 0), 1.0) + rng.normal(0, 1.5, image.shape)
-    coded = cv2.imencode(".jpg", np.clip(soft, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
+    soft = cv2.GaussianBlur(image.astype(np.float32) * light, (0, 0), 1.0) + rng.normal(
+        0, 1.5, image.shape
+    )
+    coded = cv2.imencode(
+        ".jpg", np.clip(soft, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88]
+    )[1]
     return cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
 
 
@@ -310,15 +373,21 @@ def as_photograph(image, rng):
     ],
 )
 def test_photograph_like_images_give_the_true_cameras(board, renderer, count):
-    """One pair shows the board partly outside of the left image: it is left out, with the reason."""
+    """One pair shows the board partly outside of the left image: it is left out, with the
+    reason."""
     rng = np.random.default_rng(7)
-    _, frames = rendered(BENT, board, count, seed=7, renderer=renderer, optics=Optics(psf_px=0.5, vignetting=0.2))
+    _, frames = rendered(
+        BENT, board, count, seed=7, renderer=renderer, optics=Optics(psf_px=0.5, vignetting=0.2)
+    )
     images = [(as_photograph(f.left, rng), as_photograph(f.right, rng)) for f in frames]
     columns = np.flatnonzero((frames[0].left > 100).any(axis=0))
     cut = np.roll(images[0][0], -int(np.mean(columns[[0, -1]])), axis=1)
     cut[:, -int(np.mean(columns[[0, -1]])) :] = 10
     images[0] = cut, images[0][1]
-    views = [PairView(f"{k:02d}.jpg", find_board(a, board), find_board(b, board)) for k, (a, b) in enumerate(images)]
+    views = [
+        PairView(f"{k:02d}.jpg", find_board(a, board), find_board(b, board))
+        for k, (a, b) in enumerate(images)
+    ]
     found = calibrate(board, views, (800, 600))
     assert "left: no" in found.rejected["00.jpg"]
     assert len(found.rejected) <= 3

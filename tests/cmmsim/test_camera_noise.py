@@ -1,4 +1,6 @@
-"""The camera's noise recovered from its images, after EMVA 1288: photon transfer, PRNU, DSNU; bit depth, saturation."""
+"""The camera's noise recovered from its images, after EMVA 1288: photon transfer, PRNU, DSNU; bit
+depth, saturation.
+"""
 
 from dataclasses import replace
 
@@ -17,28 +19,39 @@ SIZE = 60
 
 
 def lit_evenly(level, seed=0, changes=None):
-    """Windows (2, 16, SIZE, SIZE) of a wall of one level that fills both images; one call is one exposure."""
+    """Windows (2, 16, SIZE, SIZE) of a wall of one level that fills both images; one call is one
+    exposure.
+    """
     sensor = exact("perfect", {"stickers.obstacle_level": level} | (changes or {}), seed=seed)
     sensor.add_bodies({"wall": trimesh.creation.box(extents=(0.1, 4.0, 4.0))})
     place = np.eye(4)
     place[:3, 3] = [0.9, 0.0, 0.76]
-    place[:3, :3] = cmmsim.rod_transform([0, 0, 0], [0.72, 0.0, 0.69])[:3, :3] @ [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    place[:3, :3] = cmmsim.rod_transform([0, 0, 0], [0.72, 0.0, 0.69])[:3, :3] @ [
+        [0, 0, 1],
+        [0, 1, 0],
+        [-1, 0, 0],
+    ]
     return lambda: sensor.look(sensor.home, {"wall": place}).windows(CORNERS, SIZE).astype(float)
 
 
 def test_photon_transfer_gives_gain_and_dark_noise():
-    """The variance of a pixel's grey value grows with its mean by the gain K; what the dark has is the dark noise."""
+    """The variance of a pixel's grey value grows with its mean by the gain K; what the dark has is
+    the dark noise.
+    """
     means, variances = [], []
     for level in (0, 40, 90, 140, 190, 230):
         expose = lit_evenly(level)
         first, second = expose(), expose()
         means.append(0.5 * (first + second).mean())
-        variances.append(0.5 * (first - second).var())  # the difference frees it from what differs between pixels
+        # the difference frees it from what differs between pixels
+        variances.append(0.5 * (first - second).var())
     gain, dark = np.polyfit(np.array(means) - BLACK, variances, 1)
     assert gain == pytest.approx(GAIN, rel=0.03)
     assert np.sqrt(variances[0] - 1.0 / 12.0) / gain == pytest.approx(DARK_NOISE, rel=0.03)
     assert np.sqrt(dark - 1.0 / 12.0) / gain == pytest.approx(DARK_NOISE, rel=0.03)
-    np.testing.assert_allclose(means, BLACK + GAIN * WHITE * np.array([0, 40, 90, 140, 190, 230]) / 255.0, atol=0.1)
+    np.testing.assert_allclose(
+        means, BLACK + GAIN * WHITE * np.array([0, 40, 90, 140, 190, 230]) / 255.0, atol=0.1
+    )
 
 
 @pytest.mark.parametrize("deviation", [0.01, 0.1, 0.3, 0.5, 1.0, 3.0])
@@ -46,15 +59,21 @@ def test_rounding_excess_is_the_largest_variance_of_rounded_numbers(deviation):
     """Against the probabilities of the numbers, over means everywhere between two of them."""
     noise = CameraNoise(1e6, 1e-4, deviation / 1e-4, 2e6, 0.0)
     means, numbers = np.linspace(100.0, 101.0, 201)[:, None], np.arange(60, 142)
-    probability = norm.cdf(numbers + 0.5, means, deviation) - norm.cdf(numbers - 0.5, means, deviation)
+    probability = norm.cdf(numbers + 0.5, means, deviation) - norm.cdf(
+        numbers - 0.5, means, deviation
+    )
     variance = (probability * numbers**2).sum(axis=1) - (probability * numbers).sum(axis=1) ** 2
     expected = variance.max() / (deviation**2 + 1.0 / 12.0)
     assert noise.rounding_excess(np.array(0.0)) == pytest.approx(expected, rel=0.01)
-    assert replace(noise, frames=9).rounding_excess(np.array(0.0)) == pytest.approx(expected, rel=0.01)
+    assert replace(noise, frames=9).rounding_excess(np.array(0.0)) == pytest.approx(
+        expected, rel=0.01
+    )
 
 
 def test_pattern_is_recovered_from_averaged_images():
-    """PRNU from a bright and DSNU from a dark level: spatial variance of the mean less what the averaging leaves."""
+    """PRNU from a bright and DSNU from a dark level: spatial variance of the mean less what the
+    averaging leaves.
+    """
     spatial = {}
     for level in (0, 200):
         expose = lit_evenly(level, changes={"camera.prnu": 0.02, "camera.dsnu": 15.0})
@@ -66,7 +85,9 @@ def test_pattern_is_recovered_from_averaged_images():
 
 
 def test_pattern_stays_and_belongs_to_the_camera():
-    """The same in windows and whole images and for other noise; another one for the other camera and pattern seed."""
+    """The same in windows and whole images and for other noise; another one for the other camera
+    and pattern seed.
+    """
 
     def pattern(seed, pattern_seed):
         expose = lit_evenly(0, seed, {"camera.dsnu": 60.0, "camera.pattern_seed": pattern_seed})
@@ -100,7 +121,9 @@ def test_bit_depth_and_saturation(bits):
     image = noise.expose(np.full((50, 50), 2.0, dtype=np.float32), np.random.default_rng(0))
     assert image.dtype == (np.uint8 if bits == 8 else np.uint16)
     assert np.all(image == 2**bits - 1)
-    half = noise.expose(np.full((300, 300), 0.5, dtype=np.float32), np.random.default_rng(0)).astype(float)
+    half = noise.expose(
+        np.full((300, 300), 0.5, dtype=np.float32), np.random.default_rng(0)
+    ).astype(float)
     assert half.mean() == pytest.approx((BLACK + 0.5 * GAIN * WHITE) * scale, rel=1e-3)
     assert half.var() == pytest.approx(noise.variance(half.mean()), rel=0.03)
     full = CameraNoise(WHITE, GAIN * scale, DARK_NOISE, 900.0, BLACK * scale, bit_depth=bits)
@@ -108,7 +131,9 @@ def test_bit_depth_and_saturation(bits):
 
 
 def test_grey_values_are_those_of_the_model_in_plain_numpy():
-    """With the same stream: electrons up to the full well, shot and dark noise, offset, gain, limits."""
+    """With the same stream: electrons up to the full well, shot and dark noise, offset, gain,
+    limits.
+    """
     noise = replace(NOISE, full_well=900.0, prnu=0.05, dsnu=12.0, bit_depth=10, black_level=60.0)
     radiance = np.random.default_rng(5).random((3, 40, 50), dtype=np.float32)
     pattern = draw_pattern(radiance.shape, noise.prnu, noise.dsnu, np.random.default_rng(6))
@@ -122,7 +147,8 @@ def test_grey_values_are_those_of_the_model_in_plain_numpy():
         np.testing.assert_array_equal(found[whole], np.clip(np.rint(value), 0.0, 1023.0)[whole])
 
 
-@pytest.mark.parametrize("exposures", [25, 400])  # the one taken one by one, the other drawn at once
+# the one taken one by one, the other drawn at once
+@pytest.mark.parametrize("exposures", [25, 400])
 def test_averaging_reduces_what_changes_but_not_the_pattern(exposures):
     """The variance of averaged exposures over many patterns, sampled, is as stated."""
     noise = replace(NOISE, full_well=1e6, prnu=0.02, dsnu=10.0, frames=exposures)
@@ -138,18 +164,26 @@ def test_averaging_reduces_what_changes_but_not_the_pattern(exposures):
         pytest.param({}, id="usual"),
         pytest.param({"bit_depth": 12, "gain": 2.08, "black_level": 256.0}, id="12 bit"),
         pytest.param({"black_level": 1.0}, id="dark"),
-        pytest.param({"bit_depth": 12, "gain": 2.08, "black_level": 0.0, "full_well": 900.0}, id="12 bit dark, full"),
+        pytest.param(
+            {"bit_depth": 12, "gain": 2.08, "black_level": 0.0, "full_well": 900.0},
+            id="12 bit dark, full",
+        ),
         pytest.param({"gain": 0.2, "full_well": 1e4}, id="saturated"),
         pytest.param(
-            {"electrons_at_white": 1e6, "full_well": 2e6, "gain": 2e-4, "dark_noise": 0.0}, id="no dark noise"
+            {"electrons_at_white": 1e6, "full_well": 2e6, "gain": 2e-4, "dark_noise": 0.0},
+            id="no dark noise",
         ),
-        pytest.param({"electrons_at_white": 1e6, "full_well": 2e6, "gain": 2e-4, "dark_noise": 2e3}, id="little noise"),
+        pytest.param(
+            {"electrons_at_white": 1e6, "full_well": 2e6, "gain": 2e-4, "dark_noise": 2e3},
+            id="little noise",
+        ),
     ],
 )
 @pytest.mark.parametrize("differing", [False, True])
 def test_a_mean_drawn_at_once_has_the_mean_and_variance_of_averaged_exposures(changes, differing):
-    """Against 100,000 exposures of pixels of 25 levels, to 4.5 standard deviations, which chance alone passes in
-    5 of 1,000 runs of these 700 comparisons; what happens less than 5 times in all exposures is not seen."""
+    """Against 100,000 exposures of pixels of 25 levels, to 4.5 standard deviations, which chance
+    alone passes in 5 of 1,000 runs of these 700 comparisons; what happens less than 5 times in all
+    exposures is not seen."""
     noise, count, frames = replace(NOISE, **changes), 100_000, 40
     rng = np.random.default_rng(3)
     levels = np.concatenate([np.zeros(1), rng.uniform(0.0, 1.3, 24)]).astype(np.float32)

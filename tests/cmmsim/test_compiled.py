@@ -18,7 +18,13 @@ PROBE = (
 
 
 def run_copy(folder, environment):
-    run = {"cwd": folder, "env": os.environ | environment, "check": True, "capture_output": True, "text": True}
+    run = {
+        "cwd": folder,
+        "env": os.environ | environment,
+        "check": True,
+        "capture_output": True,
+        "text": True,
+    }
     return float(subprocess.run([sys.executable, "-c", PROBE], **run).stdout)
 
 
@@ -41,7 +47,8 @@ def test_kernel_is_compiled_anew_when_one_that_it_calls_changes(copied):
     assert first
     assert run_copy(copied, {}) == before
     assert kept() == first
-    callee = copied / "cmmsim" / "detection" / "fit_kernels.py"  # any kernel counts, whether called or not
+    # any kernel counts, whether called or not
+    callee = copied / "cmmsim" / "detection" / "fit_kernels.py"
     callee.write_text(callee.read_text() + "\n")
     run_copy(copied, {})
     assert kept() != first
@@ -51,7 +58,8 @@ def test_kernel_is_compiled_anew_when_one_that_it_calls_changes(copied):
 def test_kernels_compile_where_the_package_cannot_be_written(copied, tmp_path):
     """The cache goes to the user's folder; without one they are compiled in every process."""
     if os.geteuid() == 0:
-        (copied / "cmmsim" / "geometry" / "__pycache__").write_text("")  # root may write anywhere, but not into a file
+        # root may write anywhere, but not into a file
+        (copied / "cmmsim" / "geometry" / "__pycache__").write_text("")
     else:
         (copied / "cmmsim" / "geometry").chmod(0o555)
     (tmp_path / "nowhere").write_text("")

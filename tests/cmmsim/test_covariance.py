@@ -1,6 +1,8 @@
-"""Stickers with drawn pixel noise, without images: covariance of their poses, and those that contradict the others.
+"""Stickers with drawn pixel noise, without images: covariance of their poses, and those that
+contradict the others.
 
-Also what both cameras can look for, and the covariance expected there, against what the sensor measures.
+Also what both cameras can look for, and the covariance expected there, against what the sensor
+measures.
 """
 
 from dataclasses import replace
@@ -14,19 +16,41 @@ import cmmsim
 from cmmsim.errors import LostError
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body
+from cmmsim.geometry.camera import Distortion
 from cmmsim.geometry.disc_image import sticker_outlines
-from cmmsim.geometry.pose import apply, compose_covariance, pose_covariance, pose_to_transform, transform_to_pose
+from cmmsim.geometry.pose import (
+    apply,
+    compose_covariance,
+    invert,
+    pose_covariance,
+    pose_to_transform,
+    transform_to_pose,
+)
 from cmmsim.geometry.registration import register
+from cmmsim.geometry.rigid_kernels import residual_misfits
 from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
-from cmmsim.pose_estimation.consistency import FEWEST, LARGEST_MISFIT, consistent, outline_misfits, place_misfits
-from cmmsim.pose_estimation.estimator import by_planes, by_registration
-from cmmsim.pose_estimation.observation import DetectionSettings, Observer, Outlines, StickerObservation
+from cmmsim.measuring.frame_solver import (
+    FEWEST,
+    LARGEST_MISFIT,
+    SMALLEST_SHARE,
+    consistent,
+)
+from cmmsim.measuring.observation import (
+    DetectionSettings,
+    Observer,
+    Outlines,
+    StickerObservation,
+)
+from cmmsim.measuring.pose_estimator import by_planes, by_registration
 from cmmsim.visibility import expected_covariance, sight_lines
+from tests.cmmsim import plain
 from tests.cmmsim.sensors import CAMERA, NOISE, require_regions, require_true, squares
 
 FILE = read_sensor_file("ctrack780")
 BODY = marked_body("platform", FILE.platform)
-RIG, CAMERA_FROM_BASE = toed_in_rig(CAMERA, 1.0, np.array(FILE.rig.position), np.array(FILE.rig.target))
+RIG, CAMERA_FROM_BASE = toed_in_rig(
+    CAMERA, 1.0, np.array(FILE.rig.position), np.array(FILE.rig.target)
+)
 BASE_FROM_CAMERA = np.linalg.inv(CAMERA_FROM_BASE)
 POSES = [
     FILE.platform.home,
@@ -37,8 +61,12 @@ POSES = [
 
 def pixel_covariances(rng, count):
     """Unlike ones, as tilted stickers have them: 0.006 to 0.012 px along their axes."""
-    turn = Rotation.from_rotvec(rng.uniform(0.0, np.pi, (count, 1)) * [[0.0, 0.0, 1.0]]).as_matrix()[:, :2, :2]
-    return turn @ (np.eye(2) * rng.uniform(0.006, 0.012, (count, 1, 2)) ** 2) @ turn.transpose(0, 2, 1)
+    turn = Rotation.from_rotvec(
+        rng.uniform(0.0, np.pi, (count, 1)) * [[0.0, 0.0, 1.0]]
+    ).as_matrix()[:, :2, :2]
+    return (
+        turn @ (np.eye(2) * rng.uniform(0.006, 0.012, (count, 1, 2)) ** 2) @ turn.transpose(0, 2, 1)
+    )
 
 
 def observed(rng, pixels, spread, stickers):
@@ -48,7 +76,9 @@ def observed(rng, pixels, spread, stickers):
         for q, s in zip(pixels, spread, strict=True)
     )
     seen = triangulate(RIG, left, right, *spread)
-    return StickerObservation(stickers, left, right, seen.points, seen.covariances, np.full(len(stickers), np.nan))
+    return StickerObservation(
+        stickers, left, right, seen.points, seen.covariances, np.full(len(stickers), np.nan)
+    )
 
 
 def drawn(pose, count):
@@ -61,7 +91,11 @@ def drawn(pose, count):
 
 @pytest.mark.parametrize(
     ("method", "count"),
-    [("registration", 2000), ("planes", 300), pytest.param("planes", 2000, marks=pytest.mark.thorough)],
+    [
+        ("registration", 2000),
+        ("planes", 300),
+        pytest.param("planes", 2000, marks=pytest.mark.thorough),
+    ],
 )
 @pytest.mark.parametrize("pose", POSES, ids=["home", "corner", "other corner"])
 def test_pose_covariance(pose, method, count):
@@ -74,12 +108,16 @@ def test_pose_covariance(pose, method, count):
             found, covariance, _ = by_registration(seen, BODY.nominal)
         base_from_body = BASE_FROM_CAMERA @ found
         errors.append(transform_to_pose(base_from_body) - pose)
-        covariances.append(pose_covariance(base_from_body, compose_covariance(BASE_FROM_CAMERA, covariance)))
+        covariances.append(
+            pose_covariance(base_from_body, compose_covariance(BASE_FROM_CAMERA, covariance))
+        )
     errors, covariances = np.array(errors), np.array(covariances)
     squared = squares(errors, covariances)
     require_true(squared)
     require_regions(squared)
-    assert np.abs(errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(count))).max() < 4.5  # no bias
+    assert (
+        np.abs(errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(count))).max() < 4.5
+    )  # no bias
 
 
 ALL, RADIUS, HOME = list(range(18)), 0.003, np.array(FILE.platform.home)
@@ -90,13 +128,29 @@ SHAPES = sticker_outlines(RIG, CAMERA_FROM_BODY, BODY.nominal, BODY.sticker_norm
 
 
 def seen_from_home(rng, stickers, shift_px=0.0, shrink_px=0.0):
-    """Stickers with pixel noise; the first one's left centre is shifted along the epipolar line, its shape shrunk."""
+    """Stickers with pixel noise; the first one's left centre is shifted along the epipolar line,
+    its shape shrunk.
+    """
     pixels, shapes = PIXELS[:, stickers], SHAPES[:, stickers]
     pixels[0, 0, 0] += shift_px
     shapes[0, 0, 0, 0] -= shrink_px
     outlines = Outlines(shapes, np.broadcast_to(0.01**2 * np.eye(3), (2, len(stickers), 3, 3)))
     spread = [pixel_covariances(rng, len(stickers)) for _ in range(2)]
     return replace(observed(rng, pixels, spread, np.array(stickers)), outlines=outlines)
+
+
+def solved(seen):
+    """Stickers that agree, camera_from_body and its covariance, from half a millimetre beside."""
+    near = CAMERA_FROM_BASE @ pose_to_transform(HOME + 5e-4)
+    return consistent(seen, near, OBSERVER, BODY, BODY.nominal)
+
+
+def misfits_of(fit, points, places, covariances):
+    """Squared residuals (n,) of a registration, compiled."""
+    found, own = np.empty(len(points)), np.zeros(len(points), dtype=int)
+    fits = fit.transform[None], fit.covariance[None], own
+    residual_misfits(*fits, places, points, covariances, SMALLEST_SHARE, found)
+    return found
 
 
 @pytest.mark.parametrize("stickers", [ALL, [0, 5, 7, 12, 16]])
@@ -107,74 +161,130 @@ def test_place_misfits_are_chi_square(stickers):
         seen = seen_from_home(rng, stickers)
         places = BODY.nominal[seen.index]
         result = register(places, seen.points, seen.covariances)
-        found.append(place_misfits(result, seen.points, places, seen.covariances))
+        found.append(misfits_of(result, seen.points, places, seen.covariances))
     for k in range(len(found[0])):
         assert kstest(np.array(found)[:, k], "chi2", args=(3,)).pvalue > 1e-4
 
 
-def test_place_misfits_are_those_of_plain_numpy():
-    """By the whole covariance S - J C J' of each residual, of one registration and of two at once."""
-    rng, seen = np.random.default_rng(4), [seen_from_home(np.random.default_rng(k), ALL) for k in range(2)]
-    places = BODY.nominal[seen[0].index]
-    fits = [register(places, one.points, one.covariances) for one in seen]
-    plain = []
-    for one, fit in zip(seen, fits, strict=True):
-        turned = places @ fit.transform[:3, :3].T
-        residuals = one.points - turned - fit.transform[:3, 3]
-        turns = np.cross(np.eye(3), turned[:, None]).swapaxes(1, 2)
-        slopes = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), turns], axis=2)
-        left = one.covariances - slopes @ fit.covariance @ slopes.swapaxes(1, 2)
-        plain.append(np.einsum("ni,nij,nj->n", residuals, np.linalg.inv(left), residuals))
-        found = place_misfits(fit, one.points, places, one.covariances)
-        np.testing.assert_allclose(found, plain[-1], rtol=1e-8)
-    both = replace(
-        fits[0], transform=np.stack([f.transform for f in fits]), covariance=np.stack([f.covariance for f in fits])
+@pytest.mark.parametrize("stickers", [ALL, [0, 1, 2, 3], [0, 6, 7]])
+def test_place_misfits_are_those_of_plain_numpy(stickers):
+    """By the covariance S - J C J' of each residual, without what a sticker alone determines."""
+    for seed in range(20):
+        seen = seen_from_home(np.random.default_rng(seed), stickers)
+        places = BODY.nominal[seen.index]
+        fit = register(places, seen.points, seen.covariances)
+        expected = plain.place_misfits(
+            fit.transform, fit.covariance, places, seen.points, seen.covariances
+        )
+        found = misfits_of(fit, seen.points, places, seen.covariances)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_the_compiled_solver_finds_what_plain_numpy_finds():
+    """Frames of four to eighteen stickers, some of them displaced or misshapen, with a lens."""
+    rng, lost, left_out = np.random.default_rng(0), 0, 0
+    for k in range(150):
+        stickers = np.sort(rng.choice(18, rng.integers(4, 19), replace=False))
+        seen = seen_from_home(
+            rng, stickers, shift_px=0.4 * (k % 3 == 0), shrink_px=0.1 * (k % 5 == 0)
+        )
+        seen = seen if k % 4 else replace(seen, outlines=None)
+        seen = seen if k % 7 else replace(seen, covariances=seen.covariances / 4.0)
+        expected = plain.consistent(seen, RIG, RADIUS, BODY.nominal, BODY.sticker_normals)
+        if expected is None:
+            with pytest.raises(LostError):
+                solved(seen)
+            lost += 1
+            continue
+        used, move, covariance = solved(seen)
+        left_out += len(used.index) < len(stickers)
+        np.testing.assert_array_equal(used.index, expected[0])
+        np.testing.assert_allclose(move, expected[1], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(covariance, expected[2], rtol=1e-6, atol=1e-18)
+    assert lost >= 5
+    assert left_out > 40
+
+
+def test_rounding_errors_of_a_predicted_place_do_not_grow_from_frame_to_frame():
+    """Each frame is looked for where the two before lead to, as a tracker does, a thousand times."""
+    seen = seen_from_home(np.random.default_rng(2), ALL)
+    last = move = CAMERA_FROM_BODY
+    for _ in range(1000):
+        last, move = (
+            move,
+            consistent(seen, move @ invert(last) @ move, OBSERVER, BODY, BODY.nominal)[1],
+        )
+    assert np.abs(move[:3, :3].T @ move[:3, :3] - np.eye(3)).max() < 1e-13
+    np.testing.assert_allclose(move, solved(seen)[1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("lens", [Distortion(), Distortion(-0.12, 0.03, 1e-3, -7e-4, -4e-3)])
+def test_triangulated_points_are_those_of_opencvs_derivatives(lens):
+    rig = replace(
+        RIG, left=replace(RIG.left, distortion=lens), right=replace(RIG.right, distortion=lens)
     )
-    order = rng.permutation(2 * len(places))
-    points, spread = (np.concatenate([getattr(o, n) for o in seen])[order] for n in ("points", "covariances"))
-    of, sticker = np.divmod(order, len(places))
-    found = place_misfits(both, points, places[sticker], spread, of)
-    np.testing.assert_allclose(found, np.concatenate(plain)[order], rtol=1e-8)
+    rng, points = np.random.default_rng(3), apply(CAMERA_FROM_BODY, BODY.nominal)
+    pixels = rig.project(points)[0] + 0.1 * rng.standard_normal((2, 18, 2))
+    spread = np.stack([pixel_covariances(rng, 18) for _ in range(2)])
+    for parted in (0.0, 1e-3):
+        expected = plain.triangulate(rig, pixels, spread, points, parted)
+        for near in (None, points + 1e-3):
+            found = triangulate(rig, *pixels, *spread, near=near, parted=parted)
+            np.testing.assert_allclose(found.points, expected[0], rtol=0, atol=1e-12)
+            size = np.abs(expected[1]).max()
+            np.testing.assert_allclose(found.covariances, expected[1], rtol=0, atol=5e-8 * size)
 
 
 @pytest.mark.parametrize(("seed", "wrong"), [(2, {"shift_px": 0.5}), (3, {"shrink_px": 0.1})])
 def test_displaced_or_misshapen_sticker_is_left_out(seed, wrong):
     seen = seen_from_home(np.random.default_rng(seed), ALL, **wrong)
-    used, _ = consistent(seen, OBSERVER, BODY, BODY.nominal)
+    used = solved(seen)[0]
     np.testing.assert_array_equal(used.index, ALL[1:])
 
 
 def test_three_stickers_are_refused_and_four_of_which_one_is_wrong():
     with pytest.raises(LostError, match=f"3 visible stickers, at least {FEWEST} are needed"):
-        consistent(seen_from_home(np.random.default_rng(5), [0, 7, 12]), OBSERVER, BODY, BODY.nominal)
-    with pytest.raises(LostError, match=r"4 visible stickers contradict each other, 3 are left .* squared misfit"):
-        consistent(seen_from_home(np.random.default_rng(4), [0, 5, 7, 12], shift_px=1.0), OBSERVER, BODY, BODY.nominal)
+        solved(seen_from_home(np.random.default_rng(5), [0, 7, 12]))
+    with pytest.raises(
+        LostError, match=r"4 visible stickers contradict each other, 3 are left .* squared misfit"
+    ):
+        solved(seen_from_home(np.random.default_rng(4), [0, 5, 7, 12], shift_px=1.0))
 
 
-def test_outline_misfit_is_in_units_of_its_noise():
-    seen = seen_from_home(np.random.default_rng(7), ALL, shrink_px=0.03)
-    misfits = outline_misfits(seen, SHAPES)
-    assert misfits[0, 0] == pytest.approx(9.0)
-    assert misfits[1].max() == 0.0
+def test_a_sticker_is_left_out_once_its_outline_misfits_by_the_limit():
+    """The square of the change over that of its noise, 0.01 px, against the limit."""
+    for change, kept in ((0.99, True), (1.01, False)):
+        shrink = change * 0.01 * np.sqrt(LARGEST_MISFIT)
+        seen = seen_from_home(np.random.default_rng(7), ALL, shrink_px=shrink)
+        move = solved(seen)[1]  # where outlines are expected
+        shapes = sticker_outlines(RIG, move, BODY.nominal, BODY.sticker_normals, RADIUS)[1]
+        shapes[0, 0, 0, 0] -= shrink
+        exact = replace(seen, outlines=replace(seen.outlines, shapes=shapes))
+        assert (0 in solved(exact)[0].index) == kept
     assert 21.0 < LARGEST_MISFIT < 21.2
 
 
 def test_drifted_camera_enlarges_the_covariance():
-    """Residuals of twice the stated noise: all stickers are kept, and all covariances are four times as large."""
+    """Residuals of twice the stated noise: all stickers are kept, and all covariances are four
+    times as large.
+    """
     seen = seen_from_home(np.random.default_rng(9), ALL)
     doubled = replace(seen, covariances=seen.covariances / 4.0)
-    plain, scaled = (consistent(s, OBSERVER, BODY, BODY.nominal) for s in (seen, doubled))
+    usual, scaled = solved(seen), solved(doubled)
     assert len(scaled[0].index) == 18
-    factor = plain[1].misfit.sum() / (3 * 18 - 6)
-    np.testing.assert_allclose(scaled[1].covariance, factor * plain[1].covariance, rtol=1e-6)
-    np.testing.assert_allclose(scaled[0].covariances, factor * plain[0].covariances, rtol=1e-6)
+    squared = plain.fitted(BODY.nominal, seen.points, seen.covariances)[2]
+    factor = squared.sum() / (3 * 18 - 6)
+    np.testing.assert_allclose(scaled[2], factor * usual[2], rtol=1e-6)
+    np.testing.assert_allclose(scaled[0].covariances, factor * usual[0].covariances, rtol=1e-6)
 
 
 def test_all_stickers_are_visible_at_home_and_few_with_the_platform_turned_away_or_beyond_the_image():
     sight = sight_lines("ctrack780")
     assert sight.visible(HOME).all()
     assert not sight.visible(HOME + np.array([0, 0, 0, 0, 0, np.pi / 2])).all()
-    assert not sight.visible(HOME + np.array([0, 0, 0, 0, np.pi, 0]))[sight.platform.plane_index == 0].any()
+    assert not sight.visible(HOME + np.array([0, 0, 0, 0, np.pi, 0]))[
+        sight.platform.plane_index == 0
+    ].any()
     narrow = replace(sight.rig, left=replace(sight.rig.left, focal_px=12 * sight.rig.left.focal_px))
     assert not replace(sight, rig=narrow).visible(HOME).all()
 

@@ -1,4 +1,6 @@
-"""One contract for all detectors, their stated covariance and bias against sampling, and the eccentricity of discs."""
+"""One contract for all detectors, their stated covariance and bias against sampling, and the
+eccentricity of discs.
+"""
 
 from dataclasses import replace
 
@@ -8,13 +10,15 @@ import pytest
 from cmmsim.detection.detector import FitLimits, SpotWindows, find_detector
 from cmmsim.detector_leaderboard import Condition, draw_discs, random_ellipses, scene_of
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.plugins import DEFAULT_DETECTOR, DETECTORS
-from cmmsim.sensor import load_sensor
+from cmmsim.loading import load_sensor
+from cmmsim.plugins import ALLOWED, DEFAULT_DETECTOR, DETECTORS
 from tests.cmmsim.sensors import exact, refused, require_true, squared_errors, squares
 
 SCENE = scene_of(read_sensor_file("ctrack780"))
 SIZE, FIT = 18, 14
-EVERY = pytest.mark.parametrize("detector", [find_detector(name) for name in DETECTORS], ids=list(DETECTORS))
+EVERY = pytest.mark.parametrize(
+    "detector", [find_detector(name) for name in DETECTORS], ids=list(DETECTORS)
+)
 NO_LIMIT = FitLimits(largest_misfit=np.inf)
 
 
@@ -33,7 +37,12 @@ def corners(count):
 @EVERY
 @pytest.mark.parametrize(
     "condition",
-    [Condition(3.8, 0.8, 0.027), Condition(5.0, 0.0, 0.01), Condition(3.0, 0.5, 0.05), Condition(4.0, 0.8, 0.02, 0.6)],
+    [
+        Condition(3.8, 0.8, 0.027),
+        Condition(5.0, 0.0, 0.01),
+        Condition(3.0, 0.5, 0.05),
+        Condition(4.0, 0.8, 0.02, 0.6),
+    ],
     ids=["working", "round", "noisy", "blurred"],
 )
 def test_covariance_is_that_of_sampled_noise(detector, condition):
@@ -41,7 +50,8 @@ def test_covariance_is_that_of_sampled_noise(detector, condition):
     _, clean, noisy, noise = drawn(condition, 800, 1)
     size = FIT + 2 * detector.margin_px
     found, without = (
-        detector.detect(SpotWindows(w, corners(800), noise, size, NO_LIMIT, condition.psf_px)) for w in (noisy, clean)
+        detector.detect(SpotWindows(w, corners(800), noise, size, NO_LIMIT, condition.psf_px))
+        for w in (noisy, clean)
     )
     assert found.good.all()
     change = found.centres - without.centres
@@ -52,10 +62,17 @@ def test_covariance_is_that_of_sampled_noise(detector, condition):
 @EVERY
 def test_averaged_exposures_divide_the_covariance_and_no_windows_hold_no_centres(detector):
     _, clean, _, noise = drawn(Condition(3.8, 0.8, 0.027), 5, 2)
-    one, many = (detector.detect(SpotWindows(clean, corners(5), replace(noise, frames=n), FIT)) for n in (1, 50))
+    one, many = (
+        detector.detect(SpotWindows(clean, corners(5), replace(noise, frames=n), FIT))
+        for n in (1, 50)
+    )
     np.testing.assert_allclose(many.covariances, one.covariances / 50.0, rtol=1e-6)
     found = detector.detect(SpotWindows(np.zeros((0, SIZE, SIZE)), corners(0), SCENE.noise, FIT))
-    assert (found.centres.shape, found.covariances.shape, found.good.shape) == ((0, 2), (0, 2, 2), (0,))
+    assert (found.centres.shape, found.covariances.shape, found.good.shape) == (
+        (0, 2),
+        (0, 2, 2),
+        (0,),
+    )
 
 
 @EVERY
@@ -65,12 +82,16 @@ def test_bias_is_as_stated(detector):
     error = detector.detect(SpotWindows(clean, corners(600), noise, FIT)).centres - centres
     rms = np.sqrt(np.mean(error**2))
     assert rms == pytest.approx(detector.bias_px, rel=0.1, abs=1e-5)
-    assert np.abs(error.mean(axis=0)).max() < 5.0 * rms / np.sqrt(600) + 1e-6  # over all places in a pixel it cancels
+    assert (
+        np.abs(error.mean(axis=0)).max() < 5.0 * rms / np.sqrt(600) + 1e-6
+    )  # over all places in a pixel it cancels
 
 
 @EVERY
 def test_what_lies_beyond_the_dark_ring_does_not_matter(detector):
-    """A lighter ground beyond the ring in one corner of the window, as the body shows beside a tilted sticker."""
+    """A lighter ground beyond the ring in one corner of the window, as the body shows beside a
+    tilted sticker.
+    """
     condition = Condition(3.8, 0.0, 0.027)
     centres, clean, _, noise = drawn(condition, 60, 5)
     ticks = np.arange(SIZE)
@@ -78,7 +99,9 @@ def test_what_lies_beyond_the_dark_ring_does_not_matter(detector):
     beside = (away > 2.5 * condition.radius_px) & (ticks > 9)
     lit = np.where(beside, clean + 22.0, clean)
     assert beside.any(axis=(1, 2)).all()
-    found, without = (detector.detect(SpotWindows(w, corners(60), noise, FIT)).centres for w in (lit, clean))
+    found, without = (
+        detector.detect(SpotWindows(w, corners(60), noise, FIT)).centres for w in (lit, clean)
+    )
     assert np.abs(found - without).max() < 0.002
 
 
@@ -100,33 +123,50 @@ def test_empty_dim_and_cut_spots_are_not_good(detector):
 def test_scene_with_other_noise_keeps_contrast_and_ground_and_cannot_have_less_than_that_of_rounding():
     quieter = SCENE.with_noise(0.005)
     assert quieter.edge_noise == pytest.approx(0.005, rel=1e-9)
-    assert (quieter.ground, quieter.contrast) == pytest.approx((SCENE.ground, SCENE.contrast), rel=1e-12)
-    shot = [replace(s.noise, dark_noise=0.0).variance(s.ground + s.contrast) - 1.0 / 12.0 for s in (SCENE, quieter)]
+    assert (quieter.ground, quieter.contrast) == pytest.approx(
+        (SCENE.ground, SCENE.contrast), rel=1e-12
+    )
+    shot = [
+        replace(s.noise, dark_noise=0.0).variance(s.ground + s.contrast) - 1.0 / 12.0
+        for s in (SCENE, quieter)
+    ]
     both = [s.noise.variance(s.ground + s.contrast) - 1.0 / 12.0 for s in (SCENE, quieter)]
-    assert shot[0] / both[0] == pytest.approx(shot[1] / both[1], rel=1e-9)  # shot and dark noise in the same proportion
-    refused(lambda: SCENE.with_noise(0.001), r"0\.10% of the contrast is less than that of rounding, 0\.16%")
+    # shot and dark noise in the same proportion
+    assert shot[0] / both[0] == pytest.approx(shot[1] / both[1], rel=1e-9)
+    refused(
+        lambda: SCENE.with_noise(0.001),
+        r"0\.10% of the contrast is less than that of rounding, 0\.16%",
+    )
 
 
 @EVERY
-def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(detector, taught, moving_path):
-    """Squared pose errors along a path, normalised by the stated covariance with the detector's bias in it, and by that
-    with what teaching left, which is the same whichever detector measures."""
+def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(
+    detector, taught, moving_path
+):
+    """Squared pose errors along a path, normalised by the stated covariance with the detector's
+    bias in it, and by that with what teaching left, which is the same whichever detector measures.
+    """
     changes = {"detection.detector": detector.name}
     sensor = load_sensor("ctrack780", 1, taught=taught, renderer="analytic", changes=changes)
     path = moving_path(150)
     found = [sensor.measure(pose) for pose in path]
     assert all(m.ok for m in found)
-    assert squared_errors(found, path).mean() == pytest.approx(6.0, rel=0.25)  # neighbours share places in a pixel
+    # neighbours share places in a pixel
+    assert squared_errors(found, path).mean() == pytest.approx(6.0, rel=0.25)
     errors = np.array([m.pose for m in found]) - path
     stated = np.array([m.single_covariance for m in found])
     squared = squares(errors, stated)
-    assert 4.0 < squared.mean() < 8.0  # the mean scatters by 0.3, and one teaching is in all of them
+    assert (
+        4.0 < squared.mean() < 8.0
+    )  # the mean scatters by 0.3, and one teaching is in all of them
     assert squared[0] < 22.5  # 1 in 1,000
 
 
 @pytest.mark.parametrize("radius_px", [3.8, 4.4, 4.8, 5.2])
 def test_lines_of_the_dual_conic_that_the_window_cuts_off_move_no_good_centre(radius_px):
-    """Discs so large that their rims come near the window's sides: exact to the stated bias, or not good."""
+    """Discs so large that their rims come near the window's sides: exact to the stated bias, or not
+    good.
+    """
     centres, clean, _, noise = drawn(Condition(radius_px, np.pi / 4.0, 0.027), 200, 8)
     dual_conic = find_detector("dual_conic")
     for margin_px in (0, dual_conic.margin_px):
@@ -136,7 +176,9 @@ def test_lines_of_the_dual_conic_that_the_window_cuts_off_move_no_good_centre(ra
 
 
 class Shifted:
-    """A detector of one's own that is made once: the maximum-likelihood fit, a fifth of a pixel aside."""
+    """A detector of one's own that is made once: the maximum-likelihood fit, a fifth of a pixel
+    aside.
+    """
 
     bias_px, margin_px = 0.2, 1
 
@@ -145,7 +187,8 @@ class Shifted:
         return replace(found, centres=found.centres + np.array([0.2, 0.0]))
 
 
-def test_a_detector_of_one_s_own_measures_by_its_module_and_name():
+def test_a_detector_of_one_s_own_measures_by_its_module_and_name(monkeypatch):
+    monkeypatch.setenv(ALLOWED, f"{__name__}, cmmsim")
     """Both images are shifted alike, so the platform seems to stand a little beside its place."""
     name, usual = f"{__name__}:Shifted", exact()
     sensor = exact("perfect", {"detection.detector": name})
@@ -153,8 +196,10 @@ def test_a_detector_of_one_s_own_measures_by_its_module_and_name():
     poses = [s.measure(s.home) for s in (usual, sensor)]
     assert all(m.ok for m in poses)
     assert np.linalg.norm(poses[1].pose[:3] - poses[0].pose[:3]) > 50e-6
-    assert np.trace(poses[1].covariance) > 100.0 * np.trace(poses[0].covariance)  # its bias is in there
-    plain = find_detector("cmmsim.detection.ellipse_fit:detect_by_maximum_likelihood")  # a function, no more
+    # its bias is in there
+    assert np.trace(poses[1].covariance) > 100.0 * np.trace(poses[0].covariance)
+    # a function, no more
+    plain = find_detector("cmmsim.detection.ellipse_fit:detect_by_maximum_likelihood")
     assert (plain.bias_px, plain.margin_px) == (0.0, 0)
 
 
@@ -165,13 +210,23 @@ def nothing(given):
 
 def test_a_detector_that_returns_something_else_is_named():
     sensor = exact("perfect", {"detection.detector": f"{__name__}:nothing"})
-    refused(lambda: sensor.measure_many([sensor.home]), "nothing' must return DetectedCentres, got 36 of type int")
+    refused(
+        lambda: sensor.measure_many([sensor.home]),
+        "nothing' must return DetectedCentres, got 36 of type int",
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nowhere:detect", "detector 'nowhere:detect' is no importable module:name: No module named 'nowhere'"),
+        (
+            "nowhere:detect",
+            "detector 'nowhere:detect' is code of the module nowhere, which is not allowed to run",
+        ),
+        (
+            "tests.nowhere:detect",
+            "detector 'tests.nowhere:detect' is no importable module:name: No module named",
+        ),
         (f"{__name__}:missing", "has no attribute 'missing'; its folder must be on PYTHONPATH"),
         (f"{__name__}:SIZE", "is of type int, which cannot be called"),
     ],

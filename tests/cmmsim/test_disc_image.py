@@ -1,4 +1,6 @@
-"""The image of a disc: its ellipse, the place of the ellipse's centre, and the share of light in each pixel."""
+"""The image of a disc: its ellipse, the place of the ellipse's centre, and the share of light in
+each pixel.
+"""
 
 from dataclasses import replace
 
@@ -14,11 +16,11 @@ from cmmsim.geometry.disc_image import (
     SHAPE_BASIS,
     centre_offset,
     coverage,
-    eccentricity,
     project_discs,
 )
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
-from cmmsim.pose_estimation.observation import DetectionSettings, Observer
+from cmmsim.measuring.observation import DetectionSettings, Observer
+from tests.cmmsim.plain import eccentricity
 from tests.cmmsim.sensors import CAMERA, NOISE, random_ellipses
 
 NOISE_FREE = replace(NOISE, enabled=False)
@@ -47,15 +49,21 @@ def test_ellipse_of_a_disc_is_its_projected_rim_and_eccentricity_the_way_to_its_
     radii = rng.uniform(0.002, 0.03, 30)
     pixels, shapes = project_discs(CAMERA, centres, normals, radii)
     np.testing.assert_array_equal(shapes, shapes.swapaxes(1, 2))
-    for centre, normal, radius, middle, shape in zip(centres, normals, radii, pixels, shapes, strict=True):
+    for centre, normal, radius, middle, shape in zip(
+        centres, normals, radii, pixels, shapes, strict=True
+    ):
         way = eccentricity(centre[None], normal[None], radius, CAMERA.focal_px)[0]
         np.testing.assert_allclose(way, middle - CAMERA.project(centre)[0], atol=1e-9)
         rim = CAMERA.project(centre + radius * circle(normal, 50))[0]
-        np.testing.assert_allclose(np.linalg.norm(np.linalg.solve(shape, (rim - middle).T), axis=0), 1.0, atol=1e-9)
+        np.testing.assert_allclose(
+            np.linalg.norm(np.linalg.solve(shape, (rim - middle).T), axis=0), 1.0, atol=1e-9
+        )
 
 
 def drawn(camera, normal, corner, size):
-    """Share of each pixel within the rim, projected point by point: exact along x, the mean of scan lines along y."""
+    """Share of each pixel within the rim, projected point by point: exact along x, the mean of scan
+    lines along y.
+    """
     rim = camera.project(CENTRE + RADIUS * circle(normal, 2000))[0]
     rim = np.roll(rim - corner, -np.argmin(rim[:, 1]), axis=0)  # from the top round and back
     lowest = np.argmax(rim[:, 1])
@@ -73,14 +81,18 @@ def drawn(camera, normal, corner, size):
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize(("lens", "limit"), [(BENT, 5e-5), (Distortion(-0.5, 0.3), 4e-4)], ids=["usual", "strong"])
+@pytest.mark.parametrize(
+    ("lens", "limit"), [(BENT, 5e-5), (Distortion(-0.5, 0.3), 4e-4)], ids=["usual", "strong"]
+)
 def test_fitted_centre_of_a_distorted_sticker(tilt, lens, limit):
     camera = replace(CAMERA, distortion=lens)
     normal = np.array([0.6 * np.sin(tilt), 0.8 * np.sin(tilt), -np.cos(tilt)])
     projected = camera.project(CENTRE)[0]
     corner = np.rint(projected - 15.5).astype(int)
     grey = NOISE_FREE.black_level + 200.0 * drawn(camera, normal, corner, 32)
-    fit = fit_ellipses(grey[None], corner[None], NOISE_FREE, 30, FitLimits(largest_misfit=np.inf), iterations=6)
+    fit = fit_ellipses(
+        grey[None], corner[None], NOISE_FREE, 30, FitLimits(largest_misfit=np.inf), iterations=6
+    )
     found = fit.centres[0] - projected
     predicted = centre_offset(camera, CENTRE[None], normal[None], RADIUS)[0]
     perfect = eccentricity(CENTRE[None], normal[None], RADIUS, camera.focal_px)[0]
@@ -90,8 +102,8 @@ def test_fitted_centre_of_a_distorted_sticker(tilt, lens, limit):
 
 @pytest.mark.parametrize("radius", [0.02, 0.03])
 def test_observation_takes_the_predicted_eccentricity_of_large_stickers_away(radius):
-    """Three stickers of plane A, seen at 45 to 60 degrees, all dark around them and no noise; without the correction
-    it is the bias."""
+    """Three stickers of plane A, seen at 45 to 60 degrees, all dark around them and no noise;
+    without the correction it is the bias."""
     sensor = cmmsim.load_sensor(
         "ctrack780",
         renderer="analytic",
@@ -114,9 +126,16 @@ def test_observation_takes_the_predicted_eccentricity_of_large_stickers_away(rad
         seen = observer.observe(sensor.look(sensor.home), camera_from_body, places, normals)
         assert seen.index.tolist() == [0, 1, 2]
         errors.append(np.stack([seen.left_pixels, seen.right_pixels]) - expected)
-    for side, (camera, move) in enumerate(zip(sensor.rig.cameras, sensor.rig.from_camera, strict=True)):
-        centres, turned = apply(move @ camera_from_body, places), normals @ (move @ camera_from_body)[:3, :3].T
-        tilts = np.degrees(np.arccos(-np.einsum("ni,ni->n", centres, turned) / np.linalg.norm(centres, axis=1)))
+    for side, (camera, move) in enumerate(
+        zip(sensor.rig.cameras, sensor.rig.from_camera, strict=True)
+    ):
+        centres, turned = (
+            apply(move @ camera_from_body, places),
+            normals @ (move @ camera_from_body)[:3, :3].T,
+        )
+        tilts = np.degrees(
+            np.arccos(-np.einsum("ni,ni->n", centres, turned) / np.linalg.norm(centres, axis=1))
+        )
         assert np.all((tilts > 45.0) & (tilts < 62.0)), tilts
         predicted = eccentricity(centres, turned, radius, camera.focal_px)
         assert np.linalg.norm(predicted, axis=1).min() > 0.05
@@ -129,23 +148,34 @@ def test_coverage_is_that_of_sampled_pixels_and_its_derivatives_are_those_of_dif
     area, slopes = coverage(centres, shapes, 18)
     ticks = (np.arange(18 * 50) + 0.5) / 50 - 0.5
     for centre, shape, exact in zip(centres, shapes, area, strict=True):
-        unit = np.linalg.solve(shape, np.stack(np.meshgrid(ticks, ticks)).reshape(2, -1) - centre[:, None])
+        unit = np.linalg.solve(
+            shape, np.stack(np.meshgrid(ticks, ticks)).reshape(2, -1) - centre[:, None]
+        )
         sampled = ((unit**2).sum(axis=0) < 1.0).reshape(18, 50, 18, 50).mean(axis=(1, 3))
         assert np.abs(sampled - exact).max() < 0.01
         assert exact.sum() == pytest.approx(np.pi * np.linalg.det(shape), rel=1e-12)
     for k, unit in enumerate(1e-6 * np.eye(5)):
         turn = np.tensordot(unit[2:], SHAPE_BASIS, 1)
-        ahead, behind = (coverage(centres + s * unit[:2], shapes + s * turn, 18)[0] for s in (1.0, -1.0))
+        ahead, behind = (
+            coverage(centres + s * unit[:2], shapes + s * turn, 18)[0] for s in (1.0, -1.0)
+        )
         np.testing.assert_allclose(slopes[..., k], (ahead - behind) / 2e-6, atol=1e-7)
 
 
 def plain_coverage(centres, shapes, size):
-    """As ``coverage`` by Gauss' theorem in complex numbers, from what of each pixel's sides lies within the ellipse."""
+    """As ``coverage`` by Gauss' theorem in complex numbers, from what of each pixel's sides lies
+    within the ellipse.
+    """
     ticks, inverse = np.arange(size + 1) - 0.5, np.linalg.inv(shapes)
     places = np.stack(np.meshgrid(ticks, ticks), axis=-1) - centres[:, None, None]
-    corners = np.einsum("nij,nyxj->nyxi", inverse, places) @ [1.0, 1j]  # where the ellipse is a unit disc
+    corners = np.einsum("nij,nyxj->nyxi", inverse, places) @ [
+        1.0,
+        1j,
+    ]  # where the ellipse is a unit disc
     across, down = cut(corners[:, :, :-1], corners[:, :, 1:]), cut(corners[:, :-1], corners[:, 1:])
-    area = np.linalg.det(shapes)[:, None, None] * (np.diff(down[0], axis=2) - np.diff(across[0], axis=1))
+    area = np.linalg.det(shapes)[:, None, None] * (
+        np.diff(down[0], axis=2) - np.diff(across[0], axis=1)
+    )
     derivatives = []
     for unit in np.eye(5):
         basis = np.tensordot(unit[2:], SHAPE_BASIS, 1)
@@ -159,8 +189,8 @@ def plain_coverage(centres, shapes, size):
 
 
 def cut(start, end):
-    """Of sides between complex numbers: the area of the unit disc between side and origin, the share of the side within
-    the disc, and the middle of that part."""
+    """Of sides between complex numbers: the area of the unit disc between side and origin, the
+    share of the side within the disc, and the middle of that part."""
     step = end - start
     dot, step2 = (start.conj() * step).real, np.abs(step) ** 2
     root = np.sqrt(np.maximum(dot**2 - step2 * (np.abs(start) ** 2 - 1.0), 0.0))
@@ -172,12 +202,14 @@ def cut(start, end):
 
 @pytest.mark.parametrize("radii", [(3.8, 2.4), (0.2, 0.1), (0.5, 9.0), (1.0, 1.0), (30.0, 30.0)])
 def test_coverage_is_that_of_plain_numpy(radii):
-    """In all cases of a side: within, outside, crossed once or twice; centres on pixel corners are among them, and
-    ellipses that a window shows in part."""
+    """In all cases of a side: within, outside, crossed once or twice; centres on pixel corners are
+    among them, and ellipses that a window shows in part."""
     centres, shapes = random_ellipses(np.random.default_rng(0), 50, 16, radii)
     centres[:10] = np.round(2.0 * centres[:10]) / 2.0
     centres[10:30] += np.random.default_rng(1).uniform(-10.0, 10.0, (20, 2))
-    for found, expected in zip(coverage(centres, shapes, 16), plain_coverage(centres, shapes, 16), strict=True):
+    for found, expected in zip(
+        coverage(centres, shapes, 16), plain_coverage(centres, shapes, 16), strict=True
+    ):
         np.testing.assert_allclose(found, expected, atol=2e-12)
 
 
@@ -193,16 +225,23 @@ def integrated(centre, shape, psf_px, rings=120, rays=240):
 
 
 @pytest.mark.parametrize(
-    ("psf_px", "limit"), [(0.2, 1e-7), (0.3, 1e-7), (0.5, 1e-7), (1.0, 1e-6), (1.5, 1e-7), (2.0, 1e-7)]
+    ("psf_px", "limit"),
+    [(0.2, 1e-7), (0.3, 1e-7), (0.5, 1e-7), (1.0, 1e-6), (1.5, 1e-7), (2.0, 1e-7)],
 )
 def test_blurred_shares_and_their_derivatives_match_brute_force_integration(psf_px, limit):
     centres, shapes = random_ellipses(np.random.default_rng(0), 3, 20)
-    for centre, shape, share, slopes in zip(centres, shapes, *coverage(centres, shapes, 20, psf_px), strict=True):
+    for centre, shape, share, slopes in zip(
+        centres, shapes, *coverage(centres, shapes, 20, psf_px), strict=True
+    ):
         np.testing.assert_allclose(share, integrated(centre, shape, psf_px), atol=2e-7)
         for k, unit in enumerate(2e-5 * np.eye(5)):
             turn = np.tensordot(unit[2:], SHAPE_BASIS, 1)
-            ahead, behind = (integrated(centre + s * unit[:2], shape + s * turn, psf_px) for s in (1.0, -1.0))
-            np.testing.assert_allclose(slopes[..., k], (ahead - behind) / 4e-5, rtol=0.0, atol=limit)
+            ahead, behind = (
+                integrated(centre + s * unit[:2], shape + s * turn, psf_px) for s in (1.0, -1.0)
+            )
+            np.testing.assert_allclose(
+                slopes[..., k], (ahead - behind) / 4e-5, rtol=0.0, atol=limit
+            )
 
 
 @pytest.mark.parametrize("psf_px", [0.05, 0.4, 1.0])

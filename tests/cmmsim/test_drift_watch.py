@@ -1,7 +1,9 @@
-"""A watch over cameras that drift: false alarms, how soon a drift is noticed, and what is found of it.
+"""A watch over cameras that drift: false alarms, how soon a drift is noticed, and what is found of
+it.
 
-Many runs are of projected centres with noise: what lies between them and images is known to be noise of that size
-(`test_covariance.py`), and images are taken for some. The true rig is another object than the known one.
+Many runs are of projected centres with noise: what lies between them and images is known to be
+noise of that size (`test_covariance.py`), and images are taken for some. The true rig is another
+object than the known one.
 """
 
 from dataclasses import replace
@@ -11,16 +13,16 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import binom, multivariate_normal
 
-from cmmsim.common_errors import MeasuringGeometry
-from cmmsim.drift_watch import DriftWatch
-from cmmsim.drift_watch.evidence import Filter
 from cmmsim.errors import CmmError
-from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import PLACE_NAMES, triangulate
-from cmmsim.pose_estimation.estimator import Measurement, lost_measurement
-from cmmsim.pose_estimation.observation import StickerObservation, faces_camera
+from cmmsim.measuring.measurement import Measurement, lost_measurement
+from cmmsim.measuring.observation import StickerObservation, faces_camera
+from cmmsim.uncertainty.common_errors import MeasuringGeometry
+from cmmsim.uncertainty.drift_evidence import Filter
+from cmmsim.uncertainty.drift_watch import DriftWatch
+from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
 from tests.cmmsim.sensors import exact
 
 NOISE_PX = 0.0085  # of a centre, as of the built-in sensor
@@ -30,7 +32,9 @@ PRINCIPAL_POINT, TOE_IN = {"right.cx_px": 0.1}, {"right_from_left.ry_rad": 2e-5}
 
 def path(home, frames):
     """A motion (frames, 6) as of an exciting trajectory."""
-    angle = 2.0 * np.pi * 0.1 / RATE * np.arange(frames)[:, None] * np.array([1, 2, 3, 3, 1, 2]) + np.arange(6)
+    angle = 2.0 * np.pi * 0.1 / RATE * np.arange(frames)[:, None] * np.array(
+        [1, 2, 3, 3, 1, 2]
+    ) + np.arange(6)
     return home + np.array([0.01] * 3 + [0.04] * 3) * np.sin(angle)
 
 
@@ -41,22 +45,34 @@ def geometry():
 
 
 def taught_wrongly(geometry, error, rig=None):
-    """What is known after a rig, true minus known (24,), taught the places of the platform's stickers."""
+    """What is known after a rig, true minus known (24,), taught the places of the platform's
+    stickers.
+    """
     places = geometry.taught.platform_places + np.tensordot(error, geometry.taught_by_rig[1], 1)
-    known = replace(geometry, rig=rig or geometry.rig, taught=replace(geometry.taught, platform_places=places))
-    known.__dict__["taught_by_rig"] = geometry.taught_by_rig  # which changes little, and takes a second
+    known = replace(
+        geometry, rig=rig or geometry.rig, taught=replace(geometry.taught, platform_places=places)
+    )
+    # which changes little, and takes a second
+    known.__dict__["taught_by_rig"] = geometry.taught_by_rig
     return known
 
 
 def frontal(geometry):
     """Indices of the platform's stickers that both cameras see at home."""
-    placed = [move @ geometry.camera_from_base @ pose_to_transform(geometry.home) for move in geometry.rig.from_camera]
+    placed = [
+        move @ geometry.camera_from_base @ pose_to_transform(geometry.home)
+        for move in geometry.rig.from_camera
+    ]
     places, normals = geometry.taught.platform_places, geometry.platform.sticker_normals
-    return np.flatnonzero(np.all([faces_camera(apply(at, places), normals @ at[:3, :3].T) for at in placed], axis=0))
+    return np.flatnonzero(
+        np.all([faces_camera(apply(at, places), normals @ at[:3, :3].T) for at in placed], axis=0)
+    )
 
 
 class Projected:
-    """Measures poses from centres that a true rig projects, with noise, by a geometry that is known."""
+    """Measures poses from centres that a true rig projects, with noise, by a geometry that is
+    known.
+    """
 
     def __init__(self, known, true_taught, rng):
         self.known, self.rng, self.index = known, rng, frontal(known)
@@ -71,18 +87,29 @@ class Projected:
 
     def base_seen(self, rig):
         pixels, points, spread = self._seen(rig, apply(self.camera_from_base, self.base))
-        return StickerObservation(np.arange(len(points)), *pixels, points, spread, np.full(len(points), NOISE_PX**2))
+        return StickerObservation(
+            np.arange(len(points)), *pixels, points, spread, np.full(len(points), NOISE_PX**2)
+        )
 
     def measured(self, rig, pose):
-        pixels, points, spread = self._seen(rig, apply(self.camera_from_base @ pose_to_transform(pose), self.places))
+        pixels, points, spread = self._seen(
+            rig, apply(self.camera_from_base @ pose_to_transform(pose), self.places)
+        )
         found = register(self.known.taught.platform_places[self.index], points, spread).transform
-        names, variances = self.known.platform.sticker_ids[self.index], np.full(len(points), NOISE_PX**2)
+        names, variances = (
+            self.known.platform.sticker_ids[self.index],
+            np.full(len(points), NOISE_PX**2),
+        )
         at = transform_to_pose(self.known.taught.base_from_camera @ found)
-        return Measurement(at, np.eye(6), points, spread, *pixels, names, True, pixel_variances=variances)
+        return Measurement(
+            at, np.eye(6), points, spread, *pixels, names, True, pixel_variances=variances
+        )
 
 
 def watched(watch, eye, true, drift, frames, last=None):
-    """What a watch finds in a run whose true rig drifts by `drift` (24,) over it, of which `last` frames are seen."""
+    """What a watch finds in a run whose true rig drifts by `drift` (24,) over it, of which `last`
+    frames are seen.
+    """
     watch.restart()
     for frame, pose in enumerate(path(watch.geometry.home, frames)[:last]):
         rig = true.moved(frame / (frames - 1) * drift)
@@ -91,7 +118,9 @@ def watched(watch, eye, true, drift, frames, last=None):
 
 
 def cost(sensor, drift, pose):
-    """Error (6,) of a pose by a drift (24,), in standard deviations of its noise: from centres without noise."""
+    """Error (6,) of a pose by a drift (24,), in standard deviations of its noise: from centres
+    without noise.
+    """
     eye = Projected(
         MeasuringGeometry(sensor.rig, sensor.platform, sensor.base, sensor.truth, sensor.home),
         sensor.truth,
@@ -104,7 +133,12 @@ def cost(sensor, drift, pose):
 
 def test_a_filter_finds_what_one_gaussian_of_all_residuals_says():
     """Two unknowns that walk and three that stand still, seen in four blocks of five residuals."""
-    rng, walk, prior, frames = np.random.default_rng(0), np.array([0.3, 0.8]), np.array([0.5, 1.0, 2.0]), [3, 1, 6, 2]
+    rng, walk, prior, frames = (
+        np.random.default_rng(0),
+        np.array([0.3, 0.8]),
+        np.array([0.5, 1.0, 2.0]),
+        [3, 1, 6, 2],
+    )
     slopes, seen = rng.normal(size=(4, 5, 5)), rng.normal(size=(4, 5))
     found = Filter(prior, walk)
     for one, residuals, passed in zip(slopes, seen, frames, strict=True):
@@ -114,12 +148,16 @@ def test_a_filter_finds_what_one_gaussian_of_all_residuals_says():
     states += np.kron(np.ones((4, 4)), np.diag(np.append(np.zeros(2), prior) ** 2))
     whole = block_diag(*slopes)
     covariance, last = whole @ states @ whole.T + np.eye(20), states[15:17] @ whole.T
-    expected = multivariate_normal(np.zeros(20), covariance).logpdf(seen.ravel()) + 10.0 * np.log(2.0 * np.pi)
+    expected = multivariate_normal(np.zeros(20), covariance).logpdf(seen.ravel()) + 10.0 * np.log(
+        2.0 * np.pi
+    )
     assert found.log_likelihood == pytest.approx(expected, rel=1e-10)
     spread = states[15:17, 15:17] - last @ np.linalg.solve(covariance, last.T)
     information, score = found.told_of(2)
     np.testing.assert_allclose(information, np.linalg.inv(spread), rtol=1e-9)
-    np.testing.assert_allclose(score, information @ last @ np.linalg.solve(covariance, seen.ravel()), rtol=1e-9)
+    np.testing.assert_allclose(
+        score, information @ last @ np.linalg.solve(covariance, seen.ravel()), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("base", [False, True])
@@ -160,7 +198,9 @@ def test_errors_from_the_start_are_told_from_a_drift(geometry):
 
 
 def test_a_movement_of_the_whole_rig_shows_on_the_base_alone(geometry):
-    """Both cameras, turned together by 20 urad: no test on the platform can tell that from a movement of it."""
+    """Both cameras, turned together by 20 urad: no test on the platform can tell that from a
+    movement of it.
+    """
     for base in (False, True):
         eye = Projected(geometry, geometry.taught, np.random.default_rng(4))
         turned = np.eye(4)
@@ -170,7 +210,9 @@ def test_a_movement_of_the_whole_rig_shows_on_the_base_alone(geometry):
         assert (finding.noticed_s is not None) == base
         assert ("place of the whole rig (base pose)" in finding.unseen) == (not base)
         assert "scale of rig and taught places together" in finding.unseen
-    assert {one.name for one in finding.movements} <= {f"camera_from_base.{name}" for name in PLACE_NAMES}
+    assert {one.name for one in finding.movements} <= {
+        f"camera_from_base.{name}" for name in PLACE_NAMES
+    }
 
 
 def test_lost_frames_say_nothing_but_that_time_passes(geometry):
@@ -181,7 +223,9 @@ def test_lost_frames_say_nothing_but_that_time_passes(geometry):
     assert (found.noticed_s, found.frames, found.judged_frames) == (None, 20, 0)
     eye = Projected(geometry, geometry.taught, np.random.default_rng(5))
     for _ in range(12):
-        watch.add(eye.measured(geometry.rig.moved(rig_changes({"right.cy_px": 0.5})), geometry.home))
+        watch.add(
+            eye.measured(geometry.rig.moved(rig_changes({"right.cy_px": 0.5})), geometry.home)
+        )
     assert watch.finding.noticed_s == pytest.approx(2.5, abs=0.11)
     watch.restart()
     assert watch.finding.frames == 0
@@ -189,7 +233,10 @@ def test_lost_frames_say_nothing_but_that_time_passes(geometry):
 
 @pytest.mark.filterwarnings("error")
 def test_stickers_that_only_the_last_frame_lacks_count_after_those_before(geometry):
-    watch, eye = DriftWatch(geometry), Projected(geometry, geometry.taught, np.random.default_rng(6))
+    watch, eye = (
+        DriftWatch(geometry),
+        Projected(geometry, geometry.taught, np.random.default_rng(6)),
+    )
     for missing in (0, 0, 0, 1):
         eye.index, eye.places = eye.index[missing:], eye.places[missing:]
         watch.add(eye.measured(geometry.rig, geometry.home))
@@ -205,13 +252,17 @@ def test_what_cannot_be_watched_is_refused_in_one_line(geometry):
 
 
 def alarms(geometry, covariance, told, runs, frames, chance, rng):
-    """Number of false alarms in runs of rigs known with a covariance (24, 24), each of which taught itself."""
+    """Number of false alarms in runs of rigs known with a covariance (24, 24), each of which taught
+    itself.
+    """
     found = 0
     for _ in range(runs):
         known = KnownRig.drawn(geometry.rig, covariance, rng)
         mine = taught_wrongly(geometry, geometry.rig.parameters - known.rig.parameters, known.rig)
         watch = DriftWatch(mine, known if told else None, chance=chance)
-        finding = watched(watch, Projected(mine, geometry.taught, rng), geometry.rig, np.zeros(24), frames)
+        finding = watched(
+            watch, Projected(mine, geometry.taught, rng), geometry.rig, np.zeros(24), frames
+        )
         found += finding.noticed_s is not None
     return found
 
@@ -219,10 +270,13 @@ def alarms(geometry, covariance, told, runs, frames, chance, rng):
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 1e-2])
 def test_false_alarms_are_as_rare_as_stated(geometry, share):
-    """Watches that allow one in ten, on 50 runs: more than 9 have a chance of 2 %. Rigs that are known exactly, or to a
-    tenth of what photographs say; who is not told of that finds all of them wrong."""
+    """Watches that allow one in ten, on 50 runs: more than 9 have a chance of 2 %. Rigs that are
+    known exactly, or to a tenth of what photographs say; who is not told of that finds all of them
+    wrong."""
     rng = np.random.default_rng(6)
-    assert alarms(geometry, share * PHOTOGRAPHED, True, 50, 48, 0.1, rng) <= binom.isf(0.02, 50, 0.1)
+    assert alarms(geometry, share * PHOTOGRAPHED, True, 50, 48, 0.1, rng) <= binom.isf(
+        0.02, 50, 0.1
+    )
     if share:
         assert alarms(geometry, share * PHOTOGRAPHED, False, 5, 24, 0.1, rng) == 5
 
@@ -235,7 +289,9 @@ def test_false_alarms_are_as_rare_as_stated_in_long_runs(geometry):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("drift", [PRINCIPAL_POINT, TOE_IN, {"left.cx_px": 0.1}])
-def test_a_drift_over_a_run_of_images_is_noticed_before_it_costs_a_standard_deviation_of_a_pose(drift):
+def test_a_drift_over_a_run_of_images_is_noticed_before_it_costs_a_standard_deviation_of_a_pose(
+    drift,
+):
     """20 s in which a camera moves evenly; with the base watched. Recovered to a fiftieth."""
     sensor, frames = exact(), 1200
     ((name, size),) = drift.items()
@@ -253,7 +309,8 @@ def test_a_drift_over_a_run_of_images_is_noticed_before_it_costs_a_standard_devi
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "changes", [{"camera.noise": False}, {"detection.detector": "grey_centroid"}, {"timing.exposure": 0.004}]
+    "changes",
+    [{"camera.noise": False}, {"detection.detector": "grey_centroid"}, {"timing.exposure": 0.004}],
 )
 def test_images_give_no_alarm_for_what_is_no_drift(changes):
     """Rounding alone, a detector with a bias, stickers that smear; in motion and at rest."""

@@ -1,7 +1,9 @@
-"""Spoilt images: what is left is measured, or the frame is lost for a reason; no wrong pose is reported as good.
+"""Spoilt images: what is left is measured, or the frame is lost for a reason; no wrong pose is
+reported as good.
 
-Each fault is laid over one frame after a good one. The sensor is taught exactly, from the scene's truth: what is left
-of the pose error is observation noise, which alone the measurement's covariance states.
+Each fault is laid over one frame after a good one. The sensor is taught exactly, from the scene's
+truth: what is left of the pose error is observation noise, which alone the measurement's covariance
+states.
 """
 
 import copy
@@ -14,7 +16,7 @@ from scipy.stats import binom, chi2
 import cmmsim
 from cmmsim.fault_images import DiscMark, Fault, FaultyImages, FillMark, GlintMark, PlateMark, paint
 from cmmsim.faults import FaultGenerator, fault_bodies
-from cmmsim.radiometry.images import FrameImages, StereoFrame
+from cmmsim.radiometry.stereo_images import FrameImages, StereoFrame
 from cmmsim.tracker import Tracker
 from tests.cmmsim.sensors import CROPPED, NOISE, REACH, exact, squared_error
 
@@ -22,7 +24,16 @@ FIVE_SIGMA = 5.733e-7  # two-sided, of a normal variable
 WRONG = chi2.isf(FIVE_SIGMA, 6)
 REGION = chi2.ppf(0.95, 6)
 LOSING = ("one_camera_dark", "one_camera_covered", "swapped", "black", "saturated")
-SPOILING = ("hidden", "half_hidden", "obstacles", "false_discs", "false_points", "glint", "merging", "several")
+SPOILING = (
+    "hidden",
+    "half_hidden",
+    "obstacles",
+    "false_discs",
+    "false_points",
+    "glint",
+    "merging",
+    "several",
+)
 UNPREDICTED = np.array([3e-4] * 3 + [1e-3] * 3)  # m, rad: between two frames
 
 
@@ -39,8 +50,8 @@ def sensor():
 
 
 def run_faults(sensor, kinds, frames, seed, untracked):
-    """Measurements by kind, each with its squared error: one fault a frame, of the ``kinds`` in turn; a share
-    ``untracked`` of them without a predicted pose."""
+    """Measurements by kind, each with its squared error: one fault a frame, of the ``kinds`` in
+    turn; a share ``untracked`` of them without a predicted pose."""
     rng = np.random.default_rng(seed)
     sensor.start_run(seed)
     faults, outcomes = FaultGenerator(sensor.estimator), {kind: [] for kind in kinds}
@@ -61,11 +72,13 @@ def run_faults(sensor, kinds, frames, seed, untracked):
 
 
 def require_honest(outcomes):
-    """No wrong pose, the 95 % regions of the frames reported good hold as many true poses as they should, and others
-    are lost for a reason."""
+    """No wrong pose, the 95 % regions of the frames reported good hold as many true poses as they
+    should, and others are lost for a reason."""
     every = [row for rows in outcomes.values() for row in rows]
     squared = np.array([error for m, error in every if m.ok])
-    wrong = [kind for kind, rows in outcomes.items() if any(m.ok and error > WRONG for m, error in rows)]
+    wrong = [
+        kind for kind, rows in outcomes.items() if any(m.ok and error > WRONG for m, error in rows)
+    ]
     assert squared.max() < WRONG, (squared.max(), wrong)
     least, most = binom.interval(0.9999, len(squared), 0.95)
     assert least <= np.sum(squared < REGION) <= most, (np.mean(squared < REGION), len(squared))
@@ -93,17 +106,23 @@ def test_no_wrong_pose_in_eighty_faults_and_what_spoils_little_is_measured(rende
         *(
             pytest.param(*row, marks=pytest.mark.thorough)
             for row in (
-                *(("registration", "analytic", 3 * SPOILING + LOSING, 1000, 100 + part, 0.05) for part in range(10)),
+                *(
+                    ("registration", "analytic", 3 * SPOILING + LOSING, 1000, 100 + part, 0.05)
+                    for part in range(10)
+                ),
                 *(("planes", "analytic", SPOILING, 250, 200 + part, 0.02) for part in range(8)),
             )
         ),
         pytest.param(
-            *("registration", "pyrender", SPOILING, 200, 5, 0.05), marks=[pytest.mark.thorough, pytest.mark.rendering]
+            *("registration", "pyrender", SPOILING, 200, 5, 0.05),
+            marks=[pytest.mark.thorough, pytest.mark.rendering],
         ),
     ],
 )
 def test_no_wrong_pose_in_thousands_of_faults(method, renderer, kinds, frames, seed, untracked):
-    """10,000 for registration, a twentieth of them without a predicted pose; 2,000 for planes; 200 by pyrender."""
+    """10,000 for registration, a twentieth of them without a predicted pose; 2,000 for planes; 200
+    by pyrender.
+    """
     require_honest(run_faults(before_boxes(method, renderer), kinds, frames, seed, untracked))
 
 
@@ -116,15 +135,17 @@ def test_whole_frame_faults_are_lost_with_the_reason(sensor, kind):
 
 @pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=PYRENDER)])
 def test_lost_frames_and_jumps_are_found_again(renderer):
-    """After ten lost frames, and after a jump of up to 10 mm and 40 mrad in each coordinate, the very next good frame
-    is measured with nearly all stickers."""
+    """After ten lost frames, and after a jump of up to 10 mm and 40 mrad in each coordinate, the
+    very next good frame is measured with nearly all stickers."""
     rng, sensor = np.random.default_rng(4), before_boxes(renderer=renderer)
     tracker, faults = Tracker(sensor.estimator), FaultGenerator(sensor.estimator)
     pose = sensor.home
     assert tracker.measure(sensor.look(pose)).ok
     for kind in ("black", "one_camera_dark", None, None, None, None):
         for _ in range(10 if kind else 0):
-            m = tracker.measure(FaultyImages(sensor.look(pose), faults.draw(kind, pose, rng), sensor.noise, rng))
+            m = tracker.measure(
+                FaultyImages(sensor.look(pose), faults.draw(kind, pose, rng), sensor.noise, rng)
+            )
             assert not m.ok
             assert "bright spots" in m.reason
         pose = sensor.home + rng.uniform(-1.0, 1.0, 6) * ([0.01] * 3 + [0.04] * 3)
@@ -147,7 +168,13 @@ def test_opaque_marks_have_their_own_mean_and_noise():
     """Where a disc covers everything, grey values are those of an exposure of its radiance."""
     rng = np.random.default_rng(6)
     grey = NOISE.expose(np.full((300, 300), 0.8, dtype=np.float32), rng).astype(float)
-    paint(grey, np.array([1000, 500]), DiscMark(0, np.array([1150.0, 650.0]), 120.0 * np.eye(2), 0.3), NOISE, rng)
+    paint(
+        grey,
+        np.array([1000, 500]),
+        DiscMark(0, np.array([1150.0, 650.0]), 120.0 * np.eye(2), 0.3),
+        NOISE,
+        rng,
+    )
     inside, outside = grey[100:200, 100:200], grey[:60, :60]
     for part, radiance in ((inside, 0.3), (outside, 0.8)):
         mean = 16.0 + 0.13 * 1600.0 * radiance

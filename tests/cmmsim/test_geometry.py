@@ -1,4 +1,6 @@
-"""Poses, lenses, triangulation, plane frames and registration against closed forms, SciPy and OpenCV."""
+"""Poses, lenses, triangulation, plane frames and registration against closed forms, SciPy and
+OpenCV.
+"""
 
 import cv2
 import numpy as np
@@ -11,13 +13,20 @@ from scipy.spatial.transform import Rotation
 from cmmsim.errors import LostError, ShapeError
 from cmmsim.geometry import pose as p
 from cmmsim.geometry.camera import Distortion, PinholeCamera
-from cmmsim.geometry.plane_frame import fit_plane, frame_from_planes, frame_of_points, frames_of_points
+from cmmsim.geometry.plane_frame import (
+    fit_plane,
+    frame_from_planes,
+    frame_of_points,
+    frames_of_points,
+)
 from cmmsim.geometry.registration import register, register_sets
 from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
 from tests.cmmsim.sensors import CAMERA
 
 ANGLE = st.floats(-1.4, 1.4)
-RIG, CAMERA_FROM_BASE = toed_in_rig(CAMERA, 1.0, np.array([1.44, 0.0, 1.28]), np.array([0.3, 0.0, 0.18]))
+RIG, CAMERA_FROM_BASE = toed_in_rig(
+    CAMERA, 1.0, np.array([1.44, 0.0, 1.28]), np.array([0.3, 0.0, 0.18])
+)
 
 
 @given(ANGLE, ANGLE, ANGLE)
@@ -32,14 +41,20 @@ def test_rotation_is_the_paper_order_and_round_trips(alpha, beta, gamma):
 @given(st.floats(0.0, 2.5), ANGLE, ANGLE)
 def test_rotation_vector_round_trips(size, azimuth, elevation):
     vector = size * np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
     )
     rotation = p.rotation_exp(vector)
     np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(p.rotation_log(rotation), vector, atol=1e-8)
 
 
-@pytest.mark.parametrize("spoil", [None, "entry", "nan", "infinite", "mirror", "transpose", "scale"])
+@pytest.mark.parametrize(
+    "spoil", [None, "entry", "nan", "infinite", "mirror", "transpose", "scale"]
+)
 def test_transforms_are_told_rigid_together_where_each_passes_its_own_check(spoil):
     """The check of a single one is NumPy, and says what is wrong."""
     rng = np.random.default_rng(0)
@@ -76,27 +91,41 @@ def test_euler_rates_match_finite_differences():
 
 def test_plane_frame_of_exact_points():
     """Three planes built from a known frame give it back, seen from anywhere."""
-    normals, corner = np.array([[0.0, 0.0, 1.0], [0.8, 0.5, 0.3], [0.8, -0.5, 0.2]]), np.array([0.19, 0.02, 0.13])
+    normals, corner = (
+        np.array([[0.0, 0.0, 1.0], [0.8, 0.5, 0.3], [0.8, -0.5, 0.2]]),
+        np.array([0.19, 0.02, 0.13]),
+    )
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     own = frame_from_planes(normals, normals @ corner)
     np.testing.assert_allclose(own[:3, 3], corner, atol=1e-14)
     np.testing.assert_allclose(own[:3, 2], normals[0], atol=1e-14)
     np.testing.assert_allclose(normals[:2] @ own[:3, 0], 0.0, atol=1e-14)
     plane, spread = np.repeat(np.arange(3), 5), np.random.default_rng(2).uniform(-0.1, 0.1, (15, 3))
-    points = corner + spread - np.einsum("ni,ni->n", spread, normals[plane])[:, None] * normals[plane]
-    moved, covariances = p.pose_to_transform([0.1, -0.2, 1.7, 1.8, -0.9, 0.4]), np.tile(1e-10 * np.eye(3), (15, 1, 1))
-    frame, _ = frame_of_points(p.apply(moved, points), covariances, plane, normals @ moved[:3, :3].T)
+    points = (
+        corner + spread - np.einsum("ni,ni->n", spread, normals[plane])[:, None] * normals[plane]
+    )
+    moved, covariances = (
+        p.pose_to_transform([0.1, -0.2, 1.7, 1.8, -0.9, 0.4]),
+        np.tile(1e-10 * np.eye(3), (15, 1, 1)),
+    )
+    frame, _ = frame_of_points(
+        p.apply(moved, points), covariances, plane, normals @ moved[:3, :3].T
+    )
     np.testing.assert_allclose(frame, moved @ own, atol=1e-12)
 
 
 def test_covariance_of_a_plane_frame_is_what_errors_of_its_points_make():
-    """To first order, by differences of the whole fit: each coordinate of each point moved forth and back."""
+    """To first order, by differences of the whole fit: each coordinate of each point moved forth
+    and back.
+    """
     rng, step, std = np.random.default_rng(7), 1e-6, 2e-5
     normals = np.array([[0.0, 0.1, 1.0], [0.8, 0.5, 0.3], [0.7, -0.6, 0.2]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     plane, spread = np.repeat(np.arange(3), 4), rng.uniform(-0.1, 0.1, (12, 3))
     points = (
-        np.array([0.2, -0.1, 1.5]) + spread - np.einsum("ni,ni->n", spread, normals[plane])[:, None] * normals[plane]
+        np.array([0.2, -0.1, 1.5])
+        + spread
+        - np.einsum("ni,ni->n", spread, normals[plane])[:, None] * normals[plane]
     )
     covariances = np.tile(std**2 * np.eye(3), (12, 1, 1))
 
@@ -146,11 +175,17 @@ def test_points_explain_their_pixels_best(seen):
     for n in range(pixels.shape[1]):
 
         def whitened(point, n=n):
-            return np.einsum("kij,kj->ki", roots[:, n], RIG.project(point[None])[0][:, 0] - pixels[:, n]).ravel()
+            return np.einsum(
+                "kij,kj->ki", roots[:, n], RIG.project(point[None])[0][:, 0] - pixels[:, n]
+            ).ravel()
 
-        best = least_squares(whitened, found.points[n] + 1e-4, x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        best = least_squares(
+            whitened, found.points[n] + 1e-4, x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15
+        )
         np.testing.assert_allclose(found.points[n], best.x, atol=2e-9)
-        np.testing.assert_allclose(found.covariances[n], np.linalg.inv(best.jac.T @ best.jac), rtol=1e-4, atol=1e-13)
+        np.testing.assert_allclose(
+            found.covariances[n], np.linalg.inv(best.jac.T @ best.jac), rtol=1e-4, atol=1e-13
+        )
         assert found.ray_gap[n] == pytest.approx(2.0 * best.cost, rel=1e-4)
 
 
@@ -164,13 +199,21 @@ def test_transform_explains_the_points_best(seen):
 
     def whitened(change):
         moved = p.apply(found.transform, source)
-        turned = (moved - found.transform[:3, 3]) @ p.rotation_exp(change[3:]).T + found.transform[:3, 3] + change[:3]
+        turned = (
+            (moved - found.transform[:3, 3]) @ p.rotation_exp(change[3:]).T
+            + found.transform[:3, 3]
+            + change[:3]
+        )
         return np.einsum("nij,nj->ni", roots, turned - target.points).ravel()
 
     best = least_squares(whitened, np.zeros(6), x_scale=1e-5, xtol=1e-15, ftol=1e-15, gtol=1e-15)
     assert np.abs(best.x).max() < 1e-9
-    np.testing.assert_allclose(found.covariance, np.linalg.inv(best.jac.T @ best.jac), rtol=1e-3, atol=1e-13)
-    np.testing.assert_allclose(found.misfit, (whitened(np.zeros(6)).reshape(-1, 3) ** 2).sum(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(
+        found.covariance, np.linalg.inv(best.jac.T @ best.jac), rtol=1e-3, atol=1e-13
+    )
+    np.testing.assert_allclose(
+        found.misfit, (whitened(np.zeros(6)).reshape(-1, 3) ** 2).sum(axis=1), rtol=1e-9
+    )
 
 
 LINE, EACH = np.outer(np.arange(5.0), [0.1, 0.05, 0.0]), np.tile(np.eye(3), (5, 1, 1))
@@ -194,7 +237,9 @@ def test_several_sets_of_points_are_fitted_as_each_alone():
     )
     for k in range(4):
         own = points[k], covariances[k]
-        np.testing.assert_allclose(frames[k], frame_of_points(*own, plane, towards[k])[0], atol=1e-12)
+        np.testing.assert_allclose(
+            frames[k], frame_of_points(*own, plane, towards[k])[0], atol=1e-12
+        )
         np.testing.assert_allclose(laid[k], register(source, *own).transform, atol=1e-12)
     np.testing.assert_allclose(frames, moves @ frame_from_planes(normals, np.zeros(3)), atol=1e-3)
 
@@ -202,7 +247,10 @@ def test_several_sets_of_points_are_fitted_as_each_alone():
 @pytest.mark.parametrize(
     ("fit", "message"),
     [
-        (lambda: fit_plane(LINE[:2], EACH[:2], UP, "B"), "plane B: 2 visible stickers, at least 3 needed"),
+        (
+            lambda: fit_plane(LINE[:2], EACH[:2], UP, "B"),
+            "plane B: 2 visible stickers, at least 3 needed",
+        ),
         (lambda: fit_plane(LINE, EACH, UP, "B"), "plane B: its 5 visible stickers lie on one line"),
         (lambda: register(LINE[:2], LINE[:2], EACH[:2]), "2 visible stickers"),
         (lambda: register(LINE, LINE, EACH), "5 visible stickers"),
@@ -222,7 +270,9 @@ def test_too_few_points_and_those_on_a_line_are_lost(fit, message):
     ],
 )
 def test_distorted_pixels_are_those_of_opencv_forth_and_back_with_the_jacobian_of_differences(lens):
-    camera = PinholeCamera(2300.0, 1020.0, 771.0, 2048, 1536, aspect=1.004, distortion=Distortion(*lens))
+    camera = PinholeCamera(
+        2300.0, 1020.0, 771.0, 2048, 1536, aspect=1.004, distortion=Distortion(*lens)
+    )
     matrix, coefficients, rng = camera.matrix, np.array(lens), np.random.default_rng(1)
     points = rng.uniform([-0.6, -0.45, 1.4], [0.6, 0.45, 2.2], (200, 3))
     shown, inside = camera.project(points)
@@ -233,16 +283,26 @@ def test_distorted_pixels_are_those_of_opencv_forth_and_back_with_the_jacobian_o
     ideal, found = camera.undistort(pixels)
     assert found.all()
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-    undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # as OpenCV 4 calls it, and OpenCV 5
-    expected = undistort(pixels[:, None], matrix, coefficients, R=np.eye(3), P=matrix, criteria=criteria)
+    # as OpenCV 4 calls it, and OpenCV 5
+    undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+    expected = undistort(
+        pixels[:, None], matrix, coefficients, R=np.eye(3), P=matrix, criteria=criteria
+    )
     np.testing.assert_allclose(ideal, expected.reshape(-1, 2), rtol=0.0, atol=1e-6)
-    np.testing.assert_allclose(camera.distort(ideal)[0], pixels, rtol=0.0, atol=3e-9)  # 1e-12 focal lengths
+    # 1e-12 focal lengths
+    np.testing.assert_allclose(camera.distort(ideal)[0], pixels, rtol=0.0, atol=3e-9)
     for k, step in enumerate(1e-3 * np.eye(2)):
         slope = (camera.distort(pixels + step)[0] - camera.distort(pixels - step)[0]) / 2e-3
         np.testing.assert_allclose(camera.distortion_jacobian(pixels)[..., k], slope, atol=1e-8)
 
 
-@given(st.floats(-0.4, 0.4), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-3e-3, 3e-3), st.floats(-3e-3, 3e-3))
+@given(
+    st.floats(-0.4, 0.4),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.1, 0.1),
+    st.floats(-3e-3, 3e-3),
+    st.floats(-3e-3, 3e-3),
+)
 def test_every_point_within_the_fold_is_found_again_and_no_other(k1, k2, k3, p1, p2):
     lens = Distortion(k1, k2, p1, p2, k3)
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
@@ -262,11 +322,14 @@ def test_beyond_the_fold_nothing_is_found_and_nothing_is_nan():
     lens = Distortion(k1=-0.3)
     assert lens.fold_radius == pytest.approx(np.sqrt(1.0 / 0.9))  # 1 + 3 k1 s = 0
     farthest = lens.fold_radius * (1.0 - 0.3 * lens.fold_radius**2)
-    found, ok = lens.undistort(np.array([[0.99 * farthest, 0.0], [1.01 * farthest, 0.0], [40.0, -9.0]]))
+    found, ok = lens.undistort(
+        np.array([[0.99 * farthest, 0.0], [1.01 * farthest, 0.0], [40.0, -9.0]])
+    )
     np.testing.assert_array_equal(ok, [True, False, False])
     assert np.isfinite(found).all()
     camera = PinholeCamera(500.0, 1000.0, 700.0, 2048, 1536, distortion=lens)
-    points = np.array([[0.5, 0.0, 1.0], [1.2, 0.0, 1.0]])  # the second one folds back into the image
+    # the second one folds back into the image
+    points = np.array([[0.5, 0.0, 1.0], [1.2, 0.0, 1.0]])
     pixels, valid = camera.project(points)
     assert camera.shows(pixels).all()
     np.testing.assert_array_equal(valid, [True, False])

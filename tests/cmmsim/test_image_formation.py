@@ -39,7 +39,12 @@ def finely_drawn(sensor, side, pose, corner, size):
         centre_x_px=FINE * (camera.centre_x_px + 0.5) - 0.5,
         centre_y_px=FINE * (camera.centre_y_px + 0.5) - 0.5,
     )
-    view = View(fine, placed_at(sensor, pose)[side], (FINE * corner[0], FINE * corner[1]), (FINE * size, FINE * size))
+    view = View(
+        fine,
+        placed_at(sensor, pose)[side],
+        (FINE * corner[0], FINE * corner[1]),
+        (FINE * size, FINE * size),
+    )
     formation = sensor.camera.formation
     return formation.renderer.draw(formation.drawable, [view], 1, formation.background)[0]
 
@@ -47,7 +52,10 @@ def finely_drawn(sensor, side, pose, corner, size):
 @pytest.mark.parametrize(
     ("lens", "renderer", "largest", "rms", "mean"),
     [
-        *((lens, "analytic", 15e-4 if lens == "distorted" else 5e-4, 4e-4, 1e-4) for lens in LENSES),
+        *(
+            (lens, "analytic", 15e-4 if lens == "distorted" else 5e-4, 4e-4, 1e-4)
+            for lens in LENSES
+        ),
         pytest.param("all", "pyrender", 5e-3, 8e-4, 2e-4, marks=pytest.mark.rendering),
     ],
 )
@@ -75,7 +83,9 @@ def test_point_spread_is_a_gaussian(psf_px):
 
 
 def test_bent_images_show_what_opencv_says():
-    """Each fine point of a window, undistorted by OpenCV, looked up in a finely drawn image of a perfect lens."""
+    """Each fine point of a window, undistorted by OpenCV, looked up in a finely drawn image of a
+    perfect lens.
+    """
     sensor = exact("distorted")
     pose, size, margin = sensor.home, 16, 6
     corners = corners_about(sensor, pose, 16)[:, ::6]
@@ -84,9 +94,16 @@ def test_bent_images_show_what_opencv_says():
         lens = camera.distortion
         for corner, window in zip(corners[side], windows[side], strict=True):
             ticks = (np.arange(size * FINE) + 0.5) / FINE - 0.5
-            shown = np.stack(np.meshgrid(corner[0] + ticks, corner[1] + ticks), axis=-1).reshape(-1, 1, 2)
+            shown = np.stack(np.meshgrid(corner[0] + ticks, corner[1] + ticks), axis=-1).reshape(
+                -1, 1, 2
+            )
             ideal = cv2.undistortPoints(
-                shown, camera.matrix, np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]), None, None, camera.matrix
+                shown,
+                camera.matrix,
+                np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]),
+                None,
+                None,
+                camera.matrix,
             ).reshape(size * FINE, size * FINE, 2)
             first = np.floor(ideal.min(axis=(0, 1))).astype(int) - margin
             fine = finely_drawn(sensor, side, pose, first, size + 2 * margin + 4)
@@ -99,7 +116,9 @@ def test_bent_images_show_what_opencv_says():
 
 def test_vignetting_darkens_windows_and_whole_images_with_the_square_of_the_distance():
     """From the image's centre, the farthest corner most."""
-    dark, bright = (exact("perfect", {"lens.vignetting": share} | BESIDE_THE_MIDDLE) for share in (0.3, 0.0))
+    dark, bright = (
+        exact("perfect", {"lens.vignetting": share} | BESIDE_THE_MIDDLE) for share in (0.3, 0.0)
+    )
     placed = placed_at(dark, dark.home)
     corners = corners_about(dark, dark.home, 16)
     share = [s.camera.radiances([[placed]], [corners], 16, 6)[0] for s in (dark, bright)]
@@ -109,7 +128,9 @@ def test_vignetting_darkens_windows_and_whole_images_with_the_square_of_the_dist
     expected = 1.0 - 0.3 * away / (1100.5**2 + 835.5**2)
     np.testing.assert_allclose(whole[0], whole[1] * expected, atol=1e-6)
     for k, (x0, y0) in enumerate(corners[1]):
-        np.testing.assert_allclose(share[0][1, k], share[1][1, k] * expected[y0 : y0 + 16, x0 : x0 + 16], atol=1e-6)
+        np.testing.assert_allclose(
+            share[0][1, k], share[1][1, k] * expected[y0 : y0 + 16, x0 : x0 + 16], atol=1e-6
+        )
 
 
 @pytest.mark.parametrize(
@@ -124,7 +145,9 @@ def test_vignetting_darkens_windows_and_whole_images_with_the_square_of_the_dist
     ],
 )
 def test_poses_from_noise_free_images(lens, renderer, count):
-    """At most 2 um and 10 urad at every pose; 0.9 um and 4.5 urad were the largest of pyrender in 300 poses."""
+    """At most 2 um and 10 urad at every pose; 0.9 um and 4.5 urad were the largest of pyrender in
+    300 poses.
+    """
     sensor = exact(lens, NOISE_FREE, renderer)
     errors, found = pose_errors(sensor, poses_about_home(sensor, count))
     assert all(len(m.target_ids) == 18 for m in found)
@@ -133,7 +156,9 @@ def test_poses_from_noise_free_images(lens, renderer, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=pytest.mark.rendering)])
+@pytest.mark.parametrize(
+    "renderer", ["analytic", pytest.param("pyrender", marks=pytest.mark.rendering)]
+)
 def test_noise_free_teaching_and_measuring_through_all_effects(renderer):
     """At most 2 um and 10 urad at every pose; 0.8 um and 4 urad were the largest."""
     sensor = cmmsim.load_sensor("ctrack780", changes=LENSES["all"] | NOISE_FREE, renderer=renderer)
@@ -143,7 +168,8 @@ def test_noise_free_teaching_and_measuring_through_all_effects(renderer):
 
 
 @pytest.mark.parametrize(
-    "count", [pytest.param(60, marks=pytest.mark.slow), pytest.param(300, marks=pytest.mark.thorough)]
+    "count",
+    [pytest.param(60, marks=pytest.mark.slow), pytest.param(300, marks=pytest.mark.thorough)],
 )
 def test_covariance_is_true_through_all_effects(count):
     """Draws of noise, each at its own pose."""

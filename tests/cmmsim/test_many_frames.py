@@ -1,4 +1,6 @@
-"""Frames with images measured many at once, against the same frames looked at and measured one by one."""
+"""Frames with images measured many at once, against the same frames looked at and measured one by
+one.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +10,15 @@ from cmmsim import many_frames
 from cmmsim.geometry.pose import invert, pose_to_transform
 from tests.cmmsim.sensors import REACH, exact, poses_about_home
 
-MEASURED = ("pose", "covariance", "points", "point_covariances", "left_pixels", "right_pixels", "pixel_variances")
+MEASURED = (
+    "pose",
+    "covariance",
+    "points",
+    "point_covariances",
+    "left_pixels",
+    "right_pixels",
+    "pixel_variances",
+)
 FRAMES = 70  # more than two blocks
 PATTERNED = {"camera.prnu": 0.01, "camera.dsnu": 8.0, "camera.bit_depth": 10, "camera.gain": 0.52}
 SENSORS = {
@@ -28,15 +38,21 @@ def one_by_one(sensor, poses, near, obstacles=None):
     found = []
     for pose, around in zip(poses, near, strict=True):
         try:
-            found.append(sensor.estimator.measure(sensor.look(pose, obstacles), expected(sensor, around))[0])
+            found.append(
+                sensor.estimator.measure(sensor.look(pose, obstacles), expected(sensor, around))[0]
+            )
         except cmmsim.LostError as error:
             found.append(str(error))
     return found
 
 
-@pytest.mark.parametrize("kind", ["sharp", pytest.param("lenses", marks=pytest.mark.slow), "planes", "centroids"])
+@pytest.mark.parametrize(
+    "kind", ["sharp", pytest.param("lenses", marks=pytest.mark.slow), "planes", "centroids"]
+)
 def test_each_is_measured_as_alone(kind):
-    """Behind an obstacle that hides some stickers in part, too, and where the platform is out of sight."""
+    """Behind an obstacle that hides some stickers in part, too, and where the platform is out of
+    sight.
+    """
     sensor = SENSORS[kind]()
     sensor.add_bodies({"rod": cmmsim.rod(0.3, 0.004)})
     before = sensor.home[:3] + np.array([0.25, 0.0, 0.25])
@@ -52,11 +68,15 @@ def test_each_is_measured_as_alone(kind):
     lost = [isinstance(one, str) for one in plain]
     assert lost == [k == 2 for k in range(count)]
     assert np.array_equal(np.isnan(many.poses[:, 0]), lost)
-    assert many.stickers.tolist() == [0 if isinstance(one, str) else len(one.target_ids) for one in plain]
+    assert many.stickers.tolist() == [
+        0 if isinstance(one, str) else len(one.target_ids) for one in plain
+    ]
     assert many.stickers[~np.array(lost)].min() < len(sensor.platform.sticker_ids)
     good = [one for one in plain if not isinstance(one, str)]
     np.testing.assert_allclose(many.poses[~np.array(lost)], [one.pose for one in good], atol=1e-12)
-    np.testing.assert_allclose(many.covariances[~np.array(lost)], [one.covariance for one in good], rtol=1e-6)
+    np.testing.assert_allclose(
+        many.covariances[~np.array(lost)], [one.covariance for one in good], rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("renderer", ["analytic", "statistical"])
@@ -73,7 +93,9 @@ def test_all_of_a_measurement_is_that_of_a_frame_alone(renderer):
         for name in ("target_ids", "ok", "reason"):
             assert np.array_equal(getattr(one, name), getattr(other, name))
         for name in (*MEASURED, "common_covariance"):
-            np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-11)
+            np.testing.assert_allclose(
+                getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-11
+            )
 
 
 def test_nothing_depends_on_the_number_of_threads(monkeypatch):
@@ -88,12 +110,16 @@ def test_nothing_depends_on_the_number_of_threads(monkeypatch):
             np.testing.assert_array_equal(value, getattr(other, name))
 
 
-@pytest.mark.parametrize("kind", ["perfect", pytest.param("all", marks=pytest.mark.slow), "centroids"])
+@pytest.mark.parametrize(
+    "kind", ["perfect", pytest.param("all", marks=pytest.mark.slow), "centroids"]
+)
 def test_each_in_motion_is_measured_as_alone(kind):
-    """Streaks of up to two pixels beside ones that are too long to be told and frames at rest, behind an obstacle, with
-    one out of sight; the right camera exposes later."""
+    """Streaks of up to two pixels beside ones that are too long to be told and frames at rest,
+    behind an obstacle, with one out of sight; the right camera exposes later."""
     centroids = kind == "centroids"
-    changes = {"timing.exposure": 0.002} | ({"detection.detector": "grey_centroid"} if centroids else {})
+    changes = {"timing.exposure": 0.002} | (
+        {"detection.detector": "grey_centroid"} if centroids else {}
+    )
     sensor = exact("perfect" if centroids else kind, changes, seed=3)
     sensor.move_rig({}, right_later=1e-5)
     sensor.add_bodies({"rod": cmmsim.rod(0.3, 0.004)})
@@ -101,7 +127,11 @@ def test_each_in_motion_is_measured_as_alone(kind):
     rod = {"rod": cmmsim.rod_transform(before - aside, before + aside)}
     count = FRAMES if kind == "perfect" else 7
     poses, rng = poses_about_home(sensor, count), np.random.default_rng(2)
-    rates = rng.uniform(-1, 1, (count, 6)) * [0.3, 0.3, 0.3, 1.0, 1.0, 1.0] * (np.arange(count) % 3 > 0)[:, None]
+    rates = (
+        rng.uniform(-1, 1, (count, 6))
+        * [0.3, 0.3, 0.3, 1.0, 1.0, 1.0]
+        * (np.arange(count) % 3 > 0)[:, None]
+    )
     rates[1], poses[2, 0] = np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.0]), poses[2, 0] + 5.0
     near = poses + 0.01 * REACH * rng.uniform(-1, 1, poses.shape)
     plain = []
@@ -120,7 +150,9 @@ def test_each_in_motion_is_measured_as_alone(kind):
     assert many.stickers.tolist() == [0 if one is None else len(one.target_ids) for one in plain]
     assert np.array_equal(np.flatnonzero(np.isfinite(many.poses[:, 0])), good)
     np.testing.assert_allclose(many.poses[good], [plain[k].pose for k in good], atol=1e-12)
-    np.testing.assert_allclose(many.covariances[good], [plain[k].covariance for k in good], rtol=1e-6)
+    np.testing.assert_allclose(
+        many.covariances[good], [plain[k].covariance for k in good], rtol=1e-6
+    )
 
 
 def test_what_moves_is_measured_as_it_moves():
@@ -147,4 +179,8 @@ def test_rows_of_numbers_are_asked_for_and_may_be_none(renderer):
             sensor.measure_many(wrong)
     for none in ([], np.zeros((0, 6))):
         empty = sensor.measure_many(none)
-        assert (empty.poses.shape, empty.covariances.shape, empty.stickers.shape) == ((0, 6), (0, 6, 6), (0,))
+        assert (empty.poses.shape, empty.covariances.shape, empty.stickers.shape) == (
+            (0, 6),
+            (0, 6, 6),
+            (0,),
+        )

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -25,7 +26,9 @@ def box_before(centre, size):
     return place, trimesh.creation.box(extents=size)
 
 
-def test_first_frame_without_prior_finds_all_ids_in_images_drawn_as_far_as_read_or_handed_over_as_arrays(sensor):
+def test_first_frame_without_prior_finds_all_ids_in_images_drawn_as_far_as_read_or_handed_over_as_arrays(
+    sensor,
+):
     """Each measured point lies where the sticker of that name truly is."""
     pose = sensor.home + np.array([0.009, -0.008, 0.007, 0.03, -0.035, 0.03])
     truth = apply(camera_from(sensor, pose), sensor.truth.platform_places)
@@ -63,7 +66,9 @@ def test_same_seed_same_numbers(taught, moving_path):
 
 @pytest.mark.slow
 def test_images_decide_the_result(taught):
-    """One camera's image shifted by 0.1 px moves the pose as a least-squares fit of exact pixels predicts."""
+    """One camera's image shifted by 0.1 px moves the pose as a least-squares fit of exact pixels
+    predicts.
+    """
     poses = {}
     for shift in (0.0, 0.1):
         sensor = cmmsim.load_sensor("ctrack780", seed=9, taught=taught)
@@ -78,7 +83,10 @@ def test_images_decide_the_result(taught):
         model = apply(camera_from(sensor, pose), taught.platform_places)
         return (sensor.rig.project(model)[0] - shifted).ravel()
 
-    predicted = least_squares(residuals, sensor.home, x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15).x - sensor.home
+    predicted = (
+        least_squares(residuals, sensor.home, x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        - sensor.home
+    )
     assert np.linalg.norm(predicted[:3]) > 30e-6
     noise = 5.0 * np.sqrt(np.diag(sensor.measure(sensor.home).covariance) * 2.0 / 30.0)
     assert np.all(np.abs(moved - predicted) < 0.1 * np.abs(predicted) + noise), (moved, predicted)
@@ -125,4 +133,21 @@ def test_another_process_measures_the_same(sensor, taught, moving_path, tmp_path
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(cmmsim.__file__).parents[1])}
     subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)
-    np.testing.assert_array_equal(np.load(tmp_path / "poses.npy"), [sensor.measure(pose).pose for pose in path])
+    np.testing.assert_array_equal(
+        np.load(tmp_path / "poses.npy"), [sensor.measure(pose).pose for pose in path]
+    )
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_frame_shows_both_images_without_a_display_and_as_a_picture_in_notebooks(kind):
+    """Matplotlib's figure holds the images as they are; the picture is their mean over pixels."""
+    full = np.iinfo(kind).max
+    left = np.zeros((40, 1000), dtype=kind)
+    left[:, 500:] = full
+    frame = cmmsim.StereoFrame(left, np.full_like(left, full))
+    shown = [axis.images[0].get_array() for axis in frame.show().axes]
+    np.testing.assert_array_equal(shown, [frame.left, frame.right])
+    picture = cv2.imdecode(np.frombuffer(frame._repr_png_(), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture.shape == (32, 1600)
+    assert (picture[:, :399] == 0).all()
+    assert (picture[:, 401:] == 255).all()

@@ -1,4 +1,6 @@
-"""The exposure of a moving platform: what of it is drawn, the fit of smeared discs, and the measured pose."""
+"""The exposure of a moving platform: what of it is drawn, the fit of smeared discs, and the
+measured pose.
+"""
 
 import numpy as np
 import pytest
@@ -6,8 +8,8 @@ import pytest
 import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.disc_image import coverage
-from cmmsim.imaging.exposure import LARGEST_STEP_PX, sub_frame_poses
 from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.stereo_camera import LARGEST_STEP_PX, sub_frame_poses
 from cmmsim.imaging.whole_image import exposed_windows
 from tests.cmmsim.sensors import (
     CROPPED,
@@ -67,23 +69,31 @@ def test_constant_velocity_does_not_move_the_measured_pose(lens, longest_px):
 @pytest.mark.parametrize("smear", [(0.0, 0.0), (0.9, 0.0), (-0.7, 1.5), (0.0, 3.1)])
 @pytest.mark.parametrize("psf_px", [0.0, 0.5])
 def test_fit_of_noise_free_smeared_windows_is_exact(smear, psf_px):
-    """Light added up over four times as many places as the fit takes; centres of the middle, shapes of the disc."""
+    """Light added up over four times as many places as the fit takes; centres of the middle, shapes
+    of the disc.
+    """
     centres, shapes = random_ellipses(np.random.default_rng(2), 30, 20)
     parts = (np.arange(44) + 0.5) / 44 - 0.5
-    share = np.mean([coverage(centres + part * np.array(smear), shapes, 20, psf_px)[0] for part in parts], axis=0)
+    share = np.mean(
+        [coverage(centres + part * np.array(smear), shapes, 20, psf_px)[0] for part in parts],
+        axis=0,
+    )
     windows, moved = NOISE.mean_grey((8.0 + 220.0 * share) / 255.0), np.tile(smear, (30, 1))
-    fits = fit_ellipses(windows, np.zeros((30, 2), dtype=int), NOISE, 20, psf_px=psf_px, smears=moved)
+    fits = fit_ellipses(
+        windows, np.zeros((30, 2), dtype=int), NOISE, 20, psf_px=psf_px, smears=moved
+    )
     assert fits.good.all()
     assert np.abs(fits.centres - centres).max() < 1e-3
     assert np.abs(fits.shapes - shapes).max() < 4e-3
 
 
 @pytest.mark.parametrize(
-    "speed", [pytest.param(0.3, marks=pytest.mark.slow), pytest.param(0.2, marks=pytest.mark.thorough)]
+    "speed",
+    [pytest.param(0.3, marks=pytest.mark.slow), pytest.param(0.2, marks=pytest.mark.thorough)],
 )
 def test_tracked_frames_of_a_moving_platform_keep_their_covariance(speed):
-    """Squared pose errors along y in units of the stated covariance, with 2 ms of exposure through a sharp lens: after
-    the first frame of each run, whose movement nobody can know."""
+    """Squared pose errors along y in units of the stated covariance, with 2 ms of exposure through
+    a sharp lens: after the first frame of each run, whose movement nobody can know."""
     sensor = exact("perfect", {"timing.exposure": 0.002})
     rate, squared = np.array([0.0, speed, 0.0, 0.0, 0.0, 0.0]), []
     for run, start in enumerate(poses_about_home(sensor, 8)):
@@ -128,18 +138,27 @@ def test_whole_image_is_blurred_as_its_windows_are():
 
 def test_a_movement_that_cannot_be_drawn_is_refused():
     sensor = exact("perfect", EXPOSED)
-    with pytest.raises(cmmsim.CmmError, match=r"moves \d+ px during the exposure of 0.004 s .* at most 150 px"):
+    with pytest.raises(
+        cmmsim.CmmError, match=r"moves \d+ px during the exposure of 0.004 s .* at most 150 px"
+    ):
         sensor.measure(sensor.home, pose_rate=[100.0, 0, 0, 0, 0, 0])
 
 
 @pytest.mark.parametrize("lens", ["perfect", "all"])
-def test_windows_over_an_exposure_show_what_drawing_every_window_at_every_moment_shows(monkeypatch, lens):
+def test_windows_over_an_exposure_show_what_drawing_every_window_at_every_moment_shows(
+    monkeypatch, lens
+):
     """Four moments while the platform moves by 6 mm, and one."""
     sensor, drawn = exact(lens), []
     formation, camera = sensor.camera.formation, sensor.rig.left
-    moments = [placed_at(sensor, sensor.home + s * np.eye(6)[1])[0] for s in np.linspace(-0.003, 0.003, 4)]
+    moments = [
+        placed_at(sensor, sensor.home + s * np.eye(6)[1])[0] for s in np.linspace(-0.003, 0.003, 4)
+    ]
     tiles = TILE * np.stack(np.meshgrid(np.arange(32), np.arange(24)), axis=-1).reshape(-1, 2)
-    every = [formation.windows([Side(camera, bodies, tiles)], TILE, 2, 1, shade=False)[0] for bodies in moments]
+    every = [
+        formation.windows([Side(camera, bodies, tiles)], TILE, 2, 1, shade=False)[0]
+        for bodies in moments
+    ]
     draw = ImageFormation.windows
 
     def counted(self, sides, *arguments, **options):

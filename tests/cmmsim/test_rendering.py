@@ -1,4 +1,6 @@
-"""Both renderers against closed forms, brute-force sampling and each other; the choice between them and one's own."""
+"""Both renderers against closed forms, brute-force sampling and each other; the choice between them
+and one's own.
+"""
 
 import sys
 import warnings
@@ -12,10 +14,10 @@ import cmmsim
 from cmmsim.geometry.disc_image import coverage
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.imaging import analytic, pyrender_renderer
-from cmmsim.imaging.exposure import SUPERSAMPLING
-from cmmsim.imaging.kernels import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
+from cmmsim.imaging.layer_kernels import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
 from cmmsim.imaging.renderer import Drawable
-from cmmsim.imaging.scene import ConvexSolid, solid_mesh
+from cmmsim.imaging.scene_bodies import ConvexSolid, solid_mesh
+from cmmsim.imaging.stereo_camera import SUPERSAMPLING
 from cmmsim.imaging.view_kernels import convex_hull, outlined
 from tests.cmmsim.sensors import (
     CAMERA,
@@ -29,15 +31,25 @@ from tests.cmmsim.sensors import (
 
 
 @pytest.mark.rendering
-@pytest.mark.parametrize(("supersampling", "limit"), [(6, 0.0016), (SUPERSAMPLING, 0.0008), (16, 0.0003)])
+@pytest.mark.parametrize(
+    ("supersampling", "limit"), [(6, 0.0016), (SUPERSAMPLING, 0.0008), (16, 0.0003)]
+)
 def test_centres_of_pyrender_agree_with_their_projection(supersampling, limit):
-    """The pixel convention: half a pixel off would be 0.5; the rest falls with supersampling as the renderer states."""
+    """The pixel convention: half a pixel off would be 0.5; the rest falls with supersampling as the
+    renderer states.
+    """
     sensor = exact(renderer="pyrender")
-    errors = np.concatenate([centre_errors(sensor, pose, supersampling) for pose in poses_about_home(sensor, 8)])
+    errors = np.concatenate(
+        [centre_errors(sensor, pose, supersampling) for pose in poses_about_home(sensor, 8)]
+    )
     rms, mean = np.sqrt((errors**2).mean(axis=0)), errors.mean(axis=0)
     assert np.all(rms < limit), rms
     assert np.all(np.abs(mean) < 0.0002), mean
-    assert 0.85 < np.sqrt((errors**2).mean()) / pyrender_renderer.PYRENDER.centre_error_px(supersampling) < 1.15
+    assert (
+        0.85
+        < np.sqrt((errors**2).mean()) / pyrender_renderer.PYRENDER.centre_error_px(supersampling)
+        < 1.15
+    )
 
 
 @pytest.mark.rendering
@@ -52,21 +64,27 @@ def test_centres_of_pyrender_agree_with_their_projection(supersampling, limit):
     ],
 )
 def test_both_renderers_agree_in_every_sticker_centre(lens, supersampling, count):
-    """At most 0.005 px as they are drawn for measuring, and finer; 0.0031 was the largest in 300 poses, behind a real
-    lens 0.0030 and 0.0014."""
+    """At most 0.005 px as they are drawn for measuring, and finer; 0.0031 was the largest in 300
+    poses, behind a real lens 0.0030 and 0.0014."""
     first, other = exact(lens), exact(lens, renderer="pyrender")
     for pose in poses_about_home(first, count):
-        gap = centre_errors(first, pose, size=18) - centre_errors(other, pose, supersampling, size=18)
+        gap = centre_errors(first, pose, size=18) - centre_errors(
+            other, pose, supersampling, size=18
+        )
         assert np.abs(gap).max() < 0.005
 
 
 @pytest.mark.rendering
 def test_both_renderers_show_the_same_image():
-    """The same levels in the same places, obstacles too: only pixels on edges differ, and none by much on the mean."""
+    """The same levels in the same places, obstacles too: only pixels on edges differ, and none by
+    much on the mean.
+    """
     place, images = cmmsim.rod_transform([0.45, -0.1, 0.35], [0.3, 0.2, 0.45]), []
     for sensor in (exact(), exact(renderer="pyrender")):
         sensor.add_bodies({"rod": cmmsim.rod(0.33, 0.01)})
-        images.append(sensor.camera.whole_exposure(0, [placed_at(sensor, sensor.home, place)[0]], 6))
+        images.append(
+            sensor.camera.whole_exposure(0, [placed_at(sensor, sensor.home, place)[0]], 6)
+        )
     gap = np.abs(images[0] - images[1])
     assert (gap > 0.02).sum() < 6000  # edges of bodies, of 3 million pixels
     assert gap.mean() < 1e-4
@@ -84,7 +102,8 @@ def test_both_renderers_show_the_same_image():
 def test_the_whole_image_shows_the_windows(lens, renderer, granted):
     """Around every sticker the whole image has the radiance of the finely drawn window.
 
-    Single samples of pyrender on an edge may fall to the other side by rounding: one of the 81 in a pixel is granted.
+    Single samples of pyrender on an edge may fall to the other side by rounding: one of the 81 in a
+    pixel is granted.
     """
     sensor = exact(lens, renderer=renderer)
     placed, corners = placed_at(sensor, sensor.home), corners_about(sensor, sensor.home, 12)
@@ -97,7 +116,10 @@ def test_the_whole_image_shows_the_windows(lens, renderer, granted):
 
 def test_tracking_needs_no_opengl(taught, moving_path, monkeypatch):
     monkeypatch.setattr(pyrender_renderer, "_shared_atlas", None)  # any call would fail
-    sensor, path = cmmsim.load_sensor("ctrack780", taught=taught, renderer="analytic"), moving_path(200)
+    sensor, path = (
+        cmmsim.load_sensor("ctrack780", taught=taught, renderer="analytic"),
+        moving_path(200),
+    )
     found = [sensor.measure(pose) for pose in path]
     errors = 1e6 * (np.array([m.pose for m in found]) - path)
     assert np.all(np.sqrt((errors**2).mean(axis=0)) < [4, 4, 4, 15, 15, 15])
@@ -124,7 +146,9 @@ def test_outline_covers_what_sampling_says():
     solids = outlined(scene, move[None], CAMERA.focal_lengths, CAMERA.centre, np.array([-1]))
     half_planes = solids.half_planes[: solids.starts[1]]
     pixels = CAMERA.project(apply(move, np.asarray(rod.vertices)))[0]
-    np.testing.assert_allclose(solids.boxes[0], [*pixels.min(axis=0), *pixels.max(axis=0)], atol=1e-4)
+    np.testing.assert_allclose(
+        solids.boxes[0], [*pixels.min(axis=0), *pixels.max(axis=0)], atol=1e-4
+    )
     corner, fine, coarse = (1004.5, 744.5), np.empty((40, 40)), np.empty((40, 40))
     cover_by_polygon(half_planes, *corner, 200, fine)
     cover_by_polygon(half_planes, *corner, 6, coarse)
@@ -143,7 +167,11 @@ def test_outline_covers_what_sampling_says():
 def test_convex_hull_is_that_of_qhull(count):
     """Of points on a grid, too, where many lie on one line."""
     rng = np.random.default_rng(count)
-    for points in (rng.normal(size=(count, 2)), rng.integers(0, 5, (count, 2)).astype(float), np.zeros((count, 2))):
+    for points in (
+        rng.normal(size=(count, 2)),
+        rng.integers(0, 5, (count, 2)).astype(float),
+        np.zeros((count, 2)),
+    ):
         found = convex_hull(points.copy())
         if np.linalg.matrix_rank(points - points[0]) < 2:
             assert set(map(tuple, found)) <= set(map(tuple, points))
@@ -159,7 +187,9 @@ def test_auto_falls_back_to_analytic_with_one_line(monkeypatch):
 
     monkeypatch.setattr(pyrender_renderer, "_shared_atlas", missing)
     sensor = exact(renderer=None)  # says nothing before something is to be drawn
-    with pytest.warns(UserWarning, match=r"^images are drawn by the analytic renderer, [^\n]*no EGL[^\n]*$") as caught:
+    with pytest.warns(
+        UserWarning, match=r"^images are drawn by the analytic renderer, [^\n]*no EGL[^\n]*$"
+    ) as caught:
         assert sensor.measure(sensor.home).ok
     assert sensor.renderer == "analytic"
     assert len(caught) == 1
@@ -189,15 +219,29 @@ def test_a_renderer_of_one_s_own_draws_by_its_module_and_name():
 
 
 def test_layers_are_laid_as_plain_numpy_lays_them():
-    """Two discs over a ground, the second behind a solid that covers the left half of the window."""
+    """Two discs over a ground, the second behind a solid that covers the left half of the
+    window."""
     rng = np.random.default_rng(3)
-    centres, shapes = rng.uniform(6.0, 9.0, (2, 2)), np.stack([np.diag([5.0, 3.0]), [[2.5, 0.4], [0.4, 1.8]]])
+    centres, shapes = (
+        rng.uniform(6.0, 9.0, (2, 2)),
+        np.stack([np.diag([5.0, 3.0]), [[2.5, 0.4], [0.4, 1.8]]]),
+    )
     levels, corner = np.array([0.1, 0.9]), np.array([100.0, 50.0])
     half = np.array([[1.0, 0.0, corner[0] + 7.25]])
     solids = Solids(
-        half, np.array([0, 1]), np.array([[-1e3, -1e3, corner[0] + 7.25, 1e3]]), np.array([0.4]), np.array([0])
+        half,
+        np.array([0, 1]),
+        np.array([[-1e3, -1e3, corner[0] + 7.25, 1e3]]),
+        np.array([0.4]),
+        np.array([0]),
     )
-    discs = Discs(centres + corner, shapes, np.linalg.norm(shapes, axis=2), levels, np.array([[False], [True]]))
+    discs = Discs(
+        centres + corner,
+        shapes,
+        np.linalg.norm(shapes, axis=2),
+        levels,
+        np.array([[False], [True]]),
+    )
     shares = coverage(centres, shapes, 16)[0]
     cover = np.tile(np.clip(7.75 - np.arange(16), 0.0, 1.0), (16, 1))
     expected = 0.2 + cover * (0.4 - 0.2)

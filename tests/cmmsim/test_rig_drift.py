@@ -12,11 +12,15 @@ DRIFT = {"right.cx_px": 0.8, "left.fx_px": -3.0, "right_from_left.ry_rad": 2e-4}
 
 
 def windows(sensor, frame):
-    """Grey values around the platform's stickers in one frame of a run, drawn after those before it."""
+    """Grey values around the platform's stickers in one frame of a run, drawn after those before
+    it.
+    """
     corners = (
-        np.rint(sensor.rig.project(apply(camera_from(sensor, sensor.home), sensor.truth.platform_places))[0]).astype(
-            int
-        )
+        np.rint(
+            sensor.rig.project(
+                apply(camera_from(sensor, sensor.home), sensor.truth.platform_places)
+            )[0]
+        ).astype(int)
         - 10
     )
     sensor.start_run(3)
@@ -29,7 +33,10 @@ def windows(sensor, frame):
 @pytest.mark.parametrize(("frame", "share"), [(0, 0.0), (2, 0.5), (4, 1.0), (6, 1.0)])
 def test_a_frame_of_drifting_cameras_is_that_of_cameras_moved_so_far(renderer, frame, share):
     changes = {"camera.prnu": 0.01}  # the pixels' own pattern does not move with the rig
-    drifting, moved = exact(changes=changes, renderer=renderer), exact(changes=changes, renderer=renderer)
+    drifting, moved = (
+        exact(changes=changes, renderer=renderer),
+        exact(changes=changes, renderer=renderer),
+    )
     drifting.drift_rig(DRIFT, 5)
     moved.move_rig({name: share * value for name, value in DRIFT.items()})
     seen = windows(drifting, frame)
@@ -51,7 +58,11 @@ def test_each_run_drifts_from_its_own_beginning_and_what_teaching_sees_stands_st
 @pytest.mark.parametrize(
     ("changes", "frames", "words"),
     [
-        ({"right.centre": 1.0}, 100, "a rig has no parameter 'right.centre': it has left. and right. with fx_px"),
+        (
+            {"right.centre": 1.0},
+            100,
+            "a rig has no parameter 'right.centre': it has left. and right. with fx_px",
+        ),
         ({"right.cx_px": np.nan}, 100, "the change of right.cx_px must be a finite number"),
         ({"right.cx_px": 0.1}, 1, "at least 2, got 1"),
         (

@@ -1,11 +1,13 @@
-"""The search for a layout in a cloud of points finds what was planted there, and says what it did not find."""
+"""The search for a layout in a cloud of points finds what was planted there, and says what it did
+not find.
+"""
 
 import numpy as np
 import pytest
 
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import apply, pose_to_transform
-from cmmsim.pose_estimation.search import find_layout
+from cmmsim.measuring.layout_search import find_layout
 
 LAYOUT = np.random.default_rng(5).uniform(-0.08, 0.08, (18, 3))
 PLACE = pose_to_transform([0.1, -0.05, 1.6, 2.0, 0.4, -0.7])
@@ -13,7 +15,9 @@ TOLERANCE = 0.0005  # m
 
 
 def cloud(kept, false, seed):
-    """Points of the layout's stickers ``kept`` to 0.05 mm and false ones among them, mixed; and where each went."""
+    """Points of the layout's stickers ``kept`` to 0.05 mm and false ones among them, mixed; and
+    where each went.
+    """
     rng = np.random.default_rng(seed)
     true = apply(PLACE, LAYOUT[kept]) + 5e-5 * rng.standard_normal((len(kept), 3))
     points = np.concatenate([true, PLACE[:3, 3] + rng.uniform(-0.15, 0.15, (false, 3))])
@@ -39,15 +43,29 @@ BESIDE = apply(pose_to_transform([0.0, 0.3, 0.0, 0.3, 0.0, 0.0]), LAYOUT)
 @pytest.mark.parametrize(
     ("points", "reason"),
     [
-        (cloud(np.arange(3), 0, 1)[0], "platform: 3 of 18 stickers recognised among 3 points, at least 4 needed"),
+        (
+            cloud(np.arange(3), 0, 1)[0],
+            "platform: 3 of 18 stickers recognised among 3 points, at least 4 needed",
+        ),
         (cloud(np.arange(0), 2, 1)[0], "platform: 0 of 18 stickers recognised among 2 points"),
         (np.zeros((0, 3)), "platform: 0 of 18 stickers recognised among 0 points"),
-        (np.concatenate([LAYOUT[:10], BESIDE[:10]]), "two poses explain the points, with 10 and 10 stickers"),
-        (np.concatenate([LAYOUT[:9], BESIDE[:10]]), "two poses explain the points, with 10 and 9 stickers"),
-        (np.concatenate([LAYOUT[:10], BESIDE[:9]]), "two poses explain the points, with 10 and 9 stickers"),
+        (
+            np.concatenate([LAYOUT[:10], BESIDE[:10]]),
+            "two poses explain the points, with 10 and 10 stickers",
+        ),
+        (
+            np.concatenate([LAYOUT[:9], BESIDE[:10]]),
+            "two poses explain the points, with 10 and 9 stickers",
+        ),
+        (
+            np.concatenate([LAYOUT[:10], BESIDE[:9]]),
+            "two poses explain the points, with 10 and 9 stickers",
+        ),
     ],
 )
-def test_too_few_and_two_layouts_that_are_about_as_whole_are_lost_with_their_numbers(points, reason):
+def test_too_few_and_two_layouts_that_are_about_as_whole_are_lost_with_their_numbers(
+    points, reason
+):
     with pytest.raises(LostError, match=reason):
         find_layout(LAYOUT, points, TOLERANCE, 4, "platform")
 

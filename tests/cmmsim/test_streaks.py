@@ -1,4 +1,5 @@
-"""First frames of a platform in motion: what streaks tell of it, and poses whose covariance holds."""
+"""First frames of a platform in motion: what streaks tell of it, and poses whose covariance
+holds."""
 
 from types import SimpleNamespace
 
@@ -9,8 +10,8 @@ from scipy.stats import chi2, kstest
 import cmmsim
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import apply
-from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX
-from cmmsim.pose_estimation.streaks import find_streaks
+from cmmsim.measuring.observation import LONGEST_SMEAR_PX
+from cmmsim.measuring.streaks import find_streaks
 from tests.cmmsim.sensors import TWELVE_BIT, camera_from, exact, poses_about_home, squared_error
 
 RATES = [
@@ -51,7 +52,9 @@ def difference(found, true):
 
 
 def require_chi_square(squared):
-    """Six degrees of freedom: mean and distribution, and none beyond what chance allows once in 10,000 tests."""
+    """Six degrees of freedom: mean and distribution, and none beyond what chance allows once in
+    10,000 tests.
+    """
     count = len(squared)
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 6 * count) / count
     assert low < np.mean(squared) < high
@@ -75,7 +78,10 @@ def test_streaks_tell_the_movement_but_for_its_sign(rate):
     """To half a pixel, the length from which a smear that is not told matters."""
     sensor = exposed()
     pose = poses_about_home(sensor, 1)[0]
-    found, true = streaks_of(sensor, sensor.look(pose, pose_rate=rate), pose), true_movements(sensor, pose, rate)
+    found, true = (
+        streaks_of(sensor, sensor.look(pose, pose_rate=rate), pose),
+        true_movements(sensor, pose, rate),
+    )
     assert difference(movements(sensor, *found.swept), true) < 0.5
     assert found.longest_px == pytest.approx(np.linalg.norm(true, axis=-1).max(), abs=0.3)
 
@@ -109,7 +115,9 @@ def test_poses_of_streaks_keep_their_covariance():
     sensor, squared = exposed(), []
     for k, pose in enumerate(poses_about_home(sensor, 2 * len(RATES), seed=3)):
         images = sensor.look(pose, pose_rate=(1.0 if k % 2 else 0.5) * np.array(RATES[k // 2]))
-        squared.append(squared_error(sensor.estimator.measure_anew(images, camera_from(sensor, pose))[0], pose))
+        squared.append(
+            squared_error(sensor.estimator.measure_anew(images, camera_from(sensor, pose))[0], pose)
+        )
     require_chi_square(squared)
 
 
@@ -117,7 +125,9 @@ def test_streaks_beyond_the_limit_are_lost_with_their_length():
     sensor = exposed(0.008)
     pose, rate = sensor.home, [0, 0.82, 0, 0, 0, 0]
     assert np.linalg.norm(true_movements(sensor, pose, rate), axis=-1).max() > LONGEST_SMEAR_PX
-    with pytest.raises(LostError, match=r"draws stickers out over (8|9)\.\d px, at most 8\.0 px can be measured"):
+    with pytest.raises(
+        LostError, match=r"draws stickers out over (8|9)\.\d px, at most 8\.0 px can be measured"
+    ):
         sensor.estimator.measure_anew(sensor.look(pose, pose_rate=rate), camera_from(sensor, pose))
 
 
@@ -155,7 +165,9 @@ def test_a_frame_from_elsewhere_is_measured_by_its_streaks():
     ],
 )
 def test_first_frames_in_motion_keep_their_covariance(exposure, lens, frames):
-    """Whole images searched, speeds up to 1 m/s and 3 rad/s: measured, but for one in fifty, with errors as stated."""
+    """Whole images searched, speeds up to 1 m/s and 3 rad/s: measured, but for one in fifty, with
+    errors as stated.
+    """
     sensor, squared, lost = exposed(exposure, lens), [], []
     for k, pose in enumerate(poses_about_home(sensor, frames, seed=5)):
         sensor.start_run(k)

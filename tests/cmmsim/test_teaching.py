@@ -1,4 +1,6 @@
-"""Teaching: the frames and windows that it finds, and which sensors may take over what another one was taught."""
+"""Teaching: the frames and windows that it finds, and which sensors may take over what another one
+was taught.
+"""
 
 import pickle
 from dataclasses import replace
@@ -9,16 +11,22 @@ import pytest
 import cmmsim
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, invert, rotation_log
-from cmmsim.geometry.registration import rigid_start
 from cmmsim.teaching import exactly_taught, radius_at, window_sizes
+from tests.cmmsim.plain import rigid_start
 from tests.cmmsim.sensors import LEFT, refused, squares
 
 TAUGHT = exactly_taught(read_sensor_file("ctrack780"))
 WIDE_RINGS = {"stickers.ring_radius": 0.012}
 LARGER = [
-    pytest.param(WIDE_RINGS | {"stickers.radius": 0.0035}, id="radius 3.5 mm", marks=pytest.mark.thorough),
-    pytest.param(WIDE_RINGS | {"stickers.radius": 0.0045}, id="radius 4.5 mm", marks=pytest.mark.slow),
-    pytest.param({"rig.distance": 1.0, "rig.height": 2200}, id="distance 1 m", marks=pytest.mark.slow),
+    pytest.param(
+        WIDE_RINGS | {"stickers.radius": 0.0035}, id="radius 3.5 mm", marks=pytest.mark.thorough
+    ),
+    pytest.param(
+        WIDE_RINGS | {"stickers.radius": 0.0045}, id="radius 4.5 mm", marks=pytest.mark.slow
+    ),
+    pytest.param(
+        {"rig.distance": 1.0, "rig.height": 2200}, id="distance 1 m", marks=pytest.mark.slow
+    ),
 ]
 
 
@@ -27,14 +35,22 @@ def load(changes=None, taught=TAUGHT, name="ctrack780"):
 
 
 def require_stated_error(sensor, taught):
-    """The taught frames against the true ones: small, and within what the teaching covariance states."""
+    """The taught frames against the true ones: small, and within what the teaching covariance
+    states.
+    """
     frame = rigid_start(sensor.truth.platform_places, taught.platform_places)
-    error = {"platform": frame, "base": taught.base_from_camera @ invert(sensor.truth.base_from_camera)}
+    error = {
+        "platform": frame,
+        "base": taught.base_from_camera @ invert(sensor.truth.base_from_camera),
+    }
     stated = {"platform": taught.platform_covariance, "base": taught.base_covariance}
     for name, transform in error.items():
         values = np.concatenate([transform[:3, 3], rotation_log(transform[:3, :3])])
         assert np.all(np.abs(values) * 1e6 < [2, 2, 2, 10, 10, 10]), (name, values)
-        assert values @ np.linalg.solve(stated[name], values) < 22.5, (name, values)  # one in a thousand
+        assert values @ np.linalg.solve(stated[name], values) < 22.5, (
+            name,
+            values,
+        )  # one in a thousand
     total = np.sqrt(np.diag(taught.calibration_covariance(sensor.home))) * 1e6
     assert np.all(total < [2, 2, 2, 10, 10, 10])
 
@@ -68,7 +84,10 @@ def test_teaching_is_repeatable_and_unbiased(seed, frames, moving_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rig.target": [0.30, 0.0, 0.185]}, r"rig.target \[0.3, 0.0, 0.18\] there, \[0.3, 0.0, 0.185\] here"),
+        (
+            {"rig.target": [0.30, 0.0, 0.185]},
+            r"rig.target \[0.3, 0.0, 0.18\] there, \[0.3, 0.0, 0.185\] here",
+        ),
         ({"rig.distance": 1.5}, r"rig.position \[1.44, 0.0, 1.28\] there, \[1.37"),
         ({"rig.left": LEFT}, "rig.left.centre_px nothing there"),
         ({"stickers.placement_seed": 781}, "stickers.placement_seed 780 there, 781 here"),
@@ -108,7 +127,9 @@ def test_one_kept_from_before_setups_were_stated_or_put_together_by_hand_needs_t
     assert load(taught=by_hand).taught is by_hand
     with pytest.raises(cmmsim.TeachingError, match="'ctrack780', not to 'ctrack780_29hz'"):
         load(taught=by_hand, name="ctrack780_29hz")
-    with pytest.raises(cmmsim.TeachingError, match="holds 18 stickers of the platform, sensor 'ctrack780' has 12"):
+    with pytest.raises(
+        cmmsim.TeachingError, match="holds 18 stickers of the platform, sensor 'ctrack780' has 12"
+    ):
         load({"stickers.per_plane": 4}, taught=by_hand)
 
 
@@ -142,11 +163,13 @@ def test_windows_of_teaching_grow_as_those_of_measuring():
 
 @pytest.mark.parametrize("factor", [1.5, 2.0, 4.0])
 def test_what_is_fitted_holds_a_sticker_that_is_a_fifth_nearer(factor):
-    """A disc that faces a camera looks focal length * radius / distance large; the cameras stand half a metre aside,
-    and its middle is rounded to a pixel."""
+    """A disc that faces a camera looks focal length * radius / distance large; the cameras stand
+    half a metre aside, and its middle is rounded to a pixel."""
     radius, distance = 0.003 * factor, np.hypot(1.5841717, 0.5)
     sensor = teaching_itself({"stickers.radius": radius, "stickers.ring_radius": 3.0 * radius})
-    found = radius_at(sensor.rig, invert(sensor.truth.base_from_camera), np.array([0.3, 0.0, 0.18]), radius)
+    found = radius_at(
+        sensor.rig, invert(sensor.truth.base_from_camera), np.array([0.3, 0.0, 0.18]), radius
+    )
     assert found == pytest.approx(2300.0 * radius / distance, rel=1e-6)
     reach = found / 0.82 + 0.5
     assert reach < 0.5 * sensor.settings.fit_size < 1.3 * reach + 1.0
@@ -155,7 +178,9 @@ def test_what_is_fitted_holds_a_sticker_that_is_a_fifth_nearer(factor):
 
 @pytest.mark.parametrize("changes", LARGER)
 def test_larger_stickers_are_taught_and_measured_with_a_true_covariance(changes, moving_path):
-    """150 frames: their mean squared error, normalised by the stated covariances, is 6 with a deviation of 0.28."""
+    """150 frames: their mean squared error, normalised by the stated covariances, is 6 with a
+    deviation of 0.28.
+    """
     sensor, path = teaching_itself(changes), moving_path(150)
     found = [sensor.measure(pose) for pose in path]
     assert [m.reason for m in found if not m.ok] == []
@@ -166,7 +191,9 @@ def test_larger_stickers_are_taught_and_measured_with_a_true_covariance(changes,
 
 
 def test_teaching_names_the_stickers_that_no_image_shows():
-    """One metre from the middle of platform and base, the lower stickers of the base lie below both images."""
+    """One metre from the middle of platform and base, the lower stickers of the base lie below both
+    images.
+    """
     sensor = teaching_itself({"rig.distance": 1.0})
     places = apply(invert(sensor.truth.base_from_camera), sensor.base.nominal)
     below = sensor.base.sticker_ids[~sensor.rig.project(places)[1].all(axis=0)]

@@ -8,7 +8,8 @@ from scipy import stats
 
 from cmmsim.files.schema import Timing
 from cmmsim.geometry.pose import pose_to_transform
-from cmmsim.pose_estimation.estimator import PoseEstimator, lost_measurement
+from cmmsim.measuring.measurement import lost_measurement
+from cmmsim.measuring.pose_estimator import PoseEstimator
 from cmmsim.tracker import Tracker
 from tests.cmmsim.sensors import CROPPED, exact
 
@@ -44,7 +45,10 @@ def test_frames_drop_out_as_often_as_stated_independently_for_a_reason_and_with_
     for dropped, probability in ((lost, 0.3), (lost[::2] & lost[1::2], 0.3**2)):
         low, high = stats.binom.interval(0.999, len(dropped), probability)
         assert low <= dropped.sum() <= high
-    again = [[not s.measure(s.home).ok for _ in range(30)] for s in (dropping(0.3), dropping(0.3, seed=4))]
+    again = [
+        [not s.measure(s.home).ok for _ in range(30)]
+        for s in (dropping(0.3), dropping(0.3, seed=4))
+    ]
     assert again[0] == lost[:30].tolist() != again[1]
 
 
@@ -63,7 +67,9 @@ def test_the_images_of_other_frames_are_the_same_with_and_without_dropout():
 
 
 def test_the_prediction_goes_on_through_missed_frames():
-    """A stand-in for the estimator: the platform moves 1 mm a frame, and the tracker says where it expects it."""
+    """A stand-in for the estimator: the platform moves 1 mm a frame, and the tracker says where it
+    expects it.
+    """
     expected, never = [], pytest.fail  # no image is looked at
 
     def at(frame):

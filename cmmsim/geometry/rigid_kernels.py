@@ -1,0 +1,214 @@
+"""Compiled: rigid fits of points by steps of Gauss-Newton, and what their residuals say.
+
+A point is known in a body's axes, and measured with a covariance. ``arm`` is the known point
+turned by the transform, ``gap`` the measured point less where the transform puts it. The residual
+of a fitted point has the covariance S - J C J': its noise S less what it pulls the pose by, with
+the covariance C of the pose and the slope J of the point.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cmmsim.compilation import Array, compiled
+from cmmsim.geometry.matrix_kernels import (
+    factor,
+    from_entries,
+    inverse_entries,
+    invert_factored,
+    solve_factored,
+    square_by,
+)
+from cmmsim.geometry.transform_kernels import carry, move_by
+
+
+@compiled
+def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array) -> float:
+    """Add a point to the normal equations of a pose; return its squared gap in units of its noise.
+
+    ``info`` (3,3) is the inverse covariance W of the point. ``normal`` (6,6), lower triangle, has
+    J' W J, and ``change`` (6,) J' W gap.
+    """
+    x, y, z = arm[0], arm[1], arm[2]
+    squared = 0.0
+    for i in range(3):
+        push = info[i, 0] * gap[0] + info[i, 1] * gap[1] + info[i, 2] * gap[2]
+        squared += gap[i] * push
+        change[i] += push
+        # The row i of W J: the slope of the point by the pose is [1, -arm x].
+        by_x = info[i, 2] * y - info[i, 1] * z
+        by_y = info[i, 0] * z - info[i, 2] * x
+        by_z = info[i, 1] * x - info[i, 0] * y
+        normal[3, i] += by_x
+        normal[4, i] += by_y
+        normal[5, i] += by_z
+        for j in range(i + 1):
+            normal[i, j] += info[i, j]
+        # The column i of J' times that row.
+        if i == 0:
+            normal[4, 3] += z * by_x
+            normal[5, 3] -= y * by_x
+            normal[4, 4] += z * by_y
+            normal[5, 4] -= y * by_y
+            normal[5, 5] -= y * by_z
+            change[4] += z * push
+            change[5] -= y * push
+        elif i == 1:
+            normal[3, 3] -= z * by_x
+            normal[5, 3] += x * by_x
+            normal[5, 4] += x * by_y
+            normal[5, 5] += x * by_z
+            change[3] -= z * push
+            change[5] += x * push
+        else:
+            normal[3, 3] += y * by_x
+            normal[4, 3] -= x * by_x
+            normal[4, 4] -= x * by_y
+            change[3] += y * push
+            change[4] -= x * push
+    return squared
+
+
+@compiled
+def solve_step(normal: Array, change: Array, covariance: Array) -> float:
+    """Solve the normal equations of a pose in place; return by how much the squares fall.
+
+    ``change`` (6,) becomes the step [dt, dphi], and ``covariance`` (6,6) is filled. ``normal`` is
+    overwritten.
+    """
+    before = (change[0], change[1], change[2], change[3], change[4], change[5])
+    factor(normal)
+    invert_factored(normal, covariance)
+    solve_factored(normal, change)
+    less = 0.0
+    for a in range(6):
+        less += before[a] * change[a]
+    return less
+
+
+@compiled
+def turn_arm(transform: Array, place: Array, point: Array, arm: Array, gap: Array) -> None:
+    """Fill the arm (3,) and the gap (3,) of a point (3,) known at ``place`` (3,)."""
+    carry(transform, place, 0.0, arm)
+    for i in range(3):
+        gap[i] = point[i] - transform[i, 3] - arm[i]
+
+
+@compiled
+def rigid_fits(
+    places: Array, points: Array, informations: Array, starts: Array, steps: int,
+    transforms: Array, covariances: Array, misfits: Array,
+) -> None:  # fmt: skip
+    """Fit transforms (f,4,4), from start to result, that carry ``places`` (k,3) to ``points``.
+
+    Points ``starts[f]`` to ``starts[f + 1]`` belong to fit f; their inverse covariances are
+    ``informations`` (k,3,3). Fills covariances (f,6,6) and misfits (k,), squared residuals in
+    units of the noise.
+    """
+    arm = np.empty(3)
+    gap = np.empty(3)
+    change = np.empty(6)
+    normal = np.empty((6, 6))
+    for f in range(len(transforms)):
+        first, last = starts[f], starts[f + 1]
+        for _ in range(steps if last > first else 0):
+            normal[:] = 0.0
+            change[:] = 0.0
+            for n in range(first, last):
+                turn_arm(transforms[f], places[n], points[n], arm, gap)
+                add_point(arm, informations[n], gap, normal, change)
+            solve_step(normal, change, covariances[f])
+            move_by(transforms[f], change)
+        for n in range(first, last):
+            turn_arm(transforms[f], places[n], points[n], arm, gap)
+            misfits[n] = 0.0
+            for i in range(3):
+                for j in range(3):
+                    misfits[n] += gap[i] * informations[n, i, j] * gap[j]
+
+
+@compiled
+def left_noise(arm: Array, noise: Array, covariance: Array, half: Array, entries: Array) -> None:
+    """Fill the entries (6,) of the covariance of a fitted point's residual.
+
+    ``noise`` (3,3) is the point's covariance, ``covariance`` (6,6) the pose's; ``half`` (3,6) is
+    overwritten.
+    """
+    x, y, z = arm[0], arm[1], arm[2]
+    for b in range(6):
+        half[0, b] = covariance[0, b] + z * covariance[4, b] - y * covariance[5, b]
+        half[1, b] = covariance[1, b] - z * covariance[3, b] + x * covariance[5, b]
+        half[2, b] = covariance[2, b] + y * covariance[3, b] - x * covariance[4, b]
+    entries[0] = noise[0, 0] - (half[0, 0] + z * half[0, 4] - y * half[0, 5])
+    entries[1] = noise[0, 1] - (half[0, 1] - z * half[0, 3] + x * half[0, 5])
+    entries[2] = noise[0, 2] - (half[0, 2] + y * half[0, 3] - x * half[0, 4])
+    entries[3] = noise[1, 1] - (half[1, 1] - z * half[1, 3] + x * half[1, 5])
+    entries[4] = noise[1, 2] - (half[1, 2] + y * half[1, 3] - x * half[1, 4])
+    entries[5] = noise[2, 2] - (half[2, 2] + y * half[2, 3] - x * half[2, 4])
+
+
+@compiled
+def residual_misfit(
+    gap: Array, noise: Array, left: Array, smallest: float, inverse: Array
+) -> float:
+    """Return the squared residual ``gap`` (3,) in units of its own covariance.
+
+    ``left`` (6,) has the entries of that covariance, see ``left_noise``. Directions in which less
+    than the share ``smallest`` of the point's noise (3,3) is left are not counted: there the point
+    alone determines the pose. ``inverse`` (6,) is overwritten.
+    """
+    xx = left[0] - smallest * noise[0, 0]
+    xy = left[1] - smallest * noise[0, 1]
+    xz = left[2] - smallest * noise[0, 2]
+    yy = left[3] - smallest * noise[1, 1]
+    yz = left[4] - smallest * noise[1, 2]
+    zz = left[5] - smallest * noise[2, 2]
+    minor = xx * yy - xy * xy
+    whole = zz * minor - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
+    if xx > 0.0 and minor > 0.0 and whole > 0.0:
+        inverse_entries(left, inverse)
+        return square_by(inverse, gap[0], gap[1], gap[2])
+    return checkable_misfit(gap, noise, left, smallest)
+
+
+@compiled
+def checkable_misfit(gap: Array, noise: Array, left: Array, smallest: float) -> float:
+    """Return ``residual_misfit`` of the directions alone in which enough noise is left."""
+    lower = noise.copy()
+    factor(lower)
+    root = np.zeros((3, 3))  # the inverse of the factor, which makes the noise the unit matrix
+    for k in range(3):
+        for i in range(k, 3):
+            rest = 1.0 if i == k else 0.0
+            for j in range(k, i):
+                rest -= lower[i, j] * root[j, k]
+            root[i, k] = rest / lower[i, i]
+    matrix = np.empty((3, 3))
+    from_entries(left, matrix)
+    shares, axes = np.linalg.eigh(root @ matrix @ root.T)
+    whitened = axes.T @ (root @ gap)
+    total = 0.0
+    for i in range(3):
+        if shares[i] > smallest:
+            total += whitened[i] ** 2 / shares[i]
+    return total
+
+
+@compiled
+def residual_misfits(
+    transforms: Array, spreads: Array, of: Array, places: Array, points: Array,
+    covariances: Array, smallest: float, misfits: Array,
+) -> None:  # fmt: skip
+    """Fill ``residual_misfit`` (n,) of points (n,3) with covariances (n,3,3), known at places.
+
+    Each belongs to the fit ``of`` (n,) among transforms (f,4,4) with covariances ``spreads``.
+    """
+    arm = np.empty(3)
+    gap = np.empty(3)
+    half = np.empty((3, 6))
+    left = np.empty(6)
+    inverse = np.empty(6)
+    for n in range(len(points)):
+        turn_arm(transforms[of[n]], places[n], points[n], arm, gap)
+        left_noise(arm, covariances[n], spreads[of[n]], half, left)
+        misfits[n] = residual_misfit(gap, covariances[n], left, smallest, inverse)

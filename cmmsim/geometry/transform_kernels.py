@@ -1,0 +1,208 @@
+"""Compiled: transforms of rigid bodies, their poses, and covariances of both."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cmmsim.compilation import Array, compiled
+
+
+@compiled
+def pose_transform(pose: Array, transform: Array) -> None:
+    """Fill the transform (4,4) of a pose (6,)."""
+    ca, sa = math.cos(pose[3]), math.sin(pose[3])
+    cb, sb = math.cos(pose[4]), math.sin(pose[4])
+    cg, sg = math.cos(pose[5]), math.sin(pose[5])
+    transform[0, 0] = cb * cg
+    transform[0, 1] = -cb * sg
+    transform[0, 2] = sb
+    transform[1, 0] = ca * sg + sa * sb * cg
+    transform[1, 1] = ca * cg - sa * sb * sg
+    transform[1, 2] = -sa * cb
+    transform[2, 0] = sa * sg - ca * sb * cg
+    transform[2, 1] = sa * cg + ca * sb * sg
+    transform[2, 2] = ca * cb
+    for i in range(3):
+        transform[i, 3] = pose[i]
+        transform[3, i] = 0.0
+    transform[3, 3] = 1.0
+
+
+@compiled
+def pose_transforms(poses: Array, transforms: Array) -> None:
+    """Fill the transforms (n,4,4) of poses (n,6)."""
+    for k in range(len(poses)):
+        pose_transform(poses[k], transforms[k])
+
+
+@compiled
+def transform_pose(transform: Array, pose: Array) -> None:
+    """Fill the pose (6,) of a rigid transform (4,4)."""
+    for i in range(3):
+        pose[i] = transform[i, 3]
+    pose[3] = math.atan2(-transform[1, 2], transform[2, 2])
+    pose[4] = math.atan2(transform[0, 2], math.hypot(transform[1, 2], transform[2, 2]))
+    pose[5] = math.atan2(-transform[0, 1], transform[0, 0])
+
+
+@compiled
+def transform_poses(transforms: Array, poses: Array) -> None:
+    """Fill the poses (n,6) of rigid transforms (n,4,4)."""
+    for k in range(len(poses)):
+        transform_pose(transforms[k], poses[k])
+
+
+@compiled
+def multiply(first: Array, second: Array, product: Array) -> None:
+    """Fill the product of two transforms (4,4)."""
+    for i in range(4):
+        a, b, c, d = first[i, 0], first[i, 1], first[i, 2], first[i, 3]
+        for j in range(4):
+            product[i, j] = (
+                a * second[0, j] + b * second[1, j] + c * second[2, j] + d * second[3, j]
+            )
+
+
+@compiled
+def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
+    """Fill a point (3,), or with ``shift`` 0 a direction, carried by a transform (4,4)."""
+    x, y, z = point[0], point[1], point[2]
+    for i in range(3):
+        carried[i] = shift * move[i, 3] + move[i, 0] * x + move[i, 1] * y + move[i, 2] * z
+
+
+@compiled
+def move_by(transform: Array, change: Array) -> None:
+    """Move a transform (4,4) by ``change`` (6,) [dt, dphi], in the axes of its output."""
+    turn = change[3:]
+    angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    first = math.sin(angle) / angle if angle > 1e-9 else 1.0
+    second = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
+    for j in range(3):
+        x = turn[1] * transform[2, j] - turn[2] * transform[1, j]
+        y = turn[2] * transform[0, j] - turn[0] * transform[2, j]
+        z = turn[0] * transform[1, j] - turn[1] * transform[0, j]
+        transform[0, j] += first * x + second * (turn[1] * z - turn[2] * y)
+        transform[1, j] += first * y + second * (turn[2] * x - turn[0] * z)
+        transform[2, j] += first * z + second * (turn[0] * y - turn[1] * x)
+    for i in range(3):
+        transform[i, 3] += change[i]
+
+
+@compiled
+def make_rigid(transform: Array) -> None:
+    """Replace the rotation of a transform (4,4) by the nearest orthogonal matrix.
+
+    Newton's steps R (3 - R'R) / 2 converge quadratically. Products of transforms need this, where
+    each is made of the one before: their rounding errors double from one to the next.
+    """
+    square = np.empty((3, 3))
+    row = np.empty(3)
+    for _ in range(4):
+        for i in range(3):
+            for j in range(3):
+                square[i, j] = 3.0 if i == j else 0.0
+                for k in range(3):
+                    square[i, j] -= transform[k, i] * transform[k, j]
+        for i in range(3):
+            for j in range(3):
+                row[j] = transform[i, j]
+            for j in range(3):
+                transform[i, j] = 0.5 * (
+                    row[0] * square[0, j] + row[1] * square[1, j] + row[2] * square[2, j]
+                )
+
+
+@compiled
+def farthest_from_rigid(transforms: Array) -> float:
+    """Return the largest deviation of transforms (k,4,4) from rigid ones.
+
+    Compared are the entries of R'R of the rotations R, and the last rows. Infinite where an entry
+    is not finite, or a rotation mirrors.
+    """
+    farthest = 0.0
+    for k in range(len(transforms)):
+        t = transforms[k]
+        for i in range(4):
+            for j in range(i + 1):
+                wanted = 1.0 if i == j else 0.0
+                product = t[0, i] * t[0, j] + t[1, i] * t[1, j] + t[2, i] * t[2, j]
+                off = abs(t[3, j] - wanted) if i == 3 else abs(product - wanted)
+                if not (off < np.inf and abs(t[j, 3]) < np.inf):
+                    return np.inf
+                farthest = max(farthest, off)
+        determinant = (
+            t[0, 0] * (t[1, 1] * t[2, 2] - t[1, 2] * t[2, 1])
+            + t[0, 1] * (t[1, 2] * t[2, 0] - t[1, 0] * t[2, 2])
+            + t[0, 2] * (t[1, 0] * t[2, 1] - t[1, 1] * t[2, 0])
+        )
+        if not determinant > 0.0:
+            return np.inf
+    return farthest
+
+
+@compiled
+def angle_rates(pose: Array, rates: Array) -> None:
+    """Fill the slopes (3,3) of a pose's angles by a rotation vector, in the output's axes."""
+    ca, sa = math.cos(pose[3]), math.sin(pose[3])
+    cb, sb = math.cos(pose[4]), math.sin(pose[4])
+    rates[0, 0] = 1.0
+    rates[0, 1] = sa * sb / cb
+    rates[0, 2] = -ca * sb / cb
+    rates[1, 0] = 0.0
+    rates[1, 1] = ca
+    rates[1, 2] = sa
+    rates[2, 0] = 0.0
+    rates[2, 1] = -sa / cb
+    rates[2, 2] = ca / cb
+
+
+@compiled
+def all_angle_rates(poses: Array, rates: Array) -> None:
+    """Fill ``angle_rates`` (n,3,3) of poses (n,6)."""
+    for k in range(len(poses)):
+        angle_rates(poses[k], rates[k])
+
+
+@compiled
+def pose_covariance(pose: Array, turn: Array, covariance: Array, spread: Array) -> None:
+    """Fill the covariance (6,6) of a pose (6,) from that of its transform's small error.
+
+    The error [dt, dphi] is given in other axes, which ``turn`` (3,3) carries to those of the pose.
+    """
+    rates = np.empty((3, 3))
+    slopes = np.empty((6, 3))  # of the place by dt, then of the angles by dphi
+    half = np.empty((6, 6))
+    angle_rates(pose, rates)
+    for i in range(3):
+        for j in range(3):
+            slopes[i, j] = turn[i, j]
+            slopes[3 + i, j] = (
+                rates[i, 0] * turn[0, j] + rates[i, 1] * turn[1, j] + rates[i, 2] * turn[2, j]
+            )
+    for i in range(6):
+        first = 0 if i < 3 else 3
+        for j in range(6):
+            half[i, j] = (
+                slopes[i, 0] * covariance[first, j]
+                + slopes[i, 1] * covariance[first + 1, j]
+                + slopes[i, 2] * covariance[first + 2, j]
+            )
+    for i in range(6):
+        for j in range(6):
+            first = 0 if j < 3 else 3
+            spread[i, j] = (
+                half[i, first] * slopes[j, 0]
+                + half[i, first + 1] * slopes[j, 1]
+                + half[i, first + 2] * slopes[j, 2]
+            )
+
+
+@compiled
+def pose_covariances(poses: Array, covariances: Array, spreads: Array) -> None:
+    """Fill covariances (n,6,6) of poses (n,6) from those of their transforms' small errors."""
+    turn = np.eye(3)
+    for k in range(len(poses)):
+        pose_covariance(poses[k], turn, covariances[k], spreads[k])

@@ -1,0 +1,302 @@
+"""Solid bodies before the cameras, with the true places of stickers.
+
+Only the renderer sees this truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
+from cmmsim.checks import finite_array
+from cmmsim.errors import CmmError, SensorFileError
+from cmmsim.files.schema import Body, Stickers, unit
+from cmmsim.files.setup import MarkedBody
+from cmmsim.geometry.plane_frame import PLANE_NAMES
+from cmmsim.geometry.pose import Array, invert
+
+SUNK = 0.0003  # m the solid surface lies below the sticker planes
+RING_SUNK = 0.0001  # m the dark ring lies below its sticker
+SHORTEST_ROD = 1e-9  # m: of a shorter one rounding is the direction
+TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
+
+
+class ConvexSolid:
+    """The convex hull of vertices (n,3), m."""
+
+    def __init__(self, vertices: Array) -> None:
+        hull = ConvexHull(vertices)
+        self.vertices = vertices[hull.vertices]
+        self.middle = self.vertices.mean(axis=0)
+        faces = np.unique(np.round(hull.equations, 12), axis=0)
+        self._normals = np.ascontiguousarray(faces[:, :3])
+        self._offsets = np.ascontiguousarray(faces[:, 3])
+
+    @property
+    def faces(self) -> tuple[Array, Array]:
+        """Normals (f,3), outwards, and offsets (f,) of its faces: normal . x + offset <= 0
+        inside."""
+        return self._normals, self._offsets
+
+    def hides(self, camera_from_body: Array, points: Array) -> NDArray[np.bool_]:
+        """Tell whether the solid stands between the camera and points (..., 3) in camera axes."""
+        from cmmsim.imaging.layer_kernels import (
+            hidden_points,
+        )  # compiles, so it is loaded where it is first needed
+
+        flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
+        hidden = np.empty(len(flat), dtype=bool)
+        hidden_points(
+            invert(camera_from_body), flat, self._normals, self._offsets, TOUCHING, hidden
+        )
+        return hidden.reshape(points.shape[:-1])
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A flat disc: centre (3,) and radius m, outward unit normal (3,), level 0 to 1."""
+
+    centre: Array
+    normal: Array
+    radius: float
+    level: float
+
+
+@dataclass(frozen=True)
+class DiscStack:
+    """Discs that lie over each other, the largest and lowest first; each renderer draws them in its
+    own way.
+    """
+
+    discs: tuple[Disc, ...]
+
+    @property
+    def bounds(self) -> Array:
+        """Smallest and largest coordinates (2,3), m."""
+        centres = np.array([d.centre for d in self.discs])
+        reach = np.array(
+            [d.radius * np.sqrt(np.maximum(1.0 - d.normal**2, 0.0)) for d in self.discs]
+        )
+        return np.stack([(centres - reach).min(axis=0), (centres + reach).max(axis=0)])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices (n,3) m, faces (m,3), levels (n,) 0 to 1 of the vertices; a solid has one level."""
+
+    vertices: Array
+    faces: NDArray[np.int_]
+    levels: Array
+
+    @property
+    def bounds(self) -> Array:
+        """Smallest and largest coordinates (2,3), m."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+Patch = DiscStack | Mesh
+"""A piece of a body that is drawn as one call."""
+
+
+@dataclass(frozen=True)
+class SceneBody:
+    """A rigid body as drawn: its solid and one stack of discs for each sticker; sticker_places
+    (n,3) are the true ones, m."""
+
+    solid: Mesh
+    stickers: tuple[DiscStack, ...]
+    sticker_places: Array
+
+
+def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
+    """True sticker places (n,3): the nominal ones moved within their planes, by a seeded distance
+    and direction.
+    """
+    rng = np.random.default_rng([stickers.placement_seed, stream])
+    distance = rng.uniform(*stickers.placement, len(body.nominal))
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(body.nominal))
+    moves = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return body.nominal + np.einsum("nij,nj->ni", body.in_plane, moves)
+
+
+def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int) -> SceneBody:
+    """The drawn body of a sensor file's section."""
+    places = placed_stickers(body, stickers, stream)
+    drawn = tuple(
+        _sticker(place, axes, stickers) for place, axes in zip(places, body.in_plane, strict=True)
+    )
+    solid = solid_mesh(_solid(body, section), stickers.body_level / 255.0)
+    return SceneBody(solid, drawn, places)
+
+
+def solid_mesh(mesh: trimesh.Trimesh, level: float) -> Mesh:
+    """A solid in one grey level."""
+    vertices = np.asarray(mesh.vertices, dtype=float)
+    return Mesh(vertices, np.asarray(mesh.faces), np.full(len(vertices), level))
+
+
+def rod(length: float, radius: float) -> trimesh.Trimesh:
+    """Return a cylinder from the origin to (0, 0, length): a crank, or a link between two points.
+
+    Parameters
+    ----------
+    length, radius : float
+        Sizes in m.
+
+    Returns
+    -------
+    trimesh.Trimesh
+
+    Raises
+    ------
+    ShapeError
+        If a size is not a finite number.
+    CmmError
+        If a size is not above zero.
+
+    Examples
+    --------
+    >>> rod(0.4, 0.02).extents.round(3).tolist()
+    [0.04, 0.04, 0.4]
+    """
+    sizes = finite_array(
+        (length, radius), (2,), "length and radius of a rod are two finite numbers, m"
+    )
+    if sizes.min() <= 0.0:
+        raise CmmError(
+            f"length and radius of a rod must be above 0 m, got {length:g} and {radius:g}"
+        )
+    mesh = trimesh.creation.cylinder(radius=radius, height=length, sections=24)
+    mesh.apply_translation([0.0, 0.0, 0.5 * length])
+    return mesh
+
+
+def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
+    """Return the place of a rod between two points.
+
+    Parameters
+    ----------
+    start, end : array_like, shape (3,)
+        Points at which the rod begins, and to which it leads, in the base frame, m.
+
+    Returns
+    -------
+    ndarray, shape (4, 4)
+        base_from_body, with the rod along its z axis.
+
+    Raises
+    ------
+    ShapeError
+        If a point is not three finite numbers.
+    CmmError
+        If the points are closer than SHORTEST_ROD.
+
+    Examples
+    --------
+    >>> rod_transform([0.0, 0.0, 0.0], [0.3, 0.0, 0.0])[:3, 2].tolist()
+    [1.0, 0.0, 0.0]
+    """
+    begin = finite_array(start, (3,), "the start of a rod is three finite numbers, m")
+    return rod_transforms(
+        begin[None], finite_array(end, (3,), "the end of a rod is three finite numbers, m")[None]
+    )[0]
+
+
+def rod_transforms(starts: Array, ends: Array) -> Array:
+    """As ``rod_transform`` of k rods at once: (k,4,4) of starts and ends (k,3). Raises CmmError for
+    one too short.
+    """
+    from cmmsim.imaging.view_kernels import (
+        place_rods,
+    )  # compiles, so it is loaded where it is first needed
+
+    transforms = np.zeros((len(starts), 4, 4))
+    lengths = np.empty(len(starts))
+    place_rods(np.ascontiguousarray(starts), np.ascontiguousarray(ends), transforms, lengths)
+    if not lengths.min(initial=np.inf) >= SHORTEST_ROD:
+        k = np.flatnonzero(~(lengths >= SHORTEST_ROD))[0]
+        raise CmmError(
+            f"a rod of {lengths[k]:g} m from {starts[k].tolist()} m points nowhere, at least "
+            f"{SHORTEST_ROD:g} m is "
+            "needed"
+        )
+    return transforms
+
+
+class PlacedBodies(Mapping[str, Array]):
+    """Bodies by their names, at base_from_body ``together`` (k,4,4): a mapping that need not be put
+    together again, for a sensor that is asked for every frame."""
+
+    def __init__(self, names: tuple[str, ...], together: Array) -> None:
+        self.names = names
+        self.together = together
+
+    def __getitem__(self, name: str) -> Array:
+        try:
+            return np.asarray(self.together[self.names.index(name)])
+        except ValueError:
+            raise KeyError(name) from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
+    """Convex solid of the sunk sticker planes and the cuts. Raises SensorFileError where they
+    enclose none.
+    """
+    normals = [*body.normals, *(unit(c.normal) for c in section.cuts)]
+    points = [
+        *(d * n - SUNK * n for n, d in zip(body.normals, body.offsets, strict=True)),
+        *(np.array(c.point) for c in section.cuts),
+    ]
+    half_spaces = np.array([[*n, -(n @ p)] for n, p in zip(normals, points, strict=True)])
+    inside = body.nominal.mean(axis=0) - 0.01 * body.normals.sum(axis=0)
+    outside = half_spaces @ [*inside, 1.0]
+    if outside.max() >= 0.0:
+        side = [
+            *(f"plane {name}" for name in PLANE_NAMES),
+            *(f"cut {k + 1}" for k in range(len(section.cuts))),
+        ]
+        raise SensorFileError(
+            f"{body.name}: the middle of its stickers, {np.round(inside, 4).tolist()} m, lies "
+            f"{outside.max():.4f} m outside of {side[outside.argmax()]}: the stickers do not sit "
+            "on "
+            "the solid that its planes and cuts enclose"
+        )
+    try:
+        corners = HalfspaceIntersection(half_spaces, inside).intersections
+        if not np.isfinite(corners).all():
+            raise SensorFileError(
+                f"{body.name}: its planes and cuts enclose no solid, it is open on a side"
+            )
+        return trimesh.convex.convex_hull(corners)
+    except QhullError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise SensorFileError(
+            f"{body.name}: its planes and cuts enclose no solid: {reason}"
+        ) from error
+
+
+def _sticker(place: Array, axes: Array, stickers: Stickers) -> DiscStack:
+    """A bright disc, and RING_SUNK below it a dark one that shows as a ring."""
+    normal = np.cross(axes[:, 0], axes[:, 1])
+    return DiscStack(
+        (
+            Disc(
+                place - RING_SUNK * normal,
+                normal,
+                stickers.ring_radius,
+                stickers.ring_level / 255.0,
+            ),
+            Disc(place, normal, stickers.radius, stickers.sticker_level / 255.0),
+        )
+    )

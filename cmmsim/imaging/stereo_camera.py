@@ -1,0 +1,341 @@
+"""Exposures of two cameras: the poses that they see, and the light and noise of windows or whole
+images over them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.errors import CmmError
+from cmmsim.geometry.pose import Array, apply_each, rigid, transforms_of
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.scene_bodies import DiscStack
+from cmmsim.imaging.whole_image import whole_image
+from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
+from cmmsim.radiometry.stereo_images import StereoFrame, Windows
+
+LARGEST_STEP_PX = 0.3  # between two sub-frames no sticker moves farther
+MOST_SUB_FRAMES = 500
+SUPERSAMPLING = 9
+
+Moments = Sequence[Sequence[Array]]
+"""camera_from_body (b,4,4) of all bodies for the left and the right camera, at each sub-frame of an
+exposure.
+"""
+
+
+def sub_frame_poses(
+    poses: Array, pose_rates: Array, exposure: float, sticker_pixels: Callable[[Array], Array]
+) -> list[Array]:
+    """For each of N exposures poses (m, 6) whose mean image is that of the whole exposure, by the
+    midpoint rule.
+
+    Parameters: poses (N, 6) in the middle of the exposures; pose_rates (N, 6) their time
+    derivatives, which are constant; exposure s; sticker_pixels: places (2, N, n, 2) px of all
+    stickers in the images at poses (N, 6). Raises CmmError where the stickers move farther than an
+    image can show.
+    """
+    halves = 0.5 * exposure * pose_rates
+    moved = np.linalg.norm(
+        sticker_pixels(poses + halves) - sticker_pixels(poses - halves), axis=-1
+    ).max(axis=(0, 2))
+    counts = np.maximum(1, np.ceil(moved / LARGEST_STEP_PX)).astype(int)
+    for far, rate in zip(
+        moved[counts > MOST_SUB_FRAMES], pose_rates[counts > MOST_SUB_FRAMES], strict=True
+    ):
+        raise CmmError(
+            f"a sticker moves {far:.0f} px during the exposure of {exposure:g} s at pose rate "
+            f"{rate.tolist()}, at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn"
+        )
+    shares = [(2.0 * np.arange(count) + 1.0) / count - 1.0 for count in counts]
+    return [
+        pose + share[:, None] * half
+        for pose, share, half in zip(poses, shares, halves, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Quality of windows: supersampling per pixel and axis, and the number of exposures that are
+    averaged.
+    """
+
+    supersampling: int = SUPERSAMPLING
+    exposures: int = 1
+
+
+@dataclass(frozen=True)
+class VirtualStereoCamera:
+    """Two cameras that look at the true scene and hand out noisy grey values.
+
+    rig and camera_from_base (4,4), its place in the base frame, the true ones; formation: how light
+    becomes images, its drawable's body 0 the platform and body 1 the base, the others being
+    ``obstacle_names`` in order; noise; exposure in s; pattern_seed: of what differs from pixel to
+    pixel; right_later: by how much the right camera exposes later, s.
+    """
+
+    rig: StereoRig
+    camera_from_base: Array
+    formation: ImageFormation
+    noise: CameraNoise
+    obstacle_names: Sequence[str] = ()
+    exposure: float = 0.0
+    pattern_seed: int = 0
+    right_later: float = 0.0
+
+    def look(
+        self,
+        pose: Array,
+        rng: np.random.Generator,
+        obstacles: Mapping[str, Array] | None = None,
+        quality: Quality | None = None,
+        pose_rate: Array | None = None,
+    ) -> "LiveImages":
+        """One exposure of the platform and of the obstacles at base_from_body (4,4) each.
+
+        ``pose`` (6,) of the platform in the middle of the exposure, ``pose_rate`` (6,) its time
+        derivative; obstacles stand still.
+        """
+        rates = None if pose_rate is None else pose_rate[None]
+        return LiveImages(
+            self, self._moments(pose[None], rates, obstacles or {})[0], rng, quality or Quality()
+        )
+
+    def look_many(
+        self,
+        poses: Array,
+        rngs: Sequence[np.random.Generator],
+        obstacles: Mapping[str, Array],
+        pose_rates: Array,
+    ) -> "ManyLiveImages":
+        """Exposures of the platform at poses (N,6) in motion at pose_rates (N,6), each with its own
+        noise, as ``look`` for each of them."""
+        return ManyLiveImages(self, self._moments(poses, pose_rates, obstacles), rngs)
+
+    def moved(self, changes: Array) -> "VirtualStereoCamera":
+        """The same cameras with changes (24,) of their rig's parameters; their pixels stay what
+        they are.
+        """
+        camera = replace(self, rig=self.rig.moved(changes))
+        camera.__dict__["patterns"] = self.patterns
+        return camera
+
+    def radiances(
+        self,
+        moments: Sequence[Moments],
+        corners: Sequence[NDArray[np.int_]],
+        size: int,
+        supersampling: int,
+    ) -> list[NDArray[np.float32]]:
+        """Mean radiance (2, n, size, size) of windows at ``corners`` (2, n, 2) in the left and
+        right image over the moments of an exposure, for each of several exposures.
+
+        One moment of all exposures is drawn after the other: no more is held at once than without
+        motion.
+        """
+        light = self._drawn([first for first, *_ in moments], corners, size, supersampling)
+        for k in range(1, max(map(len, moments))):
+            going = [n for n, own in enumerate(moments) if len(own) > k]
+            drawn = self._drawn(
+                [moments[n][k] for n in going], [corners[n] for n in going], size, supersampling
+            )
+            for n, more in zip(going, drawn, strict=True):
+                light[n] += more
+        for mean, own in zip(light, moments, strict=True):
+            if len(own) > 1:
+                mean /= np.float32(len(own))
+        return light
+
+    def _drawn(
+        self,
+        placed: Sequence[Sequence[Array]],
+        corners: Sequence[NDArray[np.int_]],
+        size: int,
+        supersampling: int,
+    ) -> list[NDArray[np.float32]]:
+        """As ``radiances``, of one moment each. Exposures are drawn together where nothing finer
+        than their pixels is drawn: finer windows of many exposures would not fit into the
+        processor's caches."""
+        sides = [
+            Side(*side)
+            for at, first in zip(placed, corners, strict=True)
+            for side in zip(self.rig.cameras, at, first, strict=True)
+        ]
+        together = max(len(sides), 2) if self.formation.draws_pixels(self.rig.cameras) else 2
+        windows = [
+            window
+            for start in range(0, len(sides), together)
+            for window in self.formation.windows(
+                sides[start : start + together], size, supersampling
+            )
+        ]
+        return [np.stack(pair) for pair in zip(windows[::2], windows[1::2], strict=True)]
+
+    def whole_exposure(
+        self, side: int, moments: Sequence[Array], supersampling: int
+    ) -> NDArray[np.float32]:
+        """Mean radiance (height, width) of one whole image over the moments of an exposure."""
+        return whole_image(self.formation, self.rig.cameras[side], moments, supersampling)
+
+    def centre_error_px(self, quality: Quality) -> float:
+        """Error of a sticker's centre that drawing leaves, px rms."""
+        return self.formation.centre_error_px(self.rig.cameras, quality.supersampling)
+
+    @cached_property
+    def _from_base(self) -> list[Array]:
+        return [move @ self.camera_from_base for move in self.rig.from_camera]
+
+    @cached_property
+    def patterns(self) -> Sequence[FixedPattern | None]:
+        """Differences from pixel to pixel of the left and of the right camera; None where there are
+        none.
+        """
+        prnu = self.noise.prnu
+        dsnu = self.noise.dsnu
+        if not (self.noise.enabled and (prnu > 0.0 or dsnu > 0.0)):
+            return None, None
+        rngs = [np.random.default_rng([self.pattern_seed, side]) for side in range(2)]
+        shapes = [(camera.height, camera.width) for camera in self.rig.cameras]
+        return [
+            draw_pattern(shape, prnu, dsnu, rng) for shape, rng in zip(shapes, rngs, strict=True)
+        ]
+
+    def pattern_in(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
+        """Differences from pixel to pixel in windows of a size at ``corners`` (2, n, 2)."""
+        cut = [
+            p.windows(at, size)
+            for p, at in zip(self.patterns, corners, strict=True)
+            if p is not None
+        ]
+        return (
+            FixedPattern(np.stack([c.sensitivity for c in cut]), np.stack([c.offset for c in cut]))
+            if cut
+            else None
+        )
+
+    def _moments(
+        self, poses: Array, rates: Array | None, obstacles: Mapping[str, Array]
+    ) -> list[Moments]:
+        """The moments of exposures at poses (N,6) in motion at rates (N,6)."""
+        parts = list(poses[:, None])
+        lag = np.zeros(poses.shape)
+        if rates is not None:
+            lag = self.right_later * rates
+            if self.exposure > 0.0:
+                parts = sub_frame_poses(poses, rates, self.exposure, self._sticker_pixels)
+        counts = [len(part) for part in parts]
+        left = np.concatenate(parts)
+        placed = self._placed(left, left + np.repeat(lag, counts, axis=0), obstacles)
+        return [
+            placed[end - count : end] for count, end in zip(counts, np.cumsum(counts), strict=True)
+        ]
+
+    def _placed(
+        self, left: Array, right: Array, obstacles: Mapping[str, Array]
+    ) -> list[tuple[Array, Array]]:
+        """camera_from_body (b,4,4) of all bodies for the left and the right camera, each at its own
+        poses (N,6) of the platform, for each of N moments."""
+        # an obstacle without a place stands far behind both cameras
+        absent = rigid(np.eye(3), (0.0, 0.0, -1e3))
+        still = np.stack(
+            [np.eye(4), *(obstacles.get(name, absent) for name in self.obstacle_names)]
+        )
+        sides = []
+        for camera, poses in zip(self._from_base, (left, right), strict=True):
+            placed = np.empty((len(poses), 1 + len(still), 4, 4))
+            placed[:, 0] = camera @ transforms_of(poses)
+            placed[:, 1:] = camera @ still
+            sides.append(list(placed))
+        return list(zip(*sides, strict=True))
+
+    def _sticker_pixels(self, poses: Array) -> Array:
+        """Pixels (2, N, n, 2) of the platform's stickers at poses (N,6)."""
+        return self.rig.project(
+            apply_each(self.camera_from_base @ transforms_of(poses), self._sticker_places)
+        )[0]
+
+    @cached_property
+    def _sticker_places(self) -> Array:
+        """Places (n,3) of the platform's stickers, m, in its axes."""
+        drawable = self.formation.drawable
+        return np.array(
+            [
+                patch.discs[-1].centre
+                for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
+                if body == 0 and isinstance(patch, DiscStack)
+            ]
+        )
+
+
+class LiveImages:
+    """One exposure, drawn as far as it is read."""
+
+    def __init__(
+        self,
+        camera: VirtualStereoCamera,
+        moments: Moments,
+        rng: np.random.Generator,
+        quality: Quality,
+    ) -> None:
+        self._camera = camera
+        self._moments = moments
+        self._rng = rng
+        self._quality = quality
+
+    def full(self) -> StereoFrame:
+        """Both whole images."""
+        images = []
+        for side, pattern in enumerate(self._camera.patterns):
+            moments = [placed[side] for placed in self._moments]
+            radiance = self._camera.whole_exposure(side, moments, self._quality.supersampling)
+            images.append(self._camera.noise.expose(radiance, self._rng, pattern))
+        return StereoFrame(*images)
+
+    def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x,
+        y).
+        """
+        (radiance,) = self._camera.radiances(
+            [self._moments], [corners], size, self._quality.supersampling
+        )
+        pattern = self._camera.pattern_in(corners, size)
+        if self._quality.exposures == 1:
+            return self._camera.noise.expose(radiance, self._rng, pattern)
+        return self._camera.noise.mean_of_exposures(
+            radiance, self._rng, self._quality.exposures, pattern
+        )
+
+
+class ManyLiveImages:
+    """Exposures, drawn as far as they are read, each with noise of its own stream."""
+
+    def __init__(
+        self,
+        camera: VirtualStereoCamera,
+        moments: Sequence[Moments],
+        rngs: Sequence[np.random.Generator],
+    ) -> None:
+        self._camera = camera
+        self._moments = moments
+        self._rngs = rngs
+
+    def windows_of(
+        self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
+    ) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2), of
+        ``exposures`` (n,) in rising order."""
+        camera = self._camera
+        shown = np.unique(exposures)
+        own = np.split(corners, np.searchsorted(exposures, shown[1:]), axis=1)
+        drawn = camera.radiances(
+            [self._moments[k] for k in shown], own, size, Quality().supersampling
+        )
+        grey = [
+            camera.noise.expose(light, self._rngs[k], camera.pattern_in(at, size))
+            for k, light, at in zip(shown, drawn, own, strict=True)
+        ]
+        return np.concatenate(grey, axis=1, dtype=camera.noise.image_type)

@@ -1,0 +1,68 @@
+"""Sensors by the name or the path of a sensor file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.measuring.taught import Taught
+from cmmsim.sensor import Sensor
+from cmmsim.teaching import Progress
+from cmmsim.uncertainty.known_rig import KnownRig
+
+
+def load_sensor(
+    name: str | Path,
+    seed: int = 0,
+    method: str = "registration",
+    taught: Taught | None = None,
+    progress: Progress | None = None,
+    renderer: str | None = None,
+    changes: Mapping[str, Any] | None = None,
+    known: KnownRig | None = None,
+) -> Sensor:
+    """Load a sensor.
+
+    Parameters
+    ----------
+    name : str or Path
+        Built-in name, or path of a TOML sensor file.
+    seed : int
+        Seed of teaching, and of the noise of the first run.
+    method : {"registration", "planes"}
+        Method by which a pose is made of the stickers.
+    taught : Taught, optional
+        Result of an earlier teaching of the same cameras and bodies.
+    progress : callable, optional
+        Called while teaching, with the number of steps done and their total.
+    renderer : {"pyrender", "analytic", "auto", "statistical"}, optional
+        Renderer instead of the one that the file names.
+    changes : mapping, optional
+        Entries instead of the file's, by dotted key.
+    known : KnownRig, optional
+        Rig that measures, where it is another than the one that draws.
+
+    Returns
+    -------
+    Sensor
+
+    Raises
+    ------
+    UnknownSensorError
+        If no built-in sensor has the name.
+    SensorFileError
+        If the file cannot be read or holds a wrong value.
+    UnknownOptionError
+        If there is no such method, renderer or detector.
+    TeachingError
+        If ``taught`` belongs to another sensor.
+
+    Examples
+    --------
+    >>> sensor = load_sensor("ctrack780", renderer="statistical", changes={"camera.gain": 0.12})
+    >>> sensor.home
+    array([0. , 0. , 0.2, 0. , 0. , 0. ])
+    """
+    return Sensor(read_sensor_file(name, changes), seed, method, taught, progress, renderer, known)

@@ -1,0 +1,216 @@
+"""Poses of a body from its observed stickers, which must agree with each other.
+
+The taught places are laid onto the observed stickers. A sticker is left out, the worst one first,
+when
+
+- its place differs from where all others put it (data snooping: the residual r against its own
+  covariance S - J C J', which a sticker's pull on the pose makes smaller than its noise S), or
+- its ellipse in one image differs from the one that a whole sticker would show there: a partly
+  hidden sticker, or a bright spot that touches it, moves the centre and the rim alike.
+
+Undetected errors of both kinds are then of the size of the noise. At least four stickers must be
+left, since with three a wrong one cannot be told, and more than were left out.
+
+All residuals may be larger than noise: a camera has drifted since its calibration, or several
+stickers are a little wrong. Places are then judged against the residuals of the others, and the
+covariances grow by the same factor (Birge ratio), up to a limit.
+
+The computation is compiled, in ``solver_kernels``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from cmmsim.errors import LostError
+from cmmsim.files.setup import MarkedBody
+from cmmsim.geometry.pose import Array
+from cmmsim.geometry.registration import SMALLEST_SPREAD, require_spread
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.measuring.observation import Observer, StickerObservation
+
+if TYPE_CHECKING:
+    from cmmsim.measuring.solver_kernels import Belief, Outlines
+
+CHANCE = 1e-4  # of a good sticker to be left out, for its place and for each of its two ellipses
+EXCESS_CHANCE = 1e-4  # of a good frame's residuals to be taken for larger than noise
+LARGEST_EXCESS = 6.0  # of the residuals' mean square over that of noise
+LARGEST_MISFIT = float(chi2.isf(CHANCE, 3))
+FEWEST = 4
+SMALLEST_SHARE = 0.01  # of a sticker's noise in its residual, below which nothing can be checked
+SETTLED = 1e-8  # rad: turn of the last step of a fit
+
+
+@dataclass(frozen=True)
+class SolvedFrames:
+    """Poses of a body in f frames, and the stickers that they rest on.
+
+    ``moves`` (f,4,4) are camera_from_body, and ``covariances`` (f,6,6) those of their small errors
+    [dt, dphi]. ``stickers`` are all of them, with covariances that have grown where residuals are
+    larger than noise; ``used`` (k,) says which agree, and ``starts`` (f + 1,) where those of each
+    frame begin. ``verdicts`` (f,) and ``body`` tell why a frame is lost.
+    """
+
+    moves: Array
+    covariances: Array
+    stickers: StickerObservation
+    used: NDArray[np.bool_]
+    starts: NDArray[np.int_]
+    verdicts: Array
+    body: MarkedBody
+    places: Array
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Frames (f,) without a pose."""
+        return self.verdicts[:, 0] != 0
+
+    def of(self, frame: int) -> StickerObservation:
+        """Stickers that the pose of a frame rests on, with their index into the body's stickers."""
+        own = np.zeros(len(self.used), dtype=bool)
+        own[self.starts[frame] : self.starts[frame + 1]] = True
+        seen = self.stickers.selected(own & self.used)
+        return replace(seen, index=seen.index % len(self.places))
+
+    def reason(self, frame: int) -> str:
+        """The reason why a frame is lost."""
+        from cmmsim.measuring.solver_kernels import FIRST  # late, as numba takes time to import
+
+        verdict = self.verdicts[frame]
+        first = ""
+        if verdict[FIRST] >= 0:
+            row = self.starts[frame] + int(verdict[FIRST])
+            first = str(self.body.sticker_ids[self.stickers.index[row] % len(self.places)])
+        return lost_reason(verdict, first, self.places[self.of(frame).index])
+
+
+def solve_frames(
+    seen: StickerObservation, near: Array, observer: Observer, body: MarkedBody, places: Array
+) -> SolvedFrames:
+    """Solve f frames near camera_from_body (f,4,4), with a body's stickers taught at ``places``.
+
+    The observation's index says frame and sticker, as that of ``Observer.read``.
+    """
+    from cmmsim.measuring import solver_kernels as kernels  # late, as numba takes time to import
+
+    frames = len(near)
+    of, sticker = np.divmod(seen.index, len(places))
+    starts = np.searchsorted(of, np.arange(frames + 1)).astype(int)
+    used = np.ones(len(of), dtype=bool)
+    covariances = np.array(seen.covariances)
+    rows = kernels.Seen(
+        used,
+        np.ascontiguousarray(seen.points),
+        np.linalg.inv(covariances),
+        covariances,
+        np.empty((len(of), 3)),
+        np.empty((len(of), 3)),
+    )
+    moves = np.array(near, dtype=float)
+    spreads = np.zeros((frames, 6, 6))
+    verdicts = np.zeros((frames, kernels.COLUMNS))
+    outlines = _outlines(seen, observer, body.sticker_normals[sticker])
+    belief = belief_for(len(places))
+    taught = np.ascontiguousarray(places[sticker])
+    kernels.solve_frames(rows, taught, outlines, belief, starts, moves, spreads, verdicts)
+    return SolvedFrames(
+        moves,
+        spreads,
+        replace(seen, covariances=covariances),
+        used,
+        starts,
+        verdicts,
+        body,
+        places,
+    )
+
+
+def consistent(
+    seen: StickerObservation, near: Array, observer: Observer, body: MarkedBody, places: Array
+) -> tuple[StickerObservation, Array, Array]:
+    """The stickers of one frame that agree, camera_from_body (4,4) and its covariance (6,6).
+
+    ``near`` (4,4) is about camera_from_body. Raises LostError when too few agree.
+    """
+    solved = solve_frames(seen, near[None], observer, body, places)
+    if solved.lost[0]:
+        raise LostError(solved.reason(0))
+    return solved.of(0), solved.moves[0], solved.covariances[0]
+
+
+def belief_for(stickers: int, settled: float = SETTLED) -> Belief:
+    """The limits for frames with up to so many stickers, as the compiled solver takes them."""
+    from cmmsim.measuring.solver_kernels import Belief  # late, as numba takes time to import
+
+    return Belief(
+        LARGEST_MISFIT,
+        LARGEST_EXCESS,
+        FEWEST,
+        SMALLEST_SHARE,
+        SMALLEST_SPREAD,
+        settled,
+        _largest_totals(3 * stickers),
+    )
+
+
+def lost_reason(verdict: Array, first: str, left: Array) -> str:
+    """The reason why a frame is lost.
+
+    ``first`` names the sticker that was left out first, and ``left`` (n,3) are the places of those
+    that were not.
+    """
+    from cmmsim.measuring import solver_kernels as kernels  # late, as numba takes time to import
+
+    seen = int(verdict[kernels.SEEN])
+    count = int(verdict[kernels.LEFT])
+    if count >= FEWEST and count > seen - count:
+        try:
+            require_spread(left)
+        except LostError as error:
+            return str(error)
+    if verdict[kernels.FIRST] < 0:
+        return f"{seen} visible stickers, at least {FEWEST} are needed to tell a wrong one"
+    place = verdict[kernels.PLACE]
+    outline = verdict[kernels.OUTLINE]
+    misfit = f"{place:.0f} of its place" if place >= outline else f"{outline:.0f} of its outline"
+    return (
+        f"{seen} visible stickers contradict each other, {count} are left where at least {FEWEST} "
+        f"and more than the {seen - count} that were left out are needed; the first was {first}: "
+        f"squared misfit {misfit}, at most {LARGEST_MISFIT:.1f}"
+    )
+
+
+@lru_cache(maxsize=16)
+def _largest_totals(freedom: int) -> Array:
+    """Sums of squares (freedom + 1,), by their freedom, beyond which they exceed noise."""
+    return np.asarray(chi2.isf(EXCESS_CHANCE, np.maximum(np.arange(freedom + 1), 1)))
+
+
+def no_outlines(rig: StereoRig) -> Outlines:
+    """Outlines of a detector that states none, as the compiled solver takes them."""
+    from cmmsim.measuring.solver_kernels import Outlines  # late, as numba takes time to import
+
+    shapes = np.zeros((0, 2, 3))
+    return Outlines(shapes, np.zeros((0, 2, 6)), np.zeros((0, 3)), 0.0, rig.figures)
+
+
+def _outlines(seen: StickerObservation, observer: Observer, normals: Array) -> Outlines:
+    """The ellipses of stickers with normals (k,3), as the compiled solver takes them."""
+    known = no_outlines(observer.rig)
+    if seen.outlines is None:
+        return known
+    rows, columns = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
+    entries = seen.outlines.shapes[..., [0, 0, 1], [0, 1, 1]]
+    inverse = np.linalg.inv(seen.outlines.covariances)[..., rows, columns]
+    return known._replace(
+        shapes=np.ascontiguousarray(entries.swapaxes(0, 1)),
+        informations=np.ascontiguousarray(inverse.swapaxes(0, 1)),
+        normals=np.ascontiguousarray(normals),
+        radius=observer.settings.radius,
+    )

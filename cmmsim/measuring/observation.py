@@ -1,0 +1,376 @@
+"""Stickers of one body, observed near where they are expected: windows, detected centres,
+triangulation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.detection.detector import (
+    DetectedCentres,
+    Detector,
+    FitLimits,
+    SpotWindows,
+    find_detector,
+)
+from cmmsim.detection.ellipse_fit import (
+    MAXIMUM_LIKELIHOOD,
+    SMEAR_STEP_PX,
+    EllipseFits,
+    fit_ellipses,
+)
+from cmmsim.geometry.camera import Optics
+from cmmsim.geometry.disc_image import centre_offset
+from cmmsim.geometry.pose import Array, apply_each
+from cmmsim.geometry.stereo_rig import StereoRig, triangulate
+from cmmsim.plugins import DEFAULT_DETECTOR
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.stereo_images import StereoImages, Windows
+
+LONGEST_SMEAR_PX = 8.0  # about the size of a sticker
+SHORTEST_SMEAR = (
+    1.5  # standard deviations of the point spread: shorter ones do not change what the fit finds
+)
+GRAZING = 0.15  # cosine between a sticker's normal and the view below which it is not looked for
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap:
+    squared distance of the two rays of a sticker in units of its noise (one degree of freedom, so
+    25 is five sigma); centre_error_px: rms error of a centre that is not noise, such as the image
+    formation's own; it is added to the noise's covariance, as is the detector's; line_error_px: std
+    of how far what is not known of the rig takes images off their epipolar lines, which the two
+    rays of a sticker may miss each other by beside their noise; detector: name of the one that is
+    taken; optics: point spread and vignetting of the cameras as known; exposed_share: share of the
+    time from frame to frame during which the cameras are exposed."""
+
+    window_size: int = 16
+    fit_size: int = 14
+    radius: float = 0.003
+    limits: FitLimits = field(default_factory=FitLimits)
+    largest_ray_gap: float = 25.0
+    centre_error_px: float = 0.0
+    detector: str = DEFAULT_DETECTOR
+    optics: Optics = field(default_factory=Optics)
+    exposed_share: float = 0.0
+    line_error_px: float = 0.0
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """shapes (2,k,2,2): symmetric matrices A of the ellipses of k stickers in the left and the
+    right image, px, and covariances (2,k,3,3) of A_xx, A_xy, A_yy, px²."""
+
+    shapes: Array
+    covariances: Array
+
+    def selected(self, keep: NDArray[np.bool_]) -> Outlines:
+        """Select some of the stickers."""
+        return Outlines(self.shapes[:, keep], self.covariances[:, keep])
+
+
+@dataclass(frozen=True)
+class StickerObservation:
+    """k stickers seen by both cameras.
+
+    index (k,) into the body's stickers; left_pixels and right_pixels (k,2) of the sticker centres
+    in the images as they are, distorted (eccentricity removed); points (k,3) and covariances
+    (k,3,3) in the camera frame, m; pixel_variances (k,): mean variance of a coordinate of its two
+    centres, px². outlines: the ellipses' shapes, where the detector states them.
+    """
+
+    index: NDArray[np.int_]
+    left_pixels: Array
+    right_pixels: Array
+    points: Array
+    covariances: Array
+    pixel_variances: Array
+    outlines: Outlines | None = None
+
+    def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
+        """The observation with only some of its stickers."""
+        kept = {name: values[keep] for name, values in vars(self).items() if name != "outlines"}
+        return StickerObservation(
+            **kept, outlines=None if self.outlines is None else self.outlines.selected(keep)
+        )
+
+
+@runtime_checkable
+class StickerExposure(Protocol):
+    """An exposure without images: what the fit of ellipses would find in windows of them, and in
+    whole ones.
+    """
+
+    def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
+        """Detect stickers in 2k windows of ``size`` px with first pixels ``corners`` (2, k, 2)."""
+
+    def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
+        """Ellipses in the left and in the right image."""
+
+
+@runtime_checkable
+class ManyExposures(Protocol):
+    """Exposures of two cameras, each read for itself."""
+
+    def windows_of(
+        self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
+    ) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2), of
+        ``exposures`` (n,) in rising order."""
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Observer of stickers: the stereo rig and its cameras' noise as they are known, and the
+    settings of the search.
+    """
+
+    rig: StereoRig
+    noise: CameraNoise
+    settings: DetectionSettings
+
+    @property
+    def detector(self) -> Detector:
+        """Detector of the centres of stickers in windows."""
+        return find_detector(self.settings.detector)
+
+    def observe(
+        self,
+        images: StereoImages | StickerExposure,
+        camera_from_body: Array,
+        places: Array,
+        normals: Array,
+        swept: tuple[Array, Array] | None = None,
+    ) -> StickerObservation:
+        """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected
+        pose of the body.
+
+        ``swept``: camera_from_body at the beginning and at the end of the exposure, where they are
+        thought to be known.
+        """
+        return self.read(images, camera_from_body, places, normals).observed(swept)
+
+    def read(
+        self,
+        images: StereoImages | StickerExposure | ManyExposures,
+        camera_from_body: Array,
+        places: Array,
+        normals: Array,
+    ) -> StickerWindows:
+        """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near
+        an expected pose.
+
+        Of many exposures camera_from_body is (N,4,4), and sticker k of exposure j has the index j n
+        + k: all of them are looked for, fitted and triangulated like the stickers of a single one.
+        """
+        moves = [move @ camera_from_body for move in self.rig.from_camera]
+        centres = [apply_each(move, places).reshape(-1, 3) for move in moves]
+        turned = [(normals @ move[..., :3, :3].swapaxes(-1, -2)).reshape(-1, 3) for move in moves]
+        pixels, valid = self.rig.project(apply_each(camera_from_body, places).reshape(-1, 3))
+        facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
+        index = np.flatnonzero(np.all(valid & facing, axis=0))
+        exposures = index // len(places)
+        size = self.settings.window_size + 2 * self.detector.margin_px
+        corners = np.rint(pixels[:, index] - 0.5 * (size - 1)).astype(int)
+        windows: Windows = np.zeros((2, len(index), 0, 0))
+        offsets = np.zeros((2, 0, 2))
+        found = None
+        if len(index):
+            if isinstance(images, StickerExposure):
+                found = images.detected(corners, size, self)
+            elif isinstance(images, ManyExposures):
+                windows = self.evenly_lit(images.windows_of(exposures, corners, size), corners)
+            else:
+                windows = self.evenly_lit(images.windows(corners, size), corners)
+            offsets = np.stack(
+                [
+                    centre_offset(camera, c[index], t[index], self.settings.radius)
+                    for camera, c, t in zip(self.rig.cameras, centres, turned, strict=True)
+                ]
+            )
+        body = camera_from_body, places[index % len(places)], normals[index % len(places)]
+        return StickerWindows(self, index, exposures, *body, corners, windows, offsets, found)
+
+    def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
+        """Windows (2, n, size, size) with the light within each made even: that of its middle.
+
+        Only the slope of the light across a sticker would move its centre; the noise stays what it
+        is to a few per mille.
+        """
+        optics = self.settings.optics
+        black = self.noise.black_level
+        if optics.vignetting == 0.0:
+            return windows
+        size = windows.shape[-1]
+        middle = corners + 0.5 * (windows.shape[-1] - 1)
+        share = np.stack(
+            [
+                optics.window_illumination(camera, at, size)
+                / optics.illumination(camera, centre)[:, None, None]
+                for camera, at, centre in zip(self.rig.cameras, corners, middle, strict=True)
+            ]
+        )
+        return black + (windows - black) / share
+
+
+@dataclass(frozen=True)
+class StickerWindows:
+    """Grey values around the k stickers of a body that both cameras of an observer should see.
+
+    index (k,) into the body's stickers; exposures (k,) that show them, in rising order, 0 where
+    there is one; camera_from_body (4,4) or (N,4,4) near which they are expected; places (k,3) m and
+    normals (k,3) in body axes; corners (2,k,2) px of the first pixels of windows (2,k,h,h), evenly
+    lit; offsets (2,k,2) px of the ellipses' centres from those of the stickers (eccentricity).
+    found: what a detector finds in them, where there are no images; then the windows are empty.
+    """
+
+    observer: Observer
+    index: NDArray[np.int_]
+    exposures: NDArray[np.int_]
+    camera_from_body: Array
+    places: Array
+    normals: Array
+    corners: NDArray[np.int_]
+    windows: Windows
+    offsets: Array
+    found: DetectedCentres | None = None
+
+    def observed(self, swept: tuple[Array, Array] | None = None) -> StickerObservation:
+        """The stickers in these windows; ``swept`` as of ``Observer.observe``, (N,4,4) each where
+        the expected are.
+        """
+        if len(self.index) == 0:
+            none = np.zeros((0, 3))
+            return StickerObservation(
+                self.index, none[:, :2], none[:, :2], none, np.zeros((0, 3, 3)), none[:, 0]
+            )
+        settings = self.observer.settings
+        fits = self.found or self._detected()
+        if swept is not None and self.found is None:
+            fits = self._likelier(fits, swept)
+        seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
+        systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
+        spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
+        # Weighed by noise alone, rays that a wrong rig parts would meet nearer to the image that
+        # happens to be sharper.
+        parted = settings.line_error_px**2
+        moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
+        near = apply_each(moves, self.places[:, None])[:, 0]
+        left, right = seen_at
+        seen = triangulate(self.observer.rig, left, right, spread[0], spread[1], near, parted)
+        good = np.all(fits.good.reshape(2, -1), axis=0)
+        noise = 0.25 * np.einsum("ckii->k", spread)
+        outlines = _outlines(fits, settings.centre_error_px**2)
+        return StickerObservation(
+            self.index, seen_at[0], seen_at[1], seen.points, seen.covariances, noise, outlines
+        ).selected(good & (seen.ray_gap < settings.largest_ray_gap))
+
+    def ellipses(self, smears: Array | None = None) -> EllipseFits:
+        """Ellipses fitted to all 2k windows, good ones of any misfit; ``smears`` (2k,2) as of
+        ``SpotWindows``.
+        """
+        settings = self.observer.settings
+        limits = replace(settings.limits, largest_misfit=np.inf)
+        return fit_ellipses(
+            *self._flat,
+            self.observer.noise,
+            settings.fit_size,
+            limits,
+            psf_px=settings.optics.psf_px,
+            smears=smears,
+        )
+
+    @cached_property
+    def ellipses_at_rest(self) -> EllipseFits:
+        """``ellipses`` if nothing moved: streaks are told from them, and what stands still is
+        measured by them.
+        """
+        return self.ellipses()
+
+    def _detected(self, smears: Array | None = None) -> DetectedCentres:
+        """Centres that the detector finds in the windows."""
+        detector = self.observer.detector
+        noise = self.observer.noise
+        settings = self.observer.settings
+        if detector is MAXIMUM_LIKELIHOOD:
+            fits = self.ellipses_at_rest if smears is None else self.ellipses(smears)
+            return fits.within(settings.limits, noise)
+        fit_size = settings.fit_size + 2 * detector.margin_px
+        spots = SpotWindows(
+            *self._flat, noise, fit_size, settings.limits, settings.optics.psf_px, smears
+        )
+        return detector.detect(spots)
+
+    @property
+    def _flat(self) -> tuple[Windows, NDArray[np.int_]]:
+        """Windows (2k,h,h) and corners (2k,2) of both images together."""
+        return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
+
+    def _likelier(self, still: DetectedCentres, swept: tuple[Array, Array]) -> DetectedCentres:
+        """Choose what agrees better with the images of each exposure: ``still``, or what is found
+        of a body in motion.
+
+        The movement is only expected, and the platform may have stopped.
+        """
+        smears, shown = self._smears(swept)
+        if still.misfits is None or not shown.any():
+            return still
+        moving = self._selected(shown)._detected(smears[:, shown].reshape(-1, 2))
+        again = np.tile(shown, 2)
+        if moving.misfits is None:
+            return still
+        gains = (still.misfits[again] - moving.misfits).reshape(2, -1)
+        _, starts, counts = np.unique(self.exposures[shown], return_index=True, return_counts=True)
+        better = [np.median(own) > 0.0 for own in np.split(gains, starts[1:], axis=1)]
+        taken = np.tile(np.repeat(better, counts), 2)
+        return still.with_others(np.flatnonzero(again)[taken], moving, taken)
+
+    def _smears(self, swept: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
+        """Movement (2, k, 2) px of the stickers in both images during the exposure, and where it
+        counts (k,).
+
+        It does not in exposures where it is too short to show beside the point spread, or so long
+        that it cannot be told.
+        """
+        moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in swept)
+        first, last = (
+            self.observer.rig.project(apply_each(move, self.places[:, None])[:, 0])[0]
+            for move in moves
+        )
+        shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * self.observer.settings.optics.psf_px)
+        longest = np.zeros(self.exposures[-1] + 1)
+        np.maximum.at(longest, self.exposures, np.linalg.norm(last - first, axis=-1).max(axis=0))
+        return last - first, ((shortest < longest) & (longest < LONGEST_SMEAR_PX))[self.exposures]
+
+    def _selected(self, keep: NDArray[np.bool_]) -> StickerWindows:
+        """The windows of only some of the stickers."""
+        each = {
+            name: getattr(self, name)[keep] for name in ("index", "exposures", "places", "normals")
+        }
+        both = {name: getattr(self, name)[:, keep] for name in ("corners", "windows", "offsets")}
+        return replace(self, **each, **both)
+
+
+def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
+    """Tell whether a camera sees stickers with centres (n,3) m and normals (n,3), camera axes, not
+    at grazing incidence.
+    """
+    return np.asarray(
+        -np.einsum("ni,ni->n", centres, normals) > GRAZING * np.linalg.norm(centres, axis=1)
+    )
+
+
+def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
+    """Shapes of both images' ellipses; ``systematic`` px²: variance of a rim's place that is not
+    noise.
+    """
+    if fits.shapes is None or fits.shape_covariances is None:
+        return None
+    spread = fits.shape_covariances.reshape(2, -1, 3, 3) + systematic * np.eye(3)
+    return Outlines(fits.shapes.reshape(2, -1, 2, 2), spread)

@@ -1,0 +1,317 @@
+"""From one stereo frame to a measurement (paper eq. 27 and 28). Knows nothing of true poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cmmsim.checks import finite_array, require_kind
+from cmmsim.detection.detector import FitLimits
+from cmmsim.detection.ellipse_fit import EllipseFits
+from cmmsim.errors import LostError, ShapeError, UnknownOptionError
+from cmmsim.files.setup import MarkedBody
+from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points, frames_of_points
+from cmmsim.geometry.pose import (
+    Array,
+    compose_covariance,
+    invert,
+    pose_covariance,
+    poses_of,
+    skew,
+)
+from cmmsim.geometry.registration import register
+from cmmsim.measuring.frame_solver import SolvedFrames, consistent
+from cmmsim.measuring.layout_search import (
+    ENOUGH,
+    FEWEST_TAUGHT,
+    bright_ellipses,
+    candidate_points,
+    find_layout,
+)
+from cmmsim.measuring.measurement import Measurement, lost_measurement
+from cmmsim.measuring.observation import Observer, StickerObservation
+from cmmsim.measuring.streaks import drawn_out, find_streaks
+from cmmsim.measuring.taught import Taught
+from cmmsim.radiometry.stereo_images import FrameImages, StereoFrame, StereoImages
+
+Solution = tuple[Array, Array, StickerObservation]
+
+
+def by_registration(observation: StickerObservation, places: Array) -> Solution:
+    """camera_from_body (4,4), its covariance (6,6) and the stickers used, by a rigid fit of taught
+    ``places`` (n,3).
+
+    Raises LostError with fewer than three stickers off one line.
+    """
+    result = register(places[observation.index], observation.points, observation.covariances)
+    return result.transform, result.covariance, observation
+
+
+def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array) -> Solution:
+    """camera_from_body (4,4), its covariance (6,6) and the stickers used, by intersecting the three
+    sticker planes.
+
+    ``towards`` (3,3): rough normals of planes A, B, C in the camera frame. Raises LostError that
+    names the plane.
+    """
+    frame, covariance = frame_of_points(
+        observation.points, observation.covariances, body.plane_index[observation.index], towards
+    )
+    planes_from_body = _planes_from(body)
+    return (
+        frame @ planes_from_body,
+        move_origin(frame, covariance, planes_from_body[:3, 3]),
+        observation,
+    )
+
+
+def frames_by_planes(body: MarkedBody, points: Array, covariances: Array, towards: Array) -> Array:
+    """camera_from_body (...,4,4) as of ``by_planes`` where all stickers of a body are at points
+    (..., n, 3) with covariances (..., n, 3, 3); ``towards`` (..., 3, 3)."""
+    return frames_of_points(points, covariances, body.plane_index, towards)[0] @ _planes_from(body)
+
+
+def _planes_from(body: MarkedBody) -> Array:
+    """planes_from_body (4,4)."""
+    return invert(frame_from_planes(body.normals, body.offsets))
+
+
+def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
+    """Covariance (6,6) of [dt, dphi] for another origin of the same rigid frame, ``origin`` (3,) in
+    its own axes.
+    """
+    lever = np.eye(6)
+    lever[:3, 3:] = -skew(frame[:3, :3] @ origin)
+    return lever @ covariance @ lever.T
+
+
+METHODS: tuple[str, ...] = ("registration", "planes")
+NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
+# m: taught places are known to microns, points in a whole image to tenths of a millimetre
+TAUGHT_TOLERANCE = 0.0005
+FEWEST_NOMINAL = 6  # stickers by whose nominal places a body is found
+
+
+@dataclass(frozen=True)
+class PoseEstimator(Observer):
+    """Everything that turns images into poses: an observer, the platform, and what was taught of
+    it.
+
+    common_covariance: (6,6) that all poses have in common at a pose (6,); None: what teaching left.
+    """
+
+    platform: MarkedBody
+    taught: Taught
+    method: str = "registration"
+    common_covariance: Callable[[Array], Array] | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UnknownOptionError("method", self.method, METHODS)
+
+    def __repr__(self) -> str:
+        return (
+            f"PoseEstimator({self.method}, {len(self.platform.sticker_ids)} stickers, {self.rig!r})"
+        )
+
+    def locate(self, images: StereoImages) -> Array:
+        """Rough camera_from_platform (4,4) from whole images, without prior. Raises LostError.
+
+        Where the cameras are exposed for some time and many stickers are missing, streaks are
+        looked for as well.
+        """
+        ellipses = bright_ellipses(images, self)
+        limits = self.settings.limits
+        if self.settings.exposed_share == 0.0:
+            return self._found(ellipses, limits)[0]
+        streaks = replace(limits, largest_misfit=np.inf)
+        try:
+            found, count = self._found(ellipses, limits)
+        except LostError:
+            return self._found(ellipses, streaks)[0]
+        if count >= ENOUGH * len(self.taught.platform_places):
+            return found
+        try:
+            longer, more = self._found(ellipses, streaks)
+        except LostError:
+            return found
+        return longer if more > count else found
+
+    def measure(
+        self, images: StereoImages, expected: Array, swept: tuple[Array, Array] | None = None
+    ) -> tuple[Measurement, Array]:
+        """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises
+        LostError.
+
+        ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are
+        smeared over more than half a pixel and it is not told, a pose without point spread is worse
+        than its covariance: ``measure_anew``.
+        """
+        return self.measured(self.observe(images, expected, *self._stickers, swept), expected)
+
+    def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
+        """As ``measure`` where nothing is known of the movement: it is told from the streaks of the
+        stickers.
+
+        Raises LostError, which states the length of the streaks where they show.
+        """
+        if self.settings.exposed_share == 0.0:
+            return self.measure(images, expected)
+        read = self.read(images, expected, *self._stickers)
+        streaks = None if read.found is not None else find_streaks(read)
+        try:
+            seen = read.observed(None if streaks is None else streaks.swept)
+            return self.measured(seen, expected)
+        except LostError as error:
+            if streaks is None:
+                raise
+            raise LostError(f"{error}; {drawn_out(streaks.longest_px)}") from error
+
+    @property
+    def _stickers(self) -> tuple[Array, Array]:
+        """Taught places (n,3), m, and normals (n,3) of the platform's stickers, in its axes."""
+        return self.taught.platform_places, self.platform.sticker_normals
+
+    def _found(
+        self, ellipses: tuple[EllipseFits, EllipseFits], limits: FitLimits
+    ) -> tuple[Array, int]:
+        """Rough camera_from_platform (4,4) and the number of stickers that were recognised. Raises
+        LostError.
+        """
+        points = candidate_points(ellipses, self, limits)
+        place, stickers, _ = find_layout(
+            self.taught.platform_places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT, "platform"
+        )
+        return place, len(stickers)
+
+    def measured(self, seen: StickerObservation, near: Array) -> tuple[Measurement, Array]:
+        """Measurement from stickers near an expected camera_from_platform (4,4), and the measured
+        one. Raises LostError.
+        """
+        places = self.taught.platform_places
+        used, move, covariance = consistent(seen, near, self, self.platform, places)
+        return self._measured(used, move, covariance)
+
+    def measurement_of(self, solved: SolvedFrames, frame: int) -> Measurement:
+        """Measurement from one of several frames, or a lost one."""
+        if solved.lost[frame]:
+            return lost_measurement(solved.reason(frame))
+        used = solved.of(frame)
+        try:
+            return self._measured(used, solved.moves[frame], solved.covariances[frame])[0]
+        except LostError as error:
+            return lost_measurement(str(error))
+
+    def _measured(
+        self, used: StickerObservation, move: Array, covariance: Array
+    ) -> tuple[Measurement, Array]:
+        if self.method == "planes":
+            towards = self.platform.normals @ move[:3, :3].T
+            move, covariance, used = by_planes(used, self.platform, towards)
+        pose, spread = self.in_base(move, covariance)
+        return self.measurement(pose, spread, used), move
+
+    def in_base(self, moves: Array, covariances: Array) -> tuple[Array, Array]:
+        """Poses (..., 6) of the platform in the base frame, and their covariances (..., 6, 6).
+
+        ``moves`` (..., 4, 4) are camera_from_platform, ``covariances`` those of its small errors.
+        """
+        base_from_camera = self.taught.base_from_camera
+        base_from_platform = base_from_camera @ moves
+        spread = pose_covariance(
+            base_from_platform, compose_covariance(base_from_camera, covariances)
+        )
+        return poses_of(base_from_platform), spread
+
+    def measurement(self, pose: Array, covariance: Array, used: StickerObservation) -> Measurement:
+        """Measurement of a pose (6,) in the base frame that rests on stickers."""
+        return Measurement(
+            pose,
+            covariance,
+            used.points,
+            used.covariances,
+            used.left_pixels,
+            used.right_pixels,
+            self.platform.sticker_ids[used.index],
+            True,
+            common_at=self.common_at,
+            pixel_variances=used.pixel_variances,
+        )
+
+    def common_at(self, pose: Array) -> Array:
+        """Covariance (6,6) that all poses have in common at a pose (6,)."""
+        if self.common_covariance is None:
+            return self.taught.calibration_covariance(pose, self.method)
+        return self.common_covariance(pose)
+
+
+def measure_frame(
+    frame: StereoFrame, estimator: PoseEstimator, expected: Array | None = None
+) -> Measurement:
+    """Measure a stereo frame from any source.
+
+    Parameters
+    ----------
+    frame : StereoFrame
+        Both images.
+    estimator : PoseEstimator
+        Such as ``sensor.estimator``.
+    expected : array_like, shape (4, 4), optional
+        Rough camera_from_platform. Without it, stickers are searched in the whole images.
+
+    Returns
+    -------
+    Measurement
+        Lost, with a reason, where the images show too little.
+
+    Raises
+    ------
+    ShapeError
+        If the images have another size or bit depth than the estimator's cameras.
+    CmmError
+        If the arguments are no frame and no estimator.
+
+    Examples
+    --------
+    >>> import cmmsim
+    >>> sensor = cmmsim.load_sensor("ctrack780", renderer="analytic")
+    >>> known = cmmsim.load_sensor("ctrack780", renderer="analytic", taught=sensor.truth)
+    >>> measure_frame(known.capture(known.home), known.estimator).ok
+    True
+    """
+    require_kind(frame, StereoFrame, "a frame must be a StereoFrame(left, right)")
+    require_kind(
+        estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator"
+    )
+    require_fitting(frame, estimator)
+    if expected is not None:
+        expected = finite_array(
+            expected, (4, 4), "the expected camera_from_platform must be (4,4) and finite"
+        )
+    images = FrameImages(frame)
+    try:
+        return estimator.measure_anew(
+            images, estimator.locate(images) if expected is None else expected
+        )[0]
+    except LostError as error:
+        return lost_measurement(str(error))
+
+
+def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
+    """Raise ShapeError for images of another size or bit depth than the estimator's cameras
+    have."""
+    for name, image, camera in zip(
+        ("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True
+    ):
+        if image.shape != (camera.height, camera.width):
+            raise ShapeError(
+                f"the {name} image is {image.shape[1]} x {image.shape[0]} px, but its camera has "
+                f"{camera.width} x {camera.height} px"
+            )
+        if image.dtype != estimator.noise.image_type:
+            raise ShapeError(
+                f"the {name} image is {image.dtype}, but the camera's bit_depth "
+                f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}"
+            )

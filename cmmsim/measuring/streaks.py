@@ -1,0 +1,322 @@
+"""Movement of a body during an exposure, told from the streaks into which its stickers are drawn
+out.
+
+A disc that moves by d px while the shutter is open is drawn out: the second moments of its light
+grow by d d' / 12, and those of an ellipse with matrix A are A A / 4. With the ellipse A_0 that the
+sticker would show at rest, its apparent one therefore fulfils
+
+    A A = A_0 A_0 + d d' / 3.
+
+All stickers of a rigid body share one small movement w (6,), d = P w, which is found by least
+squares over both images. An ellipse is fitted to a streak only roughly, so the fit is repeated with
+the light of the ellipse moving by the d that was found, and what is then missing of A A is added to
+d d' / 3, until d settles. Streaks do not tell forth from back; the middle of the exposure, for
+which a pose stands, is the same for both.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from cmmsim.detection.ellipse_fit import EllipseFits
+from cmmsim.errors import LostError
+from cmmsim.geometry.disc_image import sticker_outlines
+from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.measuring.observation import LONGEST_SMEAR_PX, StickerWindows
+
+CHANCE = 1e-4  # of stickers at rest to be taken for streaks
+FEWEST = 8  # ellipses in both images together: four stickers
+# of one ellipse that counts: a partly hidden sticker is no streak
+LARGEST_MISFIT = float(chi2.isf(CHANCE, 3))
+ROUNDS = 8  # at most
+SETTLED_PX = 0.05  # far below what moves a centre or shows in an ellipse
+REWEIGHTED = 5  # times that the start is found anew
+TINY_PX2 = 1e-6
+SMALLEST_SHARE = (
+    1e-2  # of the best determined combination of movements, below which the start leaves one out
+)
+UNIT = 1e-4  # m or rad, of the movements by which projections are differentiated
+
+
+@dataclass(frozen=True)
+class Streaks:
+    """swept: camera_from_body (4,4) at one and the other end of the exposure, in unknown order;
+    longest_px: of the stickers' movements in the images."""
+
+    swept: tuple[Array, Array]
+    longest_px: float
+
+
+@dataclass(frozen=True)
+class _Ellipses:
+    """Ellipses fitted while their light moves by ``smears`` (k,2) px: what movement and rest must
+    explain.
+
+    excess (k,3) px²: xx, xy, yy of A A - A_0 A_0 + d d' / 3; whiten (k,3,3) turns its noise into
+    unit matrices; bright (k,), and good (k,) where they lie wholly inside of their windows, too.
+    """
+
+    smears: Array
+    excess: Array
+    whiten: Array
+    bright: NDArray[np.bool_]
+    good: NDArray[np.bool_]
+
+    @property
+    def misfit(self) -> float:
+        """Sum of squared misfits with the smears, each as far as a sticker that is wholly seen
+        explains it.
+
+        An ellipse that is not good counts like the worst, so that none is explained by being lost.
+        """
+        return float(
+            np.where(
+                self.good, np.minimum(self._squared_misfits, LARGEST_MISFIT), LARGEST_MISFIT
+            ).sum()
+        )
+
+    @property
+    def explained(self) -> bool:
+        """True if nothing but noise is left in the good ones."""
+        return bool(
+            self._squared_misfits[self.good].sum()
+            < chi2.isf(CHANCE, 3 * np.count_nonzero(self.good))
+        )
+
+    @property
+    def _squared_misfits(self) -> Array:
+        left = self.excess - _entries(_outer(self.smears)) / 3.0
+        return np.asarray((np.einsum("kij,kj->ki", self.whiten, left) ** 2).sum(axis=1))
+
+    @property
+    def longest_px(self) -> float:
+        """Length of the longest smear."""
+        return float(np.linalg.norm(self.smears, axis=1).max())
+
+
+def find_streaks(read: StickerWindows) -> Streaks | None:
+    """The movement during the exposure of the body whose stickers were read; None where none shows.
+
+    Raises LostError where the streaks are longer than can be measured.
+    """
+    observer = read.observer
+    places = read.places
+    rig = observer.rig
+    settings = observer.settings
+    shapes = sticker_outlines(rig, read.camera_from_body, places, read.normals, settings.radius)[1]
+    at_rest = shapes.reshape(-1, 2, 2)
+
+    def compared(smears: Array, fits: EllipseFits) -> _Ellipses:
+        squares, whiten = _squares(fits, settings.centre_error_px**2)
+        added = _entries(_outer(smears)) / 3.0
+        excess = squares - _entries(at_rest @ at_rest) + added
+        return _Ellipses(
+            smears, excess, whiten, fits.contrast >= settings.limits.smallest_contrast, fits.good
+        )
+
+    def fit(smears: Array) -> _Ellipses:
+        return compared(smears, read.ellipses(smears))
+
+    still = compared(np.zeros((2 * len(places), 2)), read.ellipses_at_rest)
+    if np.count_nonzero(still.good) < FEWEST:
+        _require_short(still)
+        return None
+    middle = places.mean(axis=0)
+    by_movement = _pixels_by_movement(rig, read.camera_from_body, places, middle)
+    found = _movement_and_ellipses(still, fit, by_movement)
+    if found is None:
+        _require_short(still)
+        return None
+    if still.misfit - found[1].misfit < chi2.isf(CHANCE, 6):
+        return None
+    movement, ellipses = found
+    if ellipses.longest_px > LONGEST_SMEAR_PX:
+        raise LostError(drawn_out(ellipses.longest_px))
+    ends = [read.camera_from_body @ _moved(share * movement, middle) for share in (-0.5, 0.5)]
+    return Streaks((ends[0], ends[1]), ellipses.longest_px)
+
+
+def drawn_out(length_px: float) -> str:
+    """In words how long the streaks are, and how long they may be."""
+    return (
+        f"the exposure draws stickers out over {length_px:.1f} px, at most "
+        f"{LONGEST_SMEAR_PX:.1f} px can be measured"
+    )
+
+
+def _require_short(still: _Ellipses) -> None:
+    """Raise LostError where what is bright is drawn out beyond its windows, by what is seen of it
+    there.
+    """
+    if np.count_nonzero(still.bright) < FEWEST:
+        return
+    squares = 3.0 * still.excess[still.bright][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    length = float(np.sqrt(max(np.median(np.linalg.eigvalsh(squares)[:, -1]), 0.0)))
+    if length > LONGEST_SMEAR_PX:
+        raise LostError(drawn_out(length))
+
+
+def _movement_and_ellipses(
+    still: _Ellipses, fit: Callable[[Array], _Ellipses], by_movement: Array
+) -> tuple[Array, _Ellipses] | None:
+    """The movement (6,) about the stickers' middle that explains all ellipses, or else most, and
+    the ellipses fitted with it; None where too few are left."""
+    best: tuple[Array, _Ellipses] | None = None
+    for movement in _fitted_movements(still, by_movement, _starts(still, by_movement)):
+        found = _settled(movement, fit, by_movement)
+        if found is not None and (best is None or found[1].misfit < best[1].misfit):
+            best = found
+        if best is not None and best[1].explained:
+            break
+    return best
+
+
+def _settled(
+    movement: Array, fit: Callable[[Array], _Ellipses], by_movement: Array
+) -> tuple[Array, _Ellipses] | None:
+    """A movement (6,) once fits of ellipses that move with it change it no more, and these
+    ellipses.
+
+    None where too few are left. One that is longer than can be measured is given back as it is, one
+    far beyond cut.
+    """
+    longest = float(np.linalg.norm(by_movement @ movement, axis=1).max())
+    movement = movement * min(1.0, 2.0 * LONGEST_SMEAR_PX / max(longest, LONGEST_SMEAR_PX))
+    ellipses = fit(by_movement @ movement)
+    for _ in range(ROUNDS):
+        if np.count_nonzero(ellipses.good) < FEWEST:
+            return None
+        if ellipses.longest_px > LONGEST_SMEAR_PX:
+            break
+        movement = _fitted_movements(ellipses, by_movement, [movement])[0]
+        before = ellipses
+        ellipses = fit(by_movement @ movement)
+        if np.abs(ellipses.smears - before.smears).max() < SETTLED_PX:
+            break
+    return movement, ellipses
+
+
+def _moved(movement: Array, middle: Array) -> Array:
+    """Transform (4,4) of a movement (6,), shift and rotation vector, of a body about the point
+    ``middle`` (3,).
+    """
+    turn = rotation_exp(movement[3:])
+    return rigid(turn, movement[:3] + middle - turn @ middle)
+
+
+def _pixels_by_movement(
+    rig: StereoRig, camera_from_body: Array, places: Array, middle: Array
+) -> Array:
+    """Derivatives (2k, 2, 6) of the pixels of k stickers in both images by a movement about
+    ``middle`` (3,).
+    """
+    columns = [
+        np.subtract(
+            *(
+                rig.project(apply(camera_from_body @ _moved(sign * unit, middle), places))[0]
+                for sign in (0.5, -0.5)
+            )
+        )
+        / UNIT
+        for unit in UNIT * np.eye(6)
+    ]
+    return np.stack(columns, axis=-1).reshape(-1, 2, 6)
+
+
+def _entries(matrices: Array) -> Array:
+    """The entries xx, xy, yy (..., 3) of symmetric matrices (..., 2, 2)."""
+    return matrices[..., [0, 0, 1], [0, 1, 1]]
+
+
+def _outer(smears: Array) -> Array:
+    return smears[..., :, None] * smears[..., None, :]
+
+
+def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
+    """Entries (k,3) px² of A A and the matrices (k,3,3) that whiten them; ``systematic`` px² of A
+    that is not noise.
+    """
+    xx, xy, yy = _entries(fits.shapes).T
+    zero = np.zeros_like(xx)
+    by_shape = np.stack(
+        [
+            np.stack(row, axis=-1)
+            for row in ((2.0 * xx, 2.0 * xy, zero), (xy, xx + yy, xy), (zero, 2.0 * xy, 2.0 * yy))
+        ],
+        axis=1,
+    )
+    spread = by_shape @ (fits.shape_covariances + systematic * np.eye(3)) @ by_shape.swapaxes(1, 2)
+    return _entries(fits.shapes @ fits.shapes), np.linalg.inv(np.linalg.cholesky(spread))
+
+
+def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:
+    """Movements (6,) from which to search: of any kind, without rotation, and without shift.
+
+    With wrong signs between stickers that all move along the same line, a search from one of them
+    alone may end beside the movement that explains all.
+    """
+    starts = []
+    for free in (slice(0, 6), slice(0, 3), slice(3, 6)):
+        start = np.zeros(6)
+        start[free] = _linear_movement(by_movement[still.good][..., free], still.excess[still.good])
+        starts.append(start)
+    return starts
+
+
+def _linear_movement(by_movement: Array, excess: Array) -> Array:
+    """The movement w (m,) whose w w' is nearest to the symmetric matrix that explains (k,3) px²
+    best.
+
+    An ellipse that went astray on its streak is far from what the others say, and counts less each
+    time.
+    """
+    scale = np.sqrt((by_movement**2).sum(axis=(0, 1)))
+    scaled = by_movement / scale
+    rows, columns = np.triu_indices(len(scale))
+    products = scaled[:, :, None, rows] * scaled[:, None, :, columns]
+    products = (
+        0.5 * (products + products.swapaxes(1, 2)) * np.where(rows == columns, 1.0, 2.0) / 3.0
+    )
+    design = np.stack([products[:, 0, 0], products[:, 0, 1], products[:, 1, 1]], axis=1)
+    weights = np.ones((len(excess), 1))
+    entries = np.zeros(len(rows))
+    for _ in range(REWEIGHTED):
+        entries = np.linalg.lstsq(
+            (weights[..., None] * design).reshape(-1, len(rows)),
+            (weights * excess).ravel(),
+            rcond=SMALLEST_SHARE,
+        )[0]
+        left = ((excess - design @ entries) ** 2).sum(axis=1, keepdims=True)
+        weights = 1.0 / (1.0 + left / max(float(np.median(left)), TINY_PX2))
+    found = np.zeros((len(scale), len(scale)))
+    found[rows, columns] = found[columns, rows] = entries
+    squares, axes = np.linalg.eigh(found)
+    return np.asarray(axes[:, -1] * np.sqrt(max(squares[-1], 0.0)) / scale)
+
+
+def _fitted_movements(ellipses: _Ellipses, by_movement: Array, starts: list[Array]) -> list[Array]:
+    """The movements (6,) found from each start that explain the good ellipses of whole stickers,
+    the best one first; partly hidden stickers count little."""
+    by_movement, excess, whiten = (
+        values[ellipses.good] for values in (by_movement, ellipses.excess, ellipses.whiten)
+    )
+    scale = np.sqrt((by_movement**2).sum(axis=(0, 1)))
+
+    def residuals(scaled: Array) -> Array:
+        left = excess - _entries(_outer(by_movement @ (scaled / scale))) / 3.0
+        return np.asarray(np.einsum("kij,kj->ki", whiten, left).ravel())
+
+    rough = max(1.0, min(float(np.median(np.abs(residuals(start * scale)))) for start in starts))
+    found = [
+        least_squares(residuals, start * scale, loss="cauchy", f_scale=3.0 * rough)
+        for start in starts
+    ]
+    return [
+        np.asarray(result.x / scale)
+        for result in sorted(found, key=lambda result: float(result.cost))
+    ]

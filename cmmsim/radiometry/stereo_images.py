@@ -1,0 +1,143 @@
+"""Images as the estimator gets them: whole stereo frames, or windows read out of them."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.checks import require_kind
+from cmmsim.errors import ShapeError
+from cmmsim.radiometry.noise import GreyImage, cut_windows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SHOWN_WIDTH_PX = 1600  # of the picture in a notebook
+Windows = GreyImage | NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """left and right: grey images (height, width) taken at the same time, uint8, or uint16 of more
+    than 8 bit.
+    """
+
+    left: GreyImage
+    right: GreyImage
+
+    def __post_init__(self) -> None:
+        for name in ("left", "right"):
+            image = getattr(self, name)
+            if not isinstance(image, np.ndarray):
+                raise ShapeError(
+                    f"the {name} image must be an array (height, width), got {type(image).__name__}"
+                )
+            if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+                raise ShapeError(
+                    f"the {name} image must be (height, width) uint8 or uint16, got {image.shape} "
+                    f"{image.dtype}"
+                )
+
+    def __repr__(self) -> str:
+        height, width = self.left.shape
+        return f"StereoFrame(two images of {width} x {height} px, {self.left.dtype})"
+
+    def show(self) -> Figure | None:
+        """Show both images side by side.
+
+        A notebook shows a picture. Elsewhere a window of Matplotlib opens.
+
+        Returns
+        -------
+        matplotlib.figure.Figure or None
+            The figure, to be saved, where there is no display; else None.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> image = np.zeros((30, 40), dtype=np.uint8)
+        >>> figure = StereoFrame(image, image).show()
+        """
+        if _in_notebook():
+            from IPython.display import display  # type: ignore[import-not-found]
+
+            display(self)
+            return None
+        from matplotlib import pyplot  # late, as it takes time to import
+
+        figure, axes = pyplot.subplots(1, 2, figsize=(12.0, 5.0), layout="constrained")
+        for axis, name, image in zip(axes, ("left", "right"), (self.left, self.right), strict=True):
+            axis.imshow(image, cmap="gray", vmin=0)
+            axis.set(title=f"{name} image", xlabel="x [px]", ylabel="y [px]")
+        if figure.canvas.required_interactive_framework is None:
+            pyplot.close(figure)
+            return figure
+        pyplot.show()
+        return None
+
+    def _repr_png_(self) -> bytes:
+        """Both images side by side as a PNG, made smaller where they are large."""
+        import cv2  # late, as it takes time to import
+
+        highest = max(self.left.max(), self.right.max(), 255)
+        both = np.hstack([self.left, self.right]) * (255.0 / highest)
+        share = min(1.0, SHOWN_WIDTH_PX / both.shape[1])
+        size = round(share * both.shape[1]), round(share * both.shape[0])
+        smaller = cv2.resize(both, size, interpolation=cv2.INTER_AREA)
+        return cv2.imencode(".png", np.rint(smaller).astype(np.uint8))[1].tobytes()
+
+
+def _in_notebook() -> bool:
+    """Tell whether a notebook runs this."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return shell is not None and hasattr(shell, "kernel")
+
+
+@runtime_checkable
+class StereoImages(Protocol):
+    """One exposure of two cameras that can be read whole or in parts."""
+
+    def full(self) -> StereoFrame:
+        """Both whole images."""
+
+    def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x,
+        y).
+        """
+
+
+class FrameImages:
+    """Windows cut out of a stereo frame; outside of the image they repeat its edge."""
+
+    def __init__(self, frame: StereoFrame) -> None:
+        self._frame = frame
+
+    def full(self) -> StereoFrame:
+        """Both whole images."""
+        return self._frame
+
+    def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x,
+        y).
+        """
+        sides = zip((self._frame.left, self._frame.right), corners, strict=True)
+        return np.stack([cut_windows(image, first, size) for image, first in sides])
+
+
+def readable(images: StereoImages | StereoFrame) -> StereoImages:
+    """Images that can be read in parts, those of a whole frame too. Raises CmmError for anything
+    else.
+    """
+    if isinstance(images, StereoFrame):
+        return FrameImages(images)
+    require_kind(
+        images,
+        StereoImages,
+        "images must be a StereoFrame(left, right) or what sensor.look returns",
+    )
+    return images

@@ -1,1 +1,0 @@
-"""Exposures without images: which stickers a detector would find in them, where, and with which covariance."""

@@ -1,0 +1,228 @@
+"""The watch itself: takes measurements frame after frame, and says what it has found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from cmmsim.errors import CmmError, LostError
+from cmmsim.geometry.pose import Array
+from cmmsim.measuring.frame_solver import consistent
+from cmmsim.measuring.measurement import Measurement
+from cmmsim.measuring.observation import Observer, StickerObservation
+from cmmsim.radiometry.stereo_images import StereoImages
+from cmmsim.uncertainty.common_errors import MeasuringGeometry
+from cmmsim.uncertainty.drift_blocks import RIG, Sightings, base_rows, platform_rows, stacked
+from cmmsim.uncertainty.drift_evidence import SIZES, Evidence
+from cmmsim.uncertainty.drift_finding import Finding, movements, unseen_directions
+from cmmsim.uncertainty.known_rig import KnownRig
+
+CHANCE = 0.01  # of a false alarm in a run
+BLOCK = 6  # frames at most whose residuals are averaged before they count
+TOGETHER = (
+    64  # blocks that are counted at once, so that a long run takes no more memory than a short one
+)
+FEWEST = 4  # stickers of a frame that can say something
+TAUGHT_OFFSET_PX = 3e-4
+"""What teaching and the image of a sticker leave of a centre, the same while it stands still."""
+
+
+class DriftWatch:
+    """Tells from measurements whether the rig still is as it was calibrated and taught.
+
+    Parameters: geometry that is known; known: how well its rig is, None for exactly; frame_period
+    s; chance of a false alarm in a run, however long; offset_px: what a centre may be off for
+    reasons that are not noise; base: whether the base's stickers are given as well. Raises CmmError
+    for a chance that is none.
+    """
+
+    def __init__(
+        self,
+        geometry: MeasuringGeometry,
+        known: KnownRig | None = None,
+        frame_period: float = 1.0 / 60.0,
+        chance: float = CHANCE,
+        offset_px: float = 0.0,
+        base: bool = False,
+    ) -> None:
+        if not 0.0 < chance < 1.0:
+            raise CmmError(f"the chance of a false alarm lies between 0 and 1, got {chance!r}")
+        self.geometry = geometry
+        self.chance = chance
+        self.watches_base = base
+        self._period = frame_period
+        self._known = known
+        self._offset_std = float(np.hypot(offset_px, TAUGHT_OFFSET_PX))
+        self._threads = ThreadpoolController()
+        self.restart()
+
+    def restart(self) -> None:
+        """A new run begins; what was found is forgotten."""
+        taught = self.geometry.taught
+        known = self._known
+        centres = len(taught.platform_places) + (
+            len(taught.base_places) if self.watches_base else 0
+        )
+        covariance = (
+            np.zeros((RIG, RIG))
+            if known is None
+            else known.covariance / np.outer(SIZES[:RIG], SIZES[:RIG])
+        )
+        values, vectors = np.linalg.eigh(covariance)
+        kept = values > 1e-12 * max(float(values[-1]), 1e-300)
+        delay_std = 0.0 if known is None else known.exposure_std
+        offsets = np.full(4 * centres, self._offset_std)
+        calibration = vectors[:, kept] * np.sqrt(values[kept])
+        self._evidence = Evidence(calibration, delay_std, offsets, self.watches_base)
+        self._frames = self._counted = self._judged = 0
+        self._platform: Sightings | None = None
+        self._base: Sightings | None = None
+        self._blocks: list[_Block] = []
+        self._largest = 0.0
+        self._noticed: int | None = None
+
+    def look(self, measurement: Measurement, images: StereoImages, observer: Observer) -> None:
+        """The next frame, as ``add``: the base's stickers are looked for in its images where they
+        are watched.
+        """
+        self.add(
+            measurement, self._base_in(images, observer) if len(measurement.target_ids) else None
+        )
+
+    def _base_in(self, images: StereoImages, observer: Observer) -> StickerObservation | None:
+        """The base's stickers in a frame; None where nobody watches them, or too few agree."""
+        if not self.watches_base:
+            return None
+        body = self.geometry.base
+        places = self.geometry.taught.base_places
+        near = self.geometry.camera_from_base
+        seen = observer.observe(images, near, places, body.sticker_normals)
+        try:
+            return consistent(seen, near, observer, body, places)[0]
+        except LostError:
+            return None
+
+    def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
+        """The next frame; a lost one, or one without stickers, says nothing but that time passes.
+        base: what is seen of the base's stickers."""
+        time = self._frames * self._period
+        self._frames += 1
+        if not measurement.ok or len(measurement.target_ids) < FEWEST:
+            return
+        self._judged += 1
+        if not self._goes_on(measurement, base):
+            self._close(self._frames - 1)
+            self._begin(measurement, base)
+        assert self._platform is not None
+        pixels = measurement.left_pixels, measurement.right_pixels
+        self._platform.add(time, measurement.pose, pixels, measurement.pixel_variances)
+        if self._base is not None and base is not None:
+            pixels = base.left_pixels, base.right_pixels
+            self._base.add(time, np.zeros(6), pixels, base.pixel_variances)
+        if len(self._platform.times) == BLOCK:
+            self._close(self._frames)
+
+    @property
+    def finding(self) -> Finding:
+        """Finding from the frames since the last ``restart``."""
+        self._close(self._frames)
+        self._count()
+        told = self._evidence.told
+        moved, share = movements(told) if self._noticed is not None else ((), 0.0)
+        return Finding(
+            None if self._noticed is None else self._noticed * self._period,
+            self._noticed,
+            self._largest,
+            float(-np.log(self.chance)),
+            self.chance,
+            self._frames,
+            self._judged,
+            moved,
+            share,
+            self._noticed is not None and told.from_start,
+            unseen_directions(self._evidence.sensitivity),
+        )
+
+    def _goes_on(self, measurement: Measurement, base: StickerObservation | None) -> bool:
+        """Tell whether the same stickers are seen as in the frames that wait to be counted."""
+        if self._platform is None or not np.array_equal(self._platform_ids, measurement.target_ids):
+            return False
+        seen = None if base is None or not self.watches_base else base.index
+        if self._base is None or seen is None:
+            return self._base is None and seen is None
+        return np.array_equal(self._base.index, seen)
+
+    def _begin(self, measurement: Measurement, base: StickerObservation | None) -> None:
+        """Have frames with these stickers wait to be counted."""
+        taught = self.geometry.taught
+        self._platform_ids = measurement.target_ids
+        index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
+        camera_from_base = self.geometry.camera_from_base
+        self._platform = Sightings(index, taught.platform_places[index], camera_from_base)
+        self._base = None
+        if base is not None and self.watches_base:
+            self._base = Sightings(base.index, taught.base_places[base.index], camera_from_base)
+
+    def _close(self, end: int) -> None:
+        """Have the frames that wait be a block, after so many frames of the run."""
+        if self._platform is None:
+            return
+        self._blocks.append(_Block(self._platform, self._base, end))
+        self._platform = self._base = None
+        if len(self._blocks) == TOGETHER:
+            self._count()
+
+    def _count(self) -> None:
+        """Count the blocks. Matrices are small: a second thread of the BLAS takes ten times as
+        long.
+        """
+        with self._threads.limit(limits=1, user_api="blas"):
+            for block, products in zip(self._blocks, self._products(), strict=True):
+                self._evidence.step(products, block.end - self._counted)
+                ratio = self._evidence.log_ratio
+                self._counted = block.end
+                self._largest = max(self._largest, ratio)
+                if self._noticed is None and ratio > -np.log(self.chance):
+                    self._noticed = block.end - 1
+        self._blocks.clear()
+
+    def _products(self) -> list[Array]:
+        """Products of each block, as the evidence takes them; those with the same stickers
+        together.
+        """
+        alike: dict[tuple[bytes, bytes | None], list[int]] = {}
+        for number, block in enumerate(self._blocks):
+            alike.setdefault(block.stickers, []).append(number)
+        found: dict[int, Array] = {}
+        taught = self.geometry.taught
+        centres = len(taught.platform_places), len(taught.base_places)
+        for numbers in alike.values():
+            rows = [
+                platform_rows(self.geometry, [self._blocks[number].platform for number in numbers])
+            ]
+            bases = [base for number in numbers if (base := self._blocks[number].base) is not None]
+            if bases:
+                rows.append(base_rows(self.geometry, bases))
+            products = self._evidence.products(stacked(rows, centres[: 1 + self.watches_base]))
+            found |= dict(zip(numbers, products, strict=True))
+        return [found[number] for number in range(len(self._blocks))]
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Frames with the same stickers: what was seen of the platform, and of the base where somebody
+    watched it; end: how many frames of the run had passed."""
+
+    platform: Sightings
+    base: Sightings | None
+    end: int
+
+    @property
+    def stickers(self) -> tuple[bytes, bytes | None]:
+        """Says which they are."""
+        return (
+            self.platform.index.tobytes(),
+            None if self.base is None else self.base.index.tobytes(),
+        )

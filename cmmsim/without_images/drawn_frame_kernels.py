@@ -1,0 +1,293 @@
+"""Compiled: a pose from what two cameras find of the platform's stickers, frame after frame.
+
+What is found is compared with what is expected at the true pose: it differs by noise, by what
+teaching left and by what is not known of the rig.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cmmsim.compilation import Array, compiled
+from cmmsim.geometry.camera_kernels import Cameras, faces, length_of, light_at, project
+from cmmsim.geometry.disc_kernels import bent_root, disc_ellipse
+from cmmsim.geometry.matrix_kernels import from_entries
+from cmmsim.geometry.point_kernels import triangulate
+from cmmsim.geometry.transform_kernels import (
+    carry,
+    multiply,
+    pose_covariance,
+    pose_transform,
+    transform_pose,
+)
+from cmmsim.measuring.solver_kernels import MEASURED, STATE, Belief, Outlines, Seen, solve
+from cmmsim.without_images.centre_kernels import CentreNoise, holds, smeared, tabulated
+from cmmsim.without_images.hiding_kernels import Solids, hidden_stickers
+
+SETTLED = 2e-4  # m: last step of a triangulation; stickers are expected where they are
+
+
+class Frame(NamedTuple):
+    """Stickers as two cameras find them in one frame.
+
+    ``stickers`` are those that are used, where they are triangulated. pixels (n,2,2) have
+    covariances ``spreads`` (n,2,2,2), px², and ``variances`` (n,) of a coordinate in the mean of
+    both images. ``longest`` (1,) is the longest way of a sticker during the exposure, px.
+    """
+
+    stickers: Seen
+    pixels: Array
+    spreads: Array
+    variances: Array
+    longest: Array
+
+
+class Stickers(NamedTuple):
+    """True and taught places (n,3) of the platform's stickers, and their normals (n,3), in its
+    axes; radius m.
+    """
+
+    true: Array
+    taught: Array
+    normals: Array
+    radius: float
+
+
+class Limits(NamedTuple):
+    """Limits for a sticker to be found.
+
+    It is turned to both cameras by more than the cosine ``grazing``. ``thin_px`` and
+    ``thin_std_px`` say how thin an ellipse may be, and how softly. ``largest_gap`` is the squared
+    gap of its two rays. Nothing stands within ``clear`` m of it. ``vignetting`` is that of the
+    lens. ``parted``, px², is the variance by which errors of the rig part its rays.
+    """
+
+    grazing: float
+    thin_px: float
+    thin_std_px: float
+    largest_gap: float
+    clear: float
+    vignetting: float
+    parted: float
+
+
+class Eyes(NamedTuple):
+    """Cameras at their true and at their known places, and all that they look at: the platform's
+    stickers with their owner (n,), body 0, the solids that hide them, the noise of centres, the
+    limits for what is found and believed, and the taught base_from_camera and camera_from_base
+    (4,4).
+    """
+
+    looking: Cameras
+    measuring: Cameras
+    stickers: Stickers
+    owners: Array
+    solids: Solids
+    noise: CentreNoise
+    limits: Limits
+    belief: Belief
+    base_from_camera: Array
+    camera_from_base: Array
+
+
+@compiled
+def see(
+    side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: Array, frame: Frame
+) -> None:
+    """Fill one image's pixels and covariances of the stickers that are ``used`` so far, and take
+    out what is not seen.
+
+    moves (b,4,4) camera_from_body of all solids, the platform first; ends (2,4,4): of the platform
+    at the beginning and the end of the exposure, where it is ``moving``; noise (n,3) unit normal:
+    of the centres, and of how thin an ellipse may be.
+    """
+    count = len(frame.variances)
+    used = frame.stickers.used
+    looking = eyes.looking
+    stickers = eyes.stickers
+    limits = eyes.limits
+    places = np.empty((count, 3))
+    normals = np.empty((count, 3))
+    hidden = np.empty(count, np.bool_)
+    for n in range(count):
+        carry(moves[0], stickers.true[n], 1.0, places[n])
+        carry(moves[0], stickers.normals[n], 0.0, normals[n])
+        used[n] = used[n] and faces(places[n], normals[n], 0.0)
+    hidden_stickers(moves, places, normals, eyes.owners, limits.clear, eyes.solids, used, hidden)
+    camera = looking.figures[side]
+    point = np.empty(3)
+    size = eyes.noise.fit_size
+    table = eyes.noise.table
+    first_node = eyes.noise.first
+    steps = eyes.noise.steps
+    by_light = eyes.noise.by_light
+    smear_step = eyes.noise.settings.smear_step
+    true = stickers.true
+    pixels = frame.pixels[:, side]
+    spreads = frame.spreads[:, side]
+    for n in range(count):
+        used[n] = used[n] and not hidden[n]
+        if not used[n]:
+            continue
+        u, v, a, b, c, d = project(camera, places[n, 0], places[n, 1], places[n, 2])
+        x, y, xx, xy, yy = disc_ellipse(places[n], normals[n], stickers.radius, camera)
+        xx, xy, yy = bent_root(xx, xy, yy, a, b, c, d)
+        middle_u = u + camera[0] * (x - places[n, 0] / places[n, 2])
+        middle_v = v + camera[1] * (y - places[n, 1] / places[n, 2])
+        smear_u = 0.0
+        smear_v = 0.0
+        if moving:
+            for end in range(2):
+                carry(ends[end], true[n], 1.0, point)
+                other_u, other_v, _, _, _, _ = project(camera, point[0], point[1], point[2])
+                sign = 1.0 if end else -1.0
+                smear_u += sign * other_u
+                smear_v += sign * other_v
+        length = length_of(smear_u, smear_v)
+        frame.longest[0] = max(frame.longest[0], length)
+        smallest = 0.5 * (xx + yy) - length_of(0.5 * (xx - yy), xy)
+        used[n] = (
+            smallest > limits.thin_px + limits.thin_std_px * noise[n, 2]
+            and holds(middle_u, length_of(xx, xy), size)
+            and holds(middle_v, length_of(xy, yy), size)
+        )
+        if not used[n]:
+            continue
+        light = light_at(camera, looking.size[side], u, v, limits.vignetting)
+        if length > smear_step:
+            wide, tilt, high = smeared(
+                eyes.noise, (xx, xy, yy), light, (middle_u, middle_v), (smear_u, smear_v)
+            )
+        else:
+            wide, tilt, high = tabulated(table, first_node, steps, by_light, xx, xy, yy, light)
+        first = math.sqrt(wide)
+        across = tilt / first
+        pixels[n, 0] = u + first * noise[n, 0]
+        pixels[n, 1] = v + across * noise[n, 0] + math.sqrt(high - across * across) * noise[n, 1]
+        spread = spreads[n]
+        spread[0, 0] = wide
+        spread[0, 1] = tilt
+        spread[1, 0] = tilt
+        spread[1, 1] = high
+        frame.variances[n] = 0.25 * (wide + high) + (frame.variances[n] if side else 0.0)
+
+
+@compiled
+def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame) -> None:
+    """Fill what both cameras find: pixels and covariances, and which stickers are used.
+
+    poses (6,6): in the middle, at the beginning and at the end of the left camera's exposure, then
+    of the right one's; bodies (b,4,4): base_from_body of all solids but the platform; noise (2,n,3)
+    unit normal; kept (n,) whether a sticker is not left out by chance.
+    """
+    moving = False
+    apart = False
+    for i in range(6):
+        moving = moving or poses[1, i] != poses[2, i]
+        apart = apart or poses[3, i] != poses[0, i]
+    frame.longest[0] = 0.0
+    for n in range(len(kept)):
+        frame.stickers.used[n] = kept[n]
+    platform = np.empty((4, 4))
+    moves = np.empty((1 + len(bodies), 4, 4))
+    ends = np.empty((2, 4, 4))
+    for side in range(2):
+        for end in range(2 if moving else 0):
+            pose_transform(poses[3 * side + 1 + end], platform)
+            multiply(eyes.looking.moves[side], platform, ends[end])
+        if side == 0 or moving or apart:
+            pose_transform(poses[3 * side], platform)
+        multiply(eyes.looking.moves[side], platform, moves[0])
+        for b in range(len(bodies)):
+            multiply(eyes.looking.moves[side], bodies[b], moves[1 + b])
+        see(side, eyes, moves, ends, moving, noise[side], frame)
+
+
+@compiled
+def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
+    """Take out stickers that nobody looks for with the platform at ``place`` (4,4).
+
+    The others are triangulated.
+    """
+    seen = frame.stickers
+    expected, direction = np.empty(3), np.empty(3)
+    point, normal = np.empty(3), np.empty(3)
+    scratch = np.empty((3, 6))
+    cameras, limits = eyes.measuring, eyes.limits
+    for n in range(len(seen.used)):
+        if not seen.used[n]:
+            continue
+        carry(place, eyes.stickers.taught[n], 1.0, expected)
+        carry(place, eyes.stickers.normals[n], 0.0, direction)
+        found = True
+        for side in range(2):
+            carry(cameras.moves[side], expected, 1.0, point)
+            carry(cameras.moves[side], direction, 0.0, normal)
+            found = found and faces(point, normal, limits.grazing)
+            for i in range(2):
+                pixel = frame.pixels[n, side, i]
+                found = found and -0.5 < pixel < cameras.size[side, i] - 0.5
+        if found:
+            for i in range(3):
+                seen.points[n, i] = expected[i]
+            gap = triangulate(
+                cameras, frame.pixels[n], frame.spreads[n], limits.parted, SETTLED,
+                seen.points[n], scratch,
+            )  # fmt: skip
+            found = gap < limits.largest_gap
+            from_entries(scratch[0], seen.informations[n])
+            from_entries(scratch[1], seen.covariances[n])
+            for i in range(3):
+                seen.arms[n, i] = expected[i] - place[i, 3]
+                seen.gaps[n, i] = seen.points[n, i] - expected[i]
+        seen.used[n] = found
+
+
+@compiled
+def measure_frame(
+    eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
+    pose: Array, spread: Array, verdict: Array,
+) -> None:  # fmt: skip
+    """Fill the measured pose (6,) and its covariance (6,6), NaN where the frame is lost.
+
+    The parameters are those of ``look``. The ``verdict`` says what became of it.
+    """
+    look(eyes, poses, bodies, noise, kept, frame)
+    platform, place = np.empty((4, 4)), np.empty((4, 4))
+    covariance = np.empty((6, 6))
+    pose_transform(poses[0], platform)
+    multiply(eyes.camera_from_base, platform, place)
+    expect(eyes, place, frame)
+    stickers = eyes.stickers
+    none = np.empty((0, 2, 3)), np.empty((0, 2, 6))
+    outlines = Outlines(none[0], none[1], stickers.normals, stickers.radius, eyes.measuring)
+    solve(frame.stickers, stickers.taught, outlines, eyes.belief, place, covariance, verdict)
+    if verdict[STATE] == MEASURED:
+        multiply(eyes.base_from_camera, place, platform)
+        transform_pose(platform, pose)
+        pose_covariance(pose, eyes.base_from_camera, covariance, spread)
+    else:
+        pose[:] = np.nan
+        spread[:] = np.nan
+
+
+@compiled
+def measure_frames(
+    eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
+    found: Array, spreads: Array, verdicts: Array,
+) -> float:  # fmt: skip
+    """``measure_frame`` N times; return the longest way of a sticker, px.
+
+    The frames have poses (N,6,6), noise (N,2,n,3) and kept (N,n), with the same bodies (b,4,4).
+    Fills found (N,6), spreads (N,6,6) and the verdict.
+    """
+    longest = 0.0
+    for k in range(len(poses)):
+        measure_frame(
+            eyes, poses[k], bodies, noise[k], kept[k], frame, found[k], spreads[k], verdicts[k]
+        )
+        longest = max(longest, frame.longest[0])
+    return longest

@@ -1,0 +1,284 @@
+"""One exposure of two cameras without images: what the fit of ellipses would find in windows of
+them.
+
+A sticker that is seen whole in an image is found where the centre of its ellipse is, and with its
+shape, both with noise of the covariance that the fit states there: the inverse of its normal matrix
+at the true ellipse. What the noise does to the fit beyond the first order is left out; so is a
+sticker of which anything is hidden.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.detection.detector import DetectedCentres
+from cmmsim.detection.ellipse_fit import SMALLEST_RADIUS_PX, EllipseFits, fit_settings
+from cmmsim.errors import CmmError
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.disc_image import bend_outlines, bending, project_discs
+from cmmsim.geometry.pose import IDENTITY, Array, frozen, rigid, transforms_of
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.renderer import Renderer
+from cmmsim.imaging.scene_bodies import PlacedBodies
+from cmmsim.imaging.stereo_camera import Quality
+from cmmsim.measuring.observation import Observer
+from cmmsim.plugins import RENDERERS
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.without_images.conditions import NAME, Light, require_short
+from cmmsim.without_images.sticker_scene import StickerScene
+
+if TYPE_CHECKING:
+    from cmmsim.without_images.drawn_window_kernels import Ellipses, Windows
+
+THIN_PX, THIN_STD_PX = 0.885, 0.055
+"""Half of an ellipse's width at which half of the fits end at the smallest one, and how softly that
+sets in: measured in images, whose fits err by more than to first order there."""
+
+
+def refuse_images(*_: object, **__: object) -> NoReturn:
+    """Raise CmmError that names the renderers that draw."""
+    drawing = ", ".join(name for name in RENDERERS if name != NAME)
+    raise CmmError(
+        f"renderer {NAME!r} draws no images, it only says what would be found in them; {drawing} "
+        "draw them"
+    )
+
+
+STATISTICAL = Renderer(NAME, refuse_images)
+ABSENT = frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
+"""base_from_body (4,4) of a body without a place: far below."""
+
+
+@dataclass(frozen=True)
+class StatisticalStereoCamera:
+    """Two cameras that look at the true scene and say what a fit would find; as
+    `VirtualStereoCamera`, without images.
+
+    rig and camera_from_base (4,4), the true ones; light; exposure and right_later in s;
+    obstacle_names: of the scene's solids after platform and base.
+    """
+
+    rig: StereoRig
+    camera_from_base: Array
+    scene: StickerScene
+    light: Light
+    obstacle_names: Sequence[str] = ()
+    exposure: float = 0.0
+    right_later: float = 0.0
+
+    def look(
+        self,
+        pose: Array,
+        rng: np.random.Generator,
+        obstacles: Mapping[str, Array] | None = None,
+        quality: Quality | None = None,
+        pose_rate: Array | None = None,
+    ) -> "DrawnStickers":
+        """One exposure; parameters as of ``VirtualStereoCamera.look``. How many are averaged, the
+        observer knows.
+        """
+        rates = None if pose_rate is None else pose_rate[None]
+        return DrawnStickers(
+            self, self.exposed(pose[None], rates)[0], self.placed(obstacles or {}), rng
+        )
+
+    def moved(self, changes: Array) -> "StatisticalStereoCamera":
+        """The same cameras with changes (24,) of their rig's parameters."""
+        return replace(self, rig=self.rig.moved(changes))
+
+    def exposed(self, poses: Array, rates: Array | None) -> Array:
+        """Poses (N,6,6) of the platform at poses (N,6) in motion at rates (N,6): in the middle, at
+        the beginning and at the end of the left camera's exposure, then of the right one's."""
+        if rates is None:
+            return np.repeat(poses[:, None], 6, axis=1)
+        half = 0.5 * self.exposure
+        lag = self.right_later
+        later = np.array([0.0, -half, half, lag, lag - half, lag + half])
+        return np.asarray(poses[:, None] + later[:, None] * rates[:, None])
+
+    def placed(self, obstacles: Mapping[str, Array]) -> Array:
+        """base_from_body (b,4,4) of the base and of all obstacles; those without a place lie far
+        below.
+        """
+        if isinstance(obstacles, PlacedBodies) and obstacles.names == tuple(self.obstacle_names):
+            return np.concatenate((IDENTITY[None], obstacles.together))
+        return np.array([IDENTITY, *(obstacles.get(name, ABSENT) for name in self.obstacle_names)])
+
+    def centre_error_px(self, quality: Quality) -> float:
+        """Error of a sticker's centre that drawing leaves: none, as nothing is drawn."""
+        return 0.0
+
+    def greys(self, noise: CameraNoise, side: int, centres: Array) -> tuple[Array, Array]:
+        """Contrasts (k,) of stickers at centres (k,2) px of one image, and the grey values (k,) of
+        their grounds.
+        """
+        lit = self.light.optics.illumination(self.rig.cameras[side], centres)
+        grounds = np.asarray(noise.mean_grey(self.light.ring * lit))
+        return np.asarray(noise.mean_grey(self.light.sticker * lit)) - grounds, grounds
+
+    @cached_property
+    def from_base(self) -> list[Array]:
+        """Places (4,4) of the base in the axes of both cameras."""
+        return [move @ self.camera_from_base for move in self.rig.from_camera]
+
+    def side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Centres (m,2) and shapes (m,2,2) of ellipses that are fitted in one image, px, and which
+        are seen whole.
+        """
+        places, normals = self.scene.placed(moves)
+        facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            middles, shapes = project_discs(
+                camera.ideal, places, normals, np.full(len(places), self.scene.radius)
+            )
+        facing &= np.isfinite(shapes).all(axis=(1, 2))
+        middles = np.where(facing[:, None], middles, 0.0)
+        shapes = np.where(facing[:, None, None], shapes, np.eye(2))
+        if not camera.distortion.is_zero:
+            holds = camera.distort(middles)[1]
+            shift = bending(camera, middles, shapes)
+            bend_outlines(camera, middles, shapes)
+            middles += shift
+            facing &= holds
+        return middles, shapes, facing & ~self.scene.hidden(moves, places, normals, facing)
+
+
+class DrawnStickers:
+    """Stickers as a fit would find them in one exposure, worked out as far as they are asked for.
+
+    camera; exposed (6,6) poses as of ``StatisticalStereoCamera.exposed``; bodies (b,4,4) as of its
+    ``placed``; rng of its noise.
+    """
+
+    full = windows = refuse_images
+
+    def __init__(
+        self,
+        camera: StatisticalStereoCamera,
+        exposed: Array,
+        bodies: Array,
+        rng: np.random.Generator,
+    ) -> None:
+        self.camera = camera
+        self.exposed = exposed
+        self.bodies = bodies
+        self.rng = rng
+
+    @cached_property
+    def _found(self) -> "Ellipses":
+        """The ellipses of all stickers; their grey values, which the observer's noise decides, are
+        not known yet.
+        """
+        from cmmsim.without_images.drawn_window_kernels import Ellipses
+
+        camera = self.camera
+        centres: list[Array] = []
+        shapes: list[Array] = []
+        smears: list[Array] = []
+        seen: list[NDArray[np.bool_]] = []
+        places = transforms_of(self.exposed)
+        for side, (lens, from_base) in enumerate(
+            zip(camera.rig.cameras, camera.from_base, strict=True)
+        ):
+            middle, first, last = (
+                from_base @ np.concatenate([place[None], self.bodies])
+                for place in places[3 * side : 3 * side + 3]
+            )
+            at, shape, whole = camera.side(lens, middle)
+            centres.append(at)
+            shapes.append(shape)
+            seen.append(whole)
+            if np.array_equal(first, last):
+                smears.append(np.zeros(at.shape))
+                continue
+            ends = (lens.project(camera.scene.placed(moves)[0])[0] for moves in (last, first))
+            smears.append(np.asarray(np.subtract(*ends)))
+        require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))
+        noise = self.rng.standard_normal((2, len(seen[0]), 6))
+        at, shape, smear = (np.stack(values) for values in (centres, shapes, smears))
+        return Ellipses(at, shape, smear, np.stack(seen), noise, np.zeros((2, 0)), np.zeros((2, 0)))
+
+    def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
+        """See ``StickerExposure``: in each window the sticker nearest to its middle."""
+        from cmmsim.without_images.drawn_window_kernels import nearest_stickers
+
+        windows = _empty_windows(2 * corners.shape[1], observer)
+        ellipses = self._found
+        nearest_stickers(
+            ellipses.seen, ellipses.centres, np.ascontiguousarray(corners), size, windows
+        )
+        return self._fitted(windows, observer)
+
+    def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
+        """See ``StickerExposure``."""
+        found = []
+        for side, camera in enumerate(self.camera.rig.cameras):
+            centres = self._found.centres[side]
+            reach = np.linalg.norm(self._found.shapes[side], axis=2)
+            whole = self._found.seen[side] & np.all(
+                (centres - reach > 0.0) & (centres + reach < (camera.width - 1, camera.height - 1)),
+                axis=1,
+            )
+            windows = _empty_windows(int(whole.sum()), observer)
+            windows.sides[:] = side
+            windows.stickers[:] = np.flatnonzero(whole)
+            windows.found[:] = True
+            windows.corners[:] = np.rint(centres[whole] - 0.5 * (windows.size - 1))
+            found.append(self._fitted(windows, observer))
+        return found[0], found[1]
+
+    def _fitted(self, windows: "Windows", observer: Observer) -> EllipseFits:
+        """Ellipses that are found in windows."""
+        from cmmsim.without_images.drawn_window_kernels import Fits, Smallest, fit_stickers
+
+        settings = observer.settings
+        noise = observer.noise
+        count = len(windows.stickers)
+        sides = [
+            self.camera.greys(noise, side, centres)
+            for side, centres in enumerate(self._found.centres)
+        ]
+        contrasts, grounds = (np.stack(values) for values in zip(*sides, strict=True))
+        shapes = ((2,), (2, 2), (5, 5), (), ())
+        found = Fits(np.empty(count, dtype=bool), *(np.empty((count, *shape)) for shape in shapes))
+        smallest = Smallest(
+            1.01 * SMALLEST_RADIUS_PX,
+            THIN_PX,
+            THIN_STD_PX,
+            float(settings.limits.smallest_contrast),
+        )
+        how = fit_settings(noise, settings.optics.psf_px)
+        fit_stickers(
+            self._found._replace(contrasts=contrasts, grounds=grounds),
+            windows,
+            smallest,
+            how,
+            found,
+        )
+        return EllipseFits(
+            found.centres,
+            found.covariances[:, :2, :2],
+            found.good,
+            found.shapes,
+            found.covariances[:, 2:, 2:],
+            np.ones(count),
+            found.contrasts,
+            found.grounds,
+        )
+
+
+def _empty_windows(count: int, observer: Observer) -> "Windows":
+    """Room for windows."""
+    from cmmsim.without_images.drawn_window_kernels import (
+        Windows,
+    )  # compiles, so it is loaded where it is first needed
+
+    whole = np.empty((2, count), dtype=int)
+    found = np.empty(count, dtype=bool)
+    return Windows(
+        whole[0], whole[1], np.empty((count, 2), dtype=int), found, observer.settings.fit_size
+    )

@@ -1,0 +1,130 @@
+"""Plain NumPy, SciPy and OpenCV for what the sensor has compiled: the oracles of its kernels."""
+
+import cv2
+import numpy as np
+from scipy.linalg import sqrtm
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from cmmsim.geometry.pose import rigid, skew
+
+FEWEST, LARGEST_MISFIT, LARGEST_EXCESS = 4, chi2.isf(1e-4, 3), 6.0
+SMALLEST_SHARE = 0.01  # of a sticker's noise that must show in its residual
+
+
+def eccentricity(centres, normals, radius, focal_px):
+    """Ellipse centres less projected circle centres through a perfect lens, px (n, 2)."""
+    d13_d23 = centres[:, :2] * centres[:, 2:] + radius**2 * normals[:, :2] * normals[:, 2:]
+    d33 = centres[:, 2:] ** 2 - radius**2 * (1.0 - normals[:, 2:] ** 2)
+    return focal_px * (d13_d23 / d33 - centres[:, :2] / centres[:, 2:])
+
+
+def project(camera, points):
+    """Pixels (n, 2) of points (n, 3) in camera axes, and their derivatives (n, 2, 3), by OpenCV."""
+    zero, lens = np.zeros(3), camera.intrinsics[4:]
+    pixels, slopes = cv2.projectPoints(
+        np.ascontiguousarray(points), zero, zero, camera.matrix, lens
+    )
+    return pixels[:, 0], slopes[:, 3:6].reshape(len(points), 2, 3)
+
+
+def outlines(rig, camera_from_body, places, normals, radius):
+    """Shapes (2, n, 2, 2) of stickers' ellipses: the dual conic, and the root of J M J'."""
+    found = []
+    for camera, move in zip(rig.cameras, rig.from_camera, strict=True):
+        move = move @ camera_from_body
+        centres, turned = places @ move[:3, :3].T + move[:3, 3], normals @ move[:3, :3].T
+        for c, n in zip(centres, turned, strict=True):
+            dual = np.outer(c, c) - radius**2 * (np.eye(3) - np.outer(n, n))
+            middle = dual[:2, 2] / dual[2, 2]
+            square = np.outer(middle, middle) - dual[:2, :2] / dual[2, 2]
+            slope = project(camera, np.array([[*middle, 1.0]]))[1][0][:, :2]
+            found.append(sqrtm(slope @ square @ slope.T))
+    return np.array(found).reshape(2, len(places), 2, 2)
+
+
+def triangulate(rig, pixels, covariances, near, parted=0.0):
+    """Points (n, 3) and covariances (n, 3, 3) from pixels (2, n, 2), by OpenCV's derivatives."""
+    points = np.array(near)
+    weights = np.linalg.inv(covariances + parted * np.eye(2))
+    for _ in range(8):
+        normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+        for side, (camera, move) in enumerate(zip(rig.cameras, rig.from_camera, strict=True)):
+            found, slopes = project(camera, points @ move[:3, :3].T + move[:3, 3])
+            slopes = slopes @ move[:3, :3]
+            weighted = slopes.swapaxes(1, 2) @ weights[side]
+            normal += weighted @ slopes
+            right += np.einsum("nij,nj->ni", weighted, pixels[side] - found)
+        points += np.linalg.solve(normal, right[..., None])[..., 0]
+    noise = 0.25 * np.einsum("cnii->n", covariances)
+    return points, np.linalg.inv(normal) * (noise / (noise + parted))[:, None, None]
+
+
+def rigid_start(source, target):
+    """Unweighted rigid transform (4,4) from source to target (n,3), by singular values."""
+    middle, other = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - other).T @ (source - middle))
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return rigid(rotation, other - rotation @ middle)
+
+
+def fitted(places, points, covariances):
+    """Rigid fit: transform (4,4), its covariance (6,6), and each point's squared residual."""
+    transform, weights = rigid_start(places, points), np.linalg.inv(covariances)
+    for _ in range(5):
+        turned = places @ transform[:3, :3].T
+        slopes = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), -skew(turned)], axis=2)
+        residuals = points - turned - transform[:3, 3]
+        covariance = np.linalg.inv(np.einsum("nij,nik,nkl->jl", slopes, weights, slopes))
+        step = covariance @ np.einsum("nij,nik,nk->j", slopes, weights, residuals)
+        turn = Rotation.from_rotvec(step[3:]).as_matrix()
+        transform = rigid(turn @ transform[:3, :3], transform[:3, 3] + step[:3])
+    residuals = points - places @ transform[:3, :3].T - transform[:3, 3]
+    return transform, covariance, np.einsum("ni,nij,nj->n", residuals, weights, residuals)
+
+
+def place_misfits(transform, covariance, places, points, covariances):
+    """Squared residuals (n,) of a fit in units of S - J C J', in directions that can be checked."""
+    turned = places @ transform[:3, :3].T
+    slopes = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), -skew(turned)], axis=2)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariances))  # makes the noise the unit matrix
+    pulled = whiten @ slopes
+    shares, axes = np.linalg.eigh(np.eye(3) - pulled @ covariance @ pulled.swapaxes(1, 2))
+    residuals = points - turned - transform[:3, 3]
+    along = np.einsum("nji,njk,nk->ni", axes, whiten, residuals)
+    return (along**2 / np.where(shares > SMALLEST_SHARE, shares, np.inf)).sum(axis=1)
+
+
+def excess(total, freedom):
+    """Mean square of residuals where it is larger than noise makes it, else 1."""
+    return total / freedom if freedom > 0 and total > chi2.isf(1e-4, freedom) else 1.0
+
+
+def outline_misfits(shapes, covariances, expected):
+    """Squared differences (2, n) of ellipses with shapes (2, n, 2, 2) from expected ones."""
+    change = (shapes - expected)[..., [0, 0, 1], [0, 1, 1]]
+    return (change * np.linalg.solve(covariances, change[..., None])[..., 0]).sum(axis=-1)
+
+
+def consistent(seen, rig, radius, places, normals):
+    """Stickers that agree: their index, camera_from_body and its covariance; None when lost."""
+    kept, left_out = np.arange(len(seen.index)), 0
+    while len(kept) >= FEWEST and len(kept) > left_out:
+        at, points, covariances = (
+            places[seen.index[kept]],
+            seen.points[kept],
+            seen.covariances[kept],
+        )
+        transform, covariance, squared = fitted(at, points, covariances)
+        total, freedom = squared.sum(), 3 * len(kept) - 6
+        misfits = place_misfits(transform, covariance, at, points, covariances)
+        misfits = np.array([m / excess(total - m, freedom - 3) for m in misfits])
+        if seen.outlines is not None:
+            expected = outlines(rig, transform, at, normals[seen.index[kept]], radius)
+            own = seen.outlines.shapes[:, kept], seen.outlines.covariances[:, kept]
+            misfits = np.maximum(misfits, outline_misfits(*own, expected).max(axis=0))
+        growth = excess(total, freedom)
+        if misfits.max() <= LARGEST_MISFIT and growth <= LARGEST_EXCESS:
+            return seen.index[kept], transform, growth * covariance
+        kept, left_out = np.delete(kept, misfits.argmax()), left_out + 1
+    return None
