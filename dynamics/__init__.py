@@ -1,34 +1,56 @@
-"""Dynamics of parallel robots: kinematics, virtual-work dynamics, joint PID, visual servo and closed loop.
+"""Dynamics of parallel robots: kinematics, virtual work, joint controllers and closed loops.
 
 Robots
-    load_robot(name_or_path) -> Robot           built in (`built_in_robots() -> list[str]`), or a TOML file
+
+    load_robot(name_or_path)                    built-in robot, or one of a TOML file
+    built_in_robots()                           names of the built-in robots
     Robot                                       kinematics and dynamics, one pose or a batch
-    fast_forward_dynamics(robot, parameters)    forward dynamics for inner loops, as a function without checks
-    workspace.check_motion(robot, pose, times)  may it move so? travel, reach and singularities
+    fast_forward_dynamics(robot, parameters)    forward dynamics for inner loops
+    workspace.check_motion(robot, pose, times)  travel, reach and singularities along a motion
 
-The closed loop
-    closed_loop.simulate(robot, parameters, reference, settings, sensor) -> ClosedLoopRun
-    simulate_batch(robot, parameters, references, settings) -> list[ClosedLoopRun]   many runs, on all cores
+Closed loops
 
-Every error that a user can cause is a DynamicsError.
+    closed_loop.simulate_servo(robot, parameters, reference, settings)   one run
+    simulate_batch(robot, parameters, references, settings)              many runs on all cores
 
-Conventions: SI units and rad; pose [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta) Rz(gamma); twist [h_dot, omega]
-in base-frame axes. The crank is what the paper calls the wrench.
+Every error that a user can cause is a DynamicsError. Names are imported on first use: CasADi and
+numba take a second to load, for which the help of the command line must not wait.
+
+Conventions: SI units and rad. A pose is [x y z alpha beta gamma] with
+R = Rx(alpha) Ry(beta) Rz(gamma). A twist is [h_dot, omega] in the axes of the base. The crank is
+what the paper calls the wrench.
 """
 
-from dynamics import closed_loop
-from dynamics.closed_loop.simulate import simulate_batch
-from dynamics.errors import DynamicsError
-from dynamics.fast_dynamics import fast_forward_dynamics
-from dynamics.robot import Robot, load_robot
-from dynamics.robot_file import built_in_robots
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "DynamicsError",
-    "Robot",
-    "built_in_robots",
-    "closed_loop",
-    "fast_forward_dynamics",
-    "load_robot",
-    "simulate_batch",
-]
+from dynamics.errors import DynamicsError as DynamicsError
+
+if TYPE_CHECKING:
+    from dynamics import closed_loop as closed_loop
+    from dynamics.closed_loop import simulate_batch as simulate_batch
+    from dynamics.robot import Robot as Robot
+    from dynamics.robot import fast_forward_dynamics as fast_forward_dynamics
+    from dynamics.robot import load_robot as load_robot
+    from dynamics.robot_file import built_in_robots as built_in_robots
+
+_HOME = {
+    **dict.fromkeys(("Robot", "fast_forward_dynamics", "load_robot"), "dynamics.robot"),
+    "built_in_robots": "dynamics.robot_file",
+    "simulate_batch": "dynamics.closed_loop",
+}
+
+__all__ = ["DynamicsError", "closed_loop", *_HOME]
+
+if not TYPE_CHECKING:  # a type checker would take every name for one that this knows
+
+    def __getattr__(name: str) -> Any:
+        if name == "closed_loop":
+            return import_module("dynamics.closed_loop")
+        if name not in _HOME:
+            said = f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}"
+            raise AttributeError(said)
+        return getattr(import_module(_HOME[name]), name)
+
+    def __dir__() -> list[str]:
+        return [*__all__, *(name for name in globals() if name.startswith("__"))]

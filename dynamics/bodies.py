@@ -1,4 +1,4 @@
-"""The bodies of a robot's legs as parts that can be placed: for other engines, and to draw them."""
+"""Bodies of a robot's legs as parts with places, for other engines and to draw them."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,15 +10,17 @@ from dynamics.checks import floats
 from dynamics.geometry import RobotGeometry
 from dynamics.legs.leg import Segment
 from dynamics.parameters import parameter_layout
-from dynamics.robot import CHART_TOLERANCE, Robot
+from dynamics.robot import Robot
+from dynamics.robot_platform import CHART_TOLERANCE
 
 
 class Part(NamedTuple):
-    """A body of a leg, or one of the equal bars that it consists of.
+    """Body of a leg, or one of the equal bars that it consists of.
 
-    name, such as link1 or link1a; leg: its number, from 0; body: its row in the robot's layout; offset (3,) of its
-    joint from the body's, in the axes of the body before, m; share: of the body's parameters; before: the part that it
-    hangs on (-1: the base); last: whether it ends at the platform.
+    name: such as link1 or link1a. leg: its number, from 0. body: its row in the layout of the
+    robot. offset (3,): of its joint from the joint of the body, in the axes of the body before, m.
+    share: share of the parameters of the body. before: number of the part that it hangs on, or -1
+    for the base. last: True where it ends at the platform.
     """
 
     name: str
@@ -32,13 +34,16 @@ class Part(NamedTuple):
 
 
 BASE = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
-"""Where the base itself is: origin, axes, spin."""
+"""Placement of the base itself: origin, axes, spin."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Where parts are: origin (parts, 3), the joint to the part before, m; axes (parts, 3, 3) as columns and angular
-    velocities (parts, 3), rad/s. Base axes; a last row stands for the base itself, so that -1 is its number."""
+    """Frames of the parts, in the axes of the base.
+
+    origin (parts, 3): joint to the part before, m. axes (parts, 3, 3): as columns. spin (parts, 3):
+    angular velocity, rad/s. A last row is the base itself, so that its number is -1.
+    """
 
     origin: np.ndarray
     axes: np.ndarray
@@ -46,8 +51,12 @@ class Frames:
 
 
 class Drawn(NamedTuple):
-    """What is drawn of the parts: the row of each in the placements (parts,), and that of the part before, -1: the
-    base; offset (parts, 3) in the axes of that, centre (parts, 3) and ends (parts, 2, 3) in its own, m."""
+    """Numbers from which the drawn parts are placed.
+
+    body, before (parts,): rows of each part and of the part before in the placements, -1 for the
+    base. offset (parts, 3): in the axes of the part before, m. centre (parts, 3) and ends (parts,
+    2, 3): in the axes of the part, m.
+    """
 
     body: np.ndarray
     before: np.ndarray
@@ -57,8 +66,11 @@ class Drawn(NamedTuple):
 
 
 class Room(NamedTuple):
-    """What a robot's functions take and return: at (6 + g,) and moving (12 + g,), a pose, a twist, and the constants of
-    the functions; joint coordinates and reach margins (2, n); placements (bodies, 15)."""
+    """Memory for the inputs and outputs of a robot's functions.
+
+    at (6 + g,) and moving (12 + g,): a pose, then a twist, then the constants of the functions.
+    reach (2, n): joint coordinates and reach margins. placements (bodies, 15).
+    """
 
     at: np.ndarray
     moving: np.ndarray
@@ -67,7 +79,7 @@ class Room(NamedTuple):
 
 
 class Parts:
-    """The parts of all legs of a geometry, leg by leg from the base."""
+    """Parts of all legs of a geometry, leg by leg from the base."""
 
     def __init__(self, geometry: RobotGeometry) -> None:
         layout = parameter_layout(geometry.legs)
@@ -75,43 +87,65 @@ class Parts:
         rows: list[int] = []
         first = 0
         for number, leg in enumerate(geometry.legs):
-            segments, before = leg.segments(), -1
+            segments = leg.segments()
+            before = -1
             for place, segment in enumerate(segments):
-                body, several = layout.of_leg[number][place], len(segment.copies) > 1
-                name, last, share = layout.bodies[body], place == len(segments) - 1, 1 / len(segment.copies)
-                for suffix, offset in zip("abcd" if several else [""], segment.copies, strict=False):
-                    self.all.append(Part(name + suffix, number, body, segment, offset, share, before, last))
+                body = layout.of_leg[number][place]
+                several = len(segment.copies) > 1
+                name = layout.bodies[body]
+                last = place == len(segments) - 1
+                share = 1 / len(segment.copies)
+                for suffix, offset in zip(
+                    "abcd" if several else [""], segment.copies, strict=False
+                ):
+                    self.all.append(
+                        Part(name + suffix, number, body, segment, offset, share, before, last)
+                    )
                     rows.append(first + place)
                 before = len(self.all) - 1
             first += len(segments)
-        self._rows, self._before = np.array(rows), np.array([part.before for part in self.all])
+        self._rows = np.array(rows)
+        self._before = np.array([part.before for part in self.all])
         self._offset = np.array([part.offset for part in self.all])
         self._centre = np.array([part.segment.centre for part in self.all])
-        before, ends = np.append(rows, -1)[self._before], np.array([part.segment.rod for part in self.all])
-        self._drawn, chart = Drawn(self._rows, before, self._offset, self._centre, ends), geometry.chart
+        before = np.append(rows, -1)[self._before]
+        ends = np.array([part.segment.rod for part in self.all])
+        self._drawn = Drawn(self._rows, before, self._offset, self._centre, ends)
+        chart = geometry.chart
         self._held = np.where(chart.basis.any(axis=1), np.nan, chart.home)
 
     def frames(self, robot: Robot, pose: np.ndarray, twist: np.ndarray | None = None) -> Frames:
-        """Where the parts are with the platform at a pose (6,) and moving with a twist (6,).
+        """Frames of the parts with the platform at a pose (6,) and moving with a twist (6,).
 
-        Raises UnreachablePoseError, ChartError.
+        Raises UnreachablePoseError or ChartError.
         """
         robot.check_reach(pose)
         moving = np.zeros(6) if twist is None else twist
         found = np.empty((len(self.all) + 1, 15))
-        found[:-1], found[-1] = robot.functions["placements"](pose[None], moving[None])[0][0][self._rows], BASE
-        axes, origin = found[:, 3:12].reshape(-1, 3, 3), found[:, :3]
-        origin[:-1] += (axes[self._before] @ self._offset[..., None] - axes[:-1] @ self._centre[..., None])[..., 0]
+        found[:-1] = robot.functions["placements"](pose[None], moving[None])[0][0][self._rows]
+        found[-1] = BASE
+        axes = found[:, 3:12].reshape(-1, 3, 3)
+        origin = found[:, :3]
+        origin[:-1] += (
+            axes[self._before] @ self._offset[..., None] - axes[:-1] @ self._centre[..., None]
+        )[..., 0]
         return Frames(origin, axes, found[:, 12:])
 
     def rods(self, robot: Robot, pose: np.ndarray) -> np.ndarray:
-        """Ends (parts, 2, 3) of what is drawn of each part, base axes, m. Raises as `frames`."""
-        from dynamics.compiled.kernel import chosen  # these import numba, which takes its time
+        """Ends (parts, 2, 3) of what is drawn of each part, in the axes of the base, m.
+
+        Raises what `frames` raises.
+        """
+        # importing Numba takes time
+        from dynamics.compiled.kernel import chosen
         from dynamics.rod_kernels import place_rods
 
-        at, functions = np.array(floats("pose", pose, (6,))), robot.functions
-        kinematics, placements = functions["inverse_kinematics"], functions["placements"]
-        fixed, bodies = placements.constants, placements.outputs[0][0]
+        at = np.array(floats("pose", pose, (6,)))
+        functions = robot.functions
+        kinematics = functions["inverse_kinematics"]
+        placements = functions["placements"]
+        fixed = placements.constants
+        bodies = placements.outputs[0][0]
         room = Room(
             at=np.concatenate((at, fixed)),
             moving=np.concatenate((at, np.zeros(6), fixed)),
@@ -121,11 +155,12 @@ class Parts:
         ends = np.empty((len(self.all), 2, 3))
         where = kinematics.address, placements.address, at, self._held, CHART_TOLERANCE
         if not chosen(place_rods, True)(*where, self._drawn, room, ends):
-            robot.check_reach(at)  # says why
+            # raises the error that says why
+            robot.check_reach(at)
         return ends
 
 
 @lru_cache(maxsize=16)
 def parts_of(geometry: RobotGeometry) -> Parts:
-    """The parts of a geometry, made once."""
+    """Parts of a geometry, made once."""
     return Parts(geometry)

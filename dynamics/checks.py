@@ -1,4 +1,4 @@
-"""What users pass as arguments, turned into numbers and arrays, or refused with name, value and what is wanted.
+"""Checks of arguments: they become numbers and arrays, or an error with name, value and limit.
 
 Nothing is transposed, padded, parsed from text, or cast from complex numbers or truth values.
 """
@@ -14,21 +14,35 @@ Shape = tuple[int | Literal["N"], ...]
 ErrorClass = type[DynamicsError]
 
 
-def floats(name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeError, finite: bool = True) -> np.ndarray:
-    """The value as float64 of one of the shapes, in which "N" stands for any length; a float64 array is not copied.
+def floats(
+    name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeError, finite: bool = True
+) -> np.ndarray:
+    """Value as a float64 array of one of the shapes, in which "N" is any length.
 
-    Raises `error`, which names the array with what was got, or with the place of an entry that is not finite.
+    A float64 array is not copied. Raises `error`, with the array or with the place of an entry that
+    is not finite.
     """
-    if type(value) is np.ndarray and value.dtype == float and value.shape in shapes and np.isfinite(value).all():
-        return value  # what inner loops ask for, in a third of the time
+    if (
+        type(value) is np.ndarray
+        and value.dtype == float
+        and value.shape in shapes
+        and np.isfinite(value).all()
+    ):
+        # inner loops come here, and need a third of the time
+        return value
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
-        raise error(f"{name} must be numbers of shape {_shapes_text(shapes)}, got {shown(value)}") from None
+        raise error(
+            f"{name} must be numbers of shape {_shapes_text(shapes)}, got {shown(value)}"
+        ) from None
     if np.ma.is_masked(value):
         raise error(f"{name} must be numbers of shape {_shapes_text(shapes)}, got masked entries")
     if array.dtype.kind not in "iuf":
-        raise error(f"{name} must be numbers of shape {_shapes_text(shapes)}, got {shown(value)} (dtype {array.dtype})")
+        raise error(
+            f"{name} must be numbers of shape {_shapes_text(shapes)}, got {shown(value)} (dtype "
+            f"{array.dtype})"
+        )
     if not any(_fits(array.shape, shape) for shape in shapes):
         raise error(f"{name} must have shape {_shapes_text(shapes)}, got {array.shape}")
     array = array.astype(float, copy=False)
@@ -39,18 +53,20 @@ def floats(name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeEr
 
 
 def rows(name: str, value: object, width: int) -> np.ndarray:
-    """The value as finite floats of shape (width,) or (N, width). Raises ShapeError."""
+    """Value as finite floats of shape (width,) or (N, width). Raises ShapeError."""
     return floats(name, value, (width,), ("N", width))
 
 
 def mask(name: str, value: object, length: int, error: ErrorClass) -> np.ndarray:
-    """The value as bool of shape (length,). Raises `error` for anything else, numbers included."""
+    """Value as bool of shape (length,). Raises `error` for anything else, numbers included."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
         raise error(f"{name} must be bool of shape ({length},), got {shown(value)}") from None
     if array.dtype != bool or array.shape != (length,):
-        raise error(f"{name} must be bool of shape ({length},), got {array.dtype} of shape {array.shape}")
+        raise error(
+            f"{name} must be bool of shape ({length},), got {array.dtype} of shape {array.shape}"
+        )
     return array
 
 
@@ -63,7 +79,7 @@ def real(
     above: float | None = None,
     unit: str = "",
 ) -> float:
-    """The value as a finite float, >= least or > above where these are given. Raises `error`."""
+    """Value as a finite float, >= least or > above where these are given. Raises `error`."""
     limit = f" >= {least:g}" if least is not None else "" if above is None else f" > {above:g}"
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise error(f"{name} is {shown(value)}{unit}, must be a number{limit}")
@@ -78,7 +94,7 @@ def real(
 
 
 def whole(name: str, value: object, error: ErrorClass, *, least: int, most: float = np.inf) -> int:
-    """The value as an int from least to most. Raises `error`."""
+    """Value as an int from least to most. Raises `error`."""
     limit = f"a whole number >= {least}" + (f" and <= {most}" if most < np.inf else "")
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise error(f"{name} is {shown(value)}, must be {limit}")
@@ -88,7 +104,7 @@ def whole(name: str, value: object, error: ErrorClass, *, least: int, most: floa
 
 
 def flag(name: str, value: object, error: ErrorClass) -> bool:
-    """The value as True or False. Raises `error` for anything else, numbers included."""
+    """Value as True or False. Raises `error` for anything else, numbers included."""
     if not isinstance(value, bool | np.bool_):
         raise error(f"{name} is {shown(value)}, must be True or False")
     return bool(value)
@@ -97,29 +113,39 @@ def flag(name: str, value: object, error: ErrorClass) -> bool:
 def check_choice(name: str, value: object, valid: Sequence[str], error: ErrorClass) -> None:
     """Raise `error`, which lists the valid names, unless the value is one of them."""
     if not isinstance(value, str) or value not in valid:
-        raise error(f"unknown {name} `{value if isinstance(value, str) else shown(value)}`; valid: {', '.join(valid)}")
+        raise error(
+            f"unknown {name} `{value if isinstance(value, str) else shown(value)}`; valid: "
+            f"{', '.join(valid)}"
+        )
 
 
 def check_type(name: str, value: object, kind: type, error: ErrorClass) -> None:
     """Raise `error` unless the value is an instance of a class."""
     if not isinstance(value, kind):
-        raise error(f"{name} must be of type {kind.__name__}, got {shown(value)} of type {type(value).__name__}")
+        raise error(
+            f"{name} must be of type {kind.__name__}, got {shown(value)} of type "
+            f"{type(value).__name__}"
+        )
 
 
 def row_text(row: np.ndarray, precision: int = 6) -> str:
-    """A short array on one line, for messages."""
+    """Short array as text on one line."""
     return np.array2string(row, precision=precision, threshold=12, max_line_width=400)
 
 
 def shown(value: object) -> str:
-    """The value in at most 60 characters of one line."""
+    """Value as text of at most 60 characters on one line."""
     return " ".join(repr(value).split())[:60]
 
 
 def _fits(shape: tuple[int, ...], wanted: Shape) -> bool:
+    """Return True where a shape is a wanted one."""
     pairs = zip(shape, wanted, strict=False)
     return len(shape) == len(wanted) and all(want in ("N", got) for got, want in pairs)
 
 
 def _shapes_text(shapes: Sequence[Shape]) -> str:
-    return " or ".join(f"({one[0]},)" if len(one) == 1 else f"({', '.join(map(str, one))})" for one in shapes)
+    """Shapes as text."""
+    return " or ".join(
+        f"({one[0]},)" if len(one) == 1 else f"({', '.join(map(str, one))})" for one in shapes
+    )

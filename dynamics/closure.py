@@ -1,8 +1,12 @@
-"""Where the loops close: poses of joint coordinates for a robot whose geometry is off, and how they change with that.
+"""Closed loops of a robot whose geometry is off: its poses, and their derivatives.
 
-The gaps of the loops (`rigid_body.jacobians.loop_closure`) with the geometric numbers as a third argument. A pose is
-where they vanish, so its derivatives follow implicitly: d(q)/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers). One
-compiled function serves all geometries near a nominal one: a search over them compiles nothing.
+The gaps of the loops (`rigid_body.jacobians.loop_closure`) have the geometric numbers as a third
+argument. They vanish at a pose, so that its derivatives follow implicitly:
+
+    d(q)/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers)
+
+One compiled function serves all geometries near a nominal one, so that a search over them compiles
+nothing.
 """
 
 from dataclasses import dataclass
@@ -22,26 +26,26 @@ from dynamics.rigid_body.jacobians import loop_closure
 
 @dataclass(frozen=True)
 class Closure:
-    """Loops of the geometries near a nominal one, which differ from it by deviations (g,), m and rad."""
+    """Loops of geometries that differ from a nominal one by deviations (g,), m and rad."""
 
     nominal: RobotGeometry
 
     def poses(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Poses (N, 6) at which the loops close with joint coordinates (N, n), searched from starts (N, 6).
+        """Poses (N, 6) at which the loops close with joint coordinates (N, n), from starts (N, 6).
 
-        Raises ConvergenceError, naming the first row whose loops stay open.
+        Raises ConvergenceError for the first row whose loops stay open.
         """
         found = self.nearest(joints, deviations, start)
         if not np.isfinite(found).all():
             row = int(np.argmin(np.isfinite(found).all(axis=1)))
             raise ConvergenceError(
-                f"no pose near {row_text(start[row], 4)} closes the loops with the joint coordinates "
-                f"{row_text(joints[row], 4)} of pose {row + 1}"
+                f"no pose near {row_text(start[row], 4)} closes the loops with the joint "
+                f"coordinates {row_text(joints[row], 4)} of pose {row + 1}"
             )
         return found
 
     def nearest(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """As `poses`, with NaN for rows whose loops stay open."""
+        """The same as `poses`, with NaN for rows whose loops stay open."""
 
         def gaps(poses: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
             return self._function(poses, theta, deviations[None])[:2]
@@ -53,21 +57,31 @@ class Closure:
     def derivatives(
         self, poses: np.ndarray, joints: np.ndarray, deviations: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How the platform's coordinates (m) at closed loops (poses (N, 6), joints (N, n)) change with deviations
-        (N, m, g) and with joint coordinates (N, m, n)."""
+        """Derivatives of the platform's coordinates at closed loops.
+
+        At poses (N, 6) with joints (N, n), they are those with respect to deviations (N, m, g) and
+        to joint coordinates (N, m, n).
+        """
         _, by_coordinates, by_joints, by_numbers = self._function(poses, joints, deviations[None])
-        return -np.linalg.solve(by_coordinates, by_numbers), -np.linalg.solve(by_coordinates, by_joints)
+        return -np.linalg.solve(by_coordinates, by_numbers), -np.linalg.solve(
+            by_coordinates, by_joints
+        )
 
     @cached_property
     def _function(self) -> MachineFunction:
+        """Compiled function of the gaps."""
         key = b"closure of the loops" + self.nominal.digest
         return compiled_functions(key, lambda: [closure_function(self.nominal)])["closure"]
 
 
 def closure_function(nominal: RobotGeometry) -> ca.Function:
-    """(pose (6,), joints (n,), deviations (g,)) -> gaps of the loops (n,), m^2, and their derivatives with respect to
-    the platform's coordinates (n, m), joint coordinates (n, n) and deviations (n, g)."""
-    pose, joints = ca.SX.sym("pose", 6), ca.SX.sym("joints", len(nominal.legs))
+    """Function (pose (6,), joints (n,), deviations (g,)) of the gaps of the loops.
+
+    It returns the gaps (n,), m^2, and their derivatives with respect to coordinates (n, m), joint
+    coordinates (n, n) and deviations (n, g).
+    """
+    pose = ca.SX.sym("pose", 6)
+    joints = ca.SX.sym("joints", len(nominal.legs))
     movable = MovableGeometry(nominal)
     (deviations,) = movable.symbols
     gaps, by_coordinates = loop_closure(movable, pose, joints)

@@ -1,8 +1,16 @@
-"""Errors of the dynamics package. Every message carries the value, the limit and the leg or name concerned."""
+"""Errors of the dynamics package. Every message has the value, the limit, and the leg or name."""
+
+LONGEST = 4000
+"""Characters of a message."""
 
 
 class DynamicsError(Exception):
-    """Base class of every error this package raises on purpose."""
+    """Base class of all errors of this package. The message is one line."""
+
+    def __str__(self) -> str:
+        """Message on one line of at most `LONGEST` characters, whatever a file had in it."""
+        text = " ".join(super().__str__().splitlines())
+        return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 class RobotFileError(DynamicsError):

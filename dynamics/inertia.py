@@ -1,14 +1,18 @@
-"""Inertias that a rigid body can have, and what changed inertias do to the motion.
+"""Inertias that a rigid body can have, and the effect of changed inertias on the motion.
 
-A rigid body has a positive mass, and no principal moment larger than the sum of the other two (`moments_fault`).
-Published tables break this (the cranks and links of the paper's Table 1 do), and multibody engines refuse such bodies.
-`physical_inertias` names them, or changes as little as possible, and where it can what the motion does not feel:
+A rigid body has a positive mass, and no principal moment larger than the sum of the other two
+(`moments_fault`). Published tables break this, as the cranks and links of the paper's Table 1 do,
+and multibody engines refuse such bodies. `physical_inertias` names them, or changes as little as
+possible. Where it can, it changes what the motion does not feel:
 
-- a body of which one moment does work, as the Izz of a crank that turns about its own z, keeps that;
-- one of which two do, as Ixx and Iyy of a link without spin, keeps those, and the third gives way;
-- where all three do, as the platform's, they share the change equally (the nearest moments in the least-squares sense).
+- A body of which one moment does work keeps that moment. An example is a crank that turns about its
+  own z, with Izz.
+- A body of which two moments do work keeps both, and the third gives way. An example is a link
+  without spin, with Ixx and Iyy.
+- Where all three moments do work, as those of the platform, they share the change equally. They
+  become the nearest moments in the least-squares sense.
 
-`acceleration_changes` measures at random states over the travel what that means for the robot's motion.
+`acceleration_changes` measures at random states what that means for the motion of the robot.
 """
 
 from collections.abc import Mapping
@@ -24,40 +28,51 @@ from dynamics.workspace import measure
 
 MOMENTS = ("Ixx", "Iyy", "Izz")
 
-# Engines refuse a moving body without mass or inertia; MuJoCo's limit is 1e-15.
+# Engines refuse a moving body without mass or inertia. The limit of MuJoCo is 1e-15.
 SMALLEST = 1e-12
 
-# A sum of two rounded moments may fall below the third by one unit of the last digit; MuJoCo compares exactly.
+# A sum of two rounded moments may fall below the third by one unit of the last digit; MuJoCo
+# compares exactly.
 ROUNDING = 1e-14
 
 
 class UnphysicalInertiaError(ParameterError):
-    """Bodies whose mass and principal inertias no rigid body can have."""
+    """Bodies with a mass and principal inertias that no rigid body can have."""
 
 
 @dataclass(frozen=True)
 class BodyInertias:
-    """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body (bodies, 4), in the order of the
-    robot's layout, and what was changed, in words by body (empty: nothing)."""
+    """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body (bodies, 4).
+
+    changes: text by body of what was changed, empty where nothing was.
+    """
 
     values: np.ndarray
     changes: dict[str, str]
 
 
-def physical_inertias(layout: ParameterLayout, parameters: np.ndarray, allow_changes: bool = False) -> BodyInertias:
-    """Inertias of a robot's parameters (p,) that a multibody engine accepts.
+def physical_inertias(
+    layout: ParameterLayout, parameters: np.ndarray, allow_changes: bool = False
+) -> BodyInertias:
+    """Inertias of parameters (p,) that a multibody engine accepts.
 
-    Raises UnphysicalInertiaError, naming bodies and values, where one must be changed and `allow_changes` is False.
+    Raises UnphysicalInertiaError, with bodies and values, where one must be changed and
+    `allow_changes` is False.
     """
     given = layout.bodies_of(np.array(parameters, dtype=float))
-    broken = {body: fault for body, row in zip(layout.bodies, given, strict=True) if (fault := _fault(row))}
+    broken = {
+        body: fault
+        for body, row in zip(layout.bodies, given, strict=True)
+        if (fault := _fault(row))
+    }
     if broken and not allow_changes:
         raise UnphysicalInertiaError(
-            f"no rigid body has these inertias [kg, kg m^2]: {'; '.join(grouped(broken))}; "
-            "pass allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to take the nearest ones "
-            "that engines accept"
+            f"no rigid body has these inertias [kg, kg m^2]: {'; '.join(grouped(broken))}; pass "
+            "allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to take "
+            "the nearest ones that engines accept"
         )
-    values, changes = given.copy(), dict[str, str]()
+    values = given.copy()
+    changes = dict[str, str]()
     for index, body in enumerate(layout.bodies):
         if body in broken:
             values[index] = _repaired(layout.kinds[index], given[index])
@@ -66,18 +81,25 @@ def physical_inertias(layout: ParameterLayout, parameters: np.ndarray, allow_cha
 
 
 def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
-    """Which of three principal moments of inertia, by name, exceeds the sum of the others by more than its share
-    `rounding`, with values; empty where a rigid body can have them."""
+    """Text for a principal moment that exceeds the sum of the other two.
+
+    rounding: share by which it may exceed the sum. The text is empty where a rigid body can have
+    the moments.
+    """
     largest = max(moments, key=moments.__getitem__)
     others = [name for name in moments if name != largest]
-    halves = sum(moments[name] / 2 for name in others)  # sums of two of the largest floats overflow
+    # sums of two of the largest floats overflow
+    halves = sum(moments[name] / 2 for name in others)
     if moments[largest] / 2 <= (1 + rounding) * halves:
         return ""
-    return f"{largest} {moments[largest]:g} > {' + '.join(f'{name} {moments[name]:g}' for name in others)}"
+    return (
+        f"{largest} {moments[largest]:g} > "
+        f"{' + '.join(f'{name} {moments[name]:g}' for name in others)}"
+    )
 
 
 def grouped(texts: dict[str, str]) -> list[str]:
-    """Texts by body as lines `body, body: text`, one for all bodies that share a text, in the order of the bodies."""
+    """Texts by body as lines `body, body: text`, with one line for all bodies that share a text."""
     bodies: dict[str, list[str]] = {}
     for body, text in texts.items():
         bodies.setdefault(text, []).append(body)
@@ -85,7 +107,7 @@ def grouped(texts: dict[str, str]) -> list[str]:
 
 
 def _fault(row: np.ndarray) -> str:
-    """What is wrong with a body's mass and moments (4,), with its values; empty when nothing is."""
+    """Text for the fault of a body's mass and moments (4,), empty where there is none."""
     for name, value in zip(("mass", *MOMENTS), row, strict=True):
         if value < SMALLEST:
             return f"{name} = {value:g} is below {SMALLEST:g}"
@@ -93,8 +115,10 @@ def _fault(row: np.ndarray) -> str:
 
 
 def _repaired(body: Body, row: np.ndarray) -> np.ndarray:
+    """Mass and moments of a body, changed as little as possible."""
     mass = max(row[0], SMALLEST)
-    moments = np.maximum(row[1:], SMALLEST) / 4  # sums of three of the largest floats overflow
+    # sums of three of the largest floats overflow
+    moments = np.maximum(row[1:], SMALLEST) / 4
     working = [MOMENTS.index(name) for name in body.moments]
     if len(working) in (1, 2):
         idle = [entry for entry in range(3) if entry not in working]
@@ -106,6 +130,7 @@ def _repaired(body: Body, row: np.ndarray) -> np.ndarray:
 
 
 def _one_kept(x: float, y: float, kept: float) -> list[float]:
+    """Moments x, y and one that is kept, such that a body can have them."""
     if x + y < kept:
         half = (kept - x - y) / 2 + ROUNDING * kept
         return [x + half, y + half, kept]
@@ -113,11 +138,13 @@ def _one_kept(x: float, y: float, kept: float) -> list[float]:
 
 
 def _two_kept(z: float, x: float, y: float) -> list[float]:
+    """Moments z, x and y, of which x and y are kept, such that a body can have them."""
     slack = ROUNDING * (x + y)
     return [min(max(z, abs(x - y) + slack), x + y - slack), x, y]
 
 
 def _nearest_moments(moments: np.ndarray) -> np.ndarray:
+    """Nearest moments that a rigid body can have."""
     largest = int(np.argmax(moments))
     excess = 2 * moments[largest] - moments.sum()
     if excess > 0:
@@ -128,23 +155,30 @@ def _nearest_moments(moments: np.ndarray) -> np.ndarray:
 
 
 def _difference(before: np.ndarray, after: np.ndarray) -> str:
+    """Text for what was changed."""
     named = zip(("mass", *MOMENTS), before, after, strict=True)
     return ", ".join(f"{name} {old:g} -> {new:g}" for name, old, new in named if old != new)
 
 
 STATES = 300
-TRAVEL_RATE, TRAVEL_GAIN = 1.0, 10.0
-"""Standard deviations of joint rates, in travel limits a second, and of accelerations, in travel limits a second^2."""
+TRAVEL_RATE = 1.0
+"""Standard deviation of joint rates, in travel limits a second."""
+
+TRAVEL_GAIN = 10.0
+"""Standard deviation of joint accelerations, in travel limits a second^2."""
 
 
-def acceleration_changes(robot: Robot, parameters: np.ndarray, inertias: np.ndarray) -> dict[str, float]:
-    """How much each changed body alters forward dynamics, by body: the largest |change| / |acceleration|.
+def acceleration_changes(
+    robot: Robot, parameters: np.ndarray, inertias: np.ndarray
+) -> dict[str, float]:
+    """Largest |change| / |acceleration| of forward dynamics for each changed body, by body.
 
-    `inertias` (bodies, 4) are masses and moments in the order of the layout; bodies that have them already in the
-    parameters (p,) are left out. Linear and angular acceleration count separately, over the states of
-    `travel_states`. Raises ParameterError for parameters outside their range.
+    inertias (bodies, 4): masses and moments in the order of the layout. Bodies that have them
+    already in the parameters (p,) are left out. Linear and angular acceleration count separately,
+    over the states of `travel_states`. Raises ParameterError for parameters outside their range.
     """
-    own, layout = robot.layout.check(parameters), robot.layout
+    own = robot.layout.check(parameters)
+    layout = robot.layout
     state = travel_states(robot, own)
     before = robot.forward_dynamics(*state, own).reshape(-1, 2, 3)
     effects = {}
@@ -153,24 +187,42 @@ def acceleration_changes(robot: Robot, parameters: np.ndarray, inertias: np.ndar
         layout.bodies_of(other)[index] = inertias[index]
         if not np.array_equal(other, own):
             change = robot.forward_dynamics(*state, other).reshape(-1, 2, 3) - before
-            sizes = np.linalg.norm(before, axis=2)  # zero where the platform cannot turn
-            effects[body] = float((np.linalg.norm(change, axis=2)[sizes > 0] / sizes[sizes > 0]).max())
+            # zero where the platform cannot turn
+            sizes = np.linalg.norm(before, axis=2)
+            effects[body] = float(
+                (np.linalg.norm(change, axis=2)[sizes > 0] / sizes[sizes > 0]).max()
+            )
     return effects
 
 
-def travel_states(robot: Robot, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random poses within the travel limit and twists, (STATES, 6) each, and torques (STATES, n); always the same for a
-    robot."""
-    rng, free, joints = np.random.default_rng(0), robot.geometry.chart.basis, robot.layout.joints
+def travel_states(
+    robot: Robot, parameters: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Random poses within the travel limit and twists, (STATES, 6) each, and torques (STATES, n).
+
+    They are always the same for a robot.
+    """
+    rng = np.random.default_rng(0)
+    free = robot.geometry.chart.basis
+    joints = robot.layout.joints
     at_home = robot.coordinate_jacobian(robot.home_pose)
     pose = np.empty((0, 6))
     while len(pose) < STATES:
-        # The linear map from angles to poses leaves the reach far from home: the factor keeps some draws near it.
-        angles = robot.travel_limit * rng.uniform(0, 1, (STATES, 1)) * rng.uniform(-1, 1, (STATES, joints))
+        # The linear map from angles to poses leaves the reach far from home: the factor keeps some
+        # draws near it.
+        angles = (
+            robot.travel_limit
+            * rng.uniform(0, 1, (STATES, 1))
+            * rng.uniform(-1, 1, (STATES, joints))
+        )
         drawn = robot.home_pose + np.linalg.solve(at_home, angles.T).T @ free.T
         pose = np.concatenate([pose, drawn[measure(robot, drawn).travel_share <= 1]])
     pose = pose[:STATES]
     drawn = robot.travel_limit * rng.standard_normal((2, STATES, joints, 1))
-    twist, gain = (np.linalg.solve(robot.joint_jacobian(pose) @ free, rates)[..., 0] @ free.T for rates in drawn)
-    twist, gain = TRAVEL_RATE * twist, TRAVEL_GAIN * gain
+    twist, gain = (
+        np.linalg.solve(robot.joint_jacobian(pose) @ free, rates)[..., 0] @ free.T
+        for rates in drawn
+    )
+    twist = TRAVEL_RATE * twist
+    gain = TRAVEL_GAIN * gain
     return pose, twist, robot.inverse_dynamics(pose, twist, gain, parameters)

@@ -1,6 +1,5 @@
-"""Robot files: TOML with geometry and named parameter sets, built in by name or given as a path."""
+"""Robot files: TOML with geometry and parameter sets, built in by name or given by path."""
 
-import tomllib
 from dataclasses import dataclass
 from importlib import resources
 from os import PathLike
@@ -12,17 +11,20 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from dynamics.checks import shown
 from dynamics.errors import DynamicsError, RobotFileError
+from dynamics.files import Name, check_name, is_file, parse_toml, read_text
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.chart import FREEDOMS, Chart
 from dynamics.legs import KINDS, AnyLeg
 from dynamics.legs.leg import INERTIAL
 from dynamics.parameters import JOINT_PID, ParameterLayout, parameter_layout
+from dynamics.quantities import Acceleration, Damping, Force, Gain, Inertia, Mass, Place, Travel
 
-_PerLeg = float | list[float]
+MOST_COMPLAINTS = 24
+"""Largest number of faults that a message lists: four for each of six legs."""
 
 
 class Family(NamedTuple):
-    """Robots whose legs are all of one kind: that, their number, and the chart of the platform."""
+    """Family of robots whose legs are all of one kind: the kind, their number, and the chart."""
 
     kind: str
     legs: int
@@ -48,77 +50,104 @@ class _Strict(BaseModel):
     def _know_every_key(cls, values: object) -> object:
         unknown = sorted(set(values) - set(cls.model_fields)) if isinstance(values, dict) else []
         if unknown:
-            raise ValueError(f"unknown key {', '.join(unknown)}; valid: {', '.join(cls.model_fields)}")
+            raise ValueError(
+                f"unknown key {', '.join(unknown)}; valid: {', '.join(cls.model_fields)}"
+            )
         return values
 
 
-class Inertia(_Strict):
-    """Mass, kg, and moments about the body's own axes through its centre of mass, kg m^2: one value, or one a leg."""
+class BodyInertia(_Strict):
+    """Mass, kg, and moments about the body's own axes through its centre of mass, kg m^2.
 
-    mass: _PerLeg
-    Ixx: _PerLeg
-    Iyy: _PerLeg
-    Izz: _PerLeg
+    Each is one value, or a list with one value a leg.
+    """
+
+    mass: Mass | list[Mass]
+    Ixx: Inertia | list[Inertia]
+    Iyy: Inertia | list[Inertia]
+    Izz: Inertia | list[Inertia]
 
 
 class Friction(_Strict):
-    """Dry friction, N m or N, and viscous friction, N m s/rad or N s/m, of the joints: one value, or one a leg."""
+    """Dry friction, N m or N, and viscous friction, N m s/rad or N s/m, of the joints.
 
-    coulomb: _PerLeg
-    viscous: _PerLeg
+    Each is one value, or a list with one value a leg.
+    """
+
+    coulomb: Force | list[Force]
+    viscous: Damping | list[Damping]
 
 
 class JointPid(_Strict):
-    """Gains of the joint PID, which all joints share; `unit` is that of lp, to be stated where actuators slide."""
+    """Gains of the joint PID, which all joints share.
 
-    lp: float
-    li: float
-    ld: float
+    `unit` is that of lp, and must be stated where actuators slide.
+    """
+
+    lp: Gain
+    li: Gain
+    ld: Gain
     unit: Literal["N m/rad", "N/m"] | None = None
 
 
 class Parameters(BaseModel):
-    """A set of parameters: platform, joints and gains, and a table for each kind of body that the legs have."""
+    """Set of parameters: platform, joints, gains, and a table for each kind of the legs' bodies."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
-    __pydantic_extra__: dict[str, Inertia] = Field(init=False)
+    __pydantic_extra__: dict[str, BodyInertia] = Field(init=False)
 
-    platform: Inertia
+    platform: BodyInertia
     joint: Friction
     joint_pid: JointPid
 
 
 class RobotFile(_Strict):
-    """A parallel robot. Lengths in m, angles in rad, masses in kg; poses are [x y z alpha beta gamma]."""
+    """A parallel robot. Lengths are in m, angles in rad, masses in kg.
 
-    name: str = Field(description="its name, in records and reports")
-    family: str | None = Field(None, description=f"one of {', '.join(FAMILIES)}: names kind of legs and chart")
+    A pose is [x y z alpha beta gamma].
+    """
+
+    name: Name = Field(description="its name, in records and reports")
+    family: str | None = Field(
+        None, description=f"one of {', '.join(FAMILIES)}: names kind of legs and chart"
+    )
     chart: str | None = Field(
         None, description=f"freedoms of the platform, where no family says: {', '.join(FREEDOMS)}"
     )
-    home_pose: list[float] = Field(min_length=6, max_length=6, description="pose of the platform at home, m and rad")
-    travel_limit: float = Field(description="largest magnitude of a joint coordinate, rad or m")
-    gravity: list[float] = Field([0.0, 0.0, -9.81], min_length=3, max_length=3, description="m/s^2, base axes")
-    legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
-        description="a table for each leg; with a family also one table with a value, or a list with one a leg, a key"
+    home_pose: list[Place] = Field(
+        min_length=6, max_length=6, description="pose of the platform at home, m and rad"
     )
-    parameters: dict[str, Parameters] = Field(description="named sets; `initial` is what identification starts from")
+    travel_limit: Travel = Field(description="largest magnitude of a joint coordinate, rad or m")
+    gravity: list[Acceleration] = Field(
+        [0.0, 0.0, -9.81], min_length=3, max_length=3, description="m/s^2, base axes"
+    )
+    legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
+        description="a table for each leg; with a family also one table with a value, or a list "
+        "with one a leg, a key"
+    )
+    parameters: dict[str, Parameters] = Field(
+        description="named sets; `initial` is what identification starts from"
+    )
 
     @model_validator(mode="before")
     @classmethod
     def _by_family(cls, values: Any) -> Any:
-        """Legs one by one, each with its kind, where the file names a family."""
+        """Replace a family by legs one by one, each with its kind."""
         if not isinstance(values, dict) or "legs" not in values:
             return values
         name = values.get("family")
         if name is None:
             if isinstance(values["legs"], dict):
-                raise ValueError("legs: a file without family needs one table [[legs]] for each leg, with its type")
+                raise ValueError(
+                    "legs: a file without family needs one table [[legs]] for each leg, with its "
+                    "type"
+                )
             _check_types(values["legs"])
             return values
         if name not in FAMILIES:
             raise ValueError(f"family: unknown `{name}`; valid: {', '.join(FAMILIES)}")
-        family, legs = FAMILIES[name], values["legs"]
+        family = FAMILIES[name]
+        legs = values["legs"]
         if isinstance(legs, dict):
             legs = _legs_of_columns(legs, family)
         if isinstance(legs, list):
@@ -128,22 +157,36 @@ class RobotFile(_Strict):
 
 
 def robot_schema() -> dict[str, Any]:
-    """JSON schema of robot files, for editors; `dynamics/robots/robot.schema.json` holds it."""
+    """JSON schema of robot files, for editors. It is kept in
+    `dynamics/robots/robot.schema.json`.
+    """
     schema = RobotFile.model_json_schema()
     one_a_leg = schema["properties"]["legs"]
-    columns = {"type": "object", "description": "with a family: for each key one value, or a list with one a leg"}
-    schema["properties"]["legs"] = {"anyOf": [one_a_leg, columns], "description": one_a_leg.pop("description")}
+    columns = {
+        "type": "object",
+        "description": "with a family: for each key one value, or a list with one a leg",
+    }
+    schema["properties"]["legs"] = {
+        "anyOf": [one_a_leg, columns],
+        "description": one_a_leg.pop("description"),
+    }
     return schema
 
 
 def _check_types(legs: Any) -> None:
+    """Raise ValueError for a leg of an unknown kind."""
     for number, leg in enumerate(legs if isinstance(legs, list) else (), 1):
         if isinstance(leg, dict) and leg.get("type") not in KINDS:
-            raise ValueError(f"leg {number}: its type is {leg.get('type')!r}; valid: {', '.join(KINDS)}")
+            raise ValueError(
+                f"leg {number}: its type is {leg.get('type')!r}; valid: {', '.join(KINDS)}"
+            )
 
 
 def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, Any]]:
-    """One table a leg of one table with columns: a value for all legs, or a list with one a leg."""
+    """Tables of the legs, from one table with columns.
+
+    A column is one value for all legs, or a list with one value a leg.
+    """
     fields = {_plural(name): name for name in KINDS[family.kind].model_fields}
     legs: list[dict[str, Any]] = [{} for _ in range(family.legs)]
     for key, value in columns.items():
@@ -151,15 +194,21 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
         if name is None:
             raise ValueError(f"legs: unknown key {key}; valid: {', '.join(fields)}")
         vector = KINDS[family.kind].model_fields[name].annotation is np.ndarray
-        each = isinstance(value, list) and (not vector or (bool(value) and isinstance(value[0], list)))
+        each = isinstance(value, list) and (
+            not vector or (bool(value) and isinstance(value[0], list))
+        )
         if each and len(value) != family.legs:
-            raise ValueError(f"legs.{key} needs one value, or one for each of {family.legs} legs, got {len(value)}")
+            raise ValueError(
+                f"legs.{key} needs one value, or one for each of {family.legs} legs, got "
+                f"{len(value)}"
+            )
         for number, leg in enumerate(legs):
             leg[name] = value[number] if each else value
     return legs
 
 
 def _plural(name: str) -> str:
+    """Plural of a field."""
     if name.endswith("axis"):
         return name.removesuffix("axis") + "axes"
     return name + "s" if name.endswith(("joint", "direction")) else name
@@ -167,8 +216,10 @@ def _plural(name: str) -> str:
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """One named set: dynamic parameters (p,) in the order of the robot's `parameter_names`, and joint PID [lp, li, ld]
-    (3,)."""
+    """Named parameter set.
+
+    dynamic (p,): in the order of `Robot.parameter_names`. joint_pid (3,): lp, li, ld.
+    """
 
     dynamic: np.ndarray
     joint_pid: np.ndarray
@@ -181,61 +232,98 @@ class ParameterSet:
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """What a robot file holds: name, geometry and named parameter sets."""
+    """Content of a robot file: name, geometry and parameter sets."""
 
     name: str
     geometry: RobotGeometry
     parameter_sets: dict[str, ParameterSet]
 
+    def __post_init__(self) -> None:
+        try:
+            check_name(self.name)
+        except ValueError as error:
+            raise RobotFileError(f"the robot's name {error}") from None
+
 
 def built_in_robots() -> list[str]:
-    """Names of the robot files that ship with the package."""
+    """Names of the built-in robots.
+
+    Returns
+    -------
+    list of str
+        Names that `load_robot` takes.
+
+    Raises
+    ------
+    OSError
+        If the folder of the robots cannot be read.
+
+    Examples
+    --------
+    >>> import dynamics
+    >>> "rss6" in dynamics.built_in_robots()
+    True
+    """
     folder = resources.files("dynamics") / "robots"
-    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return sorted(
+        Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".toml")
+    )
 
 
 def read_robot_file(name_or_path: str | Path) -> RobotDescription:
-    """Read a built-in robot (by name) or a TOML robot file (by path).
+    """Read a built-in robot by its name, or a TOML robot file by its path.
 
-    Raises RobotFileError for an unknown name (with the valid ones), an unreadable file, an unknown or missing key
-    (with its place), and for geometry or parameters that make no robot.
+    Raises RobotFileError for an unknown name, with the valid ones; for a file that cannot be read;
+    for an unknown or missing key, with its place; and for geometry or parameters that make no
+    robot.
     """
     source, text = _read_text(name_or_path)
+    return parsed_robot(text, f"robot file {source}")
+
+
+def parsed_robot(text: str, source: str) -> RobotDescription:
+    """Robot of the text of a file; source: how messages call it. Raises as `read_robot_file`."""
     try:
-        content = RobotFile.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise RobotFileError(f"robot file {source} is not valid TOML: {error}") from error
+        content = RobotFile.model_validate(parse_toml(text, source, RobotFileError))
     except ValidationError as error:
-        raise RobotFileError(f"robot file {source}: {_one_line(error)}") from error
+        raise RobotFileError(f"{source}: {_one_line(error)}") from error
     try:
         geometry = _geometry(content)
         layout = parameter_layout(geometry.legs)
-        sets = {name: _parameter_set(name, values, layout) for name, values in content.parameters.items()}
+        sets = {
+            name: _parameter_set(name, values, layout)
+            for name, values in content.parameters.items()
+        }
     except DynamicsError as error:
-        raise RobotFileError(f"robot file {source}: {error}") from error
+        raise RobotFileError(f"{source}: {error}") from error
     if "initial" not in sets:
-        raise RobotFileError(f"robot file {source} needs a parameter set `initial`; it has {sorted(sets) or 'none'}")
+        raise RobotFileError(
+            f"{source} needs a parameter set `initial`; it has {sorted(sets) or 'none'}"
+        )
     return RobotDescription(content.name, geometry, sets)
 
 
 def _geometry(content: RobotFile) -> RobotGeometry:
+    """Geometry of the content of a file."""
     if content.chart is None:
         raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
     if content.chart not in FREEDOMS:
         raise RobotFileError(f"unknown chart `{content.chart}`; valid: {', '.join(FREEDOMS)}")
     chart = Chart(content.chart, tuple(content.home_pose))
-    return RobotGeometry(tuple(content.legs), chart, content.travel_limit, np.array(content.gravity))
+    return RobotGeometry(
+        tuple(content.legs), chart, content.travel_limit, np.array(content.gravity)
+    )
 
 
 def _read_text(name_or_path: str | Path) -> tuple[str, str]:
+    """Text of a robot file. Raises RobotFileError."""
     if not isinstance(name_or_path, str | PathLike):
-        raise RobotFileError(f"a robot is given by its name or the path of its file, got {shown(name_or_path)}")
+        raise RobotFileError(
+            f"a robot is given by its name or the path of its file, got {shown(name_or_path)}"
+        )
     path = Path(name_or_path)
-    if path.suffix == ".toml" or (path.is_file() and str(name_or_path) not in built_in_robots()):
-        try:
-            return str(path), path.read_text(encoding="utf-8")
-        except (OSError, ValueError) as error:
-            raise RobotFileError(f"cannot read robot file {path}: {error}") from error
+    if path.suffix == ".toml" or (is_file(path) and str(name_or_path) not in built_in_robots()):
+        return str(path), read_text(path, f"robot file {path}", RobotFileError)
     if str(name_or_path) not in built_in_robots():
         valid = f"built-in robots: {', '.join(built_in_robots())}; or give the path of a .toml file"
         raise RobotFileError(f"unknown robot `{name_or_path}`; {valid}")
@@ -244,23 +332,37 @@ def _read_text(name_or_path: str | Path) -> tuple[str, str]:
 
 
 def _one_line(error: ValidationError) -> str:
-    """What is wrong, with the place; what is wrong with several legs alike is said once."""
+    """Faults with their places, in one line. A fault that several legs share is said once."""
     legs: dict[str, list[str]] = {}
-    for item in error.errors():
-        place, who = list(item["loc"]), ""
+    found = error.errors()
+    for item in found[:MOST_COMPLAINTS]:
+        place = list(item["loc"])
+        who = ""
         if len(place) > 1 and place[0] == "legs":
-            who, place = f"leg {int(place[1]) + 1}", place[3:]  # behind the leg's number stands its type
+            who = f"leg {int(place[1]) + 1}"
+            # the type of the leg is after its number
+            place = place[3:]
+        last = str(place[-1]) if place else ""
+        if last.startswith("list[" if not isinstance(item["input"], list) else "function-"):
+            continue  # one value is no list with one a leg, nor such a list one value
+        place = [part for part in place if not str(part).startswith(("list[", "function-"))]
         said = [".".join(map(str, place)), item["msg"].removeprefix("Value error, ")]
         got = "" if item["type"] in ("value_error", "missing") else f", got {shown(item['input'])}"
         legs.setdefault(": ".join(filter(None, said)) + got, []).append(who)
-    return "; ".join(": ".join(filter(None, [", ".join(who), text])) for text, who in legs.items())
+    lines = [": ".join(filter(None, [", ".join(who), text])) for text, who in legs.items()]
+    more = len(found) - MOST_COMPLAINTS
+    return "; ".join(lines + ([f"and {more} more"] if more > 0 else []))
 
 
 def _parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> ParameterSet:
-    def per_leg(key: str, value: _PerLeg, count: int) -> list[float]:
+    """Parameter set of its table."""
+
+    def per_leg(key: str, value: float | list[float], count: int) -> list[float]:
         expanded = value if isinstance(value, list) else [value] * count
         if len(expanded) != count:
-            raise RobotFileError(f"parameters.{name}.{key} needs one value or {count} values, got {len(expanded)}")
+            raise RobotFileError(
+                f"parameters.{name}.{key} needs one value or {count} values, got {len(expanded)}"
+            )
         return expanded
 
     kinds = [kind.name for kind in layout.kinds]
@@ -268,18 +370,27 @@ def _parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> Pa
     if set(given) != set(kinds):
         wrong = sorted(set(given) ^ set(kinds))
         valid = ", ".join([*dict.fromkeys(kinds), "joint", "joint_pid"])
-        raise RobotFileError(f"parameters.{name}: {', '.join(wrong)} unknown or missing; it needs {valid}")
+        raise RobotFileError(
+            f"parameters.{name}: {', '.join(wrong)} unknown or missing; it needs {valid}"
+        )
     rigid = np.empty((len(kinds), len(INERTIAL)))
     for kind, inertia in given.items():
         rows = [row for row, name_of in enumerate(kinds) if name_of == kind]
-        rigid[rows] = np.transpose([per_leg(f"{kind}.{k}", v, len(rows)) for k, v in inertia.model_dump().items()])
-    friction = [per_leg(f"joint.{key}", value, layout.joints) for key, value in values.joint.model_dump().items()]
+        rigid[rows] = np.transpose(
+            [per_leg(f"{kind}.{k}", v, len(rows)) for k, v in inertia.model_dump().items()]
+        )
+    friction = [
+        per_leg(f"joint.{key}", value, layout.joints)
+        for key, value in values.joint.model_dump().items()
+    ]
     dynamic = layout.check(np.concatenate([rigid.ravel(), *friction]))
-    stated, unit = values.joint_pid.unit, layout.unit("joint_pid.lp")
+    stated = values.joint_pid.unit
+    unit = layout.unit("joint_pid.lp")
     if stated != unit and (stated or layout.prismatic):
         raise RobotFileError(
-            f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} {f'is in {stated}' if stated else 'has no unit'}"
-            f", but the actuators {'slide' if layout.prismatic else 'turn'}: their gains are in {unit}, which "
+            f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} "
+            f"{f'is in {stated}' if stated else 'has no unit'}, but the actuators "
+            f"{'slide' if layout.prismatic else 'turn'}: their gains are in {unit}, which "
             f'joint_pid says by unit = "{unit}"'
         )
     joint_pid = np.array([getattr(values.joint_pid, gain) for gain in JOINT_PID])

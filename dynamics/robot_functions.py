@@ -1,7 +1,9 @@
-"""The compiled functions of a robot's geometry: one set for all robots that share it, or that are near it."""
+"""Functions of a robot's geometry: compiled ones for its own use, and CasADi's for its users."""
 
 from dataclasses import replace
 from functools import lru_cache
+
+import casadi as ca
 
 from dynamics.compiled.machine_code import MachineFunction, compiled_functions
 from dynamics.geometry import MovableGeometry, RobotGeometry
@@ -9,28 +11,71 @@ from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.virtual_work import robot_functions
 
 HOT = (
-    *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
-    *("stage_derivatives", "stop_derivatives", "slope_derivative", "forward_dynamics", "motion_in_lanes"),
-    *("acceleration_in_lanes", "servo_jacobian"),
+    "equation_of_motion",
+    "free_acceleration",
+    "response",
+    "motion_derivatives",
+    "rate_map_derivative",
+    "stage_derivatives",
+    "stop_derivatives",
+    "slope_derivative",
+    "forward_dynamics",
+    "motion_in_lanes",
+    "acceleration_in_lanes",
+    "servo_jacobian",
 )
-"""What inner loops evaluate."""
+"""Names of the functions that inner loops evaluate."""
+
+CASADI = {
+    "inverse_kinematics": ("pose", "theta reach_margin"),
+    "joint_jacobian": ("pose", "jacobian"),
+    "pose_jacobian": ("pose", "jacobian"),
+    "mass_matrix": ("pose parameters", "mass_matrix"),
+    "coriolis_matrix": ("pose twist parameters", "coriolis_matrix"),
+    "gravity_wrench": ("pose parameters", "wrench"),
+    "friction_wrench": ("pose twist parameters", "wrench"),
+    "regressor": ("pose twist twist_dot", "regressor"),
+    "inverse_dynamics": ("pose twist twist_dot parameters", "torque"),
+    "forward_dynamics": ("pose twist torque parameters", "twist_dot"),
+}
+"""Names of the inputs and of the outputs of the functions that `Robot.casadi` returns."""
 
 
 @lru_cache(maxsize=16)
 def own_functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
-    """One set for all robots of a geometry; not kept in the robot, so that robots can be pickled."""
-    return compiled_functions(geometry.digest, lambda: robot_functions(geometry) + motion_functions(geometry), HOT)
+    """Compiled functions of a geometry, the same for all its robots.
+
+    Robots do not hold them, so that robots can be pickled.
+    """
+    return compiled_functions(
+        geometry.digest, lambda: robot_functions(geometry) + motion_functions(geometry), HOT
+    )
 
 
 @lru_cache(maxsize=4)
 def _movable_functions(nominal: RobotGeometry) -> dict[str, MachineFunction]:
-    """One set for all geometries near a nominal one, with deviations from it as the last argument."""
-    movable, key = MovableGeometry(nominal), b"movable" + nominal.digest
-    return compiled_functions(key, lambda: robot_functions(movable) + motion_functions(movable), HOT)
+    """Compiled functions of all geometries near a nominal one. Their last input is deviations."""
+    movable = MovableGeometry(nominal)
+    key = b"movable" + nominal.digest
+    return compiled_functions(
+        key, lambda: robot_functions(movable) + motion_functions(movable), HOT
+    )
 
 
 @lru_cache(maxsize=64)
 def nearby_functions(nominal: RobotGeometry, geometry: RobotGeometry) -> dict[str, MachineFunction]:
-    """Those of a geometry, of the set for all that are near a nominal one."""
+    """Compiled functions of a geometry near a nominal one, of the set that both share."""
     deviations = geometry.deviations_from(nominal)
-    return {name: replace(one, constants=deviations) for name, one in _movable_functions(nominal).items()}
+    return {
+        name: replace(one, constants=deviations)
+        for name, one in _movable_functions(nominal).items()
+    }
+
+
+@lru_cache(maxsize=64)
+def casadi_function(geometry: RobotGeometry, name: str) -> ca.Function:
+    """CasADi function of a geometry, with the inputs and outputs that `CASADI` names."""
+    found = next(one for one in robot_functions(geometry) if one.name() == name)
+    inputs, outputs = (names.split() for names in CASADI[name])
+    given = [ca.SX.sym(one, found.size1_in(k)) for k, one in enumerate(inputs)]
+    return ca.Function(name, given, found.call(given), inputs, outputs)

@@ -1,4 +1,4 @@
-"""A robot as the text of its file: what `robot_file` reads, one table a leg, all numbers with all their digits."""
+"""Text of a robot file, as `robot_file` reads it, with one table a leg and all digits."""
 
 import json
 import re
@@ -12,13 +12,23 @@ from dynamics.robot_file import ParameterSet, RobotDescription
 
 
 def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
-    """TOML of a robot, below comments in lines of their own; reading it gives the same robot to the last digit."""
-    geometry, layout = robot.geometry, parameter_layout(robot.geometry.legs)
+    """TOML of a robot, with comments before it in lines of their own.
+
+    Reading it gives the same robot, to the last digit.
+    """
+    geometry = robot.geometry
+    layout = parameter_layout(robot.geometry.legs)
     turning = "m and N" if layout.prismatic else "rad and N m"
     lines = [f"# {' '.join(comment.split())}" for comment in comments]
-    lines += [f"# Lengths in m, angles in rad, masses in kg, inertias in kg m^2; joints in {turning}.", ""]
+    lines += [
+        f"# Lengths in m, angles in rad, masses in kg, inertias in kg m^2; joints in {turning}.",
+        "",
+    ]
     lines += [f"name = {json.dumps(robot.name)}", f"chart = {json.dumps(geometry.chart.name)}"]
-    lines += [f"home_pose = {_value(geometry.home_pose)}", f"travel_limit = {_value(geometry.travel_limit)}"]
+    lines += [
+        f"home_pose = {_value(geometry.home_pose)}",
+        f"travel_limit = {_value(geometry.travel_limit)}",
+    ]
     lines += [f"gravity = {_value(geometry.gravity)}"]
     for number, leg in enumerate(geometry.legs, 1):
         lines += ["", f"# Leg {number}", "[[legs]]", *_fields(leg)]
@@ -28,35 +38,47 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
 
 
 def _fields(leg: Leg) -> list[str]:
+    """Fields of a leg."""
     fields = [(name, getattr(leg, name)) for name in type(leg).model_fields]
     fields.sort(key=lambda field: field[0] != "type")
     return [f"{name} = {_value(value)}" for name, value in fields if value is not None]
 
 
 def _parameters(values: ParameterSet, layout: ParameterLayout) -> list[str]:
-    bodies, kinds = layout.bodies_of(values.dynamic), [kind.name for kind in layout.kinds]
+    """Lines of a parameter set."""
+    bodies = layout.bodies_of(values.dynamic)
+    kinds = [kind.name for kind in layout.kinds]
     lines = []
     for kind in dict.fromkeys(kinds):
         rows = bodies[[row for row, name in enumerate(kinds) if name == kind]]
         lines.append(_table(kind, {name: rows[:, entry] for entry, name in enumerate(INERTIAL)}))
-    friction = {"coulomb": values.dynamic[layout.coulomb], "viscous": values.dynamic[layout.viscous]}
+    friction = {
+        "coulomb": values.dynamic[layout.coulomb],
+        "viscous": values.dynamic[layout.viscous],
+    }
     lines.append(_table("joint", friction))
     gains = {gain: values.joint_pid[[entry]] for entry, gain in enumerate(JOINT_PID)}
-    return [*lines, _table("joint_pid", gains)[:-2] + f", unit = {json.dumps(layout.unit('joint_pid.lp'))} }}"]
+    return [
+        *lines,
+        _table("joint_pid", gains)[:-2] + f", unit = {json.dumps(layout.unit('joint_pid.lp'))} }}",
+    ]
 
 
 def _table(name: str, columns: dict[str, np.ndarray]) -> str:
-    """One value for all where they agree."""
-    said = {key: column[0] if np.all(column == column[0]) else column for key, column in columns.items()}
+    """Line of a table, with one value where all values are equal."""
+    said = {
+        key: column[0] if np.all(column == column[0]) else column for key, column in columns.items()
+    }
     return f"{name} = {{ {', '.join(f'{key} = {_value(value)}' for key, value in said.items())} }}"
 
 
 def _key(name: str) -> str:
-    """A name as TOML has it, in quotes where it needs them."""
+    """Name as a key of TOML, in quotes where it needs them."""
     return name if re.fullmatch("[A-Za-z0-9_-]+", name) else json.dumps(name)
 
 
 def _value(value: object) -> str:
+    """Value as TOML writes it."""
     if isinstance(value, np.ndarray):
         return f"[{', '.join(_value(entry) for entry in value.tolist())}]"
     return json.dumps(value) if isinstance(value, str | int) else repr(float(value))  # type: ignore[arg-type]

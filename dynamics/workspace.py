@@ -1,16 +1,18 @@
-"""May the robot move so? How far poses are from its limits: travel, reach, and its two kinds of singularity.
+"""Limits of the motion of a robot: travel, reach, and its two kinds of singularity.
 
-- Travel: the magnitude of each joint coordinate against the travel limit.
-- Reach: the reach margin of a leg; of one with a crank, sin^2 of the angle between that and the direction to the
-  platform joint in the crank's plane. At 0 the leg is stretched or folded.
-- Actuator side (J_a1): the leverage of an actuator on its leg, in 0..1; of a crank |(w x l) . s| / (|w| |l|). Where it
-  vanishes, for cranks together with the reach margin, the actuator moves the platform no more.
-- Platform side (J_a2): the condition number of J_a2 for the motions that the platform can make, its rows of unit
-  vectors along the legs' forces and its angular columns divided by the characteristic length, so that all entries are
-  plain numbers. At infinity the platform moves with all actuators locked.
+- Travel is the magnitude of each joint coordinate, against the travel limit.
+- Reach is the reach margin of a leg. For a crank it is sin^2 of the angle between the crank and the
+  direction to the platform joint in the plane of the crank. At 0 the leg is stretched or folded.
+- The actuator side (J_a1) is the leverage of an actuator on its leg, in 0..1. For a crank it is
+  |(w x l) . s| / (|w| |l|). Where it vanishes, the actuator does not move the platform any more.
+  For a crank it vanishes together with the reach margin.
+- The platform side (J_a2) is the condition number of J_a2 for the motions that the platform can
+  make. Its rows are unit vectors along the forces of the legs, and its angular columns are divided
+  by the characteristic length, so that all entries are plain numbers. Where it is infinite, the
+  platform moves with all actuators locked.
 
-The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m for rss6). As
-CasADi expressions, for a search that keeps their limits, they are `rigid_body.jacobians.singularity_measures`.
+The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m
+for rss6). `rigid_body.jacobians.singularity_measures` has the measures as CasADi expressions.
 """
 
 from __future__ import annotations
@@ -23,23 +25,36 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics.checks import check_type, floats, real, row_text, rows
-from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
+from dynamics.errors import (
+    DynamicsError,
+    ShapeError,
+    SingularPoseError,
+    TravelError,
+    UnreachablePoseError,
+)
 from dynamics.kinematics import forward_kinematics
 from dynamics.robot import Robot
 
 LEAST_LEVERAGE = 0.05
-"""Below it an actuator's force is multiplied by more than 20 along its leg; rss6 keeps above 0.09 within its travel."""
+"""Least leverage for `check_motion`.
+
+Below it an actuator's force is multiplied by more than 20 along its leg. rss6 is above 0.09 within
+its travel.
+"""
 
 MOST_CONDITION = 20.0
-"""Limit of the condition numbers for `check_motion`; rss6 keeps below 5 (J_a2) and 10 (J_ad) within its travel."""
+"""Largest condition numbers for `check_motion`.
+
+rss6 is below 5 (J_a2) and 10 (J_ad) within its travel.
+"""
 
 
 @dataclass(frozen=True)
 class WorkspaceMeasures:
-    """Measures of N poses; NaN where and only where a leg cannot reach, except for the reach margins.
+    """Measures of N poses. All but the reach margins are NaN where a leg cannot reach.
 
-    theta (N, n), rad or m; reach_margin (N, n), negative out of reach; leverage (N, n), of J_a1; platform_rows
-    (N, n, n), J_a2 without unit; travel_limit, rad or m.
+    theta (N, n): rad or m. reach_margin (N, n): negative out of reach. leverage (N, n): of J_a1.
+    platform_rows (N, n, n): J_a2 without unit. travel_limit: rad or m.
     """
 
     theta: np.ndarray
@@ -59,13 +74,14 @@ class WorkspaceMeasures:
         return self._condition(self.platform_rows / self.leverage[..., None])
 
     def _condition(self, matrices: np.ndarray) -> np.ndarray:
+        """Condition numbers of matrices, NaN out of reach."""
         result = np.full(len(matrices), np.nan)
         result[self.reachable] = np.linalg.cond(matrices[self.reachable])
         return result
 
     @property
     def reachable(self) -> np.ndarray:
-        """Whether all legs reach (N,)."""
+        """True for each pose (N,) that all legs reach."""
         return np.asarray((self.reach_margin > 0).all(axis=1))
 
     @property
@@ -76,8 +92,11 @@ class WorkspaceMeasures:
 
 @dataclass(frozen=True)
 class Extreme:
-    """Where a motion comes nearest to a limit: value, limit, row, time [s] (NaN if none was given), and leg 1..n
-    (None where it concerns all)."""
+    """Point of a motion that is nearest to a limit.
+
+    value, limit, row. time: s, NaN where no times are given. leg: 1 to n, None where all are
+    concerned.
+    """
 
     value: float
     limit: float
@@ -88,7 +107,11 @@ class Extreme:
 
 @dataclass(frozen=True)
 class MotionExtremes:
-    """The worst of a motion: reach margin, travel |theta| in rad or m, leverage of J_a1, condition of scaled J_a2."""
+    """Points of a motion that are nearest to the limits.
+
+    They are those of the reach margin, of the travel |theta| (rad or m), of the leverage of J_a1,
+    and of the condition number of the scaled J_a2.
+    """
 
     reach: Extreme
     travel: Extreme
@@ -97,15 +120,16 @@ class MotionExtremes:
 
 
 def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
-    """Measures of poses (N, 6), or of one (6,) as N = 1. Poses out of reach give NaN and a negative reach margin.
+    """Measures of poses (N, 6), or of one pose (6,) as N = 1.
 
-    Raises ShapeError for another shape or for entries that are not finite.
+    Poses out of reach give NaN and a negative reach margin. Raises ShapeError.
     """
     check_type("robot", robot, Robot, DynamicsError)
     poses = np.atleast_2d(robot.charted(pose))
     theta, margin = (part[..., 0] for part in robot.functions["inverse_kinematics"](poses))
     leverage, platform_rows = robot.functions["singularity_measures"](poses)
-    margin[np.isnan(margin)] = -np.inf  # squares have overflowed
+    # squares have overflowed there
+    margin[np.isnan(margin)] = -np.inf
     unreachable = ~(margin > 0).all(axis=1)
     for values in (theta, leverage, platform_rows):
         values[unreachable] = np.nan
@@ -113,10 +137,10 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
 
 
 def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
-    """Measures of the poses that belong to random joint coordinates within the travel limit, followed from home.
+    """Measures of poses for random joint coordinates within the travel limit, from home.
 
-    Those without a pose near home are left out: as many as there are fewer rows than samples. Always the same for a
-    robot.
+    Coordinates without a pose near home are left out, so that there may be fewer rows than samples.
+    The result is always the same for a robot.
     """
     limit = robot.travel_limit
     joints = np.random.default_rng(0).uniform(-limit, limit, (samples, robot.layout.joints))
@@ -134,11 +158,12 @@ def check_motion(
     least_leverage: float = LEAST_LEVERAGE,
     most_condition: float = MOST_CONDITION,
 ) -> MotionExtremes:
-    """The worst of a motion sampled as poses (N, 6) at times (N,) in s, N >= 1, if all of it is within the limits.
+    """Points nearest to the limits of a motion that is within all of them.
 
-    Raises, with time (or row), leg, value and limit: UnreachablePoseError; TravelError beyond the travel limit less
-    `travel_margin` (rad or m); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of
-    the scaled J_a2 above `most_condition`; ShapeError for poses or times of the wrong shape, or times that do not
+    The motion is poses (N, 6) at times (N,), s, with N >= 1. Raises, with time or row, leg, value
+    and limit: UnreachablePoseError; TravelError beyond the travel limit less `travel_margin` (rad
+    or m); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of
+    the scaled J_a2 above `most_condition`; ShapeError for another shape, or for times that do not
     increase.
     """
     poses = np.atleast_2d(rows("pose", pose, 6))
@@ -152,15 +177,19 @@ def check_motion(
 
     def extreme(values: np.ndarray, limit: float, pick: Callable[..., np.intp]) -> Extreme:
         row, *leg = (int(index) for index in np.unravel_index(pick(values), values.shape))
-        return Extreme(float(values[row, *leg]), limit, row, float(moments[row]), leg[0] + 1 if leg else None)
+        return Extreme(
+            float(values[row, *leg]), limit, row, float(moments[row]), leg[0] + 1 if leg else None
+        )
 
-    def check(worst: Extreme, within: bool, kind: type[DynamicsError], quantity: str, relation: str) -> None:
+    def check(
+        worst: Extreme, within: bool, kind: type[DynamicsError], quantity: str, relation: str
+    ) -> None:
         if not within:
             when = f"row {worst.row}" if np.isnan(worst.time) else f"t = {worst.time:.4g} s"
             who = f" of leg {worst.leg}" if worst.leg else ""
             raise kind(
-                f"{quantity}{who} of {robot.name} is {worst.value:.4g} at {when}, {relation}{worst.limit:.4g} "
-                f"(pose {row_text(poses[worst.row], 4)})"
+                f"{quantity}{who} of {robot.name} is {worst.value:.4g} at {when}, "
+                f"{relation}{worst.limit:.4g} (pose {row_text(poses[worst.row], 4)})"
             )
 
     reach = extreme(measures.reach_margin, 0.0, np.argmin)
@@ -174,16 +203,31 @@ def check_motion(
         "limit ",
     )
     leverage = extreme(measures.leverage, least_leverage, np.argmin)
-    check(leverage, leverage.value >= leverage.limit, SingularPoseError, "leverage (J_a1)", "must be >= ")
+    check(
+        leverage,
+        leverage.value >= leverage.limit,
+        SingularPoseError,
+        "leverage (J_a1)",
+        "must be >= ",
+    )
     condition = extreme(measures.platform_condition, most_condition, np.argmax)
-    check(condition, condition.value <= condition.limit, SingularPoseError, "condition of J_a2", "limit ")
+    check(
+        condition,
+        condition.value <= condition.limit,
+        SingularPoseError,
+        "condition of J_a2",
+        "limit ",
+    )
     return MotionExtremes(reach, travel, leverage, condition)
 
 
 def _increasing(times: ArrayLike, count: int) -> np.ndarray:
+    """Times (N,) that increase, NaN where there are none. Raises ShapeError."""
     moments = floats("times", times, (count,))
     back = np.flatnonzero(np.diff(moments) <= 0)
     if len(back):
         row = int(back[0]) + 1
-        raise ShapeError(f"times must increase, but times[{row}] = {moments[row]} s follows {moments[row - 1]} s")
+        raise ShapeError(
+            f"times must increase, but times[{row}] = {moments[row]} s follows {moments[row - 1]} s"
+        )
     return moments

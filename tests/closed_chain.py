@@ -1,8 +1,10 @@
-"""A robot in Pinocchio: free-flying platform, the bodies of each leg on their joints, and loop constraints at its end.
+"""A robot in Pinocchio: free-flying platform, the bodies of each leg on their joints, and loop
+constraints at its end.
 
-Pinocchio knows nothing of virtual work, of the leg Jacobians or of the platform joints' motion: it gets bodies, joints
-and the demand that points of the last bodies stay on points of the platform, which is so kept from moving as it cannot.
-Joint coordinates and rates are those the robot gives; `closure` shows whether they close the chain.
+Pinocchio knows nothing of virtual work, of the leg Jacobians or of the platform joints' motion: it
+gets bodies, joints and the demand that points of the last bodies stay on points of the platform,
+which is so kept from moving as it cannot. Joint coordinates and rates are those the robot gives;
+`closure` shows whether they close the chain.
 """
 
 from typing import NamedTuple
@@ -38,8 +40,9 @@ class ChainState(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A body of a leg: its joint to part `before` (-1: the base), where that is in the frame there; which inertia of
-    the leg it has and what share of it, its centre of mass; and its end, which is on the platform `off` the joint."""
+    """A body of a leg: its joint to part `before` (-1: the base), where that is in the frame there;
+    which inertia of the leg it has and what share of it, its centre of mass; and its end, which is
+    on the platform `off` the joint."""
 
     joint: str
     before: int
@@ -65,7 +68,10 @@ def crank_parts(leg, joint, turn=SAME, offs=(NONE,)):
     """A crank and the links on it, of which there may be two."""
     zero, tip, end = leg.crank_zero_direction, leg.crank_length * X, leg.link_length * Z
     foot = np.column_stack([zero, np.cross(leg.crank_axis, zero), leg.crank_axis])
-    links = [Part(joint, 0, turned(turn, tip + off), 1, end / 2, end, 1 / len(offs), off @ foot.T) for off in offs]
+    links = [
+        Part(joint, 0, turned(turn, tip + off), 1, end / 2, end, 1 / len(offs), off @ foot.T)
+        for off in offs
+    ]
     return [Part("hinge", -1, turned(foot, leg.base_joint), 0, tip / 2), *links]
 
 
@@ -98,8 +104,8 @@ PARTS = {
 
 
 def link_motion(axis, link, rate, spins):
-    """Axes and angular velocity of a link: x is normal to a standing axis; about this and about x it turns, or, where
-    it hangs on a ball, as it does without spin."""
+    """Axes and angular velocity of a link: x is normal to a standing axis; about this and about x
+    it turns, or, where it hangs on a ball, as it does without spin."""
     length = np.linalg.norm(link)
     z, z_rate = link / length, rate / length
     x = np.cross(axis, z) / np.linalg.norm(np.cross(axis, z))
@@ -112,7 +118,10 @@ def link_motion(axis, link, rate, spins):
 def crank_motions(leg, theta, rate, at, moving):
     axis, zero = leg.crank_axis, leg.crank_zero_direction
     x = np.cos(theta) * zero + np.sin(theta) * np.cross(axis, zero)
-    tip, tip_rate = leg.base_joint + leg.crank_length * x, rate * leg.crank_length * np.cross(axis, x)
+    tip, tip_rate = (
+        leg.base_joint + leg.crank_length * x,
+        rate * leg.crank_length * np.cross(axis, x),
+    )
     link = link_motion(axis, at - tip, moving - tip_rate, leg.type == "rus")
     return [(np.column_stack([x, np.cross(axis, x), axis]), rate * axis), link, link]
 
@@ -121,7 +130,10 @@ def slider_motions(leg, coordinate, rate, at, moving):
     axis = leg.slider_axis
     link, link_rate = at - leg.base_joint - coordinate * axis, moving - rate * axis
     spins = leg.type == "pus"
-    return [(across(axis), NONE), link_motion(leg.joint_axis if spins else axis, link, link_rate, spins)]
+    return [
+        (across(axis), NONE),
+        link_motion(leg.joint_axis if spins else axis, link, link_rate, spins),
+    ]
 
 
 def ups_motions(leg, coordinate, rate, at, moving):
@@ -164,7 +176,9 @@ class ClosedChain:
             inertia, numbers, place = part.share * self._bodies[own[part.body]], [], part.place
             for kind in kinds:
                 last = len(numbers) == len(kinds) - 1
-                numbers.append(self._body(parent, kind, place, inertia if last else None, part.centre))
+                numbers.append(
+                    self._body(parent, kind, place, inertia if last else None, part.centre)
+                )
                 parent, place = numbers[-1], pin.SE3.Identity()
             joints.append(numbers)
             if part.end is not None:
@@ -173,12 +187,18 @@ class ClosedChain:
                 kind, frame = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
                 end = turned(SAME, part.end)
                 self.loops.append(
-                    pin.RigidConstraintModel(kind, self.model, numbers[-1], end, platform, on_platform, frame)
+                    pin.RigidConstraintModel(
+                        kind, self.model, numbers[-1], end, platform, on_platform, frame
+                    )
                 )
-        self.legs.append((leg, parts, [[self.model.joints[n] for n in numbers] for numbers in joints]))
+        self.legs.append(
+            (leg, parts, [[self.model.joints[n] for n in numbers] for numbers in joints])
+        )
 
     def state(self, pose, twist, torque):
-        """The chain at a pose (6,), with a twist (6,) and net joint torques (n,); on balls nothing spins (eq. 12)."""
+        """The chain at a pose (6,), with a twist (6,) and net joint torques (n,); on balls nothing
+        spins (eq. 12).
+        """
         turn = base_from_platform(pose)
         theta, rates = self.robot.inverse_kinematics(pose), self.robot.joint_jacobian(pose) @ twist
         q, v, force = pin.neutral(self.model), np.zeros(self.model.nv), np.zeros(self.model.nv)
@@ -187,7 +207,9 @@ class ClosedChain:
         for number, (leg, parts, joints) in enumerate(self.legs):
             arm = turn @ leg.platform_joint
             at, moving = pose[:3] + arm, twist[:3] + np.cross(twist[3:], arm)
-            motions = MOTIONS.get(leg.type, crank_motions)(leg, theta[number], rates[number], at, moving)
+            motions = MOTIONS.get(leg.type, crank_motions)(
+                leg, theta[number], rates[number], at, moving
+            )
             for part, own, (axes, omega) in zip(parts, joints, motions[: len(parts)], strict=True):
                 before, omega_before = motions[part.before] if part.before >= 0 else (SAME, NONE)
                 frame = before @ part.place.rotation
@@ -203,10 +225,14 @@ class ClosedChain:
 
     def acceleration(self, state):
         """One call of `constraintDynamics`: generalised acceleration."""
-        return pin.constraintDynamics(self.model, self.data, *state, self.loops, self.loop_data, SETTINGS)
+        return pin.constraintDynamics(
+            self.model, self.data, *state, self.loops, self.loop_data, SETTINGS
+        )
 
     def recursive_acceleration(self, state):
-        """One call of `lcaba`, by articulated bodies with their loops: generalised acceleration, to some 1e-7."""
+        """One call of `lcaba`, by articulated bodies with their loops: generalised acceleration, to
+        some 1e-7.
+        """
         return pin.lcaba(self.model, self.data, *state, self.loops, self.loop_data, RECURSIVE)
 
     def twist_dot(self, state):
@@ -219,22 +245,31 @@ class ClosedChain:
         return np.concatenate([turn @ (a[:3] + np.cross(v[3:6], v[:3])), turn @ a[3:6]])
 
     def closure(self, state):
-        """Largest gap (m) and gap velocity (m/s) of the constraints: proves that the chain is set up closed."""
+        """Largest gap (m) and gap velocity (m/s) of the constraints: proves that the chain is set
+        up closed.
+        """
         pin.forwardKinematics(self.model, self.data, state.q, state.v)
 
         def end(joint, place):
             at = self.data.oMi[joint].act(place)
             return np.array([at.translation, at.rotation @ place.actInv(self.data.v[joint]).linear])
 
-        gaps = [end(c.joint1_id, c.joint1_placement) - end(c.joint2_id, c.joint2_placement) for c in self.loops]
+        gaps = [
+            end(c.joint1_id, c.joint1_placement) - end(c.joint2_id, c.joint2_placement)
+            for c in self.loops
+        ]
         return np.abs(gaps).max(axis=(0, 2))
 
 
 def _joint(part, axes, omega):
-    """Coordinates and speeds of the joints of a part, for its axes and angular velocity in the frame of the first."""
+    """Coordinates and speeds of the joints of a part, for its axes and angular velocity in the
+    frame of the first.
+    """
     if part.joint == "ball":
         return [pin.Quaternion(axes).coeffs()], [axes.T @ omega]
     if part.joint == "link hinge":
         return [[np.arctan2(axes[0, 2], axes[0, 0])]], [[omega[1]]]
     turn, tilt = np.arctan2(axes[1, 0], axes[0, 0]), np.arctan2(axes[2, 1], axes[2, 2])
-    return [[turn], [tilt]][: len(JOINTS[part.joint])], [[omega[2]], [omega @ axes[:, 0]]][: len(JOINTS[part.joint])]
+    return [[turn], [tilt]][: len(JOINTS[part.joint])], [[omega[2]], [omega @ axes[:, 0]]][
+        : len(JOINTS[part.joint])
+    ]

@@ -1,31 +1,56 @@
-"""The sampled closed loop: visual servo (eq. 30) around joint PID (eq. 31) around the robot (eq. 40).
+"""Sampled closed loop: visual servo (eq. 30), joint PID (eq. 31) and robot (eq. 40).
 
-Every frame the pose is measured, by the sensor that the caller passes or by an ideal one; the servo turns it into a
-command after the latency, and the command is held until the next. Unless a start is given the run starts at rest at the
-first reference pose, in equilibrium: integrators hold what keeps the robot there. One function serves plant and model.
+A sensor measures the pose at every frame. The servo, logged commands or a controller then give the
+joints a command. It arrives after the latency and is held until the next one arrives. A run begins
+at rest at the first reference pose unless a start is given.
 
-Written once, in the `*_kernels`, which numba compiles and which also run as the Python that they are; `execution` puts
-a run before them.
+Functions, one for each way to drive the joints
+
+    simulate_servo, simulate_commands, simulate_controller   one run
+    differentiate_servo, differentiate_commands              one run with derivatives
+    repeat_servo, repeat_commands                            one run for each noise
+    simulate_batch                                           many runs of the servo on all cores
+
+The loop itself is written once, in modules named `*_kernels`. Numba compiles them, and they also
+run as plain Python. Plant and model run the same lines.
 """
 
 from dynamics.closed_loop.drives import DriveName, Drives
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
-from dynamics.closed_loop.problem import (
+from dynamics.closed_loop.loop_settings import (
+    IDEAL,
     Controller,
     EveryFrame,
     FrameTiming,
+    IdealSensor,
     LoopSettings,
     PoseSensor,
     RateSensor,
     Reference,
+    Sensor,
     ServoGains,
+)
+from dynamics.closed_loop.many_runs import (
+    prepare,
+    repeat_commands,
+    repeat_servo,
+    simulate_batch,
+)
+from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
+from dynamics.closed_loop.simulate import (
+    differentiate_commands,
+    differentiate_servo,
+    simulate_commands,
+    simulate_controller,
+    simulate_servo,
+)
+from dynamics.closed_loop.start_state import (
     StartState,
     equilibrium,
 )
-from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
-from dynamics.closed_loop.simulate import prepare, simulate, simulate_batch, simulate_repeats
 
 __all__ = [
+    "IDEAL",
     "ClosedLoopRun",
     "Controller",
     "DriveName",
@@ -33,17 +58,24 @@ __all__ = [
     "EveryFrame",
     "FrameTiming",
     "FrictionLaw",
+    "IdealSensor",
     "JointElasticity",
     "LoopFailure",
     "LoopSettings",
     "PoseSensor",
     "RateSensor",
     "Reference",
+    "Sensor",
     "ServoGains",
     "StartState",
+    "differentiate_commands",
+    "differentiate_servo",
     "equilibrium",
     "prepare",
-    "simulate",
+    "repeat_commands",
+    "repeat_servo",
     "simulate_batch",
-    "simulate_repeats",
+    "simulate_commands",
+    "simulate_controller",
+    "simulate_servo",
 ]

@@ -1,25 +1,28 @@
-"""Drives: the law by which every joint makes a torque of its command, and the largest torque that it gives.
+"""Drives: the law by which each joint turns its command into a torque, and its largest torque.
 
-With U the command of a joint, theta its coordinate and the gains lp, li, ld, the torque or force is
+Let U be the command of a joint, theta its coordinate, and lp, li, ld the gains. The torque or force
+is, cut at the limit,
 
-    lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta,
+    lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta
 
-cut at the limit. There what z and theta hold, li z - lx theta, does not grow beyond: the integrator waits until the
-error turns (conditional integration). The laws differ in which gains they read, in c, and in lx:
+At the limit, li z - lx theta does not grow beyond the limit: the integrator waits until the error
+turns (conditional integration). The laws differ in the gains that they read, in c, and in lx:
 
-    pid       c = 1, lx = 0                   the paper's (eq. 31)
-    pd, pi    c = 1, lx = 0, without li; without ld
-    cascade   c = 0, lx = li ld / lp          P-PI of industrial drives
-    pid_filtered   as pid, with the rate U_dot - theta_dot through a low-pass filter of first order
+    pid            c = 1, lx = 0                  law of the paper (eq. 31)
+    pd             c = 1, lx = 0                  no li
+    pi             c = 1, lx = 0                  no ld
+    cascade        c = 0, lx = li ld / lp         P-PI of industrial drives
+    pid_filtered   as pid                         U_dot - theta_dot goes through a low-pass filter
 
 The cascade is a proportional controller of the position around a PI controller of the velocity,
 
-    torque = kv (w - theta_dot) + ki integral(w - theta_dot),    w = kp (U - theta),
+    torque = kv (w - theta_dot) + ki integral(w - theta_dot),    w = kp (U - theta)
 
-and the integral of theta_dot is theta but for a constant, which z takes: kp = lp / ld, kv = ld, ki = lx. In every law a
-factor common to lp, li and ld, and so to lx, is one of the torque.
+The integral of theta_dot is theta but for a constant, which z takes. So kp = lp / ld, kv = ld and
+ki = lx. In every law, a factor common to lp, li and ld is a factor of the torque.
 
-A law without an integral holds a load by an error: at rest its command is where the joint is plus the torque over lp.
+A law without an integral holds a load by an error: at rest its command is the coordinate of the
+joint plus the torque over lp.
 """
 
 from collections.abc import Mapping
@@ -53,12 +56,17 @@ ABOVE_ZERO: Mapping[str, tuple[str, ...]] = {
     "cascade": JOINT_PID,
     "pid_filtered": ("li",),
 }
-"""Gains without which it holds no load, or is another law."""
+"""Gains that must be > 0, because the law holds no load without them, or is another law."""
 
 
 class JointLaw(NamedTuple):
-    """A law with its gains: lp, li, ld as far as it reads them, lx, and c, rate_weight; lx_by (3,): derivative of lx by
-    lp, li, ld; reads (3,): which of these it reads, 1 or 0; filter_time: of the rate, s, 0 without."""
+    """Law of a joint with its gains.
+
+    lp, li, ld: gains, 0 where the law does not read them. lx and rate_weight (c): as in the
+    module's formula. lx_by (3,): derivatives of lx with respect to lp, li, ld. reads (3,): 1 for
+    each gain that the law reads, else 0. filter_time: time constant of the filter of the rate, s,
+    or 0.
+    """
 
     lp: float
     li: float
@@ -70,7 +78,9 @@ class JointLaw(NamedTuple):
     filter_time: float = 0.0
 
     def held(self, torque: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Command (n,) and integral z (n,) with which joints at rest at an angle (n,) give a torque (n,)."""
+        """Command (n,) and integral z (n,) with which joints at rest at an angle (n,) give a torque
+        (n,).
+        """
         if self.li:
             return angle, (torque + self.lx * angle) / self.li
         return angle + torque / self.lp, np.zeros_like(torque)
@@ -78,7 +88,10 @@ class JointLaw(NamedTuple):
     def held_by_parameters(
         self, torque: np.ndarray, angle: np.ndarray, by_dynamic: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives (n, p) of both by the dynamic parameters, then lp, li, ld; by_dynamic: those of the torque."""
+        """Derivatives (n, p) of command and integral of `held` with respect to all parameters.
+
+        by_dynamic: derivatives of the torque with respect to the dynamic parameters.
+        """
         command, integral = self.held(torque, angle)
         none = np.zeros((len(torque), len(JOINT_PID)))
         still = np.hstack([np.zeros_like(by_dynamic), none])
@@ -92,11 +105,29 @@ class JointLaw(NamedTuple):
 
 @dataclass(frozen=True)
 class Drives:
-    """What the actuators take and give: joint commands, which a law follows, or torques themselves; the largest torque,
-    N m or N (None: no limit); the law, which does not act where they take torques; the time constant, s, of a filter.
+    """Actuators of a robot.
 
-    Raises SimulationError: a limit or a time constant that is not > 0, a law that is none, one without its filter, or a
-    filter that belongs to another law.
+    Parameters
+    ----------
+    torques : bool
+        True for drives that take torques. The default is drives that take joint commands.
+    torque_limit : float, optional
+        Largest torque or force, N m or N. The default is no limit.
+    law : {"pid", "pd", "pi", "cascade", "pid_filtered"}
+        Law by which drives follow joint commands.
+    filter_time : float, optional
+        Time constant of the filter of the law `pid_filtered`, s.
+
+    Raises
+    ------
+    SimulationError
+        If a limit or a time constant is not > 0, if the law is unknown, or if a filter is missing
+        or belongs to another law.
+
+    Examples
+    --------
+    >>> closed_loop.Drives(torque_limit=8.0).law
+    'pid'
     """
 
     torques: bool = False
@@ -110,23 +141,30 @@ class Drives:
         if self.torque_limit is not None:
             real("torque limit", self.torque_limit, SimulationError, above=0, unit=" N m or N")
         if self.law == FILTERED:
-            real(f"filter_time of the law `{FILTERED}`", self.filter_time, SimulationError, above=0, unit=" s")
+            real(
+                f"filter_time of the law `{FILTERED}`",
+                self.filter_time,
+                SimulationError,
+                above=0,
+                unit=" s",
+            )
         elif self.filter_time is not None:
             raise SimulationError(
-                f"filter_time = {self.filter_time!r} belongs to the law `{FILTERED}`, not to `{self.law}`"
+                f"filter_time = {self.filter_time!r} belongs to the law `{FILTERED}`, not to "
+                f"`{self.law}`"
             )
 
     def joint_law(self, gains: np.ndarray) -> JointLaw:
-        """The law with the gains lp, li, ld (3,)."""
+        """Law with the gains lp, li, ld (3,)."""
         return joint_law(self.law, gains, self.filter_time)
 
 
 PID = Drives()
-"""The paper's, without a limit."""
+"""Drives of the paper, without a limit."""
 
 
 def joint_law(name: DriveName, gains: np.ndarray, filter_time: float | None = None) -> JointLaw:
-    """A law of this name with the gains lp, li, ld (3,), and the time constant of its filter, s."""
+    """Law of a name with the gains lp, li, ld (3,), and with the time constant of its filter, s."""
     reads = np.array([float(gain in READS[name]) for gain in JOINT_PID])
     lp, li, ld = (float(gain) if read else 0.0 for gain, read in zip(gains, reads, strict=True))
     if name != "cascade":
@@ -136,8 +174,9 @@ def joint_law(name: DriveName, gains: np.ndarray, filter_time: float | None = No
 
 
 class CascadeGains(NamedTuple):
-    """Gains of the cascade as drives name them: kp of the position (1/s), kv and ki of the velocity (N m s/rad and
-    N m/rad, or N s/m and N/m)."""
+    """Gains of the cascade as drives name them: kp (1/s), kv (N m s/rad or N s/m), ki (N m/rad or
+    N/m).
+    """
 
     kp: float
     kv: float
@@ -145,7 +184,9 @@ class CascadeGains(NamedTuple):
 
 
 def cascade_gains(gains: np.ndarray) -> tuple[CascadeGains, np.ndarray]:
-    """The cascade's own gains from lp, li, ld (3,), and their derivatives (3, 3) by these."""
+    """Gains of the cascade from lp, li, ld (3,), and their derivatives (3, 3) with respect to
+    these.
+    """
     lp, li, ld = gains
     by_gains = np.array(
         [[1 / ld, 0.0, -lp / ld**2], [0.0, 0.0, 1.0], [-li * ld / lp**2, ld / lp, li / lp]],

@@ -1,26 +1,43 @@
-"""The frames of a run: measuring, the visual servo of eq. 30, commands on their way to the joints, the record.
+"""Frames of a run: measurement, visual servo (eq. 30), commands on their way, and the record.
 
-The servo: U = J_theta [kp e + kd e_dot + ki integral(e)], the error e taken at the time of exposure. The pose rate is
-the difference of the last two good measurements (before the first: what the start names); the integral is the sum of
-the errors times the frame period. Lost frames leave both alone. A feedforward comes on top, of lost frames, too.
+The servo is U = J_theta [kp e + kd e_dot + ki integral(e)], with the error e at the time of
+exposure. The pose rate is the difference of the last two good measurements; before the first one,
+the start names the last. The integral is the sum of the errors times the frame period. Lost frames
+leave both alone. A feedforward is added at lost frames, too.
 """
 
 import numpy as np
 
-from dynamics.closed_loop.linear_algebra_kernels import add, add_product, clear, copy, copy_rows, dot, fill
+from dynamics.closed_loop.linear_algebra_kernels import (
+    add,
+    add_product,
+    clear,
+    copy,
+    copy_rows,
+    dot,
+    fill,
+)
 from dynamics.closed_loop.motion_kernels import MEASURED_OUT_OF_REACH, OK, all_finite
 from dynamics.closed_loop.sensitivity_kernels import velocity_by_pose
-from dynamics.closed_loop.stick_slip_kernels import NO_MARGIN, begin_span, judge, next_step, try_step
+from dynamics.closed_loop.stick_slip_kernels import (
+    NO_MARGIN,
+    begin_span,
+    judge,
+    next_step,
+    try_step,
+)
 from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 
 
 @kernel
 def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> None:
-    """Modes and derivatives at frame 0. Joints slower than NO_MARGIN are at rest."""
-    size, count = len(at[0].bias), len(now.mode)
+    """Set modes and derivatives at frame 0. Joints slower than NO_MARGIN are at rest."""
+    size = len(at[0].bias)
+    count = len(now.mode)
     copy(now.state[:], at[0].state[:])
     now.span = -1
-    status = invoke(task.evaluate_terms, task, now, at[0], d, 0)  # where it fails, the first frame does and says so
+    # where it fails, the first frame does and says so
+    status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
     for i in range(count):
         velocity = at[0].velocity[i]
         now.mode[i] = 0 if status != OK or abs(velocity) <= NO_MARGIN else 1 if velocity > 0 else -1
@@ -28,6 +45,7 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
         copy_rows(plan.start_integral_sensitivity, d.x[2 * size :], now.parameters)
         copy_rows(plan.start_servo_sensitivity, d.integral[:], now.parameters)
         copy_rows(plan.start_command_sensitivity, d.issued[len(d.issued) - 1], now.parameters)
+        # a start at rest holds the command that the servo's integral makes
         if len(plan.commands) == 0 and len(plan.feedforward) == 0:
             copy_rows(plan.start_command_sensitivity, d.last_command[:], now.parameters)
     if now.start_moves:
@@ -41,7 +59,8 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
 @kernel
 def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> None:
     """Write the state at a frame, before it is measured, into the record."""
-    size, count = len(now.servo_integral), len(now.mode)
+    size = len(now.servo_integral)
+    count = len(now.mode)
     row = now.first_row + k
     copy(now.state[:size], record.pose[row])
     copy(now.state[size : 2 * size], record.pose_rate[row])
@@ -58,8 +77,12 @@ def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> 
     keep_rows(now, d.x[:size], record.pose_sensitivity[k], record.start_sensitivity[k])
     if k + 1 == len(record.pose):
         rows = 2 * size + count
-        keep_rows(now, d.x[:rows], record.end_sensitivity[:rows], record.end_start_sensitivity[:rows])
-        keep_rows(now, d.integral[:], record.end_sensitivity[rows:], record.end_start_sensitivity[rows:])
+        keep_rows(
+            now, d.x[:rows], record.end_sensitivity[:rows], record.end_start_sensitivity[:rows]
+        )
+        keep_rows(
+            now, d.integral[:], record.end_sensitivity[rows:], record.end_start_sensitivity[rows:]
+        )
 
 
 @kernel
@@ -71,9 +94,10 @@ def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -
 
 @kernel
 def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
-    """What the ideal sensor says of the pose."""
+    """Measure the pose of a frame as the ideal sensor does."""
     row = now.first_row + k
-    seen, measured = len(plan.lost) == 0 or not plan.lost[k], record.measured[row]
+    seen = len(plan.lost) == 0 or not plan.lost[k]
+    measured = record.measured[row]
     record.measured_ok[row] = seen
     copy(now.state[: len(measured)], measured)
     if not seen:
@@ -84,13 +108,19 @@ def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
 
 @kernel
 def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k: int) -> None:
-    """The servo's command at one good frame, and its derivatives. The Jacobian that it knows, at the measured pose, is
-    often the one where the motion is known."""
-    size, known = len(measured), now.known
+    """Compute the command of the servo at a good frame, and its derivatives.
+
+    The servo knows a Jacobian at the measured pose. It is often the one of the motion, which is
+    known.
+    """
+    size = len(measured)
+    known = now.known
     same = known.valid and task.servo_knows
-    reference, reference_rate = plan.reference[k], plan.reference_rate[k]
+    reference = plan.reference[k]
+    reference_rate = plan.reference_rate[k]
     for i in range(size):
         error = reference[i] - measured[i]
+        # the rate is over the time since the last good measurement, which may be several frames
         rate = (measured[i] - now.last_measured[i]) / now.elapsed
         now.servo_integral[i] += task.period * error
         by_rate = task.kd * (reference_rate[i] - rate)
@@ -110,7 +140,7 @@ def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k
 
 @kernel
 def serve_tangent(task: Record, now: Record, d: Record, measured: Array, jacobian: Array) -> None:
-    """Derivative of the command, given that of the measured pose."""
+    """Differentiate the command of the servo, given the derivatives of the measured pose."""
     width = now.width
     velocity_by_pose(task, now, measured, now.demand[:])
     for i in range(len(now.demand)):
@@ -126,7 +156,9 @@ def serve_tangent(task: Record, now: Record, d: Record, measured: Array, jacobia
 
 
 @kernel
-def issue_command(task: Record, now: Record, d: Record, plan: Record, record: Record, k: int) -> int:
+def issue_command(
+    task: Record, now: Record, d: Record, plan: Record, record: Record, k: int
+) -> int:
     """Measure, unless that has been done, and record the command that follows."""
     if not task.measured:
         measure_ideally(now, plan, record, k)
@@ -146,7 +178,7 @@ def issue_command(task: Record, now: Record, d: Record, plan: Record, record: Re
 
 @kernel
 def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
-    """A joint's command by its number: from frame 0 on, and before that those of the start."""
+    """Command of a joint by its number. Negative numbers are those of the start."""
     return commands[number, joint] if number >= 0 else start[max(0, len(start) + number), joint]
 
 
@@ -154,17 +186,22 @@ def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
 def apply_command(
     task: Record, now: Record, d: Record, start: Array, commands: Array, number: int, ramp: float
 ) -> None:
-    """Let a command act, when a share of the way from the one before it is done: 1 is all of it."""
+    """Let a command act of which a share `ramp` of the way from the one before is done.
+
+    A share of 1 is all of it.
+    """
     now.ramping = ramp < 1
     for i in range(len(now.command)):
-        value, before = command_of(start, commands, number, i), command_of(start, commands, number - 1, i)
+        value = command_of(start, commands, number, i)
+        before = command_of(start, commands, number - 1, i)
         change = value - before
         now.command_rate[i] = change / task.period
         now.command[i] = before + ramp * change if now.ramping else value
         now.command_slope[i] = now.command_rate[i] if now.ramping else 0.0
     if not task.sensitivities:
         return
-    rows = len(d.issued) - 1  # the last one is of the commands of the start
+    # the last one is that of the commands of the start
+    rows = len(d.issued) - 1
     newer = d.issued[number % rows if number >= 0 else rows]
     older = d.issued[(number - 1) % rows if number > 0 else rows]
     for i in range(len(now.command)):
@@ -177,12 +214,17 @@ def apply_command(
 
 
 @kernel
-def next_span(task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record) -> int:
-    """Go on to the next span of a frame, or to the next frame, which is measured first."""
-    spans, k, last = plan.spans, now.frame, now.frame + 2 == len(plan.spans.first)
+def next_span(
+    task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record
+) -> int:
+    """Go on to the next span of a frame, or measure and go on to the next frame."""
+    spans = plan.spans
+    k = now.frame
+    last = now.frame + 2 == len(plan.spans.first)
     commands = record.command[now.first_row :]
     if now.span == spans.first[k + 1]:
-        now.frame, now.span = k + 1, -1
+        now.frame = k + 1
+        now.span = -1
         return OK
     if now.span < 0:
         keep_state(task, now, d, record, k)
@@ -191,8 +233,13 @@ def next_span(task: Record, now: Record, at: Record, d: Record, plan: Record, re
             return status
         now.span = spans.first[k]
     span = now.span
-    now.span, now.grid, now.steps, now.target = span + 1, 0, 0, 0.0
-    apply_command(task, now, d, plan.start_commands, commands, spans.command[span], spans.ramp[span])
+    now.span = span + 1
+    now.grid = 0
+    now.steps = 0
+    now.target = 0.0
+    apply_command(
+        task, now, d, plan.start_commands, commands, spans.command[span], spans.ramp[span]
+    )
     copy(now.state[:], at[0].state[:])
     at[0].time = 0.0
     status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
@@ -205,11 +252,23 @@ def next_span(task: Record, now: Record, at: Record, d: Record, plan: Record, re
 
 @entry
 def run_frames(
-    tasks: Array, nows: Array, at: Record, tangents: Array, plan: Record, record: Record, first: int, last: int
+    tasks: Array,
+    nows: Array,
+    at: Record,
+    tangents: Array,
+    plan: Record,
+    record: Record,
+    first: int,
+    last: int,
 ) -> tuple[int, int]:
-    """Frames `first` to `last`, without it; the status, and the frame that it is of. The memory is handed over as
-    arrays of a record each: a record takes numba 8 us, and a run that is measured comes here at every frame."""
-    task, now, d = tasks[0], nows[0], tangents[0]
+    """Do the frames from `first` to `last`, without `last`. Return the status and its frame.
+
+    The memory comes as arrays of one record each. To take a record from Python costs Numba 8 us,
+    and a run that is measured in Python comes here at every frame.
+    """
+    task = tasks[0]
+    now = nows[0]
+    d = tangents[0]
     if first == 0:
         begin(task, now, at, d, plan)
     status = OK

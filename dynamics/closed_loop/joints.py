@@ -1,15 +1,20 @@
-"""Joints: laws of dry and viscous friction, and elasticity between motor and crank.
+"""Joints: laws of dry and viscous friction, and springs between motors and cranks.
 
-Friction (eq. 24), N m: torque = coulomb * dry(theta_dot) + viscous * theta_dot.
+Friction (eq. 24) is, in N m,
 
-Elastic joints have a spring between each motor and the body that it drives, a crank or a slider (Spong, J. Dyn. Sys.
-Meas. Control 109, 1987). With q the pose, phi the motor angles as they turn the cranks, theta(q) the crank angles:
+    torque = coulomb * dry(theta_dot) + viscous * theta_dot
+
+Elastic joints have a spring between each motor and the body that it drives, which is a crank or a
+slider (Spong, J. Dyn. Sys. Meas. Control 109, 1987). Let q be the pose, phi the motor angles as
+they turn the cranks, and theta(q) the crank angles. Then
 
     spring torque = stiffness (phi - theta) + damping (phi_dot - theta_dot)
-    M q_ddot + b = J_theta^T spring torque,    motor inertia phi_ddot = motor torque - friction(phi_dot) - spring torque
+    M q_ddot + b = J_theta^T spring torque
+    motor inertia phi_ddot = motor torque - friction(phi_dot) - spring torque
 
-Encoder, joint PID and friction sit at the motor. What turns with it is taken out of the cranks' Izz, or out of the
-sliders' mass, so that the rigid robot of the same parameters is the limit of stiff springs.
+Encoder, joint PID and friction sit at the motor. The inertia of the motor is taken out of the Izz
+of the crank, or out of the mass of the slider. The rigid robot of the same parameters is thus the
+limit of stiff springs.
 """
 
 from dataclasses import dataclass
@@ -26,20 +31,46 @@ from dynamics.robot import Robot
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
 
 FRICTION = np.dtype(
-    (np.record, [("law", "i8"), ("smoothing_velocity", "f8"), ("static_level", "f8"), ("stribeck_velocity", "f8")])
+    (
+        np.record,
+        [
+            ("law", "i8"),
+            ("smoothing_velocity", "f8"),
+            ("static_level", "f8"),
+            ("stribeck_velocity", "f8"),
+        ],
+    )
 )
-"""A friction law as kernels read it; the law by its place in `LawName`."""
+"""Type of a friction law as kernels read it. The law is its place in `LawName`."""
 
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """How the dry part depends on the joint's velocity.
+    """Law of the dry part of joint friction.
 
-    coulomb_viscous: the sign of eq. 24, exact, with sticking up to the Coulomb torque.
-    smoothed: tanh(theta_dot / smoothing_velocity); never sticks. smoothing_velocity in rad/s.
-    stribeck: sticks up to static_ratio times the Coulomb torque; slipping, the excess fades as
-    exp(-(theta_dot / stribeck_velocity)^2). stribeck_velocity in rad/s, static_ratio >= 1.
-    Raises SimulationError for an unknown name or a constant that is missing, not allowed, or out of range.
+    Parameters
+    ----------
+    name : {"coulomb_viscous", "smoothed", "stribeck"}
+        coulomb_viscous has the exact sign of eq. 24 and sticks up to the Coulomb torque. smoothed
+        has tanh(theta_dot / smoothing_velocity) and never sticks. stribeck sticks up to
+        static_ratio times the Coulomb torque. When the joint slips, the excess fades as
+        exp(-(theta_dot / stribeck_velocity)^2).
+    smoothing_velocity : float, optional
+        Velocity over which the smoothed law turns, rad/s.
+    static_ratio : float, optional
+        Static torque over the Coulomb torque, at least 1.
+    stribeck_velocity : float, optional
+        Velocity over which the excess fades, rad/s.
+
+    Raises
+    ------
+    SimulationError
+        If the name is unknown, or if a constant is missing, not allowed or out of range.
+
+    Examples
+    --------
+    >>> closed_loop.FrictionLaw("smoothed", smoothing_velocity=0.002).name
+    'smoothed'
     """
 
     name: LawName = "coulomb_viscous"
@@ -54,16 +85,33 @@ class FrictionLaw:
         self._check("static_ratio", "stribeck", least=1)
 
     def _check(
-        self, constant: str, law: str, *, above: float | None = None, least: float | None = None, unit: str = ""
+        self,
+        constant: str,
+        law: str,
+        *,
+        above: float | None = None,
+        least: float | None = None,
+        unit: str = "",
     ) -> None:
         value = getattr(self, constant)
         if self.name == law:
-            real(f"{constant} of the law `{law}`", value, SimulationError, above=above, least=least, unit=unit)
+            real(
+                f"{constant} of the law `{law}`",
+                value,
+                SimulationError,
+                above=above,
+                least=least,
+                unit=unit,
+            )
         elif value is not None:
-            raise SimulationError(f"{constant} = {shown(value)} belongs to the law `{law}`, not to `{self.name}`")
+            raise SimulationError(
+                f"{constant} = {shown(value)} belongs to the law `{law}`, not to `{self.name}`"
+            )
 
     def level(self, velocity: np.ndarray) -> np.ndarray:
-        """Dry friction over the Coulomb torque at joint velocities, rad/s or m/s, of any shape; 0 at rest."""
+        """Ratio of dry friction to the Coulomb torque at joint velocities, rad/s or m/s. It is 0 at
+        rest.
+        """
         if self.name == "smoothed":
             return np.asarray(np.tanh(velocity / self.smoothing_velocity))
         excess = np.zeros_like(velocity)
@@ -74,21 +122,41 @@ class FrictionLaw:
 
     @property
     def record(self) -> np.record:
-        """The law as kernels read it: see `motion_kernels`."""
-        constants = self.smoothing_velocity or 0.0, self.static_ratio or 1.0, self.stribeck_velocity or 0.0
+        """Law in the form that kernels read."""
+        constants = (
+            self.smoothing_velocity or 0.0,
+            self.static_ratio or 1.0,
+            self.stribeck_velocity or 0.0,
+        )
         return np.array([(get_args(LawName).index(self.name), *constants)], FRICTION)[0]
 
 
 LARGEST_STEP = 1.0
-"""Largest eigenvalue times step of Runge-Kutta; it is unstable from 2.8 on."""
+"""Largest product of eigenvalue and step of the Runge-Kutta method, which is unstable from 2.8."""
 
 
 @dataclass(frozen=True)
 class JointElasticity:
-    """Stiffness (N m/rad) and damping (N m s/rad) of every joint's spring; inertia (kg m^2) of every motor, as its
-    joint feels it; of actuators that slide N/m, N s/m and kg.
+    """Springs between the motors and the bodies that they drive.
 
-    Raises SimulationError for a stiffness or an inertia that is not > 0, a damping < 0, or one that is not finite.
+    Parameters
+    ----------
+    stiffness : float
+        Stiffness of each spring, N m/rad, or N/m for actuators that slide.
+    motor_inertia : float
+        Inertia of each motor as its joint feels it, kg m^2 or kg.
+    damping : float
+        Damping of each spring, N m s/rad or N s/m.
+
+    Raises
+    ------
+    SimulationError
+        If the stiffness or the inertia is not > 0, or if the damping is < 0.
+
+    Examples
+    --------
+    >>> closed_loop.JointElasticity(stiffness=500.0, motor_inertia=3e-4, damping=0.02).stiffness
+    500.0
     """
 
     stiffness: float
@@ -101,28 +169,37 @@ class JointElasticity:
         real("joint damping", self.damping, SimulationError, least=0, unit=" N m s/rad")
 
     def beyond_the_springs(self, layout: ParameterLayout, rigid: np.ndarray) -> np.ndarray:
-        """Parameters of the rigid bodies that the springs carry: the driven bodies without their motors.
+        """Parameters of the rigid bodies that the springs carry, which exclude the motors.
 
-        Raises SimulationError for a robot with a leg whose actuator drives no body alone.
+        Raises SimulationError for a robot with a leg whose actuator does not drive a body alone.
         """
         carried = np.array(rigid)
         for leg, row in enumerate(layout.of_leg):
             body = layout.kinds[row[0]]
             if body.driven is None:
-                raise SimulationError(f"joints cannot be elastic: the actuator of leg {leg + 1} drives no body alone")
+                raise SimulationError(
+                    f"joints cannot be elastic: the actuator of leg {leg + 1} drives no body alone"
+                )
             layout.bodies_of(carried)[row[0], INERTIAL.index(body.driven)] -= self.motor_inertia
         return carried
 
     def steps_needed(
-        self, robot: Robot, parameters: np.ndarray, pose: np.ndarray, frame_period: float, friction: FrictionLaw
+        self,
+        robot: Robot,
+        parameters: np.ndarray,
+        pose: np.ndarray,
+        frame_period: float,
+        friction: FrictionLaw,
     ) -> int:
-        """Steps of integration a frame (s) that follow the fastest motion around a pose (6,), for all parameters.
+        """Number of integration steps a frame that follow the fastest motion near a pose (6,).
 
-        It is the largest eigenvalue of the joints and motors under joint PID and friction, linearised at rest.
-        Raises SimulationError where the motors are more than the cranks' inertia.
+        The fastest motion is that of the largest eigenvalue of joints and motors under joint PID
+        and friction, linearised at rest. Raises SimulationError where a motor has more inertia than
+        its crank.
         """
         self._check_motors(robot, parameters)
-        free, n = robot.geometry.chart.basis, robot.layout.joints
+        free = robot.geometry.chart.basis
+        n = robot.layout.joints
         jacobian = robot.joint_jacobian(pose) @ free
         mass = free.T @ robot.mass_matrix(pose, parameters[robot.layout.dynamic]) @ free
         carried = mass - self.motor_inertia * jacobian.T @ jacobian
@@ -130,28 +207,38 @@ class JointElasticity:
         per_inertia[:n, :n] = jacobian @ np.linalg.solve(carried, jacobian.T)
         per_inertia[n:, n:] = np.eye(n) / self.motor_inertia
         _, coulomb, viscous, (lp, _, ld) = robot.layout.split(parameters)
-        slope = 1 / friction.smoothing_velocity if friction.smoothing_velocity else 0.0  # of dry friction, at rest
+        # slope of dry friction at rest
+        slope = 1 / friction.smoothing_velocity if friction.smoothing_velocity else 0.0
         stiffness = _coupled(self.stiffness, np.full(n, lp))
         damping = _coupled(self.damping, ld + viscous + coulomb * slope)
         motion = np.block(
-            [[np.zeros((2 * n, 2 * n)), np.eye(2 * n)], [-per_inertia @ stiffness, -per_inertia @ damping]]
+            [
+                [np.zeros((2 * n, 2 * n)), np.eye(2 * n)],
+                [-per_inertia @ stiffness, -per_inertia @ damping],
+            ]
         )
-        return max(1, ceil(frame_period * float(np.abs(np.linalg.eigvals(motion)).max()) / LARGEST_STEP))
+        return max(
+            1, ceil(frame_period * float(np.abs(np.linalg.eigvals(motion)).max()) / LARGEST_STEP)
+        )
 
     def _check_motors(self, robot: Robot, parameters: np.ndarray) -> None:
         layout = robot.layout
         bodies = layout.bodies_of(parameters)
-        driven = [leg.driven_inertia(bodies[of[0]]) for leg, of in zip(robot.geometry.legs, layout.of_leg, strict=True)]
+        driven = [
+            leg.driven_inertia(bodies[of[0]])
+            for leg, of in zip(robot.geometry.legs, layout.of_leg, strict=True)
+        ]
         least = int(np.argmin(driven))
         if self.motor_inertia >= driven[least]:
-            name, unit = layout.bodies[layout.of_leg[least][0]], "kg" if layout.prismatic else "kg m^2"
+            name = layout.bodies[layout.of_leg[least][0]]
+            unit = "kg" if layout.prismatic else "kg m^2"
             raise SimulationError(
-                f"motor inertia is {self.motor_inertia:g} {unit}, must be below the {driven[least]:.3g} {unit} "
-                f"of {name} about its axis, which it is a part of"
+                f"motor inertia is {self.motor_inertia:g} {unit}, must be below the "
+                f"{driven[least]:.3g} {unit} of {name} about its axis, which it is a part of"
             )
 
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
-    """(2 n, 2 n): what a spring between each driven body and its motor, and `at_motor` (n,) to the base, do to both."""
+    """Matrix (2 n, 2 n) of springs between bodies and motors, with `at_motor` (n,) to the base."""
     one = spring * np.eye(len(at_motor))
     return np.block([[one, -one], [-one, one + np.diag(at_motor)]])

@@ -1,38 +1,57 @@
-"""Several runs of one model at once, which differ in what they measure: a lane each.
+"""Several runs of one model at once, one in each lane, which differ in what they measure.
 
-Every run goes its own way, with modes, events and steps of its own. What they have in common is that all of them ask
-for the equation of motion, time and again: that is computed for all lanes together.
+Every run goes its own way, with its own modes, events and steps. All of them ask for the equation
+of motion time and again, which is computed for all lanes together.
 """
 
 import numpy as np
 
+from dynamics.closed_loop.drive_kernels import drive
 from dynamics.closed_loop.frame_kernels import begin, next_span
 from dynamics.closed_loop.linear_algebra_kernels import copy
-from dynamics.closed_loop.motion_kernels import OK, count_stuck, drive, hold_stuck, push
+from dynamics.closed_loop.motion_kernels import OK, count_stuck, hold_stuck, push
 from dynamics.closed_loop.sensitivity_kernels import END
-from dynamics.closed_loop.stick_slip_kernels import BRACKET, TAKEN, begin_step, judge, next_step, set_stage
+from dynamics.closed_loop.stick_slip_kernels import (
+    BRACKET,
+    TAKEN,
+    begin_step,
+    judge,
+    next_step,
+    set_stage,
+)
 from dynamics.compiled.kernel import Array, Record, call_columns, entry, invoke, kernel
 from dynamics.parameters import LANES
 
 
 @kernel
-def evaluate_lanes(task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array, k: int) -> None:
-    """What `evaluate` finds at stage `k` of the lanes that ask for it, and the status of each. Of a stage within a step
-    on which no joint sticks only the slope counts; what is known at the end of a step is needed again."""
-    size, count = len(at[0, 0].bias), len(at[0, 0].angle)
+def evaluate_lanes(
+    task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array, k: int
+) -> None:
+    """Do what `evaluate` does at stage `k` of the lanes that ask for it.
+
+    Within a step in which no joint sticks, only the slope is needed. What is known at the end of a
+    step is needed again.
+    """
+    size = len(at[0, 0].bias)
+    count = len(at[0, 0].angle)
     for lane in asked:
         for j in range(2 * size):
             lanes.states[j, lane] = at[lane, k].state[j]
     call_columns(task.motion_in_lanes, lanes.shared, lanes.states, lanes.bias_acceleration, LANES)
     for lane in asked:
-        own, stage = now[lane], at[lane, k]
+        own = now[lane]
+        stage = at[lane, k]
         if own.status != OK:
             continue
         stuck = count_stuck(own)
-        if task.stiffness == 0 and (stuck > 1 or (k == END and (stuck > 0 or own.purpose >= BRACKET))):
+        # what is known of the platform is copied only where it will be read again
+        if task.stiffness == 0 and (
+            stuck > 1 or (k == END and (stuck > 0 or own.purpose >= BRACKET))
+        ):
             take_lane(lanes, lane, stage)
         for i in range(count):
-            stage.angle[i], stage.velocity[i] = lanes.angle[i, lane], lanes.velocity[i, lane]
+            stage.angle[i] = lanes.angle[i, lane]
+            stage.velocity[i] = lanes.velocity[i, lane]
         drive(task, own, stage)
         push(task, own, stage)
         for i in range(count):
@@ -44,21 +63,24 @@ def evaluate_lanes(task: Record, now: Record, at: Record, d: Record, lanes: Reco
                 stage.jacobian[joint, j] = lanes.row[j, lane] = lanes.jacobian[joint, j, lane]
     call_columns(task.acceleration_in_lanes, lanes.shared, lanes.factor, lanes.acceleration, LANES)
     for lane in asked:
-        own, stage = now[lane], at[lane, k]
+        own = now[lane]
+        stage = at[lane, k]
         if own.status != OK:
             continue
         if has_factor(lanes, lane):
             for j in range(size):
-                stage.slope[size + j], stage.response[0, j] = lanes.acceleration[j, lane], lanes.response[j, lane]
+                stage.slope[size + j] = lanes.acceleration[j, lane]
+                stage.response[0, j] = lanes.response[j, lane]
             hold_stuck(task, own, stage, 1)
         else:
             own.known.valid = False
-            own.status = invoke(task.evaluate, task, own, stage, d, 0)  # says what is wrong
+            # the plain way says what is wrong
+            own.status = invoke(task.evaluate, task, own, stage, d, 0)
 
 
 @kernel
 def has_factor(lanes: Record, lane: int) -> bool:
-    """Whether the mass matrix of a lane is positive definite, and finite."""
+    """Return True where the mass matrix of a lane is positive definite and finite."""
     has = True
     for i in range(lanes.factor.shape[0]):
         has = has and 0 < lanes.factor[i, i, lane] < np.inf
@@ -67,7 +89,7 @@ def has_factor(lanes: Record, lane: int) -> bool:
 
 @kernel
 def take_lane(lanes: Record, lane: int, into: Record) -> None:
-    """What is known of the platform in one lane."""
+    """Copy what is known of the platform in one lane."""
     count, size = into.jacobian.shape
     for i in range(size):
         into.bias[i] = lanes.bias[i, lane]
@@ -75,7 +97,8 @@ def take_lane(lanes: Record, lane: int, into: Record) -> None:
             into.factor[i, j] = lanes.factor[i, j, lane]
     for i in range(count):
         into.bias_acceleration[i] = lanes.bias_acceleration[i, lane]
-        into.angle[i], into.velocity[i] = lanes.angle[i, lane], lanes.velocity[i, lane]
+        into.angle[i] = lanes.angle[i, lane]
+        into.velocity[i] = lanes.velocity[i, lane]
         for j in range(size):
             into.jacobian[i, j] = lanes.jacobian[i, j, lane]
 
@@ -83,15 +106,18 @@ def take_lane(lanes: Record, lane: int, into: Record) -> None:
 @kernel
 def know_lane(now: Record, at: Record, lanes: Record, lane: int) -> None:
     """Keep what is known of the platform at the end of a span, where the next one begins."""
-    known, size = now.known, len(at.bias)
+    known = now.known
+    size = len(at.bias)
     copy(at.state[: 2 * size], known.inputs[: 2 * size])
     take_lane(lanes, lane, known)
     known.valid = True
 
 
 @kernel
-def try_steps(task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array) -> None:
-    """The steps that lanes ask for; the status of each."""
+def try_steps(
+    task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array
+) -> None:
+    """Do the steps that lanes ask for."""
     for lane in asked:
         now[lane].status = begin_step(task, now[lane], at[lane], d)
     for k in range(1, END + 1):
@@ -101,10 +127,16 @@ def try_steps(task: Record, now: Record, at: Record, d: Record, lanes: Record, a
 
 
 @entry
-def run_lanes(task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record, lanes: Record) -> None:
-    """All frames of the runs `now` (one a lane), whose rows in plan and record follow each other; the status of each
-    and its frame."""
-    frames, asked = len(plan.spans.first) - 1, lanes.asked
+def run_lanes(
+    task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record, lanes: Record
+) -> None:
+    """Do all frames of runs, one in each lane.
+
+    The rows of the runs in plan and record follow each other. Each run has its own status and
+    frame.
+    """
+    frames = len(plan.spans.first) - 1
+    asked = lanes.asked
     for lane in range(len(now)):
         begin(task, now[lane], at[lane], d, plan)
     count = 1

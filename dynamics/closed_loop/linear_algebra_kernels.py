@@ -1,11 +1,14 @@
-"""Small dense linear algebra, and the rows of derivatives that follow it: one row an unknown, one column a variable."""
+"""Small dense linear algebra, for vectors and for rows of derivatives.
+
+A row of derivatives belongs to one unknown, and its columns to the variables.
+"""
 
 from dynamics.compiled.kernel import Array, add_row, kernel, part
 
 
 @part
 def factorise(matrix: Array, size: int, factor: Array) -> None:
-    """Factor (size, size) of a symmetric matrix, see `accelerations.factored`."""
+    """Factorise a symmetric matrix (size, size). See `accelerations.factored`."""
     for i in range(size):
         for j in range(i + 1):
             left = matrix[i, j]
@@ -38,7 +41,7 @@ def dot(row: Array, vector: Array) -> float:
 
 @part
 def copy(source: Array, into: Array) -> None:
-    """Copy a vector. Assigning slices would do it in numba, too, and take a second to compile."""
+    """Copy a vector. Numba would take a second to compile the assignment of a slice."""
     for k in range(len(source)):
         into[k] = source[k]
 
@@ -59,7 +62,7 @@ def add(source: Array, into: Array) -> None:
 
 @part
 def clear(rows: Array, width: int) -> None:
-    """Zero the columns in use of some rows."""
+    """Set the columns in use of some rows to zero."""
     for i in range(len(rows)):
         for k in range(width):
             rows[i, k] = 0.0

@@ -1,21 +1,24 @@
-"""The equation of motion at a state, for joints that slip one way (mode +1 or -1) or are stuck (0).
+"""Equation of motion at a state, for joints that slip one way (mode +1 or -1) or stick (mode 0).
 
-Stuck joints carry the friction torque that keeps their acceleration zero. At rest, which joints stick is a
-box-constrained problem in the friction torques. Friction and elastic joints: see `joints`.
+Stuck joints carry the friction torque that keeps their acceleration zero. Which joints stick at
+rest is a problem of friction torques with bounds. For friction and elastic joints see `joints`.
 """
 
 import numpy as np
 
+from dynamics.closed_loop.drive_kernels import drive, winds_up
 from dynamics.closed_loop.linear_algebra_kernels import copy, dot, factorise, fill, solve
 from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 
-SMOOTHED, STRIBECK = 1, 2  # see `joints.LawName`
+# places of the laws in `joints.LawName`
+SMOOTHED = 1
+STRIBECK = 2
 OK, LEFT_REACH, SINGULAR_MASS, TOO_MANY_EVENTS, MEASURED_OUT_OF_REACH = range(5)
 
 
 @kernel
 def dry_level(friction: Record, velocity: float, mode: int) -> float:
-    """Dry friction over Coulomb torque of a joint that slips towards `mode` (+1 or -1) at a velocity, rad/s."""
+    """Ratio of dry friction to the Coulomb torque of a joint that slips at a velocity, rad/s."""
     if friction.law == SMOOTHED:
         return np.tanh(velocity / friction.smoothing_velocity)
     if friction.law == STRIBECK:
@@ -39,7 +42,7 @@ def dry_slope(friction: Record, velocity: float, mode: int) -> float:
 
 @kernel
 def has_events(task: Record, joint: int) -> bool:
-    """Whether a joint can stick."""
+    """Return True where a joint can stick."""
     return task.friction.law != SMOOTHED and task.coulomb[joint] > 0
 
 
@@ -52,12 +55,15 @@ def breakaway(task: Record, joint: int) -> float:
 @kernel
 def slip_friction(task: Record, joint: int, velocity: float, mode: int) -> float:
     """Friction torque, N m, of a joint that slips towards `mode`."""
-    return task.coulomb[joint] * dry_level(task.friction, velocity, mode) + task.viscous[joint] * velocity
+    return (
+        task.coulomb[joint] * dry_level(task.friction, velocity, mode)
+        + task.viscous[joint] * velocity
+    )
 
 
 @kernel
 def count_stuck(now: Record) -> int:
-    """How many joints stick; they are the first in `now.stuck`."""
+    """Number of joints that stick. They are the first ones in `now.stuck`."""
     count = 0
     for i in range(len(now.mode)):
         if now.mode[i] == 0:
@@ -68,7 +74,7 @@ def count_stuck(now: Record) -> int:
 
 @kernel
 def all_finite(matrix: Array) -> bool:
-    """Whether no entry is infinite or NaN."""
+    """Return True where no entry is infinite or NaN."""
     finite = True
     for row in matrix:
         for value in row:
@@ -78,7 +84,10 @@ def all_finite(matrix: Array) -> bool:
 
 @kernel
 def know_motion(task: Record, known: Record, state: Array) -> int:
-    """The equation of motion at pose and rate, unless that is where it is known: steps and frames share their ends."""
+    """Compute the equation of motion at coordinates and rates, unless it is known there.
+
+    Steps and frames share their ends, so that it often is.
+    """
     size = len(known.bias)
     same = known.valid
     for j in range(2 * size):
@@ -92,12 +101,13 @@ def know_motion(task: Record, known: Record, state: Array) -> int:
         known.valid = known.valid and 0 < known.factor[i, i] < np.inf
     if known.valid:
         return OK
+    # entries are NaN out of reach; finite entries mean that masses or inertias are wrong
     return SINGULAR_MASS if all_finite(known.mass) else LEFT_REACH
 
 
 @entry
 def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Everything at the state and time of an evaluation that does not depend on the modes."""
+    """Compute everything at the state and time of an evaluation that modes do not change."""
     status = know_motion(task, now.known, at.state[:])
     if status == OK:
         take_known(now.known, at)
@@ -107,62 +117,26 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
 
 @kernel
 def take_known(known: Record, at: Record) -> None:
-    """What an evaluation says of the platform, from where it is known."""
+    """Copy what is known of the platform into an evaluation."""
     count, size = known.jacobian.shape
     for i in range(size):
         at.bias[i] = known.bias[i]
         copy(known.factor[i], at.factor[i])
     for i in range(count):
-        at.angle[i], at.velocity[i] = known.angle[i], known.velocity[i]
+        at.angle[i] = known.angle[i]
+        at.velocity[i] = known.velocity[i]
         at.bias_acceleration[i] = known.bias_acceleration[i]
         copy(known.jacobian[i], at.jacobian[i])
 
 
 @kernel
-def drive(task: Record, now: Record, at: Record) -> None:
-    """Torques of the drives, whose angles and velocities are known."""
-    state, count, first = at.state, len(at.angle), 2 * len(at.bias)
-    time, lp, li, ld = at.time, task.lp, task.li, task.ld  # read once, not at every joint
-    for i in range(count):
-        if task.stiffness > 0:  # from here on the motors stand for the cranks in what joint PID and friction feel
-            motor, motor_rate = state[len(state) - 2 * count + i], state[len(state) - count + i]
-            wound, winding = motor - at.angle[i], motor_rate - at.velocity[i]
-            at.spring[i] = task.stiffness * wound + task.damping * winding
-            at.angle[i], at.velocity[i] = motor, motor_rate
-        error = now.command[i] + now.command_slope[i] * time - at.angle[i]
-        damped = ld * (task.rate_weight * now.command_rate[i] - at.velocity[i])
-        if task.filter_time > 0:
-            damped = ld * state[first + count + i]
-        at.error[i] = error
-        at.torque[i] = lp * error + damped + li * state[first + i]
-        if task.lx > 0:
-            at.torque[i] -= task.lx * at.angle[i]
-        if task.torques:
-            at.torque[i], at.error[i] = now.command[i] + now.command_slope[i] * time, 0.0
-        if task.torque_limit > 0:
-            at.torque[i] = min(max(at.torque[i], -task.torque_limit), task.torque_limit)
-
-
-@kernel
-def follows_law(task: Record, at: Record, joint: int) -> float:
-    """1 where the drive's law says what the torque is, 0 where that is commanded, or at its limit."""
-    if task.torques or (task.torque_limit > 0 and abs(at.torque[joint]) >= task.torque_limit):
-        return 0.0
-    return 1.0
-
-
-@kernel
-def winds_up(task: Record, at: Record, joint: int) -> bool:
-    """Whether a drive at its limit would integrate on; its integrator then holds (conditional integration)."""
-    if task.torques or follows_law(task, at, joint) > 0:
-        return False
-    return bool((task.li * at.error[joint] - task.lx * at.velocity[joint]) * at.torque[joint] > 0)
-
-
-@kernel
 def hold_compliance(task: Record, at: Record, joints: Array, known: int) -> None:
-    """M^-1 J^T (n, m), the first `known` rows of which are known, and J M^-1 J^T (n, n) of some joints, in their order,
-    and the factor of the latter."""
+    """Compute the response of the platform to torques at some joints, and of these joints to each
+    other.
+
+    The response M^-1 J^T has a row (m,) for each joint. Its first `known` rows are known already.
+    The compliance J M^-1 J^T is factorised.
+    """
     for s in range(len(joints)):
         if s >= known:
             copy(at.jacobian[joints[s]], at.row)
@@ -175,16 +149,19 @@ def hold_compliance(task: Record, at: Record, joints: Array, known: int) -> None
 
 @kernel
 def accelerate_freely(task: Record, at: Record, torque: Array, acceleration: Array) -> None:
-    """Acceleration (m,) of the platform under joint torques (n,)."""
+    """Compute the acceleration (m,) of the platform under joint torques (n,)."""
     copy(torque, at.push)
     call(task.free_acceleration, at.factor, acceleration)
 
 
 @kernel
 def push(task: Record, now: Record, at: Record) -> None:
-    """Net torques in the present modes, without what holds stuck joints, and the slope of the state but for what these
-    torques accelerate."""
-    size, count = len(at.bias), len(at.angle)
+    """Compute net torques in the present modes, without those that hold stuck joints.
+
+    The slope of the state is filled except for the acceleration that these torques give.
+    """
+    size = len(at.bias)
+    count = len(at.angle)
     for i in range(count):
         at.stick_force[i] = 0.0
         at.net_torque[i] = at.torque[i]
@@ -197,13 +174,16 @@ def push(task: Record, now: Record, at: Record) -> None:
     if task.filter_time > 0:
         for i in range(count):
             unfiltered = task.rate_weight * now.command_rate[i] - at.velocity[i]
-            at.slope[2 * size + count + i] = (unfiltered - at.state[2 * size + count + i]) / task.filter_time
+            at.slope[2 * size + count + i] = (
+                unfiltered - at.state[2 * size + count + i]
+            ) / task.filter_time
     if task.stiffness > 0:
         motors = len(at.slope) - 2 * count
         copy(at.velocity[:], at.slope[motors : motors + count])
         for i in range(count):
             left = at.net_torque[i] - at.spring[i]
             at.slope[motors + count + i] = left / task.motor_inertia if now.mode[i] != 0 else 0.0
+            # a stuck motor does not turn, and its friction takes what is left of its torque
             if now.mode[i] == 0:
                 at.stick_force[i] = left
                 at.net_torque[i] -= left
@@ -211,13 +191,17 @@ def push(task: Record, now: Record, at: Record) -> None:
 
 @kernel
 def hold_stuck(task: Record, now: Record, at: Record, known: int) -> None:
-    """Give rigid joints that are stuck the torque that keeps them at rest; the slope knows the free acceleration, and
-    `known` joints' response to it is known (see `hold_compliance`)."""
-    size, stuck = len(at.bias), now.stuck[: count_stuck(now)]
+    """Give stuck rigid joints the torque that keeps them at rest.
+
+    The slope has the free acceleration before. For `known` see `hold_compliance`.
+    """
+    size = len(at.bias)
+    stuck = now.stuck[: count_stuck(now)]
     if task.stiffness > 0 or len(stuck) == 0:
         return
     acceleration = at.slope[size : 2 * size]
     hold_compliance(task, at, stuck, known)
+    # the torques of stuck joints make their accelerations zero, all of them together
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], acceleration) + at.bias_acceleration[stuck[s]]
     solve(at.stuck_factor, len(stuck), at.force)
@@ -227,21 +211,24 @@ def hold_stuck(task: Record, now: Record, at: Record, known: int) -> None:
         for j in range(size):
             acceleration[j] -= at.response[s, j] * at.force[s]
     if len(stuck) == size:
-        fill(acceleration, 0.0)  # a robot that stands still stands still: rounding must not make it creep
+        # a robot that stands still stands still: rounding must not make it creep
+        fill(acceleration, 0.0)
 
 
 @kernel
 def accelerate(task: Record, now: Record, at: Record) -> None:
-    """The slope of the state in the present modes."""
+    """Compute the slope of the state in the present modes."""
     size = len(at.bias)
     push(task, now, at)
-    accelerate_freely(task, at, at.spring if task.stiffness > 0 else at.net_torque, at.slope[size : 2 * size])
+    accelerate_freely(
+        task, at, at.spring if task.stiffness > 0 else at.net_torque, at.slope[size : 2 * size]
+    )
     hold_stuck(task, now, at, 0)
 
 
 @entry
 def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """The whole evaluation at its state and time, in the present modes."""
+    """Compute everything at the state and time of an evaluation, in the present modes."""
     status = invoke(task.evaluate_terms, task, now, at, d, 0)
     if status == OK:
         accelerate(task, now, at)
@@ -250,18 +237,22 @@ def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
 
 @kernel
 def follow_frictionless(task: Record, now: Record, at: Record) -> bool:
-    """Joints without dry friction have no modes to break: they slip the way they move; whether one turns."""
+    """Set the modes of joints without dry friction to the direction in which they move.
+
+    Returns True where one of them has turned.
+    """
     turns = False
     for i in range(len(now.mode)):
         mode = -1 if at.velocity[i] < 0 else 1
         if not has_events(task, i) and now.mode[i] != mode:
-            now.mode[i], turns = mode, True
+            now.mode[i] = mode
+            turns = True
     return turns
 
 
 @kernel
 def all_hold(task: Record, now: Record, at: Record) -> bool:
-    """Whether no stuck joint is at its breakaway torque."""
+    """Return True where no stuck joint is at its breakaway torque."""
     holds = True
     for i in range(len(now.mode)):
         holds = holds and (now.mode[i] != 0 or abs(at.stick_force[i]) < breakaway(task, i))
@@ -270,9 +261,13 @@ def all_hold(task: Record, now: Record, at: Record) -> bool:
 
 @entry
 def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Which of the joints in mode 0, at rest, stick, and how the others start: projected Gauss-Seidel on friction."""
+    """Decide which of the joints at rest (mode 0) stick, and which way the others start.
+
+    The friction torques are found by projected Gauss-Seidel iterations.
+    """
     joints = now.stuck[: count_stuck(now)]
-    if task.stiffness > 0:  # motors at rest do not feel each other
+    # motors at rest do not feel each other
+    if task.stiffness > 0:
         for i in joints:
             left = at.torque[i] - at.spring[i]
             now.mode[i] = 0 if abs(left) < breakaway(task, i) else 1 if left >= 0 else -1
@@ -293,6 +288,7 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
             push = dot(at.jacobian[joints[s]], free) + at.bias_acceleration[joints[s]]
             for r in range(len(joints)):
                 push -= at.compliance[s, r] * at.force[r]
+            # each joint takes the friction that would stop it, as far as it has that
             limit = breakaway(task, joints[s])
             wanted = min(max(at.force[s] + push / at.compliance[s, s], -limit), limit)
             change = max(change, abs(wanted - at.force[s]))
@@ -307,14 +303,20 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
 @kernel
 def mode_margin(task: Record, now: Record, at: Record) -> tuple[float, int]:
-    """How far the modes are from being broken (>= 0 while they hold), and the joint that is closest (-1: none)."""
-    least, joint = 1.0, -1
+    """Compute the margin of the modes, and the joint that has it, or -1.
+
+    The margin is >= 0 while all modes hold.
+    """
+    least = 1.0
+    joint = -1
     for i in range(len(now.mode)):
         if not has_events(task, i):
             continue
         margin = now.mode[i] * at.velocity[i]
         if now.mode[i] == 0:
+            # a share of the breakaway torque, which is comparable between joints
             margin = 1 - abs(at.stick_force[i]) / breakaway(task, i)
         if margin < least:
-            least, joint = margin, i
+            least = margin
+            joint = i
     return least, joint

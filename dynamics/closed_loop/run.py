@@ -1,23 +1,71 @@
-"""What comes out of a closed-loop run: its record, or where and why it ended early."""
+"""Results of a closed-loop run: its record, or the frame and the reason of an early end."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from dynamics.checks import whole
-from dynamics.closed_loop.problem import MAX_DELAY_FRAMES, StartState
+from dynamics.closed_loop.loop_settings import (
+    MAX_DELAY_FRAMES,
+)
+from dynamics.closed_loop.start_state import (
+    StartState,
+)
 from dynamics.errors import SimulationError
 
 
 @dataclass(frozen=True)
 class ClosedLoopRun:
-    """A run, one row a frame, of a robot with n joints, m coordinates and p parameters (rss6: 6, 6, 67): time (s), true
-    pose and pose rate (6,), actuator torque (N m or N) and command (rad or m) (n,), measured pose, whether the
-    measurement was good; joint PID integral (n,) and servo integral (m,) as the frame begins; derivatives of the poses
-    by the parameters (frames, 6, p) and by the s = 3 m + n entries of the start (frames, 6, s; see StartState), and of
-    those of the last frame's state by both, end_sensitivity (s, p) and end_start_sensitivity (s, s), each or None;
-    angle and rate of the motors of elastic joints, and the rates of the joints' errors that drives filter, or None;
-    number of stick-slip events; the start."""
+    """Record of a run, one row a frame.
+
+    The robot has n joints, m coordinates and p parameters (rss6: 6, 6, 67). The start state has s =
+    3 m + n entries, in the order of `StartState`. Fields that a run does not have are None.
+
+    Attributes
+    ----------
+    time : ndarray, shape (frames,)
+        Time, s.
+    pose, pose_rate : ndarray, shape (frames, 6)
+        True pose and its time derivative.
+    torque : ndarray, shape (frames, n)
+        Actuator torque or force, N m or N.
+    command : ndarray, shape (frames, n)
+        Command that was issued, rad or m, or torque.
+    measured : ndarray, shape (frames, 6)
+        Measured pose, NaN where lost.
+    measured_ok : ndarray of bool, shape (frames,)
+        False where the measurement was lost.
+    joint_integral : ndarray, shape (frames, n)
+        Integral of the drives as the frame begins.
+    servo_integral : ndarray, shape (frames, m)
+        Integral of the servo as the frame begins.
+    pose_sensitivity : ndarray, shape (frames, 6, p)
+        Derivatives of the poses with respect to the parameters.
+    start_sensitivity : ndarray, shape (frames, 6, s)
+        Derivatives of the poses with respect to the start state.
+    end_sensitivity, end_start_sensitivity : ndarray, shapes (s, p) and (s, s)
+        The same derivatives of the state at the last frame.
+    motor_angle, motor_rate : ndarray, shape (frames, n)
+        Angle and rate of the motors of elastic joints.
+    filtered_rate : ndarray, shape (frames, n)
+        Rates of the errors in drives that filter them.
+    events : int
+        Number of stick-slip events.
+    start : StartState
+        State at the first frame.
+
+    Examples
+    --------
+    >>> still = closed_loop.Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
+    >>> servo = closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4)
+    >>> settings = closed_loop.LoopSettings(servo, closed_loop.FrameTiming(60.0))
+    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> run = closed_loop.simulate_servo(robot, parameters, still, settings)
+    >>> run.pose.shape
+    (3, 6)
+    >>> run.state_at(2).joint_integral.shape
+    (6,)
+    """
 
     time: np.ndarray
     pose: np.ndarray
@@ -40,19 +88,25 @@ class ClosedLoopRun:
 
     def __repr__(self) -> str:
         lost = len(self.time) - int(self.measured_ok.sum())
-        return f"ClosedLoopRun({len(self.time)} frames to {self.time[-1]:.4g} s, {lost} lost, {self.events} events)"
+        return (
+            f"ClosedLoopRun({len(self.time)} frames to {self.time[-1]:.4g} s, {lost} lost, "
+            f"{self.events} events)"
+        )
 
     def state_at(self, frame: int) -> StartState:
-        """The state at a frame: a run that starts from it repeats the rest of this one, where latencies differ with
-        those of the commands before beside it.
+        """State at a frame, from which another run repeats the rest of this one.
 
-        Raises SimulationError for a frame that the run does not have, or that follows a lost measurement.
+        Where latencies differ, the new run also needs those of the commands before. Raises
+        SimulationError for a frame that the run does not have, or that follows a lost measurement.
         """
         frame = whole("frame", frame, SimulationError, least=0, most=len(self.time) - 1)
         if frame == 0:
             return self.start
         if not self.measured_ok[frame - 1]:
-            raise SimulationError(f"frame {frame} follows a lost measurement: the servo's last one is older")
+            raise SimulationError(
+                f"frame {frame} follows a lost measurement: the servo's last one is older"
+            )
+        # older commands have arrived, because no latency is more than so many frames
         commands = np.vstack([self.start.commands, self.command[:frame]])[-MAX_DELAY_FRAMES - 2 :]
         return StartState(
             self.pose[frame],
@@ -68,13 +122,19 @@ class ClosedLoopRun:
 
 
 class LoopFailure(SimulationError):
-    """A run that ended early: `frame` says where, `saturated` at how many frames before an actuator gave all."""
+    """Early end of a run.
+
+    frame: number of the frame. saturated: number of frames before it at which an actuator gave its
+    largest torque.
+    """
 
     def __init__(self, message: str, frame: int, saturated: int = 0) -> None:
         super().__init__(message)
-        self.frame, self.saturated = frame, saturated
+        self.frame = frame
+        self.saturated = saturated
 
 
 def saturated_frames(torque: np.ndarray, limit: float | None) -> int:
-    """Frames at which an actuator gave all that it has, of torques (frames, n), with a limit, N m or N, or none."""
+    """Number of frames with a torque (frames, n) at its limit, N m or N. None is no limit."""
+    # the kernels cut torques at the limit, but for rounding
     return 0 if limit is None else int((np.abs(torque) >= limit * (1 - 1e-12)).any(axis=1).sum())

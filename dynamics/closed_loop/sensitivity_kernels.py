@@ -1,12 +1,15 @@
-"""Sensitivities over the steps of the integrator, the exact derivative of what it computes.
+"""Sensitivities over the steps of the integrator: the exact derivative of what it computes.
 
-Derivatives are rows over columns: the parameters (of rigid bodies those that stand for all), the start state if wanted,
-and the length of a step that an event cuts, as long as that is not known. A Runge-Kutta step is differentiated stage by
-stage, the equation of motion at each implicitly. A step that an event cuts has the length at which a margin vanishes at
-its end; the margin's derivative gives that of the length, and the step that follows is shorter by it. Stopping joints
-by an impulse is differentiated implicitly too.
+Derivatives are rows over columns. The columns are the parameters, the start state if wanted, and
+the length of a step that an event cuts while that length is unknown. Of the parameters of rigid
+bodies only those have a column that stand for all. A Runge-Kutta step is differentiated stage by
+stage, and the equation of motion at each stage implicitly. A step that an event cuts has the length
+at which a margin vanishes at its end. The derivative of the margin gives that of the length, and
+the step that follows is shorter by it. The impulse that stops joints is differentiated implicitly,
+too.
 """
 
+from dynamics.closed_loop.drive_kernels import follows_law, winds_up
 from dynamics.closed_loop.linear_algebra_kernels import (
     add_product,
     clear,
@@ -20,24 +23,33 @@ from dynamics.closed_loop.motion_kernels import (
     count_stuck,
     dry_level,
     dry_slope,
-    follows_law,
     hold_compliance,
     mode_margin,
-    winds_up,
 )
-from dynamics.compiled.kernel import Array, Record, add_row, call, call_columns, entry, invoke, kernel
+from dynamics.compiled.kernel import (
+    Array,
+    Record,
+    add_row,
+    call,
+    call_columns,
+    entry,
+    invoke,
+    kernel,
+)
 from dynamics.parameters import LANES
 
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 END = 4
-NO_APPROACH = 1e-9  # rad/s^2 or N m/s: an event so slow has no derivative
+# an event that approaches more slowly, rad/s^2 or N m/s, has no derivative
+NO_APPROACH = 1e-9
 
 
 @kernel
 def ask_derivatives(now: Record, at: Record, k: int) -> None:
-    """Ask for the derivatives of the equation of motion at an evaluation, in place of a step's stage `k`."""
-    size, given = len(at.bias), now.stages.inputs
+    """Copy an evaluation to stage `k` of the inputs of `differentiate_stages`."""
+    size = len(at.bias)
+    given = now.stages.inputs
     for j in range(2 * size):
         given[j, k] = at.state[j]
     for j in range(size):
@@ -48,26 +60,34 @@ def ask_derivatives(now: Record, at: Record, k: int) -> None:
 
 @kernel
 def differentiate_stages(task: Record, now: Record) -> None:
-    """Derivatives of the equation of motion at fixed acceleration and net joint torque, of all stages together."""
+    """Differentiate the equation of motion at all stages together.
+
+    Accelerations and net joint torques are fixed.
+    """
     call(task.stage_derivatives, now.stages.inputs, now.stages.by_pose)
 
 
 @kernel
 def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
-    """What the derivatives of a slope have in common beside the derivatives of the equation of motion."""
-    known, size = now.stages, len(at.bias)
+    """Copy what the columns of a slope have in common beside the equation of motion."""
+    known = now.stages
+    size = len(at.bias)
     for i in range(size):
         for j in range(size):
             known.factor[i, j, k] = at.factor[i, j]
     filtering = task.filter_time > 0
     for i in range(len(now.mode)):
-        mode, slips, law = now.mode[i], now.mode[i] != 0, follows_law(task, at, i)
+        mode = now.mode[i]
+        slips = now.mode[i] != 0
+        law = follows_law(task, at, i)
         known.by_error[i, k] = law * (task.lp + task.lx)
         known.by_integral[i, k] = law * task.li
         known.by_command_rate[i, k] = 0.0 if filtering else law * task.rate_weight * task.ld
         known.damping[i, k] = 0.0 if filtering else law * task.ld
         if slips:
-            known.damping[i, k] += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
+            known.damping[i, k] += task.viscous[i] + task.coulomb[i] * dry_slope(
+                task.friction, at.velocity[i], mode
+            )
         for j in range(size):
             known.jacobian[i, j, k] = at.jacobian[i, j]
             known.pushing[i, j, k] = at.jacobian[i, j] if slips else 0.0
@@ -75,19 +95,27 @@ def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
 
 @kernel
 def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage: int) -> None:
-    """What the parameters do at a fixed state: to -M q_ddot - b (`d.push`), and to the torque of each joint without the
-    friction that holds it (`d.direct`)."""
-    count, first, rigid = len(now.mode), 2 * len(at.bias), task.shown
+    """Compute the effect of the parameters at a fixed state.
+
+    It is that on -M q_ddot - b (`d.push`), and that on the torque of each joint without the
+    friction that holds it (`d.direct`).
+    """
+    count = len(now.mode)
+    first = 2 * len(at.bias)
+    rigid = task.shown
     lp = rigid + 2 * count
     for i in range(len(at.bias)):
         for k in range(rigid):
             d.push[i, k] = -now.stages.columns[i, task.pivots[k], stage]
     for i in range(count):
-        mode, row, law = now.mode[i], d.direct[i], follows_law(task, at, i)
+        mode = now.mode[i]
+        row = d.direct[i]
+        law = follows_law(task, at, i)
         rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
         if task.lx > 0 or task.filter_time > 0:
             fill(row, 0.0)
-            add_row(-law * task.lx, d.acting[i], row, now.width)  # with lx added to lp, it is of error less command
+            # with lx added to lp, the derivative is that of the error less the command
+            add_row(-law * task.lx, d.acting[i], row, now.width)
         if task.filter_time > 0:
             rate = at.state[first + count + i]
             add_row(law * task.ld, d.filtered[i], row, now.width)
@@ -105,15 +133,23 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage:
 
 @kernel
 def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Derivative of the slopes of filtered rates, which in `d.k[k]` stand before the net torques."""
-    size, count, width = len(at.bias), len(now.mode), now.width
+    """Differentiate the slopes of filtered rates, which are before the torques in `d.k[k]`."""
+    size = len(at.bias)
+    count = len(now.mode)
+    width = now.width
     first = 2 * size + count
-    slopes, torque = d.k[k, first : first + count], d.k[k, first + count :]
+    slopes = d.k[k, first : first + count]
+    torque = d.k[k, first + count :]
     copy_rows(slopes, torque, width)
     clear(slopes, width)
     for i in range(count):
         for j in range(size):
-            add_row(-0.5 / task.filter_time * now.stages.crank_by_rate[i, j, k], d.trial[j], slopes[i], width)
+            add_row(
+                -0.5 / task.filter_time * now.stages.crank_by_rate[i, j, k],
+                d.trial[j],
+                slopes[i],
+                width,
+            )
     add_product(-1 / task.filter_time, at.jacobian, d.trial[size : 2 * size], slopes, width)
     for i in range(count):
         add_row(task.rate_weight / task.filter_time, d.command_rate[i], slopes[i], width)
@@ -122,12 +158,15 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
 
 @kernel
 def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Derivative of the slopes of integrals that a drive at its limit holds: lx / li times the joint's velocity."""
-    size, width, known = len(at.bias), now.width, now.stages
+    """Differentiate the slopes of integrals that a drive at its limit holds: lx / li velocity."""
+    size = len(at.bias)
+    width = now.width
+    known = now.stages
     lp = task.shown + 2 * len(now.mode)
     for i in range(len(now.mode)):
         if winds_up(task, at, i):
-            row, share = d.k[k, 2 * size + i], task.lx / task.li
+            row = d.k[k, 2 * size + i]
+            share = task.lx / task.li
             fill(row, 0.0)
             for j in range(size):
                 add_row(0.5 * share * known.crank_by_rate[i, j, k], d.trial[j], row, width)
@@ -139,13 +178,19 @@ def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> No
 
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Derivative of the slope at one state, and behind it of the net torques, into `d.k[k]`: implicitly, for those of
-    the state and the time in `d.trial`, `d.filtered` and `d.stage_time`, with those of the equation of motion that are
-    known. See `slope_derivative`.
+    """Differentiate the slope and the net torques at one state, into `d.k[k]`.
+
+    State, filtered rates and time move as in `d.trial`, `d.filtered` and `d.stage_time`. The
+    derivatives of the equation of motion are known. See `slope_derivative`.
     """
-    size, count, width, known = len(at.bias), len(now.mode), now.width, now.stages
-    pose, rate = d.trial[:size], d.trial[size : 2 * size]
-    acceleration, torque = d.k[k, size : 2 * size], d.k[k, len(d.k[k]) - count :]
+    size = len(at.bias)
+    count = len(now.mode)
+    width = now.width
+    known = now.stages
+    pose = d.trial[:size]
+    rate = d.trial[size : 2 * size]
+    acceleration = d.k[k, size : 2 * size]
+    torque = d.k[k, len(d.k[k]) - count :]
     share_with_columns(task, now, at, k)
     if now.ramping:
         copy_rows(d.command[:], d.acting[:], width)
@@ -175,7 +220,7 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
 
 @kernel
 def give_back(at: Record, d: Record, stuck: int, rows: Array, width: int) -> None:
-    """Solve for what holds stuck joints (`d.force`), and take its effect out of the rows of the platform."""
+    """Solve for the torques of stuck joints (`d.force`), and take their effect out of the rows."""
     solve_rows(at.stuck_factor, stuck, d.force[:], width)
     for s in range(stuck):
         for j in range(len(rows)):
@@ -184,9 +229,16 @@ def give_back(at: Record, d: Record, stuck: int, rows: Array, width: int) -> Non
 
 @kernel
 def move_tangent(
-    now: Record, at: Record, d: Record, stage: int, h: float, fraction: float, moved: Array, first: int
+    now: Record,
+    at: Record,
+    d: Record,
+    stage: int,
+    h: float,
+    fraction: float,
+    moved: Array,
+    first: int,
 ) -> None:
-    """Add fraction (h slope's derivative + d_length slope) at a stage to rows of unknowns, from the `first` on."""
+    """Add fraction (h d_slope + d_length slope) at a stage to rows of unknowns, from `first` on."""
     for i in range(len(moved)):
         add_row(fraction * h, d.k[stage, first + i], moved[i], now.width)
         if now.length_moves:
@@ -203,7 +255,7 @@ def try_tangent(now: Record, d: Record) -> None:
 
 @kernel
 def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> None:
-    """d(J_theta rate)/d(pose) (n, m), into `now.rate_map`."""
+    """Compute d(J_theta rate)/d(pose) (n, m), into `now.rate_map`."""
     copy(pose, now.pose_and_rate[: len(pose)])
     copy(rate, now.pose_and_rate[len(pose) :])
     call(task.rate_map_derivative, now.pose_and_rate, now.rate_map)
@@ -211,9 +263,15 @@ def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> Non
 
 @kernel
 def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
-    """The event sets the length of the step that it cuts: margin(end of the step, its length) = 0. The margin is that
-    of a velocity, or of what a stuck joint holds."""
-    size, width, column, joint = len(end.bias), now.width, now.step_column, mode_margin(task, now, end)[1]
+    """Differentiate the length of a step that an event cuts.
+
+    The length is the one at which margin(end of the step, length) = 0. The margin is that of a
+    velocity, or of the torque that holds a stuck joint.
+    """
+    size = len(end.bias)
+    width = now.width
+    column = now.step_column
+    joint = mode_margin(task, now, end)[1]
     fill(d.margin[:], 0.0)
     if now.mode[joint] != 0:
         velocity_by_pose(task, now, end.state[:size], end.state[size : 2 * size])
@@ -229,32 +287,43 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
         invoke(task.slope_tangent, task, now, end, d, 0)
         torque = d.k[0, len(d.k[0]) - len(now.mode) + joint]
         add_row(1.0 if end.stick_force[joint] > 0 else -1.0, torque, d.margin[:], width)
+        # the breakaway torque grows with the Coulomb parameter of the joint
         d.margin[task.shown + joint] -= task.friction.static_level
     approach = d.margin[column]
     fill(d.length[:], 0.0)
+    # an event that hardly approaches has no derivative of its length that means anything
     if abs(approach) > NO_APPROACH:
         add_row(-1 / approach, d.margin[:], d.length[:], width)
     d.length[column] = 0.0
     for i in range(len(d.x)):
+        # the length is no variable any more: its column goes into those of all others
         add_row(d.x[i, column], d.length[:], d.x[i], width)
         d.x[i, column] = 0.0
 
 
 @kernel
 def whole_vectors(columns: int) -> int:
-    """The columns in use, so many at least; those behind them are zero."""
+    """Round a number of columns up to whole vectors. The added columns are zero."""
     return -(-columns // LANES) * LANES
 
 
 @kernel
-def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, event: bool, cut: bool) -> None:
-    """Sensitivities over the stored step. One that ends on the grid is shorter by what its start is later; one that is
-    `cut` by an event has the length that the event sets: until that is known it is one more variable."""
+def step_tangent(
+    task: Record, now: Record, at: Record, d: Record, h: float, event: bool, cut: bool
+) -> None:
+    """Differentiate the step that is stored.
+
+    A step that ends on the grid is shorter by as much as its start is later. A step that is `cut`
+    by an event has the length that the event sets. Until that is known, the length is one more
+    variable.
+    """
     fill(d.length[:], 0.0)
     if cut:
+        # the length of the step is a variable of its own until the event has set it
         now.width = whole_vectors(now.step_column + 1)
         d.length[now.step_column] = 1.0
     if not event:
+        # the step ends on the grid, so that a later start makes it shorter
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
     for k in range(END):
@@ -280,13 +349,17 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
 
 @entry
 def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Derivative of stopping joints, which changed the pose rate by `now.change` and left it in `now.state`.
+    """Differentiate the stop of joints that changed the pose rate by `now.change`.
 
-    M change = -J^T impulse (`at.force`) and J rate = 0 in these joints, differentiated implicitly.
+    M change = -J^T impulse (`at.force`) and J rate = 0 hold in these joints, and both are
+    differentiated implicitly.
     """
-    size, width, known = len(at.bias), now.width, now.stopping
+    size = len(at.bias)
+    width = now.width
+    known = now.stopping
     stuck = now.stuck[: count_stuck(now)]
-    pose, rate = d.x[:size], d.x[size : 2 * size]
+    pose = d.x[:size]
+    rate = d.x[size : 2 * size]
     copy(now.state[:size], known.inputs[:size])
     copy(now.change[:], known.inputs[size : 2 * size])
     impulse = known.inputs[2 * size : 2 * size + len(now.mode)]
@@ -314,8 +387,9 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
 @kernel
 def rest_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
-    """A start state moved at joints that stick: their velocities are lost at once, without a path."""
-    size, stuck = len(at.bias), now.stuck[: count_stuck(now)]
+    """Project a start state that moves at stuck joints: their velocities are lost at once."""
+    size = len(at.bias)
+    stuck = now.stuck[: count_stuck(now)]
     if len(stuck) == size:
         clear(d.x[size : 2 * size], now.width)
     elif len(stuck) > 0:

@@ -1,9 +1,10 @@
-"""Stability of the sampled loop near rest: the linear map of its state from one frame to the next.
+"""Stability of the sampled loop near rest, by the linear map of its state from frame to frame.
 
-Small deviations of the robot under its joint PID (eq. 31) follow a linear differential equation, of which the matrix
-exponential is the exact solution while a command acts; the servo (eq. 30) and the commands on their way close the loop
-once a frame. The loop is stable where all eigenvalues of that map are inside the unit circle. Dry friction, which only
-helps at rest, and elasticity of the joints are left out.
+Small deviations of the robot under its joint PID (eq. 31) follow a linear differential equation.
+The matrix exponential is its exact solution while a command acts. The servo (eq. 30) and the
+commands on their way close the loop once a frame. The loop is stable where all eigenvalues of the
+map are inside the unit circle. Dry friction, which only helps at rest, and elasticity of the joints
+are left out.
 """
 
 from __future__ import annotations
@@ -17,27 +18,35 @@ import numpy as np
 from scipy.linalg import expm
 
 from dynamics.closed_loop.drives import Drives, JointLaw
-from dynamics.closed_loop.problem import (
+from dynamics.closed_loop.loop_settings import (
     FrameTiming,
     LoopSettings,
     ServoGains,
+)
+from dynamics.closed_loop.start_state import (
     check_start_pose,
     checked_loop_parameters,
 )
 from dynamics.robot import Robot
 
-SLOWEST_HZ, MOST_GAIN = 0.5, 100.0
-"""Ends of the searches for the frame rate and the gains at which a loop is lost."""
+SLOWEST_HZ = 0.5
+"""Slowest frame rate that is searched for a limit of stability."""
+
+MOST_GAIN = 100.0
+"""Largest factor of the gains that is searched for a limit of stability."""
 
 STEP = 1.1
-"""Ratio of neighbours in these searches, between which the limit is then bisected."""
+"""Ratio of neighbours in these searches, between which the limit is bisected."""
 
 
-def frame_map(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> np.ndarray:
-    """The map (s, s) of small deviations from rest at a pose (6,), for all parameters, from frame to frame.
+def frame_map(
+    robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
+) -> np.ndarray:
+    """Map (s, s) of small deviations from rest at a pose (6,), from frame to frame.
 
-    The state: coordinates, their rates, joint PID integrals, coordinates measured at the last frame, servo integrals,
-    and the commands on their way, the latest first. Raises what `closed_loop.equilibrium` raises.
+    The state has coordinates, their rates, joint integrals, coordinates measured at the last frame,
+    servo integrals, and the commands on their way, of which the latest is first. Raises what
+    `closed_loop.equilibrium` raises.
     """
     return _frame_map(_near_rest(robot, parameters, pose, settings.drives), settings)
 
@@ -45,15 +54,16 @@ def frame_map(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose
 def pose_response(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> Callable[[float], np.ndarray]:
-    """What the coordinates do when the desired ones oscillate by a little about a pose (6,): a function of the angular
-    frequency, rad/s, that gives the matrix (m, m) from the desired to the true ones, at the frames.
+    """Response of the coordinates to small oscillations of the desired ones about a pose (6,).
 
-    Raises what `closed_loop.equilibrium` raises.
+    Returns a function of the angular frequency, rad/s, that gives the matrix (m, m) from the
+    desired to the true coordinates at the frames. Raises what `closed_loop.equilibrium` raises.
     """
     near = _near_rest(robot, parameters, pose, settings.drives)
     size = near.jacobian.shape[1]
     map_, by_desired = np.split(_with_desired(near, settings), [-size], axis=1)
-    one, period = np.eye(len(map_)), 1 / settings.timing.frame_rate_hz
+    one = np.eye(len(map_))
+    period = 1 / settings.timing.frame_rate_hz
 
     def response(frequency: float) -> np.ndarray:
         return np.linalg.solve(np.exp(1j * frequency * period) * one - map_, by_desired)[:size]
@@ -66,36 +76,56 @@ def _frame_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
 
 
 def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
-    """The frame map (s, s), and beside it (s, m) what the desired coordinates of the frame do."""
-    (joints, size), timing = robot.jacobian.shape, settings.timing
-    period, servo = 1 / timing.frame_rate_hz, _servo(robot, settings)
+    """Frame map (s, s), and the effect (s, m) of the desired coordinates of the frame."""
+    joints, size = robot.jacobian.shape
+    timing = settings.timing
+    period = 1 / timing.frame_rate_hz
+    servo = _servo(robot, settings)
+    # the small number keeps a latency of whole frames from rounding down to one frame less
     whole = floor(timing.latency_s / period + 1e-9)
     rest = max(0.0, timing.latency_s - whole * period)
-    inner, kept = len(robot.motion) - 3 * joints, whole + 2
+    inner = len(robot.motion) - 3 * joints
+    kept = whole + 2
     states = inner + 2 * size + kept * joints
-    start, desired = np.eye(states, states + size), np.eye(size, states + size, states)
-    coordinates, integral = start[:size] - desired, start[inner + size : inner + 2 * size]
+    start = np.eye(states, states + size)
+    desired = np.eye(size, states + size, states)
+    coordinates = start[:size] - desired
+    integral = start[inner + size : inner + 2 * size]
     seen = np.vstack([coordinates, start[inner : inner + size], integral])
-    turned = (robot.turning if settings.servo.ki else 0 * robot.turning) @ start[:size]  # without: no demand at rest
+    # without an integral the servo demands nothing at rest, which then does not turn
+    turning = robot.turning if settings.servo.ki else 0 * robot.turning
+    turned = turning @ start[:size]
     commands = [servo @ seen + turned, *np.split(start[inner + 2 * size :], kept)]
     state = start[:inner]
+    # within a frame, the older command acts until the newer one arrives after the rest
     for age, begin, end in ((whole + 1, 0.0, rest), (whole, rest, period)):
-        newer, older = commands[age], commands[age + 1] if age + 1 <= kept else commands[age]
-        ramp = (begin + (period - rest if age > whole else -rest)) / period if timing.hold == "linear" else 1.0
+        newer = commands[age]
+        older = commands[age + 1] if age + 1 <= kept else commands[age]
+        ramp = (
+            (begin + (period - rest if age > whole else -rest)) / period
+            if timing.hold == "linear"
+            else 1.0
+        )
         slope = (newer - older) / period
         at_once = older + ramp * (newer - older)
         moving = slope if timing.hold == "linear" else 0 * slope
-        state = expm(robot.motion * (end - begin))[:inner] @ np.vstack([state, at_once, moving, slope])
+        state = expm(robot.motion * (end - begin))[:inner] @ np.vstack(
+            [state, at_once, moving, slope]
+        )
     return np.vstack([state, coordinates, integral - period * coordinates, *commands[:kept]])
 
 
-def spectral_radius(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
-    """Largest magnitude of the eigenvalues of `frame_map`: the loop is stable below 1."""
+def spectral_radius(
+    robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
+) -> float:
+    """Largest magnitude of the eigenvalues of `frame_map`. The loop is stable if it is below 1."""
     return _radius(_near_rest(robot, parameters, pose, settings.drives), settings)
 
 
-def gain_margin(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
-    """Factor by which the gains of the servo may grow, or below 1 have to shrink, until the loop is just stable."""
+def gain_margin(
+    robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
+) -> float:
+    """Factor of the servo's gains at which the loop is just stable."""
     near = _near_rest(robot, parameters, pose, settings.drives)
 
     def radius(factor: float) -> float:
@@ -106,26 +136,36 @@ def gain_margin(robot: Robot, parameters: np.ndarray, settings: LoopSettings, po
     return last_stable(radius, 1.0, MOST_GAIN, 1 / MOST_GAIN)
 
 
-def lowest_frame_rate(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
-    """Frame rate, Hz, from which on the loop is stable with all else as it is; the latency stays a time.
+def lowest_frame_rate(
+    robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
+) -> float:
+    """Lowest frame rate, Hz, at which the loop is stable, with the same latency in s.
 
-    Above the settings' rate where it is not stable there. NaN where no rate makes it stable.
+    It is above the rate of the settings where the loop is not stable there, and NaN where no rate
+    makes it stable.
     """
-    rate, near = settings.timing.frame_rate_hz, _near_rest(robot, parameters, pose, settings.drives)
+    rate = settings.timing.frame_rate_hz
+    near = _near_rest(robot, parameters, pose, settings.drives)
 
     def radius(hz: float) -> float:
         timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
         return _radius(near, replace(settings, timing=timing))
 
-    fastest = min(100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf)
+    fastest = min(
+        100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf
+    )
     return last_stable(radius, rate, SLOWEST_HZ, fastest)
 
 
 def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
-    """What the linear loop says of a run that was lost: its eigenvalue, and the frame rate that would hold it."""
+    """Text for a run that was lost: the largest eigenvalue, and a frame rate that is stable."""
     arguments = robot, parameters, settings, pose
-    radius, hz = spectral_radius(*arguments), settings.timing.frame_rate_hz
-    said = f"its largest eigenvalue from frame to frame near the start is {radius:.4g}, and must be below 1"
+    radius = spectral_radius(*arguments)
+    hz = settings.timing.frame_rate_hz
+    said = (
+        f"its largest eigenvalue from frame to frame near the start is {radius:.4g}, and must be "
+        "below 1"
+    )
     if radius < 1:
         return f"{said}: it is lost far from there"
     rate = lowest_frame_rate(*arguments)
@@ -134,8 +174,11 @@ def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: 
 
 
 class _NearRest(NamedTuple):
-    """A robot near rest, as far as neither the servo's gains nor timing matter: how it moves, see `_joint_loop`; J
-    (n, m) of its coordinates, and the derivative (n, m) of J times the demand that holds the joints where they are."""
+    """Robot near rest, without the gains and the timing of the servo.
+
+    motion: see `_joint_loop`. jacobian (n, m): of the joints with respect to the coordinates.
+    turning (n, m): derivative of the Jacobian times the demand that holds the joints.
+    """
 
     motion: np.ndarray
     jacobian: np.ndarray
@@ -145,7 +188,8 @@ class _NearRest(NamedTuple):
 def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray, drives: Drives) -> _NearRest:
     parameters = checked_loop_parameters(robot, parameters, drives.law)
     check_start_pose(robot, parameters, pose)
-    jacobian, law = robot.coordinate_jacobian(pose), drives.joint_law(parameters[robot.layout.joint_pid])
+    jacobian = robot.coordinate_jacobian(pose)
+    law = drives.joint_law(parameters[robot.layout.joint_pid])
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
     demand = np.linalg.solve(jacobian, law.held(holding, robot.inverse_kinematics(pose))[0])
     (turning,) = _values(robot, "rate_map_derivative", robot.coordinates(pose), demand)
@@ -156,21 +200,33 @@ def _radius(robot: _NearRest, settings: LoopSettings) -> float:
     return float(np.abs(np.linalg.eigvals(_frame_map(robot, settings))).max())
 
 
-def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray, law: JointLaw) -> np.ndarray:
-    """d/dt of [q, q_dot, joint integrals, filtered rates where there are any, command, slope of the command, U_dot] by
-    these, square: a command changes with its slope, and what the drive takes for U_dot need not be that. An integral
-    that nothing reads dies out."""
-    q, joints = robot.coordinates(pose), robot.layout.joints
+def _joint_loop(
+    robot: Robot, parameters: np.ndarray, pose: np.ndarray, law: JointLaw
+) -> np.ndarray:
+    """Matrix of the linear differential equation of the joints under their drives.
+
+    The state has q, q_dot, joint integrals, filtered rates if there are any, the command, its
+    slope, and U_dot. The command changes with its slope, which need not be what the drive takes for
+    U_dot. An integral that no law reads dies out.
+    """
+    q = robot.coordinates(pose)
+    joints = robot.layout.joints
     rigid, _, viscous, _ = robot.layout.split(parameters)
-    lp, li, ld, filtering = law.lp, law.li, law.ld, law.filter_time > 0
-    at_rest, size = np.zeros(len(q)), len(q)
+    lp = law.lp
+    li = law.li
+    ld = law.ld
+    filtering = law.filter_time > 0
+    at_rest = np.zeros(len(q))
+    size = len(q)
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
     mass, _, jacobian, *_ = _values(robot, "equation_of_motion", q, at_rest, rigid)
     by_pose, by_rate, *_ = _values(robot, "motion_derivatives", q, at_rest, at_rest, holding, rigid)
     push = np.linalg.solve(mass, jacobian.T)
     inner = 2 * size + joints * (1 + filtering)
     system = np.zeros((inner + 3 * joints, inner + 3 * joints))
-    at, moving, summed = slice(0, size), slice(size, 2 * size), slice(2 * size, 2 * size + joints)
+    at = slice(0, size)
+    moving = slice(size, 2 * size)
+    summed = slice(2 * size, 2 * size + joints)
     filtered = slice(2 * size + joints, inner)
     command, slope, rate = (slice(inner + k * joints, inner + (k + 1) * joints) for k in range(3))
     system[at, moving] = np.eye(size)
@@ -182,27 +238,41 @@ def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray, law: Joi
     system[moving, command] = lp * push
     if filtering:
         system[moving, filtered] = ld * push
-        system[filtered, moving], system[filtered, rate] = -jacobian / law.filter_time, np.eye(joints) / law.filter_time
+        system[filtered, moving] = -jacobian / law.filter_time
+        system[filtered, rate] = np.eye(joints) / law.filter_time
         system[filtered, filtered] = -np.eye(joints) / law.filter_time
     else:
         system[moving, rate] = law.rate_weight * ld * push
-    system[summed, at], system[summed, command] = -jacobian, np.eye(joints)
+    system[summed, at] = -jacobian
+    system[summed, command] = np.eye(joints)
     system[summed, summed] = -np.eye(joints) if li == 0 else 0.0
     system[command, slope] = np.eye(joints)
     return system
 
 
 def _servo(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
-    """The command of a frame by [coordinates less the desired, those of the frame before, servo integral before]."""
-    gains, period, jacobian = settings.servo, 1 / settings.timing.frame_rate_hz, robot.jacobian
+    """Command of a frame as a matrix of the servo's inputs.
+
+    The inputs are the coordinates less the desired ones, those of the frame before, and the servo
+    integral before.
+    """
+    gains = settings.servo
+    period = 1 / settings.timing.frame_rate_hz
+    jacobian = robot.jacobian
     by_now = -(gains.kp + gains.kd / period + gains.ki * period) * jacobian
     return np.hstack([by_now, gains.kd / period * jacobian, gains.ki * jacobian])
 
 
-def torque_motion(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Near rest at a pose (6,), of a robot whose drives hold torques: d/dt (2 m, 2 m) of coordinates and rates, and the
-    accelerations (m, n) of torques beside those that hold it."""
-    q, rest = robot.coordinates(pose), np.zeros(len(robot.coordinate_names))
+def torque_motion(
+    robot: Robot, parameters: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Linear motion near rest at a pose (6,) of a robot whose drives hold torques.
+
+    Returns the matrix (2 m, 2 m) of coordinates and rates, and the accelerations (m, n) of torques
+    beside those that hold the robot.
+    """
+    q = robot.coordinates(pose)
+    rest = np.zeros(len(robot.coordinate_names))
     rigid, _, viscous, _ = robot.layout.split(parameters)
     mass, _, jacobian, *_ = _values(robot, "equation_of_motion", q, rest, rigid)
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
@@ -217,16 +287,24 @@ def _values(robot: Robot, name: str, *inputs: np.ndarray) -> list[np.ndarray]:
     return [output[0] for output in robot.functions[name](*[value[None] for value in inputs])]
 
 
-def last_stable(radius: Callable[[float], float], start: float, stable_end: float, other_end: float) -> float:
-    """Where the radius first passes 1 on the way from start to an end: the first of these if it is stable at the start,
-    which is then returned where all the way is; else the other, and NaN where no way is."""
-    stable, value = radius(start) < 1, start
+def last_stable(
+    radius: Callable[[float], float], start: float, stable_end: float, other_end: float
+) -> float:
+    """Limit of stability on the way from a start to one of two ends.
+
+    It is where the radius first passes 1. If the loop is stable at the start, the way is to
+    `stable_end`, which is returned if the loop is stable all the way. Else the way is to
+    `other_end`, and NaN is returned if the loop is nowhere stable.
+    """
+    stable = radius(start) < 1
+    value = start
     end = stable_end if stable else other_end
     step = STEP if end > start else 1 / STEP
     while (value < end) == (step > 1):
         following = value * step
         if (radius(following) < 1) != stable:
-            low, high = value, following
+            low = value
+            high = following
             for _ in range(30):
                 middle = (low * high) ** 0.5
                 low, high = (middle, high) if (radius(middle) < 1) == stable else (low, middle)

@@ -1,7 +1,8 @@
 """Motion with dry joint friction over a span of constant command.
 
-Between mode changes the motion is smooth and classical Runge-Kutta integrates it. A mode ends where a slipping joint
-comes to rest or a stuck joint reaches its breakaway torque (eq. 24); the step is cut there, to rounding.
+Between changes of the modes the motion is smooth, and the classical Runge-Kutta method integrates
+it. A mode ends where a slipping joint comes to rest, or where a stuck joint reaches its breakaway
+torque (eq. 24). The step is cut there, to rounding.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import clear, copy, dot, fill, solve
@@ -15,30 +16,44 @@ from dynamics.closed_loop.motion_kernels import (
     hold_compliance,
     mode_margin,
 )
-from dynamics.closed_loop.sensitivity_kernels import END, FRACTION, WEIGHT, rest_tangent, step_tangent
+from dynamics.closed_loop.sensitivity_kernels import (
+    END,
+    FRACTION,
+    WEIGHT,
+    rest_tangent,
+    step_tangent,
+)
 from dynamics.compiled.kernel import Record, entry, invoke, kernel
 
 MAX_EVENTS_PER_SEGMENT = 400
-NO_MARGIN = 1e-12  # rad/s, or share of the breakaway torque
-LITTLE_SHARE = 1e-13  # of the breakaway torque: as far as rounding lets it be known
+# rad/s, or share of the breakaway torque
+NO_MARGIN = 1e-12
+# share of the breakaway torque that rounding hides
+LITTLE_SHARE = 1e-13
 
 
 TAKEN, WHOLE, HALF, AGAIN, BRACKET, CROSSING = range(6)
-"""What the step that is tried is for: none is, the last one was taken; the one to be taken; half of it, to see whether
-modes are broken in between, and the whole again where they are not; one that begins where an event's bracket does; and
-one that ends at the event."""
+"""Purposes of the step that is tried.
+
+TAKEN: none is tried, the last one was taken. WHOLE: the step is to be taken. HALF: half of it, to
+see whether modes are broken in between. AGAIN: the whole again, where they are not. BRACKET: a step
+to the beginning of an event's bracket. CROSSING: a step that ends at the event.
+"""
 
 
 @kernel
 def ask(now: Record, purpose: int, length: float) -> None:
     """Ask for a step of a length, s, to be tried."""
-    now.purpose, now.length = purpose, length
+    now.purpose = purpose
+    now.length = length
 
 
 @kernel
 def set_stage(now: Record, at: Record, k: int) -> None:
-    """State and time of stage `k` of the step that is tried, or of its end."""
-    start, stage, h = at[0], at[k], now.length
+    """Set state and time of stage `k` of the step that is tried, or of its end."""
+    start = at[0]
+    stage = at[k]
+    h = now.length
     if k < END:
         before = at[k - 1]
         for i in range(now.unknowns):
@@ -55,7 +70,7 @@ def set_stage(now: Record, at: Record, k: int) -> None:
 
 @kernel
 def begin_step(task: Record, now: Record, at: Record, d: Record) -> int:
-    """Evaluate the state that the integrator has reached, unless that is known from the end of the step before."""
+    """Evaluate the state that the integrator has reached, unless the step before has done so."""
     if not now.moved:
         return OK
     now.moved = 0
@@ -64,7 +79,10 @@ def begin_step(task: Record, now: Record, at: Record, d: Record) -> int:
 
 @kernel
 def try_step(task: Record, now: Record, at: Record, d: Record) -> int:
-    """The Runge-Kutta step that is asked for, with fixed modes, from the evaluation `at[0]`: its stages and its end."""
+    """Do the Runge-Kutta step that is asked for, with fixed modes.
+
+    It begins at the evaluation `at[0]` and fills its stages and its end.
+    """
     status = begin_step(task, now, at, d)
     if status != OK:
         return status
@@ -78,8 +96,13 @@ def try_step(task: Record, now: Record, at: Record, d: Record) -> int:
 
 @kernel
 def crossing(now: Record, count: int) -> float:
-    """Where the last `count` steps that were tried would have no margin left: the polynomial of step over margin."""
-    length, margin, found = now.tried, now.tried_margin, now.tried_crossing
+    """Length of the step at which the margin would be zero.
+
+    It is the polynomial of length over margin through the last `count` steps that were tried.
+    """
+    length = now.tried
+    margin = now.tried_margin
+    found = now.tried_crossing
     for i in range(count):
         found[i] = length[i]
     for order in range(1, count):
@@ -91,33 +114,42 @@ def crossing(now: Record, count: int) -> float:
 
 @kernel
 def remember(now: Record, h: float, margin: float) -> None:
-    """Put a step that was tried, and the margin at its end, before the ones before."""
+    """Put a step that was tried, and the margin at its end, before the earlier ones."""
     for i in range(len(now.tried) - 1, 0, -1):
-        now.tried[i], now.tried_margin[i] = now.tried[i - 1], now.tried_margin[i - 1]
-    now.tried[0], now.tried_margin[0] = h, margin
+        now.tried[i] = now.tried[i - 1]
+        now.tried_margin[i] = now.tried_margin[i - 1]
+    now.tried[0] = h
+    now.tried_margin[0] = margin
 
 
 @kernel
 def locate_event(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Look for the step, not longer than the last one tried, at which the modes stop holding: the margin, here that of
-    the last one, crosses zero. By inverse interpolation, and by halving the bracket where that leads out of it; the
-    first time with what the stage at half the step says, which is near.
+    """Search for the step at which the modes stop to hold, up to the last one tried.
 
-    A joint that has just started from rest has no margin yet: then the bracket is found by halving.
+    The margin, which is that of the last step here, crosses zero there. The search uses inverse
+    interpolation, and halves the bracket where that leads out of it. The first guess uses the stage
+    at half the step. A joint that has just started from rest has no margin yet, so that its bracket
+    is found by halving.
     """
     now.events_left -= 1
     if now.events_left < 0:
         return TOO_MANY_EVENTS
-    now.cut, now.low, now.high, now.trials = now.length, 0.0, now.length, 0
-    now.low_margin, now.high_margin = mode_margin(task, now, at[0])[0], margin
+    now.cut = now.length
+    now.low = 0.0
+    now.high = now.length
+    now.trials = 0
+    now.low_margin = mode_margin(task, now, at[0])[0]
+    now.high_margin = margin
     now.half_margin = mode_margin(task, now, at[2])[0]
     return narrow(task, now, at, d)
 
 
 @kernel
 def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
-    """Ask for the next step of an event's search, once its bracket begins with a margin; take the last one tried where
-    40 halvings have not found that."""
+    """Ask for the next step of the search for an event, once its bracket begins with a margin.
+
+    The last step tried is taken where 40 halvings have not found such a bracket.
+    """
     if now.low_margin < NO_MARGIN and now.trials < 40:
         ask(now, BRACKET, now.high / 2)
         return OK
@@ -133,7 +165,10 @@ def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
 
 @kernel
 def ask_between(now: Record, length: float) -> None:
-    """Ask for a step where the event seems to be; half way of the bracket where that is outside, or slow."""
+    """Ask for a step where the event seems to be.
+
+    It is in the middle of the bracket where the guess is outside, or where the search is slow.
+    """
     if now.trials > 43 or not now.low < length < now.high:
         length = 0.5 * (now.low + now.high)
     ask(now, CROSSING, length)
@@ -141,18 +176,21 @@ def ask_between(now: Record, length: float) -> None:
 
 @kernel
 def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """A step of half the bracket was tried: it begins there, or it ends there."""
+    """Begin or end the bracket at the step that was tried, half as long as the bracket."""
     now.trials += 1
     if margin > 0:
-        now.low, now.low_margin, now.trials = now.length, margin, 40
+        now.low = now.length
+        now.low_margin = margin
+        now.trials = 40
     else:
-        now.high, now.high_margin = now.length, margin
+        now.high = now.length
+        now.high_margin = margin
     return narrow(task, now, at, d)
 
 
 @kernel
 def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """A step to where an event seems to be was tried: it is taken once no better one is known."""
+    """Take a step to where an event seems to be, once no better one is known."""
     tried = now.length
     if margin > 0:
         now.low = tried
@@ -162,6 +200,7 @@ def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: flo
     better = crossing(now, min(now.trials, len(now.tried)))
     holds = now.mode[mode_margin(task, now, at[END])[1]] == 0
     little = LITTLE_SHARE if holds else 0.0
+    # rounding keeps a bracket from becoming shorter than this
     near = min(abs(better - tried), now.high - now.low) <= 1e-15 + 1e-13 * now.cut
     now.trials += 1
     if abs(margin) <= little or near or now.trials == 83:
@@ -172,10 +211,10 @@ def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: flo
 
 @kernel
 def judge(task: Record, now: Record, at: Record, d: Record) -> int:
-    """What follows from a step that was tried: it is taken, or another one is asked for.
+    """Decide what follows from a step that was tried: it is taken, or another one is asked for.
 
-    Modes that hold at both ends of a step may be broken in between (a joint reversing twice): the stages give a hint,
-    which a step of half the length confirms.
+    Modes that hold at both ends of a step may be broken in between, when a joint reverses twice.
+    The stages give a hint of that, which a step of half the length confirms.
     """
     margin = mode_margin(task, now, at[END])[0]
     if now.purpose == BRACKET:
@@ -184,9 +223,12 @@ def judge(task: Record, now: Record, at: Record, d: Record) -> int:
         return judge_crossing(task, now, at, d, margin)
     if now.purpose != AGAIN and margin < 0:
         return locate_event(task, now, at, d, margin)
+    # half a step has held its modes, so that the whole step can be taken
     if now.purpose == HALF:
         ask(now, AGAIN, 2 * now.length)
-    elif now.purpose == AGAIN or (mode_margin(task, now, at[1])[0] >= 0 and mode_margin(task, now, at[2])[0] >= 0):
+    elif now.purpose == AGAIN or (
+        mode_margin(task, now, at[1])[0] >= 0 and mode_margin(task, now, at[2])[0] >= 0
+    ):
         return take_step(task, now, at, d, False, True)
     else:
         ask(now, HALF, now.length / 2)
@@ -195,15 +237,21 @@ def judge(task: Record, now: Record, at: Record, d: Record) -> int:
 
 @entry
 def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Take the velocities of the stuck joints, whose compliance is known, out of the state, as an impulse would."""
-    size, stuck = len(at.bias), now.stuck[: count_stuck(now)]
+    """Take the velocities of stuck joints out of the state, as an impulse would.
+
+    The compliance of the joints is known.
+    """
+    size = len(at.bias)
+    stuck = now.stuck[: count_stuck(now)]
     rate = now.state[size : 2 * size]
     if task.stiffness > 0:
+        # elastic joints are stopped one by one, because their motors do not feel each other
         for i in stuck:
             now.state[2 * size + 2 * len(now.mode) + i] = 0.0
         return OK
     if len(stuck) == 0:
         return OK
+    # with as many stuck joints as coordinates nothing moves, and rounding must not let it
     if len(stuck) == size:
         fill(rate, 0.0)
         clear(d.x[size : 2 * size], now.width)
@@ -224,9 +272,13 @@ def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int
 
 @kernel
 def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) -> int:
-    """Change the modes; `held` is False where a joint that starts from rest turns back at once: it sticks."""
+    """Change the modes after an event.
+
+    `held` is False where a joint that starts from rest turns back at once, and sticks.
+    """
     end = at[END]
     joint = mode_margin(task, now, end)[1]
+    # a stuck joint breaks away in the direction of the torque that it carried
     if now.mode[joint] == 0:
         now.mode[joint] = 1 if end.stick_force[joint] > 0 else -1
         return OK
@@ -236,6 +288,7 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
     invoke(task.stop_joints, task, now, end, d, 0)
     copy(now.state[:], end.state[:])
     status = invoke(task.evaluate_terms, task, now, end, d, 0)
+    # the impulse that stops a joint may break others away, so that modes are decided anew
     if status == OK and held:
         invoke(task.decide_modes, task, now, end, d, 0)
     return status
@@ -243,9 +296,12 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
 
 @kernel
 def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, held: bool) -> int:
-    """Take the step that was tried, which ends at its target, or where an event cuts it. held: not where a joint that
-    has just started from rest turns back at once."""
-    now.purpose, time = TAKEN, now.target
+    """Take the step that was tried, which ends at its target or where an event cuts it.
+
+    `held` is as in `after_event`.
+    """
+    time = now.target
+    now.purpose = TAKEN
     if task.sensitivities:
         step_tangent(task, now, at, d, now.length, event, event and held)
     copy(at[END].state[:], now.state[:])
@@ -259,19 +315,26 @@ def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, hel
         invoke(task.stop_joints, task, now, at[END], d, 0)
         same_modes = not follow_frictionless(task, now, at[END])
         if same_modes and count_stuck(now) == 0:
+            # the end of this step is the start of the next, which need not be evaluated again
             at[0] = at[END]
             at[0].time = time
             return OK
     copy(now.state[:], at[0].state[:])
-    at[0].time, now.moved = time, 1
+    at[0].time = time
+    now.moved = 1
     return OK
 
 
 @kernel
-def begin_span(task: Record, now: Record, at: Record, d: Record, duration: float, steps: int) -> None:
-    """Begin a time, s, with one command, whose torques are known. Modes are decided anew at its start, where these
-    jump, unless all stuck joints hold."""
-    start, now.moved = at[0], 0
+def begin_span(
+    task: Record, now: Record, at: Record, d: Record, duration: float, steps: int
+) -> None:
+    """Begin a time, s, with one command, whose torques are known.
+
+    The modes are decided anew at its start, where torques jump, unless all stuck joints hold.
+    """
+    start = at[0]
+    now.moved = 0
     follow_frictionless(task, now, start)
     accelerate(task, now, start)
     if not all_hold(task, now, start):
@@ -281,12 +344,13 @@ def begin_span(task: Record, now: Record, at: Record, d: Record, duration: float
         rest_tangent(task, now, start, d)
     now.start_moves = 0
     now.events_left = MAX_EVENTS_PER_SEGMENT
-    now.duration, now.steps = duration, steps
+    now.duration = duration
+    now.steps = steps
 
 
 @kernel
 def next_step(now: Record, at: Record) -> bool:
-    """Ask for the next step of the span, unless one is being tried; False where the span's end is reached."""
+    """Ask for the next step of the span, unless one is being tried. Return False at its end."""
     if now.purpose != TAKEN:
         return True
     while at[0].time >= now.target:

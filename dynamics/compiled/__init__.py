@@ -1,1 +1,1 @@
-"""Machine code without a C compiler: CasADi's functions by way of LLVM, loops around them by numba."""
+"""Machine code without a C compiler: CasADi's functions by LLVM, and loops around them by Numba."""

@@ -1,9 +1,10 @@
-"""Parts of a function that are alike: what they compute is one stream of operations on vectors, a lane for each part.
+"""Parts of a function that are alike, computed as one stream of operations on vectors.
 
-A robot's legs are such parts: each is the same expression with numbers of its own. Lanes are found in the instructions
-themselves: what all parts need is computed once, before them; what is left of each part is put into the order in which
-its outputs ask for it, and parts with the same operations in that order become lanes of one group. So the result is
-that of the parts one by one, bit for bit, and legs of several kinds become several groups.
+Each part has a lane of the vectors. The legs of a robot are such parts: they have the same
+expression with different numbers. Lanes are found in the instructions themselves. Values that all
+parts need are computed once, before them. The rest of each part is put into the order in which its
+outputs ask for it, and parts with the same operations in that order become lanes of one group. The
+result is that of the parts one by one, bit for bit. Legs of several kinds become several groups.
 """
 
 from collections.abc import Iterable
@@ -16,17 +17,21 @@ import casadi as ca
 import numpy as np
 
 NAMES = {getattr(ca, name): name.removeprefix("OP_") for name in dir(ca) if name.startswith("OP_")}
-"""CasADi's names of its operations, by their numbers."""
+"""Names of CasADi's operations by their numbers."""
 
 LEAVES = ("CONST", "INPUT")
 
 
 @dataclass(frozen=True)
 class PartedFunction:
-    """A function by its parts. parts: (inputs, constants) -> a column of the same length for each part; end: (inputs,
-    columns of the parts) -> outputs, under the function's name. constants (c,): numbers that CasADi would simplify
-    away, such as a sign, and so make parts unlike. side_by_side: for so many sets of inputs at once, each entry of
-    which, and of the outputs, is a row of as many numbers."""
+    """Function that is given by its parts.
+
+    parts: (inputs, constants) -> a column for each part, all of the same length. end: (inputs,
+    columns of the parts) -> outputs, under the function's name. constants (c,): numbers, such as a
+    sign, that CasADi would simplify away, which would make parts unlike. side_by_side: number of
+    input sets that are computed at once; each entry of inputs and outputs is then a row of so many
+    numbers.
+    """
 
     parts: ca.Function
     end: ca.Function
@@ -35,31 +40,37 @@ class PartedFunction:
 
     @property
     def inputs(self) -> int:
-        """How many inputs it has."""
+        """Number of inputs."""
         return int(self.parts.n_in()) - 1
 
     def name(self) -> str:
-        """That of the function."""
+        """Name of the function."""
         return str(self.end.name())
 
     @property
     def whole(self) -> ca.Function:
-        """The same as one function of CasADi."""
+        """The same function as one function of CasADi."""
         inputs = self.end.sx_in()[: self.inputs]
         columns = self.parts.call([*inputs, ca.SX(ca.DM(self.constants))])
         return ca.Function(self.name(), inputs, self.end.call([*inputs, *columns]))
 
     def beside(self, count: int, name: str) -> "PartedFunction":
-        """The same for so many sets of inputs at once, under another name."""
+        """The same function for `count` sets of inputs at once, under another name."""
         inputs = self.end.sx_in()
-        return PartedFunction(self.parts, ca.Function(name, inputs, self.end.call(inputs)), self.constants, count)
+        return PartedFunction(
+            self.parts, ca.Function(name, inputs, self.end.call(inputs)), self.constants, count
+        )
 
 
 @dataclass(frozen=True)
 class ColumnFunction:
-    """A function of columns: the first `common` inputs are the same for all, the others and the outputs have a row an
-    entry, with `room` for so many columns. It is computed for `lanes` of them at once, and what is behind the last one
-    asked for is overwritten up to there. apart: how far entries of the first inputs are from each other."""
+    """Function of columns.
+
+    The first `common` inputs are the same for all columns. The other inputs and the outputs have a
+    row for each entry, with `room` for so many columns. `lanes` columns are computed at once, so
+    that memory behind the last column is overwritten up to a whole number of lanes. apart: distance
+    of the entries of the first inputs.
+    """
 
     function: ca.Function
     common: int
@@ -68,13 +79,15 @@ class ColumnFunction:
     apart: int = 1
 
     def name(self) -> str:
-        """That of the function."""
+        """Name of the function."""
         return str(self.function.name())
 
 
 class Node(NamedTuple):
-    """One value: CasADi's name of the operation that makes it, and the values that go into that; value: a constant;
-    entry: the number of an input, and the place in it."""
+    """One value: the name of the operation that makes it, and the values that go into it.
+
+    value: number of a constant. entry: number of an input, and the place in it.
+    """
 
     operation: str
     operands: tuple[int, ...] = ()
@@ -84,25 +97,32 @@ class Node(NamedTuple):
 
 @dataclass(frozen=True)
 class Graph:
-    """Values of an SX function, each behind those that go into it; which of them its outputs are, by their entries."""
+    """Values of an SX function, each after those that go into it.
+
+    outputs: places of the outputs among the values, by their entries.
+    """
 
     nodes: list[Node]
     outputs: list[list[int]]
 
 
 Operand = int | tuple[int, ...]
-"""A step of the same group by its number, or values from outside, one a lane."""
+"""Number of a step of the same group, or values from outside, one for each lane."""
 
 
 class Group(NamedTuple):
-    """Parts that are alike: their numbers, the operations that each has, in their order, and what its outputs are."""
+    """Parts that are alike.
+
+    It has the numbers of the parts, the operations that each part has in their order, and the
+    places of their outputs.
+    """
 
     lanes: tuple[int, ...]
     steps: list[tuple[str, list[Operand]]]
     outputs: list[Operand]
 
     def split(self, count: int) -> list["Group"]:
-        """Groups of at most so many of the parts."""
+        """Split into groups of at most `count` parts."""
 
         def some(operands: list[Operand], first: int) -> list[Operand]:
             return [of if isinstance(of, int) else of[first : first + count] for of in operands]
@@ -118,13 +138,17 @@ class Group(NamedTuple):
 
 
 def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Graph:
-    """The values of an SX function, whose instructions reuse places in memory; constants: what its last input is."""
+    """Values of an SX function, whose own instructions reuse places in memory.
+
+    constants: values of its last input.
+    """
     nodes: list[Node] = []
     held: dict[int, int] = {}
     outputs = [[-1] * function.nnz_out(k) for k in range(function.n_out())]
     for index in range(function.n_instructions()):
         operation = NAMES[function.instruction_id(index)]
-        into, source = function.instruction_output(index), function.instruction_input(index)
+        into = function.instruction_output(index)
+        source = function.instruction_input(index)
         if operation == "OUTPUT":
             outputs[into[0]][into[1]] = held[source[0]]
             continue
@@ -142,18 +166,20 @@ def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Grap
 
 
 def lane_groups(graph: Graph) -> list[Group]:
-    """The parts, which are the outputs of a graph, in groups of those that are alike."""
+    """Sort the parts, which are the outputs of a graph, into groups of parts that are alike."""
     everywhere = _needed_by(graph)
     alike: dict[str, list[tuple[int, Group]]] = {}
     for part, outputs in enumerate(graph.outputs):
         own = _own_steps(graph, everywhere, part, outputs)
-        form = repr([(name, [_form(k) for k in of]) for name, of in [*own.steps, ("", own.outputs)]])
+        form = repr(
+            [(name, [_form(k) for k in of]) for name, of in [*own.steps, ("", own.outputs)]]
+        )
         alike.setdefault(form, []).append((part, own))
     return [_together(group) for group in alike.values()]
 
 
 def _needed_by(graph: Graph) -> list[bool]:
-    """Whether all parts need a value."""
+    """List that is True for each value that all parts need."""
     needed = [0] * len(graph.nodes)
     for part, outputs in enumerate(graph.outputs):
         for node in outputs:
@@ -166,7 +192,7 @@ def _needed_by(graph: Graph) -> list[bool]:
 
 
 def _own_steps(graph: Graph, everywhere: list[bool], part: int, outputs: list[int]) -> Group:
-    """The steps of one part in the order in which its outputs ask for them, as a group of one lane."""
+    """Steps of one part as a group of one lane, in the order in which its outputs need them."""
     number: dict[int, int] = {}
     steps: list[tuple[str, list[Operand]]] = []
 
@@ -181,7 +207,11 @@ def _own_steps(graph: Graph, everywhere: list[bool], part: int, outputs: list[in
             asked.pop()
             continue
         of = graph.nodes[node].operands
-        missing = [k for k in of if not everywhere[k] and graph.nodes[k].operation not in LEAVES and k not in number]
+        missing = [
+            k
+            for k in of
+            if not everywhere[k] and graph.nodes[k].operation not in LEAVES and k not in number
+        ]
         if missing:
             asked.extend(reversed(missing))
             continue
@@ -192,19 +222,23 @@ def _own_steps(graph: Graph, everywhere: list[bool], part: int, outputs: list[in
 
 
 def _form(operand: Operand) -> int:
-    """What of an operand has to be the same in all lanes."""
+    """Part of an operand that must be the same in all lanes."""
     return operand if isinstance(operand, int) else -1
 
 
 def _together(group: list[tuple[int, Group]]) -> Group:
     parts = [own for _, own in group]
     names = [name for name, _ in parts[0].steps]
-    operands = [_across(of) for of in zip(*[[of for _, of in own.steps] for own in parts], strict=True)]
+    operands = [
+        _across(of) for of in zip(*[[of for _, of in own.steps] for own in parts], strict=True)
+    ]
     lanes = tuple(part for part, _ in group)
-    return Group(lanes, list(zip(names, operands, strict=True)), _across([own.outputs for own in parts]))
+    return Group(
+        lanes, list(zip(names, operands, strict=True)), _across([own.outputs for own in parts])
+    )
 
 
 def _across(operands: Iterable[list[Operand]]) -> list[Operand]:
-    """Operands of all lanes as those of the group."""
+    """Operands of a group from those of its lanes."""
     columns = zip(*operands, strict=True)
     return [of[0] if isinstance(of[0], int) else sum(of, ()) for of in columns]

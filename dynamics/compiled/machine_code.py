@@ -1,4 +1,4 @@
-"""CasADi functions as machine code in this process: compiled by LLVM once, and kept in the user's cache folder."""
+"""CasADi functions as machine code, which LLVM compiles once for the user's cache folder."""
 
 import ctypes
 import json
@@ -14,57 +14,70 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
+from dynamics.compiled.function_body import AnyFunction, shapes
 from dynamics.compiled.lanes import ColumnFunction
 from dynamics.compiled.object_files import load_object, save_object
-from dynamics.compiled.translation import AnyFunction, llvm_text, shapes
+from dynamics.compiled.translation import llvm_text
 
 
 @dataclass(frozen=True)
 class MachineFunction:
-    """A compiled function: called with batches (N or 1, columns) of its arguments it returns all outputs (N, rows,
-    columns), NaN included. `address` is that of the code for a single call, see `translation`; it is valid as long as
-    the function lives. constants (c,): values of the last argument, where callers leave that out."""
+    """Compiled function.
+
+    address: that of the code for a single call (see `translation`), valid as long as the function
+    lives. constants (c,): values of the last argument, which callers leave out.
+    """
 
     inputs: list[int]
     outputs: list[tuple[int, int]]
     address: int
     over_rows: Callable[[int, int, int], None]
-    engine: Any  # whose end is that of the code
+    # the code lives as long as its engine
+    engine: Any
     constants: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __call__(self, *batches: np.ndarray) -> list[np.ndarray]:
-        """All outputs (N, rows, columns) over batches (N or 1, columns) of the arguments, NaN included."""
+        """Compute all outputs (N, rows, columns) for batches (N or 1, columns) of the arguments.
+
+        NaN is returned as any other number.
+        """
         count = max((len(batch) for batch in batches if len(batch) != 1), default=1)
         if len(self.constants):
             batches = (*batches, self.constants[None])
-        given, end = np.empty((count, sum(self.inputs))), 0
+        given = np.empty((count, sum(self.inputs)))
+        end = 0
         for batch, size in zip(batches, self.inputs, strict=True):
             given[:, end : end + size] = batch
             end += size
         found = np.empty((count, sum(rows * columns for rows, columns in self.outputs)))
         self.over_rows(count, given.ctypes.data, found.ctypes.data)
-        parts, end = [], 0
+        parts = []
+        end = 0
         for rows, columns in self.outputs:
             parts.append(found[:, end : end + rows * columns].reshape(count, rows, columns))
             end += rows * columns
         return parts
 
     def bound_to(self, inputs: np.ndarray, outputs: np.ndarray) -> Callable[[], None]:
-        """The code for one set of inputs, with the constants, and outputs as a function without arguments; the caller
-        keeps both alive."""
+        """Function without arguments that computes from `inputs` into `outputs`.
+
+        The constants are part of the inputs. The caller keeps both arrays alive.
+        """
         single = ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(self.address)
         single.engine = self.engine  # type: ignore[attr-defined]
-        return partial(single, ctypes.c_void_p(inputs.ctypes.data), ctypes.c_void_p(outputs.ctypes.data))
+        return partial(
+            single, ctypes.c_void_p(inputs.ctypes.data), ctypes.c_void_p(outputs.ctypes.data)
+        )
 
 
 def compiled_functions(
     content: bytes, build: Callable[[], list[AnyFunction]], hot: Collection[str] = ()
 ) -> dict[str, MachineFunction]:
-    """The functions that `build()` returns, by name; `content` is what they depend on besides this package.
+    """Compile the functions that `build()` returns, or load them from the cache, by name.
 
-    hot: names of those that inner loops evaluate: optimised further, and free to round otherwise than CasADi's.
-    Compiled on first use, some seconds, and kept in the cache folder. Raises DynamicsError for an operation that has no
-    translation.
+    content: what they depend on besides this package. hot: names of functions that inner loops
+    evaluate, which are optimised further and may round otherwise than CasADi does. Compiling takes
+    some seconds. Raises DynamicsError for an operation that has no translation.
     """
     digest = sha256(_package_digest() + content)
     versions = (ca.CasadiMeta.version(), llvmlite.__version__, llvm.get_process_triple())
@@ -78,14 +91,17 @@ def compiled_functions(
 
 
 def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
-    """A line of JSON with the shapes of inputs and outputs of each function, and the code of all.
+    """Line of JSON with the shapes of inputs and outputs of each function, then the machine code.
 
-    LLVM's passes find pairs of equal operations; they gain a seventh in speed, for some tenths of a second each. In a
-    loop over columns they lose: what all columns share is taken before it, and registers have no room for that."""
+    LLVM's passes find pairs of equal operations, which gains a seventh in speed. In a loop over
+    columns they would lose time: what all columns share is computed before the loop, and registers
+    have no room for it.
+    """
     module = llvm.parse_assembly(llvm_text(functions, hot))
     module.verify()
     machine = _machine()
-    module.triple, module.data_layout = machine.triple, str(machine.target_data)
+    module.triple = machine.triple
+    module.data_layout = str(machine.target_data)
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
     columns = [function.name() for function in functions if isinstance(function, ColumnFunction)]
     for name in [name for name in hot if name not in columns]:
@@ -95,6 +111,7 @@ def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
 
 
 def _load(compiled: bytes) -> dict[str, MachineFunction]:
+    """Load functions from what `_compile` has returned."""
     shapes, _, code = compiled.partition(b"\n")
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
@@ -105,7 +122,8 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
             inputs,
             [(rows, columns) for rows, columns in outputs],
             engine.get_function_address(name),
-            over_rows(engine.get_function_address(f"{name}.rows")),  # functions of columns have none
+            # a function of columns has no code for rows, and its address is 0
+            over_rows(engine.get_function_address(f"{name}.rows")),
             engine,
         )
         for name, (inputs, outputs) in json.loads(shapes).items()
@@ -113,20 +131,27 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
 
 
 def _machine() -> llvm.TargetMachine:
-    """This processor. Nothing is fused or reordered: the same seed gives the same numbers on every one."""
+    """Description of this processor for LLVM.
+
+    Nothing is fused or reordered, so that a seed gives the same numbers on every processor.
+    """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_triple(llvm.get_process_triple())
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=2, jit=True)
+    return target.create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=_features(), opt=2, jit=True
+    )
 
 
 @cache
 def _features() -> str:
+    """Features of this processor that the code may use."""
     return str(llvm.get_host_cpu_features().flatten())
 
 
 @cache
 def _package_digest() -> bytes:
+    """Digest of everything in this package that the code depends on."""
     digest = sha256()
     package = Path(__file__).parent.parent
     rooms = [package / "expressions.py", package / "parameters.py"]

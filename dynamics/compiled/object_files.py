@@ -1,4 +1,4 @@
-"""Machine code in the user's cache folder: files that belong to the user alone, whole or not at all."""
+"""Machine code in the user's cache folder, in files that only the user can have written."""
 
 import os
 import stat
@@ -10,61 +10,79 @@ from pathlib import Path
 
 import platformdirs
 
-DIGEST = sha256().digest_size  # bytes that a file begins with: the digest of its key and of what follows
+# bytes at the beginning of a file: the digest of its key and of what follows
+DIGEST = sha256().digest_size
+
+AT_ONCE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+"""Flags with which files are opened. A pipe would otherwise wait for somebody to write into it."""
 
 
 class CacheWarning(UserWarning):
-    """Said once where machine code cannot be kept."""
+    """Warning, given once, that machine code cannot be kept."""
 
 
 def cache_folder() -> Path:
-    """Folder of machine code; the environment variable CMMSIM_CACHE overrides the user's cache folder."""
+    """Folder of machine code: CMMSIM_CACHE if that is set, else the user's cache folder."""
     chosen = os.environ.get("CMMSIM_CACHE")
     return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("cmmsim")) / "compiled"
 
 
 def load_object(name: str) -> bytes | None:
-    """What was saved under a name; None where that is nothing, damaged, or may come from somebody else."""
+    """Content that was saved under a name.
+
+    None if there is no such file, if it is damaged, or if somebody else may have written it.
+    """
     path = cache_folder() / name
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            return None
-        with path.open("rb") as file:
+        with os.fdopen(os.open(path, AT_ONCE), "rb") as file:
             if not _ours_alone(os.fstat(file.fileno())):
                 return None
-            digest, content = file.read(DIGEST), file.read()
+            digest = file.read(DIGEST)
+            content = file.read()
     except OSError:
         return None
     return content if digest == sha256(name.encode() + content).digest() else None
 
 
 def save_object(name: str, content: bytes) -> None:
-    """Keep it, in place of what was there; one warning where nothing can be written.
+    """Save content under a name, in place of what was there.
 
-    The file is built beside its place and then renamed: a process that breaks off, or another that compiles the same,
-    never leaves half a file.
+    The file is built beside its place and then renamed. A process that breaks off, or another one
+    that compiles the same, thus never leaves half a file. Gives one warning where nothing can be
+    written.
     """
-    path, beside = cache_folder() / name, None
+    path = cache_folder() / name
+    beside = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        descriptor, beside = tempfile.mkstemp(dir=path.parent)  # readable and writable by its owner alone
+        # readable and writable by its owner alone
+        descriptor, beside = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(descriptor, "wb") as file:
             file.write(sha256(name.encode() + content).digest() + content)
         Path(beside).replace(path)
     except OSError as error:
         if beside is not None:
             Path(beside).unlink(missing_ok=True)
-        text = f"machine code cannot be kept in {path.parent} ({error.strerror}), so that every process compiles anew"
+        text = (
+            f"machine code cannot be kept in {path.parent} ({error.strerror}), so that every "
+            "process compiles anew"
+        )
         _warn_once(f"{text}; name another folder with CMMSIM_CACHE")
 
 
 @cache
 def _warn_once(text: str) -> None:
+    """Give a warning once."""
     warnings.warn(text, CacheWarning, stacklevel=3)
 
 
 def _ours_alone(status: os.stat_result) -> bool:
-    """Whether only the user can have written a file. Windows keeps others out of the user's folders by itself."""
+    """Return True for a file that only the user can have written.
+
+    Windows itself keeps others out of the folders of a user.
+    """
+    if not stat.S_ISREG(status.st_mode):
+        return False
     if not hasattr(os, "geteuid"):
         return True
     return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

@@ -1,12 +1,14 @@
-"""What inner loops compute, as arithmetic of fewer and shorter chains: the numbers are the same but for rounding.
+"""Faster arithmetic for inner loops, with results that differ by rounding alone.
 
-Sine, cosine and arctangent become arithmetic, so that lanes, and instructions side by side, compute several at once.
-Each is a rational approximation on a small interval, to which the argument is reduced (Moshier, Cephes Mathematical
-Library, sin.c and atan.c): correct to 3e-16 for sine and cosine up to a hundred thousand radians, beyond which they
-lose digits, and to 3e-16 of the angle for the arctangent, which has no value where both arguments are zero.
+Sine, cosine and arctangent become arithmetic, so that lanes, and instructions side by side, compute
+several at once. Each is a rational approximation on a small interval, to which the argument is
+reduced (Moshier, Cephes Mathematical Library, sin.c and atan.c). Sine and cosine are correct to
+3e-16 up to a hundred thousand radians, beyond which they lose digits. The arctangent is correct to
+3e-16 of the angle, and has no value where both arguments are zero.
 
-Several quotients by one number become products with its reciprocal: a division takes as long as five products. A
-product and a sum are rounded once (processors have done both at once since 2013; older ones take long over it).
+Several quotients by one number become products with its reciprocal, because a division takes as
+long as five products. A product and a sum are rounded once. Processors since 2013 do both in one
+instruction; older ones take long.
 """
 
 from collections import Counter
@@ -18,8 +20,12 @@ import numpy as np
 
 from dynamics.compiled.lanes import Graph, Node, graph_of
 
-HALF_PI = (2 * 7.85398125648498535156e-1, 2 * 3.77489470793079817668e-8, 2 * 2.69515142907905952645e-15)
-"""pi / 2 in parts; whole multiples of the first two have no rounding error."""
+HALF_PI = (
+    2 * 7.85398125648498535156e-1,
+    2 * 3.77489470793079817668e-8,
+    2 * 2.69515142907905952645e-15,
+)
+"""Parts of pi / 2. Whole multiples of the first two have no rounding error."""
 
 SINE = (
     *(-1.66666666666666307295e-1, 8.33333333332211858878e-3, -1.98412698295895385996e-4),
@@ -37,10 +43,10 @@ OVER = (
     *(1.945506571482613964425e2, 4.853903996359136964868e2, 4.328810604912902668951e2),
     *(1.650270098316988542046e2, 2.485846490142306297962e1, 1.0),
 )
-"""Coefficients of polynomials in the square of the reduced argument, the constant first."""
+"""Coefficients of polynomials in the square of the reduced argument. The constant is first."""
 
 LEAST_TURNED = 0.66
-"""Tangents above it are reduced by an eighth of a turn."""
+"""Tangent above which an angle is reduced by an eighth of a turn."""
 
 
 def quickened(graph: Graph) -> Graph:
@@ -50,12 +56,17 @@ def quickened(graph: Graph) -> Graph:
 
 @cache
 def _approximations() -> dict[str, tuple[ca.Function, int]]:
-    """What takes the place of operations, by CasADi's names of them: a function, and which of its outputs."""
-    turning, tangent = _sine_and_cosine(), _arctangent()
+    """Functions that replace operations, by CasADi's names of the operations.
+
+    Each comes with the number of its output.
+    """
+    turning = _sine_and_cosine()
+    tangent = _arctangent()
     return {"SIN": (turning, 0), "COS": (turning, 1), "ATAN2": (tangent, 0)}
 
 
 def _with_approximations(graph: Graph) -> Graph:
+    """Replace operations by the functions of `_approximations`."""
     nodes: list[Node] = []
     placed: list[int] = []
     made: dict[tuple[str, tuple[int, ...]], list[int]] = {}
@@ -74,7 +85,7 @@ def _with_approximations(graph: Graph) -> Graph:
 
 
 def _inlined(nodes: list[Node], function: Graph, operands: tuple[int, ...]) -> list[int]:
-    """The outputs of a function of numbers, whose values are put behind the others."""
+    """Append the values of a function to nodes, and return its outputs."""
     placed: list[int] = []
     for node in function.nodes:
         if node.operation == "INPUT":
@@ -86,7 +97,10 @@ def _inlined(nodes: list[Node], function: Graph, operands: tuple[int, ...]) -> l
 
 
 def _with_reciprocals(graph: Graph) -> Graph:
-    divisors = Counter(node.operands[-1] for node in graph.nodes if node.operation in ("DIV", "INV"))
+    """Replace quotients by one number by products with its reciprocal."""
+    divisors = Counter(
+        node.operands[-1] for node in graph.nodes if node.operation in ("DIV", "INV")
+    )
     nodes: list[Node] = []
     placed: list[int] = []
     reciprocals: dict[int, int] = {}
@@ -100,14 +114,18 @@ def _with_reciprocals(graph: Graph) -> Graph:
             if node.operation == "INV":
                 placed.append(inverse)
                 continue
-            node, operands = Node("MUL"), (operands[0], inverse)
+            node = Node("MUL")
+            operands = (operands[0], inverse)
         placed.append(len(nodes))
         nodes.append(node._replace(operands=operands))
     return Graph(nodes, [[placed[k] for k in of] for of in graph.outputs])
 
 
 def _fused(graph: Graph) -> Graph:
-    """Every sum with a product in it, whether others need that or not: so what is alike stays alike."""
+    """Fuse every sum with a product in it.
+
+    It does so also where others need the product, so that parts that are alike stay alike.
+    """
     nodes: list[Node] = []
     placed: list[int] = []
 
@@ -127,25 +145,31 @@ def _fused(graph: Graph) -> Graph:
             if second:
                 one, other = factors(node.operands[1])
                 other = other if added else put(Node("NEG", (other,)))
-                node, operands = Node("FMA"), (one, other, operands[0])
+                node = Node("FMA")
+                operands = (one, other, operands[0])
             elif first:
                 rest = operands[1] if added else put(Node("NEG", operands[1:]))
-                node, operands = Node("FMA"), (*factors(node.operands[0]), rest)
+                operands = (*factors(node.operands[0]), rest)
+                node = Node("FMA")
         placed.append(put(node._replace(operands=operands)))
     return Graph(nodes, [[placed[k] for k in of] for of in graph.outputs])
 
 
 def _once_each(graph: Graph) -> Graph:
-    """Every value once, however often it is asked for."""
+    """Keep every value once, however often it is needed."""
     nodes: dict[Node, int] = {}
     placed: list[int] = []
     for node in graph.nodes:
-        placed.append(nodes.setdefault(node._replace(operands=tuple(placed[k] for k in node.operands)), len(nodes)))
+        placed.append(
+            nodes.setdefault(
+                node._replace(operands=tuple(placed[k] for k in node.operands)), len(nodes)
+            )
+        )
     return Graph(list(nodes), [[placed[k] for k in of] for of in graph.outputs])
 
 
 def _sine_and_cosine() -> ca.Function:
-    """x -> sin x, cos x."""
+    """Function x -> sin x, cos x."""
     x = ca.SX.sym("x")
     turns = ca.floor(x * (2 / np.pi) + 0.5)
     reduced = x
@@ -169,15 +193,22 @@ def _sine_and_cosine() -> ca.Function:
 
 
 def _arctangent() -> ca.Function:
-    """y, x -> atan2(y, x)."""
-    y, x = ca.SX.sym("y"), ca.SX.sym("x")
-    height, width = ca.fabs(y), ca.fabs(x)
+    """Function y, x -> atan2(y, x)."""
+    y = ca.SX.sym("y")
+    x = ca.SX.sym("x")
+    height = ca.fabs(y)
+    width = ca.fabs(x)
     steep = height > width
-    opposite, adjacent = ca.if_else(steep, width, height), ca.if_else(steep, height, width)
+    opposite = ca.if_else(steep, width, height)
+    adjacent = ca.if_else(steep, height, width)
     turned = opposite > LEAST_TURNED * adjacent
-    tangent = ca.if_else(turned, opposite - adjacent, opposite) / ca.if_else(turned, opposite + adjacent, adjacent)
+    tangent = ca.if_else(turned, opposite - adjacent, opposite) / ca.if_else(
+        turned, opposite + adjacent, adjacent
+    )
     square = tangent * tangent
-    angle = tangent + tangent * square * (_polynomial(ARCTANGENT, square) / _polynomial(OVER, square))
+    angle = tangent + tangent * square * (
+        _polynomial(ARCTANGENT, square) / _polynomial(OVER, square)
+    )
     angle = angle + ca.if_else(turned, np.pi / 4, 0)
     angle = ca.if_else(steep, np.pi / 2 - angle, angle)
     angle = ca.if_else(x < 0, np.pi - angle, angle)
@@ -185,7 +216,7 @@ def _arctangent() -> ca.Function:
 
 
 def _polynomial(coefficients: Sequence[float], x: ca.SX) -> ca.SX:
-    """The value of a polynomial, pairs of terms side by side (Estrin): no long chain of operations."""
+    """Value of a polynomial with pairs of terms side by side (Estrin), without a long chain."""
     terms: list[ca.SX] = [ca.SX(one) for one in coefficients]
     while len(terms) > 1:
         last = terms[-1:] if len(terms) % 2 else []

@@ -1,235 +1,64 @@
-"""CasADi functions as LLVM text: one straight line of arithmetic, in which each value is assigned once.
+"""CasADi functions as LLVM text: one straight line of arithmetic that assigns each value once.
 
-A translated function reads its inputs from one array of doubles and writes its outputs to another: dense matrices one
-after the other, row by row. It is `void name(const double *inputs, double *outputs)`, and comes with
-`void name.rows(long count, const double *inputs, double *outputs)` for many inputs and outputs behind each other.
-Parts of a function that are alike are computed in vectors, one lane each (`lanes`): the numbers are the same.
+A translated function is `void name(const double *inputs, double *outputs)`. Its inputs are dense
+matrices in one array, one after the other, row by row, and so are its outputs. Beside it there is
+`void name.rows(long count, const double *inputs, double *outputs)` for many inputs in a row. Parts
+of a function that are alike are computed in vectors, one lane each (`lanes`), with the same
+numbers.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 
-import casadi as ca
-
-from dynamics.compiled.lanes import LEAVES, ColumnFunction, Graph, Group, Node, PartedFunction, graph_of, lane_groups
-from dynamics.compiled.operations import (
-    CALLED,
-    MEANING,
-    MOST_LANES,
-    OF_TRUTH,
-    OF_VECTORS,
-    TRUTH,
-    constant,
-    lanes_for,
-    type_name,
-)
-from dynamics.compiled.quick_arithmetic import quickened
-from dynamics.errors import DynamicsError
-
-AnyFunction = ca.Function | PartedFunction | ColumnFunction
+from dynamics.compiled.function_body import AnyFunction, FunctionBody, GraphValues
+from dynamics.compiled.lanes import LEAVES, ColumnFunction, Graph
+from dynamics.compiled.operations import type_name
 
 
 def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
-    """The LLVM text of SX functions; hot: names of those that may round otherwise where that is quicker, see
-    `quick_arithmetic`. Raises DynamicsError, naming it, for an operation that is not known here."""
+    """LLVM text of SX functions.
+
+    hot: names of functions that may round otherwise where that is quicker (see `quick_arithmetic`).
+    Raises DynamicsError with the name of an operation that has no translation.
+    """
     bodies = [_body(one, one.name() in hot) for one in functions]
     declared = sorted({called for body in bodies for called in body.called})
-    return "\n".join([*(f"declare {called}" for called in declared), *(body.text() for body in bodies)])
-
-
-def _body(function: AnyFunction, quick: bool) -> "_Body":
-    return _ColumnBody(function, quick) if isinstance(function, ColumnFunction) else _Body(function, quick)
-
-
-def shapes(function: AnyFunction) -> tuple[list[int], list[tuple[int, int]]]:
-    """Sizes of the inputs of a function, and shapes of its outputs."""
-    last = _last(function)
-    return (
-        [last.nnz_in(k) for k in range(_inputs(function))],
-        [last.size_out(k) for k in range(last.n_out())],
+    return "\n".join(
+        [*(f"declare {called}" for called in declared), *(body.text() for body in bodies)]
     )
 
 
-def _last(function: AnyFunction) -> ca.Function:
-    """What makes the outputs of a function."""
-    if isinstance(function, ColumnFunction):
-        return function.function
-    return function.end if isinstance(function, PartedFunction) else function
+def _body(function: AnyFunction, quick: bool) -> FunctionBody:
+    """Body of a function."""
+    return (
+        _ColumnBody(function, quick)
+        if isinstance(function, ColumnFunction)
+        else FunctionBody(function, quick)
+    )
 
 
-def _inputs(function: AnyFunction) -> int:
-    """The number of its inputs; behind them its end may have parts."""
-    return int(function.inputs if isinstance(function, PartedFunction) else _last(function).n_in())
-
-
-class _Body:
-    """The lines of one function, and what they call."""
-
-    def __init__(self, function: AnyFunction, quick: bool = False) -> None:
-        last = _last(function)
-        if not last.is_a("SXFunction"):
-            raise DynamicsError(f"only SX functions become machine code: {last.name()} is {last.class_name()}")
-        self._name, self._sizes, self.own_inputs = last.name(), shapes(function), _inputs(function)
-        self._beside = function.side_by_side if isinstance(function, PartedFunction) else 1
-        self._number = type_name(self._beside)
-        self._inputs = _places(self._name, [last.sparsity_in(k) for k in range(self.own_inputs)])
-        self._outputs = _places(self._name, [last.sparsity_out(k) for k in range(last.n_out())])
-        self._quickened: Callable[[Graph], Graph] = quickened if quick else lambda graph: graph
-        self._count, self._vectors = 0, dict[tuple[str, ...], str]()
-        self._lines: list[str] = []
-        self._truth: dict[str, str] = {}  # of numbers that say whether something holds, the bit that says it
-        self.called: set[str] = set()
-        parts = self._parts(function) if isinstance(function, PartedFunction) else []
-        self._write(self._quickened(graph_of(last)), parts)
-
-    def text(self) -> str:
-        """The function, and the one that calls it for many rows."""
-        lines = "\n".join(self._lines)
-        signature = "(ptr noalias readonly %inputs, ptr noalias %outputs)"
-        body = f"define void @{self._name}{signature} nounwind {{\n{lines}\nret void\n}}\n"
-        return body + (_rows(self._name, *self._sizes) if self._beside == 1 else "")
-
-    def _write(self, graph: Graph, parts: list[list[str]]) -> None:
-        """The values of a graph, and its outputs. parts: columns of what is known of the last of its inputs."""
-        values = _Values(self, graph, parts)
-        for places, nodes in zip(self._outputs, graph.outputs, strict=True):
-            for place, node in zip(places, nodes, strict=True):
-                address = self.new(f"getelementptr double, ptr %outputs, i64 {place * self._beside}")
-                self._lines.append(f"store {self._number} {values.of(node)}, ptr {address}, align 8")
-
-    def _parts(self, function: PartedFunction) -> list[list[str]]:
-        """The columns of all parts, group by group of those that are alike."""
-        graph = self._quickened(graph_of(function.parts, function.constants))
-        values, columns = _Values(self, graph, []), [[""] * len(of) for of in graph.outputs]
-        for group in lane_groups(graph):
-            for some in group.split(max(1, MOST_LANES // self._beside)):
-                width = lanes_for(len(some.lanes))
-                for row, vector in enumerate(self._group(some, values, width)):
-                    for lane, part in enumerate(some.lanes):
-                        columns[part][row] = self._entry(vector, lane, width)
-        return columns
-
-    def _group(self, group: Group, values: "_Values", width: int) -> list[str]:
-        """The outputs of parts that are alike, as vectors."""
-        steps: list[str] = []
-
-        def operand(of: int | tuple[int, ...]) -> str:
-            return steps[of] if isinstance(of, int) else self._vector([values.of(node) for node in of], width)
-
-        for operation, of in group.steps:
-            steps.append(self.result(operation, [operand(k) for k in of], len(group.lanes), width))
-        return [operand(of) for of in group.outputs]
-
-    def result(self, operation: str, operands: list[str], lanes: int = 1, width: int = 1) -> str:
-        """What an operation makes of numbers, or of vectors with so many lanes in use."""
-        if operation == "ASSIGN":
-            return operands[0]
-        lanes, width = lanes * self._beside, width * self._beside
-        if operation in OF_VECTORS and width > 1:
-            return self._call(f"{OF_VECTORS[operation]}.v{width}f64", operands, type_name(width))
-        if operation in CALLED:
-            entries = [[self._lane(of, lane, width) for of in operands] for lane in range(lanes)]
-            return self._of_lanes([self._call(CALLED[operation], of, "double") for of in entries], width)
-        if operation not in MEANING:
-            known = ", ".join(sorted({*MEANING, *CALLED}))
-            raise DynamicsError(f"{self._name}: no machine code for the operation {operation}; known: {known}")
-        words = {"double": type_name(width), "i1": type_name(width, "i1")}
-        words |= {name: constant([value] * width) for name, value in (("zero", 0.0), ("one", 1.0), ("minus", -1.0))}
-        words["true"] = "true" if width == 1 else f"<{', '.join(['i1 true'] * width)}>"
-        last = before = ""
-        lines = MEANING[operation]
-        if operation in OF_TRUTH and operands[0] in self._truth:
-            last, lines = self._truth[operands[0]], OF_TRUTH[operation]
-        for line in lines:
-            last, before = self.new(line.format(*operands, last=last, before=before, **words)), last
-        if lines[-1] == TRUTH:
-            self._truth[last] = before
-        return last
-
-    def _call(self, name: str, operands: list[str], kind: str) -> str:
-        self.called.add(f"{kind} @{name}({', '.join([kind] * len(operands))})")
-        return self.new(f"call {kind} @{name}({', '.join(f'{kind} {of}' for of in operands)})")
-
-    def _vector(self, entries: list[str], width: int) -> str:
-        """A vector of numbers, or of several side by side; lanes without one repeat the first."""
-        if self._beside == 1:
-            return self._of_lanes(entries, width)
-        joined, size = entries + entries[:1] * (width - len(entries)), self._beside
-        while len(joined) > 1:
-            pairs, kind = zip(joined[::2], joined[1::2], strict=True), type_name(size)
-            mask = f"<{2 * size} x i32> <{', '.join(f'i32 {lane}' for lane in range(2 * size))}>"
-            joined = [self._once(f"shufflevector {kind} {one}, {kind} {other}, {mask}") for one, other in pairs]
-            size *= 2
-        return joined[0]
-
-    def _once(self, text: str) -> str:
-        """A value by the line that makes it, or the one that the same line has made before."""
-        if (known := self._vectors.get((text,))) is None:
-            known = self._vectors[(text,)] = self.new(text)
-        return known
-
-    def _of_lanes(self, entries: list[str], width: int) -> str:
-        """A vector of numbers; lanes without one repeat the first."""
-        if width == 1:
-            return entries[0]
-        filled = entries + entries[:1] * (width - len(entries))
-        if all(entry.startswith("0x") for entry in filled):
-            return f"<{', '.join(f'double {entry}' for entry in filled)}>"
-        if (known := self._vectors.get(tuple(filled))) is None:
-            known, once = "poison", len(set(filled)) == 1
-            for lane, entry in enumerate(filled[: 1 if once else width]):
-                known = self.new(f"insertelement {type_name(width)} {known}, double {entry}, i64 {lane}")
-            if once:
-                mask = f"<{width} x i32> zeroinitializer"
-                known = self.new(f"shufflevector {type_name(width)} {known}, {type_name(width)} poison, {mask}")
-            self._vectors[tuple(filled)] = known
-        return known
-
-    def _entry(self, vector: str, part: int, width: int) -> str:
-        """The number, or the several side by side, of a part in a vector."""
-        if width == 1 or self._beside == 1:
-            return self._lane(vector, part, width)
-        kind, own = type_name(width * self._beside), range(part * self._beside, (part + 1) * self._beside)
-        mask = f"<{self._beside} x i32> <{', '.join(f'i32 {lane}' for lane in own)}>"
-        return self.new(f"shufflevector {kind} {vector}, {kind} poison, {mask}")
-
-    def _lane(self, vector: str, lane: int, width: int) -> str:
-        return vector if width == 1 else self.new(f"extractelement {type_name(width)} {vector}, i64 {lane}")
-
-    def input(self, number: int, entry: int) -> str:
-        """An entry of an input."""
-        place = self.new(f"getelementptr double, ptr %inputs, i64 {self._inputs[number][entry] * self._apart()}")
-        return self.new(f"load {self._number}, ptr {place}, align 8")
-
-    def _apart(self) -> int:
-        """How far the entries of inputs are from each other."""
-        return self._beside
-
-    def constant(self, value: float) -> str:
-        """A constant."""
-        return constant([value] * self._beside)
-
-    def new(self, text: str) -> str:
-        """A value by the line that makes it."""
-        self._count += 1
-        self._lines.append(f"%v{self._count} = {text}")
-        return f"%v{self._count}"
-
-
-class _ColumnBody(_Body):
-    """The lines of a function of columns: what all share first, then a loop over so many columns at once."""
+class _ColumnBody(FunctionBody):
+    """Lines of a function of columns: what all columns share, then a loop over the columns."""
 
     def __init__(self, given: ColumnFunction, quick: bool = False) -> None:
         self._given = given
         super().__init__(given.function, quick)
 
     def text(self) -> str:
-        """The function: `void name(const double *common, const double *rows, double *into, long width)`."""
+        """Text of the function.
+
+        It is `void name(const double *common, const double *rows, double *into, long width)`.
+        """
         lines = "\n".join(self._lines)
-        signature = "(ptr noalias readonly %inputs, ptr noalias readonly %rows, ptr noalias %into, i64 %width)"
+        signature = (
+            "(ptr noalias readonly %inputs, ptr noalias readonly %rows, ptr noalias %into, i64 "
+            "%width)"
+        )
         return f"define void @{self._name}{signature} nounwind {{\n{lines}\n}}\n"
 
     def _write(self, graph: Graph, parts: list[list[str]]) -> None:
-        common, values, lanes = self._given.common, _Values(self, graph, parts), self._given.lanes
+        common = self._given.common
+        values = GraphValues(self, graph, parts)
+        lanes = self._given.lanes
         varies: list[bool] = []
         for number, node in enumerate(graph.nodes):
             of_column = node.operation == "INPUT" and node.entry[0] >= common
@@ -237,92 +66,43 @@ class _ColumnBody(_Body):
             if not varies[-1] and node.operation not in LEAVES:
                 values.of(number)
         self._lines += ["br label %ask", "ask:", "%k = phi i64 [0, %0], [%next, %do]"]
-        self._lines += ["%goes = icmp slt i64 %k, %width", "br i1 %goes, label %do, label %done", "do:"]
+        self._lines += [
+            "%goes = icmp slt i64 %k, %width",
+            "br i1 %goes, label %do, label %done",
+            "do:",
+        ]
         vectors: dict[int, str] = {}
 
         def in_lanes(number: int) -> str:
-            return vectors[number] if varies[number] else self._vector([values.of(number)] * lanes, lanes)
+            return (
+                vectors[number]
+                if varies[number]
+                else self._vector([values.of(number)] * lanes, lanes)
+            )
 
         for number in [number for number, of_column in enumerate(varies) if of_column]:
             operation, operands, _, (place, entry) = graph.nodes[number]
             if operation == "INPUT":
-                address = self._place("rows", self._inputs[place][entry] - sum(self._sizes[0][:common]))
+                address = self._place(
+                    "rows", self._inputs[place][entry] - sum(self._sizes[0][:common])
+                )
                 vectors[number] = self.new(f"load {type_name(lanes)}, ptr {address}, align 8")
             else:
-                vectors[number] = self.result(operation, [in_lanes(k) for k in operands], lanes, lanes)
+                vectors[number] = self.result(
+                    operation, [in_lanes(k) for k in operands], lanes, lanes
+                )
         for places, nodes in zip(self._outputs, graph.outputs, strict=True):
             for row, found in zip(places, nodes, strict=True):
                 address = self._place("into", row)
-                self._lines.append(f"store {type_name(lanes)} {in_lanes(found)}, ptr {address}, align 8")
+                self._lines.append(
+                    f"store {type_name(lanes)} {in_lanes(found)}, ptr {address}, align 8"
+                )
         self._lines += [f"%next = add i64 %k, {lanes}", "br label %ask", "done:", "ret void"]
 
     def _apart(self) -> int:
         return self._given.apart
 
     def _place(self, name: str, row: int) -> str:
-        """Where the present columns of a row are."""
+        """Place of the present columns of a row."""
         begin = self.new(f"getelementptr double, ptr %{name}, i64 {row * self._given.room}")
         return self.new(f"getelementptr double, ptr {begin}, i64 %k")
-
-
-class _Values:
-    """The values of a graph, written where they are asked for, once."""
-
-    def __init__(self, body: _Body, graph: Graph, parts: list[list[str]]) -> None:
-        self._body, self._nodes, self._known = body, graph.nodes, dict[int, str]()
-        self._parts = parts
-
-    def of(self, node: int) -> str:
-        """The name of a value."""
-        asked = [node]
-        while asked:
-            missing = [k for k in self._nodes[asked[-1]].operands if k not in self._known]
-            if missing:
-                asked.extend(reversed(missing))
-            elif (known := asked.pop()) not in self._known:
-                self._known[known] = self._written(self._nodes[known])
-        return self._known[node]
-
-    def _written(self, node: Node) -> str:
-        if node.operation == "CONST":
-            return self._body.constant(node.value)
-        if node.operation != "INPUT":
-            return self._body.result(node.operation, [self._known[k] for k in node.operands])
-        number, entry = node.entry
-        first = self._body.own_inputs
-        return self._parts[number - first][entry] if number >= first else self._body.input(number, entry)
-
-
-def _places(name: str, sparsities: list[ca.Sparsity]) -> list[list[int]]:
-    """Where the entries of each matrix, in CasADi's order by columns, lie in all of them, row by row."""
-    places, first = [], 0
-    for sparsity in sparsities:
-        if not sparsity.is_dense():
-            raise DynamicsError(f"only dense matrices become machine code: {name} has one of {sparsity.dim(True)}")
-        rows, columns = sparsity.shape
-        places.append([first + row * columns + column for column in range(columns) for row in range(rows)])
-        first += rows * columns
-    return places
-
-
-def _rows(name: str, inputs: list[int], outputs: list[tuple[int, int]]) -> str:
-    """The function that calls another for many inputs."""
-    return f"""define void @{name}.rows(i64 %count, ptr %inputs, ptr %outputs) nounwind {{
-entry:
-  br label %ask
-ask:
-  %n = phi i64 [0, %entry], [%next, %do]
-  %goes = icmp slt i64 %n, %count
-  br i1 %goes, label %do, label %done
-do:
-  %from = mul i64 %n, {sum(inputs)}
-  %to = mul i64 %n, {sum(rows * columns for rows, columns in outputs)}
-  %input = getelementptr double, ptr %inputs, i64 %from
-  %output = getelementptr double, ptr %outputs, i64 %to
-  call void @{name}(ptr %input, ptr %output)
-  %next = add i64 %n, 1
-  br label %ask
-done:
-  ret void
-}}
-"""

@@ -1,13 +1,16 @@
-"""Law `feedforward`: joint commands so shaped that the torque of the joint PID is what the motion takes.
+"""Law `feedforward`: joint commands for which the joint PID gives the torque of the motion.
 
-No access to torques is needed. While a command U acts, a drive (eq. 31) gives lp (U - theta) + ld (c U_dot - theta_dot)
-+ li z - lx theta with z_dot = U - theta (`closed_loop.drives`). Along the desired motion everything but U is known, so
-that each command follows from the one before: with commands that are held, the mean of the drive's torque over the
-time for which a command acts is that of the inverse dynamics; with commands that ramp, the torque at the end of the
-ramp. The servo's correction comes on top.
+The law needs no access to torques. While a command U acts, the torque of a drive (eq. 31) is
 
-Before the motion the robot stands in equilibrium: the integral z holds what the model says of rest at the start, so
-that of a wrong holding torque only its change along the motion is felt.
+    lp (U - theta) + ld (c U_dot - theta_dot) + li z - lx theta,    z_dot = U - theta
+
+as in `closed_loop.drives`. Everything but U is known along the desired motion, so that each command
+follows from the one before. With commands that are held, the mean torque of the drive over the time
+of a command is that of the inverse dynamics. With commands that ramp, it is the torque at the end
+of the ramp. The servo adds its correction.
+
+Before the motion the robot is in equilibrium, and the integral z holds the torque that the model
+gives at rest. Of an error of the holding torque, only its change along the motion is felt.
 """
 
 from dataclasses import replace
@@ -15,34 +18,54 @@ from dataclasses import replace
 import numpy as np
 
 from dynamics.closed_loop.drives import PID, Drives
-from dynamics.closed_loop.problem import EveryFrame, FrameTiming
+from dynamics.closed_loop.loop_settings import (
+    EveryFrame,
+    FrameTiming,
+)
 from dynamics.control.inverse_dynamics import Model, Motion, spans
 from dynamics.control.law import Assignment, LawInLoop
 from dynamics.control.observer import Estimate
 
 
-def joint_commands(model: Model, motion: Motion, timing: FrameTiming, frames: int, drives: Drives = PID) -> np.ndarray:
-    """Commands (frames, n), rad or m, of the frames of a motion that starts from rest at time 0.
+def joint_commands(
+    model: Model, motion: Motion, timing: FrameTiming, frames: int, drives: Drives = PID
+) -> np.ndarray:
+    """Commands (frames, n), rad or m, for a motion that starts from rest at time 0.
 
-    Each is for the time from its arrival, after the latency, to that of the next. Raises what `Robot.inverse_dynamics`
-    does where the motion leaves the reach.
+    Each command is for the time from its arrival, after the latency, to the arrival of the next.
+    Raises what `Robot.inverse_dynamics` raises where the motion leaves the reach.
     """
     period = 1 / timing.frame_rate_hz
     along = spans(model, motion, np.arange(frames) * period + timing.latency_s, period)
     law = drives.joint_law(model.parameters[model.robot.layout.joint_pid])
-    lp, li, ld, c, stiff = law.lp, law.li, law.ld, law.rate_weight, law.lp + law.lx
+    lp = law.lp
+    li = law.li
+    ld = law.ld
+    c = law.rate_weight
+    stiff = law.lp + law.lx
     before, integral = model.held(motion.pose(np.zeros(1))[0], drives)
     commands = np.empty_like(along.mean)
     held = timing.hold == "zero"
     for k in range(frames):
-        moved, mean = along.end[k] - along.begin[k], along.mean[k]
+        moved = along.end[k] - along.begin[k]
+        mean = along.mean[k]
         by_before = ld * (c * before + moved) / period
         if held:
-            left = along.torque[k] + stiff * mean + by_before - li * (integral - along.mean_integral[k])
+            left = (
+                along.torque[k]
+                + stiff * mean
+                + by_before
+                - li * (integral - along.mean_integral[k])
+            )
             commands[k] = left / (lp + c * ld / period + li * period / 2)
             integral = integral + period * (commands[k] - mean)
         else:
-            left = along.torque[k] + stiff * along.end[k] + by_before - li * (integral + period * (before / 2 - mean))
+            left = (
+                along.torque[k]
+                + stiff * along.end[k]
+                + by_before
+                - li * (integral + period * (before / 2 - mean))
+            )
             commands[k] = left / (lp + c * ld / period + li * period / 2)
             integral = integral + period * ((before + commands[k]) / 2 - mean)
         before = commands[k]
@@ -50,16 +73,20 @@ def joint_commands(model: Model, motion: Motion, timing: FrameTiming, frames: in
 
 
 def feedforward(assignment: Assignment) -> LawInLoop:
-    """The servo around these commands, which with an observer sees where the robot is as its correction arrives.
+    """Law of the servo around these commands.
 
-    Raises what `joint_commands` does.
+    With an observer, the servo corrects the pose at the time when its correction arrives. Raises
+    what `joint_commands` raises.
     """
-    settings, model = assignment.settings, assignment.model
+    settings = assignment.settings
+    model = assignment.model
     drives = replace(settings.drives, torques=False)
     commands = joint_commands(model, assignment.motion, settings.timing, assignment.frames, drives)
     if not assignment.feedback.observer:
         return LawInLoop(feedforward=commands, drives=drives)
-    watched, gains, chart = assignment.watched(drives), settings.servo, model.robot.geometry.chart
+    watched = assignment.watched(drives)
+    gains = settings.servo
+    chart = model.robot.geometry.chart
     expected: list[Estimate] = []
     integral = np.zeros(len(chart.freedoms))
 
@@ -67,13 +94,20 @@ def feedforward(assignment: Assignment) -> LawInLoop:
         nonlocal integral
         expected.append(watched.see(frame, measured))
         at = watched.arrival(frame)
-        seen, (pose, rate, _) = watched.ahead(at), assignment.desired(at)
+        seen = watched.ahead(at)
+        pose, rate, _ = assignment.desired(at)
         error = chart.coordinates(pose) - seen.coordinates
         integral = integral + assignment.period * error
-        demand = gains.kp * error + gains.kd * (chart.coordinates(rate) - seen.rates) + gains.ki * integral
+        demand = (
+            gains.kp * error
+            + gains.kd * (chart.coordinates(rate) - seen.rates)
+            + gains.ki * integral
+        )
         jacobian = model.robot.coordinate_jacobian(chart.pose(seen.coordinates))
         issued = np.asarray(commands[frame] + jacobian @ demand)
         watched.issue(frame, issued)
         return issued
 
-    return LawInLoop(controller=EveryFrame(command), drives=drives, expected=expected, by_servo=True)
+    return LawInLoop(
+        controller=EveryFrame(command), drives=drives, expected=expected, by_servo=True
+    )

@@ -1,8 +1,9 @@
-"""Gains by design: what bandwidth and damping a loop has near rest, and the gains that give those asked for.
+"""Design of gains: bandwidth and damping of a loop near rest, and gains that give wanted ones.
 
-Bandwidth, rad/s: the lowest frequency at which the error of an oscillating desired pose reaches 1/sqrt(2) of it, in the
-worst direction. Damping: the least damping ratio of the eigenvalues of the map from frame to frame. Both are of the
-linear loop (`closed_loop.stability`), without dry friction.
+The bandwidth, rad/s, is the lowest frequency at which the error of an oscillating desired pose
+reaches 1/sqrt(2) of that pose, in the worst direction. The damping is the least damping ratio of
+the eigenvalues of the map from frame to frame. Both are those of the linear loop
+(`closed_loop.stability`), without dry friction.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,10 @@ from scipy.linalg import expm
 from scipy.optimize import brentq, minimize
 
 from dynamics.closed_loop import stability
-from dynamics.closed_loop.problem import LoopSettings, ServoGains
+from dynamics.closed_loop.loop_settings import (
+    LoopSettings,
+    ServoGains,
+)
 from dynamics.control.computed_torque import INTEGRAL, error_map
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.law import Feedback
@@ -23,15 +27,18 @@ HALF_POWER = 2**-0.5
 AT_ONCE = 1e-3
 """Magnitude of eigenvalues below which a motion has died within a frame."""
 SLOWEST = 1e-2
-"""rad/s: slower loops are not looked for."""
+"""Lowest frequency, rad/s, that is searched for a bandwidth."""
 MET = 0.02
-"""Share by which a designed loop may miss what was asked."""
+"""Share by which a designed loop may miss the wanted figures."""
 
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """Of a loop near rest: bandwidth, rad/s; damping, 1; largest magnitude of an eigenvalue; and the factor by which
-    its gains may grow."""
+    """Figures of a loop near rest.
+
+    bandwidth, rad/s. damping, 1. radius: largest magnitude of an eigenvalue. gain_margin: factor by
+    which the gains may grow.
+    """
 
     bandwidth: float
     damping: float
@@ -40,23 +47,26 @@ class LoopFigures:
 
 
 def servo_figures(model: Model, settings: LoopSettings, pose: np.ndarray) -> LoopFigures:
-    """Figures of the visual servo around the joint PID, laws pid and feedforward, near rest at a pose (6,).
+    """Figures of the visual servo near rest at a pose (6,), for the laws pid and feedforward.
 
     Raises what `closed_loop.equilibrium` raises.
     """
     arguments = model.robot, model.parameters, settings, pose
     map_ = stability.frame_map(*arguments)
-    radius, rate = stability.spectral_radius(*arguments), settings.timing.frame_rate_hz
-    bandwidth = float("nan") if radius >= 1 else _bandwidth(stability.pose_response(*arguments), rate)
+    radius = stability.spectral_radius(*arguments)
+    rate = settings.timing.frame_rate_hz
+    bandwidth = (
+        float("nan") if radius >= 1 else _bandwidth(stability.pose_response(*arguments), rate)
+    )
     return LoopFigures(bandwidth, _damping(map_), radius, stability.gain_margin(*arguments))
 
 
 def design_servo(
     model: Model, settings: LoopSettings, pose: np.ndarray, bandwidth: float, damping: float
 ) -> ServoGains:
-    """Gains of the visual servo for a bandwidth, rad/s, and at least a damping, near rest at a pose (6,).
+    """Gains of the visual servo for a bandwidth, rad/s, and at least a damping, at a pose (6,).
 
-    Raises SimulationError where none were found, with what can be had.
+    Raises SimulationError where there are none, with the best that can be had.
     """
 
     def servo(logs: np.ndarray) -> ServoGains:
@@ -65,28 +75,44 @@ def design_servo(
 
     def figures(logs: np.ndarray) -> tuple[float, float]:
         arguments = model.robot, model.parameters, replace(settings, servo=servo(logs)), pose
-        return _error_share(stability.pose_response(*arguments)(bandwidth)), _damping(stability.frame_map(*arguments))
+        return _error_share(stability.pose_response(*arguments)(bandwidth)), _damping(
+            stability.frame_map(*arguments)
+        )
 
     def cost(logs: np.ndarray) -> float:
         share, damped = figures(logs)
-        return 100 * (share / HALF_POWER - 1) ** 2 + 100 * max(damping - damped, 0.0) + 1e-4 * float(logs @ logs)
+        # the last term chooses one of the many gains that meet both wishes
+        return (
+            100 * (share / HALF_POWER - 1) ** 2
+            + 100 * max(damping - damped, 0.0)
+            + 1e-4 * float(logs @ logs)
+        )
 
     period = 1 / settings.timing.frame_rate_hz
+    # from a servo that is stable on most robots, with logarithms because gains are positive
     start = np.log([0.3, 0.06 * period, bandwidth])
-    found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8, "maxfev": 600})
+    found = minimize(
+        cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8, "maxfev": 600}
+    )
     share, damped = figures(found.x)
     if abs(share / HALF_POWER - 1) > MET or damped < damping - MET:
         raise SimulationError(
-            f"no gains of the servo give {model.robot.name} a bandwidth of {bandwidth:g} rad/s with a damping of "
-            f"{damping:g} at {settings.timing.frame_rate_hz:g} Hz: found were a damping of {damped:.3g} and an error "
-            f"of {share:.3g} of the motion there, {HALF_POWER:.3g} is wanted"
+            f"no gains of the servo give {model.robot.name} a bandwidth of {bandwidth:g} rad/s "
+            f"with a damping of {damping:g} at {settings.timing.frame_rate_hz:g} Hz: found were a "
+            f"damping of {damped:.3g} and an error of {share:.3g} of the motion there, "
+            f"{HALF_POWER:.3g} is wanted"
         )
     return servo(found.x)
 
 
-def torque_figures(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> LoopFigures:
-    """Figures of the law computed_torque near rest at a pose (6,): with an observer, which foresees the latency, of the
-    feedback of what it foresees; its bandwidth is the one asked for."""
+def torque_figures(
+    model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback
+) -> LoopFigures:
+    """Figures of the law computed_torque near rest at a pose (6,).
+
+    With an observer, which foresees the latency, they are those of the feedback of what it
+    foresees. The bandwidth is then the one asked for.
+    """
     period, delay = _times(settings, feedback)
 
     def map_of(factor: float) -> np.ndarray:
@@ -96,14 +122,21 @@ def torque_figures(model: Model, settings: LoopSettings, pose: np.ndarray, feedb
     return LoopFigures(feedback.bandwidth, _damping(map_of(1.0)), _radius(map_of(1.0)), margin)
 
 
-def torque_radius(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> float:
-    """Largest magnitude of an eigenvalue of the law computed_torque, as `torque_figures` says."""
+def torque_radius(
+    model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback
+) -> float:
+    """Largest magnitude of an eigenvalue of the law computed_torque. See `torque_figures`."""
     return _radius(_torque_map(model, pose, feedback, 1.0, *_times(settings, feedback)))
 
 
-def largest_bandwidth(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> float:
-    """Up to which bandwidth, rad/s, the law computed_torque is stable near rest, from that of the feedback on; at most
-    half the frame rate, beyond which a command a frame shows no motion. NaN where it is stable with none."""
+def largest_bandwidth(
+    model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback
+) -> float:
+    """Largest bandwidth, rad/s, at which the law computed_torque is stable near rest.
+
+    The search begins at the bandwidth of the feedback and ends at half the frame rate, beyond which
+    one command a frame shows no motion. NaN where the law is stable with no bandwidth.
+    """
 
     def radius(bandwidth: float) -> float:
         return torque_radius(model, settings, pose, replace(feedback, bandwidth=bandwidth))
@@ -112,53 +145,75 @@ def largest_bandwidth(model: Model, settings: LoopSettings, pose: np.ndarray, fe
     return stability.last_stable(radius, min(feedback.bandwidth, nyquist), nyquist, SLOWEST)
 
 
-def check_torque_gains(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> None:
-    """Raise SimulationError, with eigenvalue and limit, where the law computed_torque is unstable near rest, or faster
-    than frames can show: a torque that acts for a frame then stops the platform, and hardly brings it back."""
-    rate, radius = settings.timing.frame_rate_hz, torque_radius(model, settings, pose, feedback)
+def check_torque_gains(
+    model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback
+) -> None:
+    """Raise SimulationError, with eigenvalue and limit, for a law computed_torque that is too fast.
+
+    It is too fast where it is unstable near rest, or faster than frames can show. A torque that
+    acts for a frame then stops the platform and hardly brings it back.
+    """
+    rate = settings.timing.frame_rate_hz
+    radius = torque_radius(model, settings, pose, feedback)
     asked = (
-        f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s and a damping of {feedback.damping:.3g}"
+        f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s and a damping of "
+        f"{feedback.damping:.3g}"
     )
     if radius >= 1:
         limit = largest_bandwidth(model, settings, pose, feedback)
         mend = f"it is up to {limit:.3g} rad/s" if limit > 0 else "no bandwidth makes it so"
         raise SimulationError(
-            f"{asked} is unstable with this model at {rate:g} Hz: its largest eigenvalue from frame to frame is "
-            f"{radius:.4g}, must be below 1; {mend}"
+            f"{asked} is unstable with this model at {rate:g} Hz: its largest eigenvalue from "
+            f"frame to frame is {radius:.4g}, must be below 1; {mend}"
         )
     if feedback.bandwidth > np.pi * rate:
         wanted = np.exp(np.linalg.eigvals(error_map(feedback)).real.max() / rate)
         raise SimulationError(
-            f"{asked} is too fast for {rate:g} Hz, half of which is {np.pi * rate:.3g} rad/s: its largest eigenvalue "
-            f"from frame to frame is {radius:.4g}, and {wanted:.3g} was asked for"
+            f"{asked} is too fast for {rate:g} Hz, half of which is {np.pi * rate:.3g} rad/s: its "
+            f"largest eigenvalue from frame to frame is {radius:.4g}, and {wanted:.3g} was asked "
+            "for"
         )
 
 
 def _times(settings: LoopSettings, feedback: Feedback) -> tuple[float, float]:
-    """Time between two frames and, of what an observer does not foresee, the latency, s."""
-    return 1 / settings.timing.frame_rate_hz, 0.0 if feedback.observer else settings.timing.latency_s
+    """Time between two frames, s, and the latency that no observer foresees, s."""
+    return (
+        1 / settings.timing.frame_rate_hz,
+        0.0 if feedback.observer else settings.timing.latency_s,
+    )
 
 
 def _radius(map_: np.ndarray) -> float:
+    """Largest magnitude of the eigenvalues of a map."""
     return float(np.abs(np.linalg.eigvals(map_)).max())
 
 
 def _torque_map(
     model: Model, pose: np.ndarray, feedback: Feedback, factor: float, period: float, delay: float
 ) -> np.ndarray:
-    """From frame to frame: coordinates, rates; and without observer those measured before, the integral of the error,
-    and the torques on their way."""
+    """Map of the law computed_torque from frame to frame.
+
+    The state has coordinates and rates. Without an observer it also has those measured before, the
+    integral of the error, and the torques on their way.
+    """
     motion, push = stability.torque_motion(model.robot, model.parameters, pose)
-    size, joints = len(motion) // 2, push.shape[1]
-    w, one, map_ = feedback.bandwidth, np.eye(size), error_map(feedback)
-    stiff, damp = motion[size:, :size], motion[size:, size:]
+    size = len(motion) // 2
+    joints = push.shape[1]
+    w = feedback.bandwidth
+    one = np.eye(size)
+    map_ = error_map(feedback)
+    stiff = motion[size:, :size]
+    damp = motion[size:, size:]
     inverse = np.linalg.pinv(push)
-    mean = np.linalg.solve(map_, expm(map_ * period) - np.eye(2)) / period  # of the way back, over a frame
+    # the acceleration of the way back, over a frame
+    mean = np.linalg.solve(map_, expm(map_ * period) - np.eye(2)) / period
     by_place, by_rate = (
-        inverse @ (factor * (map_[1] @ along) * one - along[0] * stiff - along[1] * damp) for along in mean.T
+        inverse @ (factor * (map_[1] @ along) * one - along[0] * stiff - along[1] * damp)
+        for along in mean.T
     )
     inner = np.zeros((2 * size + joints, 2 * size + joints))
-    inner[: 2 * size, : 2 * size], inner[size : 2 * size, 2 * size :] = motion, push
+    inner[: 2 * size, : 2 * size] = motion
+    inner[size : 2 * size, 2 * size :] = push
 
     def over(time: float) -> tuple[np.ndarray, np.ndarray]:
         moved = expm(inner * time)[: 2 * size]
@@ -171,9 +226,15 @@ def _torque_map(
     rest = max(0.0, delay - whole * period)
     states = 4 * size + (whole + 1) * joints
     start = np.eye(states)
-    place, before, summed = start[:size], start[2 * size : 3 * size], start[3 * size : 4 * size]
+    place = start[:size]
+    before = start[2 * size : 3 * size]
+    summed = start[3 * size : 4 * size]
     integral = summed - period * place
-    torque = by_place @ place + by_rate @ (place - before) / period + factor * INTEGRAL * w**3 * inverse @ integral
+    torque = (
+        by_place @ place
+        + by_rate @ (place - before) / period
+        + factor * INTEGRAL * w**3 * inverse @ integral
+    )
     torques = [torque, *np.split(start[4 * size :], whole + 1)]
     state = start[: 2 * size]
     for age, time in ((whole + 1, rest), (whole, period - rest)):
@@ -183,13 +244,20 @@ def _torque_map(
 
 
 def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float:
-    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`; that of Nyquist where it never does."""
+    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`, at most that of Nyquist."""
     places = np.geomspace(1e-2, np.pi * rate_hz, 60)
     beyond = [_error_share(response(w)) > HALF_POWER for w in places]
     first = int(np.argmax(beyond))
     if not any(beyond) or first == 0:
         return float(places[0 if any(beyond) else -1])
-    return float(brentq(lambda w: _error_share(response(w)) - HALF_POWER, places[first - 1], places[first], rtol=1e-6))
+    return float(
+        brentq(
+            lambda w: _error_share(response(w)) - HALF_POWER,
+            places[first - 1],
+            places[first],
+            rtol=1e-6,
+        )
+    )
 
 
 def _error_share(response: np.ndarray) -> float:
@@ -197,6 +265,8 @@ def _error_share(response: np.ndarray) -> float:
 
 
 def _damping(map_: np.ndarray) -> float:
+    """Least damping ratio of the eigenvalues of a map."""
     values = np.linalg.eigvals(map_).astype(complex)
     poles = np.log(values[np.abs(values) > AT_ONCE])
-    return float(np.min(-poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)))  # what stands still: none
+    # a state that stands still has no damping
+    return float(np.min(-poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)))

@@ -1,4 +1,4 @@
-"""What a model says a motion takes: joint coordinates and torques along it, and their means over spans of time."""
+"""Model of a robot as a law knows it: joint coordinates and torques along a motion."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,34 +10,75 @@ from dynamics.closed_loop.joints import FrictionLaw
 from dynamics.robot import Robot
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
-"""Gauss-Legendre quadrature; friction that turns within a span is met to some eighth of it."""
+"""Gauss-Legendre quadrature. Friction that turns within a span is met to some eighth of it."""
 
 
-VAGUE, FITTED = 0.2, 4e-4
-"""How fast the torques of a model depart from the true ones along a motion, over the torque at rest, 1/s, before a run
-has told: of a model that is a guess, and of one that fits what was measured.
+VAGUE = 0.2
+"""Doubt of a model that is a guess, 1/s. See `Model`."""
 
-The latter is what the covariances of identified parameters say along unseen motions, where no joint turns back: 3.3e-4
-to 5.4e-4 of three robots, at 29 and 60 Hz."""
+FITTED = 4e-4
+"""Doubt of a model that fits what was measured, 1/s.
+
+The covariances of identified parameters give 3.3e-4 to 5.4e-4 for three robots, at 29 and 60 Hz,
+along unseen motions without reversals.
+"""
 
 
 class Motion(Protocol):
-    """A desired motion: poses, their rates and accelerations (N, 6) at times (N,), s."""
+    """Desired motion of the platform, as a law asks for it.
+
+    Any object with these three methods is a motion. They take times (N,), s, and return arrays (N,
+    6).
+
+    Examples
+    --------
+    >>> from dynamics.control import Motion
+    >>> class Rest:
+    ...     def pose(self, t):
+    ...         return np.tile(robot.home_pose, (len(t), 1))
+    ...     def pose_rate(self, t):
+    ...         return np.zeros((len(t), 6))
+    ...     def pose_acceleration(self, t):
+    ...         return np.zeros((len(t), 6))
+    >>> motion: Motion = Rest()
+    >>> motion.pose(np.zeros(2)).shape
+    (2, 6)
+    """
 
     def pose(self, t: np.ndarray) -> np.ndarray:
-        """Poses, m and rad."""
+        """Poses (N, 6), m and rad."""
 
     def pose_rate(self, t: np.ndarray) -> np.ndarray:
-        """Their time derivatives."""
+        """Pose rates (N, 6)."""
 
     def pose_acceleration(self, t: np.ndarray) -> np.ndarray:
-        """Their second time derivatives."""
+        """Pose accelerations (N, 6)."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A robot as a law knows it: with all its parameters (p,), its law of friction, and a doubt: how fast
-    its torques' errors change, over the torque at rest, 1/s, as an observer first takes it."""
+    """Robot as a law knows it.
+
+    Parameters
+    ----------
+    robot : Robot
+        Kinematics and dynamics.
+    parameters : ndarray, shape (p,)
+        Dynamic parameters, then lp, li, ld of the drives.
+    friction : FrictionLaw
+        Law of joint friction.
+    doubt : float
+        Rate, 1/s, at which the errors of the torques change before a run has told, over the
+        torque at rest.
+
+    Examples
+    --------
+    >>> from dynamics.control import Model
+    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> model = Model(robot, parameters, closed_loop.FrictionLaw())
+    >>> model.dynamic.shape
+    (64,)
+    """
 
     robot: Robot
     parameters: np.ndarray
@@ -50,31 +91,48 @@ class Model:
         return self.parameters[self.robot.layout.dynamic]
 
     def held(self, pose: np.ndarray, drives: Drives) -> tuple[np.ndarray, np.ndarray]:
-        """Joint commands (n,) and integrals (n,) of the drives of a robot at rest at a pose (6,), friction unloaded."""
-        law, rest = drives.joint_law(self.parameters[self.robot.layout.joint_pid]), np.zeros((1, 6))
+        """Joint commands (n,) and integrals (n,) of the drives at rest at a pose (6,).
+
+        Friction is unloaded.
+        """
+        law = drives.joint_law(self.parameters[self.robot.layout.joint_pid])
+        rest = np.zeros((1, 6))
         return law.held(self.torque(pose[None], rest, rest)[0], self.robot.inverse_kinematics(pose))
 
     def torque(
-        self, pose: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, dry_along: np.ndarray | None = None
+        self,
+        pose: np.ndarray,
+        rate: np.ndarray,
+        acceleration: np.ndarray,
+        dry_along: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Actuator torques (N, n), N m or N, of pose rates and accelerations (N, 6) (eq. 17 and 23).
+        """Actuator torques (N, n), N m or N, for pose rates and accelerations (N, 6) (eq. 17, 23).
 
-        dry_along (N, n): joint velocities that say which way dry friction acts, instead of the motion's own.
-        Raises what `Robot.inverse_dynamics` does.
+        dry_along (N, n): joint velocities whose signs dry friction has, instead of those of the
+        motion. Raises what `Robot.inverse_dynamics` raises.
         """
-        robot, parameters = self.robot, self.dynamic.copy()
+        robot = self.robot
+        parameters = self.dynamic.copy()
         coulomb = self.parameters[robot.layout.coulomb]
         parameters[robot.layout.coulomb] = 0.0
-        twist, twist_dot = robot.twist(pose, rate), robot.twist_dot(pose, rate, acceleration)
-        turning = np.einsum("nij,nj->ni", robot.pose_jacobian(pose), rate) if dry_along is None else dry_along
+        twist = robot.twist(pose, rate)
+        twist_dot = robot.twist_dot(pose, rate, acceleration)
+        turning = (
+            np.einsum("nij,nj->ni", robot.pose_jacobian(pose), rate)
+            if dry_along is None
+            else dry_along
+        )
         without = robot.inverse_dynamics(pose, twist, twist_dot, parameters)
         return np.asarray(without + coulomb * self.friction.level(turning))
 
 
 @dataclass(frozen=True)
 class Spans:
-    """Along a motion, over spans of time of one length: joint coordinates as they begin and end (N, n), their mean and
-    that of their integral since the beginning (N, n), and the mean torque (N, n)."""
+    """Joints and torques of a motion over spans of time of one length.
+
+    begin, end (N, n): joint coordinates at the ends. mean (N, n): their mean. mean_integral (N, n):
+    mean of their integral since the beginning. torque (N, n): mean torque.
+    """
 
     begin: np.ndarray
     end: np.ndarray
@@ -83,18 +141,28 @@ class Spans:
     torque: np.ndarray
 
 
-def spans(model: Model, motion: Motion, begins: np.ndarray, length: float, dry: Motion | None = None) -> Spans:
-    """What a motion takes over the spans that begin at times (N,), s; dry: the motion whose joints say which way dry
-    friction acts, if not its own. Raises what `Robot.inverse_dynamics` does."""
-    share, weight = (NODES + 1) / 2, WEIGHTS / 2
+def spans(
+    model: Model, motion: Motion, begins: np.ndarray, length: float, dry: Motion | None = None
+) -> Spans:
+    """Joints and torques of a motion over the spans that begin at times (N,), s.
+
+    dry: motion whose joints have the signs of dry friction, if not this one. Raises what
+    `Robot.inverse_dynamics` raises.
+    """
+    share = (NODES + 1) / 2
+    weight = WEIGHTS / 2
     times = (begins[:, None] + share * length).ravel()
     poses = motion.pose(times)
     joints = model.robot.inverse_kinematics(poses).reshape(len(begins), len(share), -1)
     turning = None
     if dry is not None:
-        turning = np.einsum("nij,nj->ni", model.robot.pose_jacobian(dry.pose(times)), dry.pose_rate(times))
+        turning = np.einsum(
+            "nij,nj->ni", model.robot.pose_jacobian(dry.pose(times)), dry.pose_rate(times)
+        )
     torque = model.torque(poses, motion.pose_rate(times), motion.pose_acceleration(times), turning)
-    begin, end = (model.robot.inverse_kinematics(motion.pose(begins + shift)) for shift in (0.0, length))
+    begin, end = (
+        model.robot.inverse_kinematics(motion.pose(begins + shift)) for shift in (0.0, length)
+    )
     return Spans(
         begin,
         end,

@@ -1,4 +1,4 @@
-"""The interface of the laws: what one is asked, and what it answers for a run of the closed loop."""
+"""Interface of the control laws: the assignment that a law takes, and what it returns for a run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -6,15 +6,34 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dynamics.closed_loop.drives import Drives
-from dynamics.closed_loop.problem import Controller, EveryFrame, LoopSettings
+from dynamics.closed_loop.loop_settings import (
+    Controller,
+    EveryFrame,
+    LoopSettings,
+)
 from dynamics.control.inverse_dynamics import Model, Motion
 from dynamics.control.observer import Estimate, Observer
 
 
 @dataclass(frozen=True)
 class Feedback:
-    """What is asked of the loop of a law that sets torques: bandwidth, rad/s, and damping, 1; whether an observer
-    predicts the pose."""
+    """Wanted feedback of a law that sets torques.
+
+    Parameters
+    ----------
+    bandwidth : float
+        Bandwidth, rad/s.
+    damping : float
+        Damping ratio.
+    observer : bool
+        True where an observer predicts the pose.
+
+    Examples
+    --------
+    >>> from dynamics.control import Feedback
+    >>> Feedback(bandwidth=20.0)
+    Feedback(bandwidth=20.0, damping=1.0, observer=True)
+    """
 
     bandwidth: float
     damping: float = 1.0
@@ -23,12 +42,46 @@ class Feedback:
 
 @dataclass(frozen=True)
 class Assignment:
-    """What a law is asked: to make a robot follow a motion for some frames.
+    """Task of a law: to make a robot follow a motion for some frames.
 
-    model: the robot as the law knows it; settings: of the loop, its drives left to the law; holding (n,): the torque at
-    rest at the start, as drives that take torques report it; latencies (frames,), s: when the command of each frame
-    acts, of which a law may use those of frames that have come; noise(frame): covariance (6, 6) of the measured pose;
-    common (6, 6): that of what all measured poses have in common.
+    Parameters
+    ----------
+    model : Model
+        Robot as the law knows it.
+    motion : Motion
+        Desired motion.
+    frames : int
+        Number of frames.
+    settings : LoopSettings
+        Settings of the loop. The law decides whether the drives take torques.
+    feedback : Feedback
+        Wanted bandwidth and damping.
+    holding : ndarray, shape (n,)
+        Torque at rest at the start, as drives that take torques report it.
+    latencies : ndarray, shape (frames,)
+        Latency of each frame's command, s. A law may use those of frames that have come.
+    noise : callable
+        Function frame -> covariance (6, 6) of the measured pose.
+    common : ndarray, shape (6, 6)
+        Covariance of the error that all measured poses have in common.
+
+    Examples
+    --------
+    >>> from dynamics.control import Assignment, Feedback, Model
+    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> servo = closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4)
+    >>> task = Assignment(
+    ...     model=Model(robot, parameters, closed_loop.FrictionLaw()),
+    ...     motion=None,  # an object with the methods of `Motion`
+    ...     frames=3,
+    ...     settings=closed_loop.LoopSettings(servo, closed_loop.FrameTiming(50.0)),
+    ...     feedback=Feedback(bandwidth=20.0),
+    ...     holding=np.zeros(6),
+    ...     latencies=np.zeros(3),
+    ...     noise=lambda frame: 1e-10 * np.eye(6),
+    ... )
+    >>> task.period
+    0.02
     """
 
     model: Model
@@ -47,22 +100,46 @@ class Assignment:
         return 1 / self.settings.timing.frame_rate_hz
 
     def desired(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pose, rate and acceleration (6,) at a time, s."""
-        at, motion = np.array([time]), self.motion
+        """Pose, pose rate and pose acceleration (6,) at a time, s."""
+        at = np.array([time])
+        motion = self.motion
         return motion.pose(at)[0], motion.pose_rate(at)[0], motion.pose_acceleration(at)[0]
 
     def watched(self, drives: Drives) -> Observer:
-        """An observer of the run."""
-        holding = self.holding if drives.torques else self.model.held(self.desired(0.0)[0], drives)[0]
+        """Observer of the run, for drives of a kind."""
+        holding = (
+            self.holding if drives.torques else self.model.held(self.desired(0.0)[0], drives)[0]
+        )
         settings = replace(self.settings, drives=drives)
         pose = self.desired(0.0)[0]
-        return Observer(self.model, settings, pose, holding, self.latencies, self.noise, self.common)
+        return Observer(
+            self.model, settings, pose, holding, self.latencies, self.noise, self.common
+        )
 
 
 @dataclass(frozen=True)
 class LawInLoop:
-    """What a law gives `closed_loop.simulate`, and what its observer, if any, expected of each frame; of the drives it
-    decides whether they take torques. by_servo: whether a controller corrects by the gains of the servo."""
+    """Answer of a law: a feedforward for the servo, or a controller.
+
+    Parameters
+    ----------
+    feedforward : ndarray, shape (frames, n), optional
+        Joint commands, to which the servo adds its own.
+    controller : Controller or EveryFrame, optional
+        Function that takes the place of the servo.
+    drives : Drives
+        Drives of the run. The law decides whether they take torques.
+    expected : list of Estimate
+        Estimates of the law's observer, one for each frame, filled during the run.
+    by_servo : bool
+        True for a controller that corrects by the gains of the servo.
+
+    Examples
+    --------
+    >>> from dynamics.control import LawInLoop
+    >>> LawInLoop(feedforward=np.zeros((3, 6))).controller is None
+    True
+    """
 
     feedforward: np.ndarray | None = None
     controller: Controller | EveryFrame | None = None
@@ -72,3 +149,8 @@ class LawInLoop:
 
 
 Law = Callable[[Assignment], LawInLoop]
+
+
+def pid(assignment: Assignment) -> LawInLoop:
+    """Law `pid`: the paper's visual servo around the drives, without a model."""
+    return LawInLoop(drives=assignment.settings.drives)

@@ -1,17 +1,17 @@
-"""One step of a robot in its drives, from what is known of it now to what will be known of it.
+"""One step of a robot in its drives, with the covariance of its state.
 
-The state: coordinates q (m,) and their rates (m,), the integral of the joint PID (n,); and what stays as it is: a
-torque at each joint (n,) and viscous friction of each (n,) of which the model does not know, and what all measured
-poses have in common (m,), an offset of the sensor.
+The state has coordinates q (m,), their rates (m,) and the integral of the joint PID (n,). It also
+has values that stay as they are: a torque (n,) and viscous friction (n,) at each joint that the
+model does not know, and an offset of the sensor (m,) that all measured poses have in common.
 
-Without dry friction a step is an exponential one, exact for linear motion. Dry friction is then taken in implicitly, as
-time stepping does for contacts (Moreau, Unilateral contact and dry friction in finite freedom dynamics, 1988): a joint
-that would end the step with a velocity u, friction of the others counted, keeps what is beyond b, the change that the
-Coulomb torque can make in a step, and rests otherwise. The velocity is not known exactly, so that of this
+Without dry friction a step is exponential, which is exact for linear motion. Dry friction is then
+taken in implicitly, as time stepping does for contacts (Moreau, Unilateral contact and dry friction
+in finite freedom dynamics, 1988). Let u be the velocity with which a joint would end the step, with
+the friction of the other joints, and b the change that its Coulomb torque can make in a step. The
+joint keeps what is beyond b, and rests otherwise. The velocity is not known exactly, so that the
+torque is the expectation, over normal u, of
 
     torque = coulomb sat(u / b),    sat(x) = min(1, max(-1, x))
-
-the expectation counts, over normal u.
 """
 
 from itertools import pairwise
@@ -21,24 +21,29 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.special import ndtr
 
-from dynamics.closed_loop.problem import LoopSettings
+from dynamics.closed_loop.loop_settings import (
+    LoopSettings,
+)
 from dynamics.control.inverse_dynamics import Model
 
-ROUNDS, SETTLED = 12, 1e-6
-"""Of Newton's method over the joints, and the error of a saturation at which it ends."""
+ROUNDS = 12
+"""Largest number of iterations of Newton's method over the joints."""
+
+SETTLED = 1e-6
+"""Error of a saturation at which these iterations end."""
 
 LEAST_WIDTH = 1e-9
-"""Standard deviation of a joint's velocity, rad/s or m/s: it is never known exactly."""
+"""Least standard deviation of a joint's velocity, rad/s or m/s: it is never known exactly."""
 
 SHORTEST = 1.5e-3
 """Time, s, that is not halved where a joint turns."""
 
 LEAST_REACH = 1e-3
-"""Of what dry friction can change in a step, over that deviation: where there is none, a division by zero."""
+"""Least change by dry friction in a step, over the deviation. Zero would be divided by."""
 
 
 class Blocks(NamedTuple):
-    """Where the parts of a state lie: those that move, then those that stay as they are."""
+    """Places of the parts of a state: those that move, then those that stay as they are."""
 
     coordinates: slice
     rates: slice
@@ -49,113 +54,159 @@ class Blocks(NamedTuple):
 
     @classmethod
     def of(cls, m: int, n: int) -> "Blocks":
-        """Of a robot with so many coordinates, m, and joints, n."""
+        """Blocks of a robot with m coordinates and n joints."""
         ends = np.cumsum([m, m, n, n, n, m]).tolist()
         return cls(*(slice(begin, end) for begin, end in pairwise([0, *ends])))
 
     @property
     def moving(self) -> slice:
-        """What moves: coordinates, rates, integral."""
+        """Place of what moves: coordinates, rates, integral."""
         return slice(0, self.integral.stop)
 
     @property
     def size(self) -> int:
-        """Of a state."""
+        """Number of entries of a state."""
         return self.offset.stop
 
 
 class Prediction:
-    """Steps of a robot as a model has it, in its drives."""
+    """Steps of a robot in its drives, as a model has it."""
 
     def __init__(self, model: Model, settings: LoopSettings) -> None:
         robot = model.robot
         self.blocks = Blocks.of(len(robot.coordinate_names), robot.layout.joints)
         rigid, self._coulomb, self._viscous, gains = robot.layout.split(model.parameters)
-        self._rigid, self._friction, self._drives = rigid[None], model.friction, settings.drives
+        self._rigid = rigid[None]
+        self._friction = model.friction
+        self._drives = settings.drives
         self._law = settings.drives.joint_law(gains)
         self._motion = robot.functions["equation_of_motion"]
         self._derivatives = robot.functions["motion_derivatives"]
 
     def step(
-        self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, command_rate: np.ndarray, length: float
+        self,
+        state: np.ndarray,
+        covariance: np.ndarray,
+        command: np.ndarray,
+        command_rate: np.ndarray,
+        length: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The state after a time, s, in which a command and its rate (n,) act; and the map (size, size) of errors.
+        """State after a time, s, in which a command (n,) and its rate act, and the map of errors.
 
-        covariance (size, size): of the state, which says how well the velocities of joints are known. A time in which a
-        joint comes to rest or breaks away is halved until that makes less of its velocity than is not known of it.
+        covariance (size, size): that of the state, which says how well the velocities of joints are
+        known. A time in which a joint comes to rest or breaks away is halved until that changes its
+        velocity by less than is known of it.
         """
         after, errors, turns = self._once(state, covariance, command, command_rate, length)
         if not turns or length < SHORTEST:
             return after, errors
         midway, first = self.step(state, covariance, command, command_rate, length / 2)
-        after, second = self.step(midway, first @ covariance @ first.T, command, command_rate, length / 2)
+        after, second = self.step(
+            midway, first @ covariance @ first.T, command, command_rate, length / 2
+        )
         return after, second @ first
 
     def _once(
-        self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, command_rate: np.ndarray, length: float
+        self,
+        state: np.ndarray,
+        covariance: np.ndarray,
+        command: np.ndarray,
+        command_rate: np.ndarray,
+        length: float,
     ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """The same in one go, and whether a joint comes to rest or breaks away by more than is not known of it."""
+        """State and map of errors after one step, and True where the step is too long.
+
+        It is too long where a joint comes to rest or breaks away by more than is known of it.
+        """
         at = self.blocks
         free, errors, jacobian = self._without_dry_friction(state, command, command_rate, length)
         if not self._coulomb.any():
             return free, errors, False
-        by_rates, velocity = jacobian @ errors[at.rates], jacobian @ free[at.rates]
-        pushed = errors[at.moving, at.torque]  # by a torque over the step
+        by_rates = jacobian @ errors[at.rates]
+        velocity = jacobian @ free[at.rates]
+        # effect of a torque over the step
+        pushed = errors[at.moving, at.torque]
         turned = jacobian @ pushed[at.rates]
         width = np.sqrt(np.einsum("ij,jk,ik->i", by_rates, covariance, by_rates) + LEAST_WIDTH**2)
         largest, smooth = self._dry(velocity)
         level, kept = expected_dry_friction(velocity, width, turned, largest, smooth)
-        gain = np.linalg.solve(np.eye(len(level)) + kept[:, None] * (turned - np.diag(np.diag(turned))), np.diag(kept))
+        # friction at one joint changes the velocities of the others, which change their friction
+        gain = np.linalg.solve(
+            np.eye(len(level)) + kept[:, None] * (turned - np.diag(np.diag(turned))), np.diag(kept)
+        )
         free[at.moving] -= pushed @ level
         errors[at.moving] -= pushed @ gain @ by_rates
         moved = np.maximum(np.abs(jacobian @ state[at.rates]), np.abs(jacobian @ free[at.rates]))
-        unused = np.diag(turned) * (largest - np.abs(level))  # what more friction could take of the velocity
+        # velocity that more friction could take
+        unused = np.diag(turned) * (largest - np.abs(level))
         return free, errors, bool((np.minimum(moved, unused) > width).any())
 
     def _dry(self, velocity: np.ndarray) -> tuple[np.ndarray, float]:
-        """The largest dry friction (n,) at joint velocities, and the velocity over which it turns."""
-        law, largest = self._friction, self._coulomb
+        """Largest dry friction (n,) at joint velocities, and the velocity over which it turns."""
+        law = self._friction
+        largest = self._coulomb
         if law.name == "stribeck":
-            largest = largest * np.where(velocity == 0.0, law.static_ratio, np.abs(law.level(velocity)))
+            largest = largest * np.where(
+                velocity == 0.0, law.static_ratio, np.abs(law.level(velocity))
+            )
         return largest, law.smoothing_velocity or 0.0
 
     def _without_dry_friction(
         self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray, length: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """State after the step, the map of errors, and the Jacobian of the joints (n, m) at its start."""
+        """State after a step, map of errors, and Jacobian of the joints (n, m) at its start."""
         slope, by_state, jacobian = self._slope(state, command, command_rate)
-        moving, size = self.blocks.moving, len(slope)
+        moving = self.blocks.moving
+        size = len(slope)
         held = slice(size, by_state.shape[1])
         augmented = np.zeros((by_state.shape[1] + 1, by_state.shape[1] + 1))
-        augmented[moving, :-1], augmented[moving, -1] = length * by_state, length * slope
-        moved, after, errors = expm(augmented), state.copy(), np.eye(self.blocks.size)
+        augmented[moving, :-1] = length * by_state
+        augmented[moving, -1] = length * slope
+        moved = expm(augmented)
+        after = state.copy()
+        errors = np.eye(self.blocks.size)
         after[moving] += moved[moving, -1]
-        errors[moving, moving], errors[moving, held] = moved[moving, moving], moved[moving, held]
+        errors[moving, moving] = moved[moving, moving]
+        errors[moving, held] = moved[moving, held]
         return after, errors, jacobian
 
     def _slope(
         self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """d/dt of what moves, its derivative by the state but for the offset, and the Jacobian of the joints (n, m)."""
-        at, law, pid = self.blocks, self._law, not self._drives.torques
-        li, ld, stiff = law.li, law.ld, law.lp + law.lx
-        q, rate, integral = state[at.coordinates], state[at.rates], state[at.integral]
+        """Time derivative of what moves, its derivatives, and the Jacobian of the joints (n, m).
+
+        The derivatives are those with respect to the state without the offset.
+        """
+        at = self.blocks
+        law = self._law
+        pid = not self._drives.torques
+        li = law.li
+        ld = law.ld
+        stiff = law.lp + law.lx
+        q = state[at.coordinates]
+        rate = state[at.rates]
+        integral = state[at.integral]
         found = self._motion(q[None], rate[None], self._rigid)
         mass, bias, jacobian, _, angle, *_ = (part[0] for part in found)
-        velocity, error = jacobian @ rate, command - angle[:, 0]
+        velocity = jacobian @ rate
+        error = command - angle[:, 0]
         by_error = law.lp * error + li * integral - law.lx * angle[:, 0]
         torque = by_error + ld * (law.rate_weight * command_rate - velocity) if pid else command
-        limit, growing = self._drives.torque_limit, error
+        limit = self._drives.torque_limit
+        growing = error
         if limit is not None:
+            # conditional integration, as the drives do it
             further = (np.abs(torque) >= limit) & ((li * error - law.lx * velocity) * torque > 0)
             growing = np.where(further, law.lx * velocity / (li or 1.0), error)
             torque = np.clip(torque, -limit, limit)
-        push, falling = np.linalg.solve(mass, jacobian.T), np.linalg.solve(mass, bias[:, 0])
+        push = np.linalg.solve(mass, jacobian.T)
+        falling = np.linalg.solve(mass, bias[:, 0])
         viscous = self._viscous + state[at.viscous]
         net = torque + state[at.torque] - viscous * velocity
         acceleration = push @ net - falling
         given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
         by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*given))
+        # the derivative of the joint velocities by the pose rate is 2 J_theta_dot
         damping = (ld * pid + viscous)[:, None]
         by_state = np.zeros((at.moving.stop, at.offset.start))
         by_state[at.coordinates, at.rates] = np.eye(len(rate))
@@ -163,33 +214,44 @@ class Prediction:
         of_rates[:, at.coordinates] = push @ (-stiff * pid * jacobian - damping * (turning / 2))
         of_rates[:, at.coordinates] -= np.linalg.solve(mass, by_q)
         of_rates[:, at.rates] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
-        of_rates[:, at.integral], of_rates[:, at.torque] = li * pid * push, push
+        of_rates[:, at.integral] = li * pid * push
+        of_rates[:, at.torque] = push
         of_rates[:, at.viscous] = -push * velocity
         by_state[at.integral, at.coordinates] = -pid * jacobian
         return np.concatenate([rate, acceleration, pid * growing]), by_state, jacobian
 
 
 def expected_dry_friction(
-    velocity: np.ndarray, width: np.ndarray, turned: np.ndarray, largest: np.ndarray, smooth: float = 0.0
+    velocity: np.ndarray,
+    width: np.ndarray,
+    turned: np.ndarray,
+    largest: np.ndarray,
+    smooth: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Dry friction (n,) over a step, and how it answers to errors of each joint's velocity (n,).
+    """Expected dry friction (n,) over a step, and its gain on errors of each joint's velocity (n,).
 
-    velocity (n,): that of the joints after the step without dry friction, normal with standard deviations width (n,);
-    turned (n, n): what a torque over the step makes of them; largest (n,): torque; smooth: velocity over which it
-    turns. Errors of a joint's velocity are passed on by so much that their variance is that after dry friction, of
-    which some of the drawn joints rest, not that of a line through it.
+    velocity (n,): velocity after the step without dry friction, with normal errors of standard
+    deviations `width` (n,). turned (n, n): change of the velocities by a torque over the step.
+    largest (n,): largest torque. smooth: velocity over which the torque turns. The gain passes
+    errors on such that their variance is that after dry friction, which stops some of the drawn
+    joints. A line through the torque would give another variance.
     """
     own = np.diag(turned)
-    reach, others = np.maximum(own * largest + smooth, LEAST_REACH * width), turned - np.diag(own)
+    reach = np.maximum(own * largest + smooth, LEAST_REACH * width)
+    others = turned - np.diag(own)
+    # Newton's method from a guess in which each joint slips or rests as it would alone
     level = largest * np.sign(velocity) * (np.abs(velocity) > reach)
     for _ in range(ROUNDS):
         share, slope, _ = expected_saturation(velocity - others @ level, width, reach)
         miss = largest * share - level
-        level = level + np.linalg.solve(np.eye(len(level)) + (largest * slope)[:, None] * others, miss)
+        level = level + np.linalg.solve(
+            np.eye(len(level)) + (largest * slope)[:, None] * others, miss
+        )
         if np.abs(miss).max() <= SETTLED * largest.max():
             break
     _, slope, variance = expected_saturation(velocity - others @ level, width, reach)
     change = own * largest
+    # share of the variance of a velocity that is left after dry friction
     passed = 1 - 2 * change * slope + (change / width) ** 2 * variance
     return np.clip(level, -largest, largest), (1 - np.sqrt(np.clip(passed, 0.0, 1.0))) / own
 
@@ -197,9 +259,12 @@ def expected_dry_friction(
 def expected_saturation(
     mean: np.ndarray, deviation: np.ndarray, reach: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Expectation of sat(u / reach) over normal u, its derivative by the mean, and its variance, of any shape;
-    deviation and reach > 0."""
-    low, high = (-reach - mean) / deviation, (reach - mean) / deviation
+    """Expectation of sat(u / reach) over normal u, its derivative by the mean, and its variance.
+
+    Arrays have any shape. deviation and reach are > 0.
+    """
+    low = (-reach - mean) / deviation
+    high = (reach - mean) / deviation
     inside = ndtr(high) - ndtr(low)
     at_low, at_high = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) for end in (low, high))
     line = mean * inside + deviation * (at_low - at_high)

@@ -1,1 +1,1 @@
-"""The robot in other multibody engines."""
+"""Robots in other multibody engines, and from their files."""

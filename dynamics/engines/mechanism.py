@@ -1,7 +1,7 @@
-"""A mechanism as files of other programs describe it: bodies at home and what joins them; and its legs, as chains.
+"""Mechanism in a file of another program: bodies at home, their connections, and legs as chains.
 
-What is welded together becomes one body, and joints that meet in a body without mass become one joint: two hinges a
-universal joint, three a ball.
+Bodies that are welded together become one body. Joints that meet in a body without mass become one
+joint: two hinges become a universal joint, three a ball.
 """
 
 from collections.abc import Iterator
@@ -17,13 +17,19 @@ BASE = 0
 """Number of the body that stands still."""
 
 SHARE_OF_HUB = 1e-4
-"""A body with less of all mass that stands between two hinges is a part of their joint; engines ask for some mass."""
+"""Share of all mass below which a body between two hinges is a part of their joint.
+
+Engines ask for some mass.
+"""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A body at home: mass, kg, centre of mass (3,), m, and inertia about that (3, 3), kg m^2, base axes; its own axes
-    (3, 3) as columns, and what is drawn of it, length and radius of a rod."""
+    """Body at home, in the axes of the base.
+
+    Mass, kg; centre of mass (3,), m; inertia about it (3, 3), kg m^2; its own axes (3, 3) as
+    columns; and length and radius of a rod that is drawn of it.
+    """
 
     name: str
     mass: float
@@ -34,8 +40,11 @@ class Solid:
 
 
 class Freedom(NamedTuple):
-    """One of the elementary joints between two bodies: kind "hinge", "slide" or "ball", at a point (3,), m, about or
-    along an axis (3,), base axes. coordinate: at home; friction: dry and viscous; actuator: its number, or None."""
+    """Elementary joint between two bodies.
+
+    kind: "hinge", "slide" or "ball". It is at a point (3,), m, about or along an axis (3,), in the
+    axes of the base. coordinate: at home. friction: dry and viscous. actuator: its number, or None.
+    """
 
     kind: str
     name: str
@@ -48,18 +57,24 @@ class Freedom(NamedTuple):
 
 @dataclass(frozen=True)
 class Connection:
-    """What joins a body (number) to another: elementary joints in the order from the first; none where it is a weld."""
+    """Connection of two bodies, by their numbers.
+
+    Its elementary joints are in the order from the first body. A weld has none.
+    """
 
     first: int
     second: int
     freedoms: tuple[Freedom, ...]
 
     def other(self, body: int) -> int:
-        """The body at the other end."""
+        """Number of the body at the other end."""
         return self.second if body == self.first else self.first
 
     def seen_from(self, body: int) -> tuple[Freedom, ...]:
-        """The joints in the order from a body, with axes about which the other turns, or along which it goes."""
+        """Joints in the order from a body.
+
+        Their axes are those about which, or along which, the other body moves.
+        """
         if body == self.first:
             return self.freedoms
         return tuple(one._replace(axis=-one.axis) for one in self.freedoms[::-1])
@@ -67,8 +82,11 @@ class Connection:
 
 @dataclass(frozen=True)
 class Mechanism:
-    """Bodies, the base first, and what joins them. gravity (3,), m/s^2; ranges: of joints by name, where the file has
-    them; gains: lp, li, ld (3,); travel_limit: rad or m; notes: what is worth saying of the file."""
+    """Bodies, with the base first, and their connections.
+
+    gravity (3,): m/s^2. ranges: of joints by name, where the file has them. gains: lp, li, ld (3,).
+    travel_limit: rad or m. notes: remarks on the file.
+    """
 
     name: str
     solids: list[Solid]
@@ -81,7 +99,10 @@ class Mechanism:
 
 
 class MechanismLeg(NamedTuple):
-    """A leg: its chain of joints, its actuated joint, and its bodies from the base, each with the bars that it is."""
+    """Leg: its chain of joints, its actuated joint, and its bodies from the base.
+
+    A body is a list of the bars that it consists of.
+    """
 
     chain: Chain
     actuated: Freedom
@@ -89,8 +110,9 @@ class MechanismLeg(NamedTuple):
 
 
 def simplified(mechanism: Mechanism) -> Mechanism:
-    """The mechanism with welded bodies as one, and without bodies that are only part of a joint."""
-    solids, connections = list(mechanism.solids), list(mechanism.connections)
+    """Mechanism with welded bodies as one, and without bodies that are only part of a joint."""
+    solids = list(mechanism.solids)
+    connections = list(mechanism.connections)
     while weld := next((one for one in connections if not one.freedoms), None):
         keep, gone = sorted((weld.first, weld.second))
         solids[keep] = solids[keep] if keep == BASE else _together(solids[keep], solids[gone])
@@ -100,7 +122,10 @@ def simplified(mechanism: Mechanism) -> Mechanism:
     while (hub := _hub(solids, connections, limit)) is not None:
         body, (a, b) = hub
         if solids[body].mass:
-            notes.append(f"{solids[body].name} ({solids[body].mass:g} kg) is part of a joint here, without mass")
+            notes.append(
+                f"{solids[body].name} ({solids[body].mass:g} kg) is part of a joint here, without "
+                "mass"
+            )
         freedoms = a.seen_from(a.other(body)) + b.seen_from(body)
         connections[connections.index(a)] = Connection(a.other(body), b.other(body), freedoms)
         connections.remove(b)
@@ -108,7 +133,10 @@ def simplified(mechanism: Mechanism) -> Mechanism:
 
 
 def platform_of(mechanism: Mechanism) -> int:
-    """Number of the body that the legs come together in. Raises RobotFileError where there is none."""
+    """Number of the body at which the legs come together.
+
+    Raises RobotFileError where there is none.
+    """
     count = dict.fromkeys(range(1, len(mechanism.solids)), 0)
     for one in mechanism.connections:
         for body in {one.first, one.second} - {BASE}:
@@ -117,14 +145,19 @@ def platform_of(mechanism: Mechanism) -> int:
     found = [body for body, number in count.items() if number == most]
     if most < 2 or len(found) > 1:
         names = ", ".join(mechanism.solids[body].name for body in found) or "none"
-        raise RobotFileError(f"no body is the platform, where all legs meet: most joints ({most}) have {names}")
+        raise RobotFileError(
+            f"no body is the platform, where all legs meet: most joints ({most}) have {names}"
+        )
     return found[0]
 
 
-def legs_of(mechanism: Mechanism, platform: int, from_platform: np.ndarray) -> Iterator[MechanismLeg]:
-    """The legs of a simplified mechanism, each a chain from the base to the platform, or one with two bars.
+def legs_of(
+    mechanism: Mechanism, platform: int, from_platform: np.ndarray
+) -> Iterator[MechanismLeg]:
+    """Legs of a simplified mechanism, each a chain from the base to the platform.
 
-    from_platform (3, 4): platform axes and origin at home. Raises RobotFileError, with leg and bodies, for any other.
+    A chain may have two bars. from_platform (3, 4): platform axes and origin at home. Raises
+    RobotFileError, with leg and bodies, for any other mechanism.
     """
     left = [body for body in range(1, len(mechanism.solids)) if body != platform]
     number = 0
@@ -132,7 +165,7 @@ def legs_of(mechanism: Mechanism, platform: int, from_platform: np.ndarray) -> I
         members = _reached(mechanism, left[0], {BASE, platform})
         left = [body for body in left if body not in members]
         if not any({one.first, one.second} & members for one in mechanism.connections):
-            continue  # it has become a part of another
+            continue
         number += 1
         try:
             yield _leg(mechanism, members, platform, from_platform)
@@ -141,27 +174,49 @@ def legs_of(mechanism: Mechanism, platform: int, from_platform: np.ndarray) -> I
             raise RobotFileError(f"leg {number} ({names}): {error}") from None
 
 
-def _leg(mechanism: Mechanism, members: set[int], platform: int, from_platform: np.ndarray) -> MechanismLeg:
+def _leg(
+    mechanism: Mechanism, members: set[int], platform: int, from_platform: np.ndarray
+) -> MechanismLeg:
+    """Leg of its member bodies."""
+    joined = sum(bool({one.first, one.second} & members) for one in mechanism.connections)
+    # more loops would have ways without number
+    if joined > len(members) + 2:
+        raise RobotFileError(
+            f"{joined} joints hold its {len(members)} bodies, at most {len(members) + 2} make one "
+            "way from the base to the platform, or two equal bars"
+        )
     paths = list(_paths(mechanism, BASE, platform, members, []))
     solids = mechanism.solids
     if not paths or len(paths) > 2 or len({len(path) for path in paths}) > 1:
         raise RobotFileError(
-            f"it has {len(paths)} ways from the base to the platform, must have one, or two equal bars"
+            f"it has {len(paths)} ways from the base to the platform, must have one, or two equal "
+            "bars"
         )
     for body in sorted(members - {body for path in paths for body, _ in path}):
         raise RobotFileError(f"{solids[body].name} is on no way from the base to the platform")
-    actuated = [one for body, joint in paths[0] for one in joint.seen_from(body) if one.actuator is not None]
+    actuated = [
+        one for body, joint in paths[0] for one in joint.seen_from(body) if one.actuator is not None
+    ]
     if len(actuated) != 1:
         raise RobotFileError(f"it has {len(actuated)} actuated joints, must have one")
-    joints, points, axes, bodies = [], [], [], []
+    joints = []
+    points = []
+    axes = []
+    bodies = []
     across = np.zeros(3)
     for steps in zip(*paths, strict=True):
         kinds = [_joint(connection.seen_from(body)) for body, connection in steps]
         kind, point, axis = kinds[0]
-        if len({body for body, _ in steps}) > 1 or len({id(connection) for _, connection in steps}) > 1:
+        if (
+            len({body for body, _ in steps}) > 1
+            or len({id(connection) for _, connection in steps}) > 1
+        ):
             if kinds[0][0] != kinds[1][0]:
-                raise RobotFileError(f"its two bars are joined differently, by {kinds[0][0]} and {kinds[1][0]}")
-            before, across = across, kinds[1][1] - kinds[0][1]
+                raise RobotFileError(
+                    f"its two bars are joined differently, by {kinds[0][0]} and {kinds[1][0]}"
+                )
+            before = across
+            across = kinds[1][1] - kinds[0][1]
             if before.any() and np.linalg.norm(across - before) > SAME:
                 raise RobotFileError("its two bars are not parallel")
             point = (kinds[0][1] + kinds[1][1]) / 2
@@ -173,18 +228,35 @@ def _leg(mechanism: Mechanism, members: set[int], platform: int, from_platform: 
     centres = np.array([np.average([s.centre for s in bars], axis=0) for bars in bodies])
     end = from_platform[:, :3].T @ (points[-1] - from_platform[:, 3])
     rods = [bars[0].rod for bars in bodies]
-    chain = Chain(tuple(joints), np.array(points), np.array(axes), actuated[0].coordinate, end, across, centres, rods)
+    chain = Chain(
+        tuple(joints),
+        np.array(points),
+        np.array(axes),
+        actuated[0].coordinate,
+        end,
+        across,
+        centres,
+        rods,
+    )
     return MechanismLeg(chain, actuated[0], bodies)
 
 
 def _paths(
-    mechanism: Mechanism, body: int, end: int, members: set[int], behind: list[tuple[int, Connection]]
+    mechanism: Mechanism,
+    body: int,
+    end: int,
+    members: set[int],
+    behind: list[tuple[int, Connection]],
 ) -> Iterator[list[tuple[int, Connection]]]:
-    """Ways from a body to the end through members, as steps: the body that each begins at, and what joins that."""
+    """Ways from a body to the end through members, as steps.
+
+    A step is the body that it begins at, and its connection.
+    """
     for connection in mechanism.connections:
         if body not in (connection.first, connection.second):
             continue
-        other, path = connection.other(body), [*behind, (body, connection)]
+        other = connection.other(body)
+        path = [*behind, (body, connection)]
         if other == end and behind:
             yield path
         elif other in members and other not in [step[0] for step in behind]:
@@ -192,11 +264,12 @@ def _paths(
 
 
 def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
-    """Kind of joint that elementary ones make, where it is (3,), and its axes (2, 3)."""
+    """Kind of joint that elementary ones make, its place (3,), and its axes (2, 3)."""
     for one in freedoms:
         if one.actuator is None and any(one.friction):
             raise RobotFileError(
-                f"{one.name} has friction {max(one.friction):g}; joints without actuator have none here"
+                f"{one.name} has friction {max(one.friction):g}; joints without actuator have "
+                "none here"
             )
     kinds = [one.kind for one in freedoms]
     axes = np.array([one.axis for one in freedoms] + [np.full(3, np.nan)])[:2]
@@ -216,16 +289,21 @@ def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
         lean = abs(float(directions[0] @ directions[1]))
         if lean > SAME:
             raise RobotFileError(
-                f"the hinges {names} are {np.degrees(np.arcsin(lean)):.3g} deg from normal to each other"
+                f"the hinges {names} are {np.degrees(np.arcsin(lean)):.3g} deg from normal to "
+                "each other"
             )
         return "universal", point, axes
     if abs(np.linalg.det(directions)) < 1e-3:
-        raise RobotFileError(f"the hinges {names} are in one plane at home, and make no ball joint there")
+        raise RobotFileError(
+            f"the hinges {names} are in one plane at home, and make no ball joint there"
+        )
     return "ball", point, axes
 
 
 def _reached(mechanism: Mechanism, start: int, walls: set[int]) -> set[int]:
-    found, left = {start}, [start]
+    """Bodies that are reached from a start without passing walls."""
+    found = {start}
+    left = [start]
     while left:
         body = left.pop()
         for one in mechanism.connections:
@@ -238,22 +316,33 @@ def _reached(mechanism: Mechanism, start: int, walls: set[int]) -> set[int]:
 def _hub(
     solids: list[Solid], connections: list[Connection], limit: float
 ) -> tuple[int, tuple[Connection, Connection]] | None:
-    """A body that is only part of a joint: nearly no mass, and two connections of hinges in one point."""
+    """Body that is only part of a joint, or None.
+
+    It has nearly no mass, and two connections of hinges in one point.
+    """
     for body in range(1, len(solids)):
         own = [one for one in connections if body in (one.first, one.second)]
-        if len(own) == 2 and solids[body].mass <= limit and all(f.kind == "hinge" for one in own for f in one.freedoms):
+        if (
+            len(own) == 2
+            and solids[body].mass <= limit
+            and all(f.kind == "hinge" for one in own for f in one.freedoms)
+        ):
             return body, (own[0], own[1])
     return None
 
 
 def _moved(connections: list[Connection], gone: Connection, old: int, new: int) -> list[Connection]:
-    """The connections but one, those of one body now another's."""
+    """Connections without one of them, with those of one body now at another."""
     left = [one for one in connections if one is not gone]
     names = {old: new}
-    return [Connection(names.get(c.first, c.first), names.get(c.second, c.second), c.freedoms) for c in left]
+    return [
+        Connection(names.get(c.first, c.first), names.get(c.second, c.second), c.freedoms)
+        for c in left
+    ]
 
 
 def _together(a: Solid, b: Solid) -> Solid:
+    """Two connections as one."""
     mass = a.mass + b.mass
     centre = (a.mass * a.centre + b.mass * b.centre) / mass if mass else a.centre
     inertia = np.zeros((3, 3))

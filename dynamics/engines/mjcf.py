@@ -1,13 +1,14 @@
-"""A robot as MJCF, the text of a model that MuJoCo loads: a closed chain of all its bodies, at home.
+"""MJCF of a robot, the text of a model that MuJoCo loads: a closed chain of its bodies at home.
 
-The platform flies freely; the bodies of each leg hang on the base and on each other by the joints that the leg's
-segments name, and a `connect` equality holds each leg's end to the platform, which so keeps the freedoms that the legs
-leave it. Joint coordinates are those of `inverse_kinematics`. Motors act on the actuated joints; joint damping is the
-viscous friction, joint friction loss the Coulomb friction. A link that is two equal bars is written as two.
+The platform flies freely. The bodies of each leg hang on the base and on each other by the joints
+that the segments of the leg name. A `connect` equality holds the end of each leg at the platform,
+which thus keeps the freedoms that the legs leave it. Joint coordinates are those of
+`inverse_kinematics`. Motors act on the actuated joints. Joint damping is the viscous friction, and
+joint friction loss the Coulomb friction. A link that is two equal bars is written as two.
 
-MuJoCo's ball joints leave bodies free to spin about their own axes, which eq. 12 excludes. Nothing drives that spin as
-long as Ixx = Iyy: it stays zero. Damping it away would damp the other two axes of the ball joint too, so the export
-adds none.
+MuJoCo's ball joints leave bodies free to spin about their own axes, which eq. 12 excludes. Nothing
+drives that spin as long as Ixx = Iyy, so that it stays zero. Damping it would damp the other two
+axes of the ball joint, too, and the export adds none.
 """
 
 from __future__ import annotations
@@ -29,30 +30,34 @@ from dynamics.inertia import BodyInertias, grouped, physical_inertias
 from dynamics.kinematics.platform import base_from_platform
 from dynamics.robot import Robot
 
-# MuJoCo silently lowers larger ones.
+# MuJoCo silently lowers larger values.
 MAX_IMPEDANCE = 0.9999
 
-# XML has no way to write these: control characters, halves of surrogate pairs (undecodable file names), non-characters.
+# XML has no way to write these: control characters, halves of surrogate pairs (undecodable file
+# names), non-characters.
 NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 Integrator = Literal["implicitfast", "RK4"]
 
 CHANGED_INERTIAS = (
-    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments that do no work in its",
-    "leg, as of a crank that turns about z alone and of a link that does not spin, do not alter the motion; others do.",
+    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments "
+    "that do no work in its",
+    "leg, as of a crank that turns about z alone and of a link that does not spin, do not alter "
+    "the motion; others do.",
 )
 
 
 @dataclass(frozen=True)
 class MjcfSolver:
-    """How MuJoCo integrates the exported model. Its loops are springs, never exactly closed, so they are made stiff.
+    """Integration of the exported model by MuJoCo.
 
-    timestep_s: the springs must be resolved by the step, so stiff loops ask for short steps; at 0.25 ms the loops of
-    rss6 stay closed to some nanometres in the motions of `cmmsim verify-model`.
-    time_constant_steps: time constant of a loop's spring in steps; 2 is the shortest that MuJoCo allows.
-    impedance: share of a loop force that the solver enforces at once; the springs bring the rest.
-    integrator: implicitfast takes joint damping implicitly, so that any viscous friction is stable, at one evaluation
-    a step; RK4 is of fourth order, for comparisons with other engines, at four.
+    Its loops are springs, which are never exactly closed, so that they are made stiff. timestep_s:
+    time step. Stiff springs need short steps; at 0.25 ms the loops of rss6 stay closed to some
+    nanometres in the motions of `cmmsim verify-model`. time_constant_steps: time constant of the
+    spring of a loop, in steps, of which MuJoCo allows 2 or more. impedance: share of the force of a
+    loop that the solver enforces at once; the springs bring the rest. integrator: implicitfast
+    takes joint damping implicitly, which is stable for any viscous friction, at one evaluation a
+    step. RK4 is of fourth order, for comparisons with other engines, at four evaluations.
     """
 
     timestep_s: float = 2.5e-4
@@ -64,7 +69,9 @@ class MjcfSolver:
         real("timestep", self.timestep_s, DynamicsError, above=0, unit=" s")
         real("time constant", self.time_constant_steps, DynamicsError, least=2, unit=" steps")
         if real("impedance", self.impedance, DynamicsError, above=0) > MAX_IMPEDANCE:
-            raise DynamicsError(f"impedance is {self.impedance}, must be > 0 and <= {MAX_IMPEDANCE}")
+            raise DynamicsError(
+                f"impedance is {self.impedance}, must be > 0 and <= {MAX_IMPEDANCE}"
+            )
         check_choice("integrator", self.integrator, get_args(Integrator), DynamicsError)
 
 
@@ -77,21 +84,26 @@ def mjcf_text(
     solver: MjcfSolver | None = None,
     source: str = "nominal parameters",
 ) -> str:
-    """MJCF of a robot with dynamic parameters (p,) (None: nominal); `source` says in the file where they come from.
+    """MJCF of a robot with dynamic parameters (p,), by default the nominal ones.
 
-    coulomb: write the dry friction; without it the joints only damp. Raises ParameterError, and its subclass
-    UnphysicalInertiaError where a body breaks Ix + Iy >= Iz and `allow_unphysical_inertia` is False.
+    coulomb: write the dry friction; without it the joints only damp. source: text that says in the
+    file where the parameters come from. Raises ParameterError, and its subclass
+    UnphysicalInertiaError for a body that breaks Ix + Iy >= Iz where `allow_unphysical_inertia` is
+    False.
     """
     check_type("robot", robot, Robot, DynamicsError)
     check_type("source", source, str, DynamicsError)
     solver = MjcfSolver() if solver is None else solver
     check_type("solver", solver, MjcfSolver, DynamicsError)
     values = robot.layout.check(robot.nominal_parameters if parameters is None else parameters)
-    allow_unphysical_inertia = flag("allow_unphysical_inertia", allow_unphysical_inertia, DynamicsError)
+    allow_unphysical_inertia = flag(
+        "allow_unphysical_inertia", allow_unphysical_inertia, DynamicsError
+    )
     coulomb = flag("coulomb", coulomb, DynamicsError)
     inertias = physical_inertias(robot.layout, values, allow_unphysical_inertia)
     _, dry, viscous, _ = robot.layout.split(values)
-    chain, gains = _Chain(robot), robot.parameter_sets["initial"].joint_pid
+    chain = _Chain(robot)
+    gains = robot.parameter_sets["initial"].joint_pid
     root = Xml.Element("mujoco", model=NOT_IN_XML.sub("?", robot.name))
     _add_header(root, robot, inertias, source)
     Xml.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
@@ -120,11 +132,15 @@ def mjcf_text(
 
 
 class _Chain:
-    """Parts of a robot where they are at home, and the points of the platform that the last ones are joined to (3,),
-    platform axes, m, by part."""
+    """Parts of a robot at home.
+
+    It also has the points (3,) of the platform that the last parts are joined to, in platform axes,
+    m, by part.
+    """
 
     def __init__(self, robot: Robot) -> None:
-        self.robot, self.parts = robot, parts_of(robot.geometry).all
+        self.robot = robot
+        self.parts = parts_of(robot.geometry).all
         self.home = parts_of(robot.geometry).frames(robot, robot.home_pose)
         self.joints = robot.inverse_kinematics(robot.home_pose)
         platform = base_from_platform(robot.home_pose)
@@ -137,21 +153,26 @@ class _Chain:
 
 
 def end_names(part: Part) -> dict[str, str]:
-    """Names of the two sites that a loop holds together, at the end of a leg's last part and on the platform."""
+    """Names of the two sites that a loop holds together: at a leg's last part, and at the
+    platform.
+    """
     tail = part.name.lstrip("abcdefghijklmnopqrstuvwxyz_")
     return {"site1": f"link_end{tail}", "site2": f"platform_joint{tail}"}
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion (4,) of a rotation matrix (3, 3), scalar first and not negative, as MuJoCo writes it."""
+    """Unit quaternion (4,) of a rotation matrix (3, 3), scalar first and not negative."""
     return Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
 
 
 def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source: str) -> None:
+    """Add name and comments."""
     lines = [
         f"Parallel robot {robot.name}, {source}; exported by cmmsim. Units: m, kg, s, rad, N, N m.",
-        "Keyframe home, and as written: all actuated joints at their home coordinates, platform at rest.",
-        "Links on ball joints may spin about their own axes; no force makes them as long as Ixx = Iyy.",
+        "Keyframe home, and as written: all actuated joints at their home coordinates, platform "
+        "at rest.",
+        "Links on ball joints may spin about their own axes; no force makes them as long as Ixx "
+        "= Iyy.",
     ]
     if inertias.changes:
         lines += [*CHANGED_INERTIAS, *grouped(inertias.changes)]
@@ -160,7 +181,10 @@ def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source:
 
 
 def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int) -> None:
-    _add_comment(root, f"Newton solves the {3 * loops} stiff loop equations exactly in a step or two.")
+    """Add the settings of the integration."""
+    _add_comment(
+        root, f"Newton solves the {3 * loops} stiff loop equations exactly in a step or two."
+    )
     Xml.SubElement(
         root,
         "option",
@@ -176,22 +200,32 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int
         "solimp": _numbers([solver.impedance, solver.impedance, 1e-3, 0.5, 2.0]),
     }
     default = Xml.SubElement(root, "default")
-    _add_comment(default, "Stiffest stable loops: time constant of two steps, critically damped, impedance near 1.")
+    _add_comment(
+        default,
+        "Stiffest stable loops: time constant of two steps, critically damped, impedance near 1.",
+    )
     Xml.SubElement(default, "equality", stiff)
-    _add_comment(default, "Dry friction is a soft constraint too: as stiff, so that a resting joint creeps least.")
+    _add_comment(
+        default,
+        "Dry friction is a soft constraint too: as stiff, so that a resting joint creeps least.",
+    )
     Xml.SubElement(default, "joint", solreffriction=stiff["solref"], solimpfriction=stiff["solimp"])
     Xml.SubElement(default, "geom", contype="0", conaffinity="0", group="1")
     Xml.SubElement(default, "site", size="0.004", group="3")
 
 
 def _add_platform(world: Xml.Element, chain: _Chain, inertia: np.ndarray) -> None:
-    pose, joints = chain.robot.home_pose, chain.robot.geometry.platform_joints
+    """Add the platform."""
+    pose = chain.robot.home_pose
+    joints = chain.robot.geometry.platform_joints
     turned = _numbers(quaternion(base_from_platform(pose)))
     body = Xml.SubElement(world, "body", name="platform", pos=_numbers(pose[:3]), quat=turned)
     Xml.SubElement(body, "freejoint", name="platform")
     _add_inertia(body, np.zeros(3), inertia)
     for number, end in chain.ends.items():
-        Xml.SubElement(body, "site", name=end_names(chain.parts[number])["site2"], pos=_numbers(end))
+        Xml.SubElement(
+            body, "site", name=end_names(chain.parts[number])["site2"], pos=_numbers(end)
+        )
     centre, radius = _disc(joints)
     half = np.array([0.0, 0.0, PLATE_THICKNESS / 2])
     _rod(body, "cylinder", centre - half, centre + half, radius, "plate")
@@ -202,16 +236,23 @@ def _add_platform(world: Xml.Element, chain: _Chain, inertia: np.ndarray) -> Non
 def _add_part(
     parent: Xml.Element, chain: _Chain, number: int, inertia: np.ndarray, friction: dict[str, str]
 ) -> tuple[Xml.Element, list[float]]:
-    """Add one part to the body before; returns it, and the coordinates of its joint at home."""
-    part, home = chain.parts[number], chain.home
-    segment, before = part.segment, part.before
+    """Add a part to the body before.
+
+    Returns the part, and the coordinates of its joint at home.
+    """
+    part = chain.parts[number]
+    home = chain.home
+    segment = part.segment
+    before = part.before
     turn = home.axes[before].T
     place = {
         "pos": _numbers(_cleaned(turn @ (home.origin[number] - home.origin[before]))),
         "quat": _numbers(_cleaned(quaternion(turn @ home.axes[number]))),
     }
     body = Xml.SubElement(parent, "body", name=part.name, attrib=place)
-    coordinates = _add_joint(body, part, part_axis(part, home, number), chain.joints[part.leg], friction)
+    coordinates = _add_joint(
+        body, part, part_axis(part, home, number), chain.joints[part.leg], friction
+    )
     _add_inertia(body, segment.centre, inertia)
     start, end = segment.rod
     _rod(body, "capsule", start, end, segment.radius, "crank" if segment.actuated else "link")
@@ -225,8 +266,10 @@ def _add_part(
 def _add_joint(
     body: Xml.Element, part: Part, axis: np.ndarray, coordinate: float, friction: dict[str, str]
 ) -> list[float]:
-    """Add the joint of a part; returns its coordinates at home. A universal joint is two hinges, first the one in the
-    body before."""
+    """Add the joint of a part and return its coordinates at home.
+
+    A universal joint is two hinges. The first is the one in the body before.
+    """
     if part.segment.joint == "ball":
         Xml.SubElement(body, "joint", name=part.name, type="ball")
         return [1.0, 0.0, 0.0, 0.0]
@@ -244,30 +287,41 @@ def _add_joint(
 
 
 def part_axis(part: Part, frames: Frames, number: int) -> np.ndarray:
-    """Axis (3,) of the joint of a part, which is given in the axes of the body before, in its own."""
+    """Axis (3,) of the joint of a part, in its own axes."""
     return _cleaned(frames.axes[number].T @ frames.axes[part.before] @ part.segment.axis)
 
 
 def _cleaned(values: np.ndarray) -> np.ndarray:
-    """Values of order one (m, or without unit) without the rounding that stands for their zeros."""
+    """Values of order one, m or without unit, without the rounding that stands for zeros."""
     return np.where(np.abs(values) < 2e-15, 0.0, values)
 
 
 def _add_inertia(body: Xml.Element, centre: np.ndarray, inertia: np.ndarray) -> None:
-    Xml.SubElement(body, "inertial", pos=_numbers(centre), mass=_numbers(inertia[0]), diaginertia=_numbers(inertia[1:]))
+    """Add mass, centre and inertia of a body."""
+    Xml.SubElement(
+        body,
+        "inertial",
+        pos=_numbers(centre),
+        mass=_numbers(inertia[0]),
+        diaginertia=_numbers(inertia[1:]),
+    )
 
 
 def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
-    equality, actuator = Xml.SubElement(root, "equality"), Xml.SubElement(root, "actuator")
+    """Add closed loops and motors."""
+    equality = Xml.SubElement(root, "equality")
+    actuator = Xml.SubElement(root, "actuator")
     for number in chain.ends:
         ends = end_names(chain.parts[number])
-        Xml.SubElement(equality, "connect", name=ends["site2"].replace("platform_joint", "loop"), attrib=ends)
+        Xml.SubElement(
+            equality, "connect", name=ends["site2"].replace("platform_joint", "loop"), attrib=ends
+        )
     for leg, joint in enumerate(chain.robot.joint_names, 1):
         Xml.SubElement(actuator, "motor", name=f"motor{leg}", joint=joint)
 
 
 def _add_comment(parent: Xml.Element, text: str) -> None:
-    """Add a comment; XML allows neither two hyphens side by side in it nor some characters."""
+    """Add a comment. XML allows no two hyphens side by side in it, nor some characters."""
     parent.append(Xml.Comment(f" {re.sub('-(?=-)', '- ', NOT_IN_XML.sub('?', text))} "))
 
 
@@ -277,7 +331,8 @@ def _numbers(values: ArrayLike) -> str:
 
 
 # What the exported robot looks like: geoms without mass or contact, so that a viewer shows it.
-BALL_RADIUS, PLATE_THICKNESS = 0.009, 0.012
+BALL_RADIUS = 0.009
+PLATE_THICKNESS = 0.012
 COLOURS = {
     "base": "0.35 0.37 0.40 1",
     "crank": "0.85 0.45 0.15 1",
@@ -287,7 +342,7 @@ COLOURS = {
 
 
 def add_assets(root: Xml.Element, geometry: RobotGeometry) -> None:
-    """Sky, light and view, and the colours of the bodies."""
+    """Add sky, light and view, and the colours of the bodies."""
     points = np.concatenate([geometry.base_joints, geometry.joints_at(geometry.home_pose)])
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     extent = 1.6 * np.linalg.norm(points - centre, axis=1).max()
@@ -302,12 +357,17 @@ def add_assets(root: Xml.Element, geometry: RobotGeometry) -> None:
 
 
 def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
-    """A plate behind the legs, seen from the platform; a motor on each hinge of the base, a rail below each slide."""
+    """Add the looks of the base.
+
+    They are a plate behind the legs, seen from the platform, a motor on each hinge of the base, and
+    a rail below each slide.
+    """
     centre, radius = _disc(geometry.base_joints)
     behind = np.array([0.0, 0.0, -1.0 if geometry.home_pose[2] >= centre[2] else 1.0])
     _rod(world, "cylinder", centre + 0.05 * behind, centre + 0.06 * behind, radius + 0.04, "base")
     for leg in geometry.legs:
-        foot, segment = leg.base_joint, leg.segments()[0]
+        foot = leg.base_joint
+        segment = leg.segments()[0]
         if segment.joint == "universal":
             _ball(world, foot, 0.022)
             continue
@@ -318,14 +378,21 @@ def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
 
 
 def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius of a disc behind points."""
     centre = points.mean(axis=0)
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
-def _rod(parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radius: float, material: str) -> None:
+def _rod(
+    parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radius: float, material: str
+) -> None:
+    """Add a rod."""
     ends = _numbers(np.concatenate([start, end]))
     Xml.SubElement(parent, "geom", type=kind, fromto=ends, size=_numbers(radius), material=material)
 
 
 def _ball(parent: Xml.Element, centre: np.ndarray, radius: float) -> None:
-    Xml.SubElement(parent, "geom", type="sphere", pos=_numbers(centre), size=_numbers(radius), material="link")
+    """Add a ball."""
+    Xml.SubElement(
+        parent, "geom", type="sphere", pos=_numbers(centre), size=_numbers(radius), material="link"
+    )

@@ -1,31 +1,48 @@
-"""A robot from MJCF: a model of any program whose loops are `connect` or `weld` equalities, compiled by MuJoCo.
+"""Robot from MJCF, a model of any program that MuJoCo compiles.
 
-Home is the keyframe `home`, else the first one, else the model as it is written. The platform may fly freely or hang on
-a leg. What the exporter writes besides (`numeric` joint_pid and travel_limit) is read back.
+Its loops are `connect` or `weld` equalities. Home is the keyframe `home`, else the first one, else
+the model as it is written. The platform may fly freely or hang on a leg. What the exporter adds
+(`numeric` joint_pid and travel_limit) is read back.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dynamics.checks import shown
 from dynamics.engines.mechanism import Connection, Freedom, Mechanism, Solid
 from dynamics.engines.mujoco_engine import import_mujoco
 from dynamics.engines.recognition import recognised
 from dynamics.errors import RobotFileError
+from dynamics.files import LARGEST_XML, parse_xml, read_bytes
 from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
+MOST = 120
+"""Largest number of bodies of a robot."""
+
+MULTIPLYING = ("replicate", "composite", "flexcomp", "attach", "plugin")
+"""Elements that stand for many others."""
+
+SIZED = ("size", "texture", "hfield")
+SIZES = ("njmax", "nconmax", "nstack", "nuserdata", "nkey", "width", "height", "nrow", "ncol")
+MOST_SIZE = 4096
+"""Largest number in a size of memory, of a picture or of a field of heights."""
+
 
 def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
-    """The robot in an MJCF file, and what a reader of it should know.
+    """Robot in an MJCF file, and remarks on the file.
 
-    Raises RobotFileError: MuJoCo refuses the file, or its mechanism is none of the known kinds; MujocoMissingError.
+    Raises RobotFileError where MuJoCo refuses the file, or where its mechanism has legs of no known
+    kind. Raises MujocoMissingError.
     """
     mujoco = import_mujoco()
+    _refuse_large(Path(path))
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
+    except (ValueError, mujoco.FatalError) as error:
         raise RobotFileError(f"MuJoCo refuses {path}: {' '.join(str(error).split())}") from None
     try:
         return recognised(_mechanism(mujoco, model))
@@ -33,7 +50,39 @@ def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
         raise RobotFileError(f"{path}: {error}") from None
 
 
+def _refuse_large(path: Path, above: tuple[Path, ...] = ()) -> int:
+    """Count the bodies of a file and of those that it includes.
+
+    Raises RobotFileError for what would make a large model of a small file, or read other folders.
+    """
+    content = read_bytes(path, str(path), RobotFileError, LARGEST_XML)
+    bodies = 0
+    for element in parse_xml(content, str(path), RobotFileError).iter():
+        bodies += element.tag == "body"
+        if element.tag in MULTIPLYING:
+            raise RobotFileError(f"{path} has an element {element.tag}, which no robot has here")
+        for key, value in element.items() if element.tag in SIZED else ():
+            if key in SIZES and not (value.isdecimal() and int(value[:9]) <= MOST_SIZE):
+                raise RobotFileError(
+                    f"{path}: {element.tag} has {key} = {shown(value)}, at most {MOST_SIZE} here"
+                )
+            if key == "memory" and not re.fullmatch(r"\d{1,3}[KM]?", value):
+                raise RobotFileError(f"{path}: memory = {shown(value)}, at most 999M here")
+        if element.tag == "include":
+            name = Path(element.get("file", ""))
+            further = path.parent / name
+            if name.is_absolute() or ".." in name.parts or further in above or len(above) > 8:
+                raise RobotFileError(
+                    f"{path} includes {shown(str(name))}, must be files of its folder, each once"
+                )
+            bodies += _refuse_large(further, (*above, path, further))
+    if bodies > MOST:
+        raise RobotFileError(f"{path} has {bodies} bodies, a robot has at most {MOST}")
+    return bodies
+
+
 def _mechanism(mujoco: Any, model: Any) -> Mechanism:
+    """Mechanism of a model."""
     data = mujoco.MjData(model)
     if model.nkey:
         home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
@@ -44,11 +93,14 @@ def _mechanism(mujoco: Any, model: Any) -> Mechanism:
     driven = {int(model.actuator_trnid[k, 0]): k for k in range(model.nu)}
     connections = []
     for body in range(1, model.nbody):
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        first = int(model.body_jntadr[body])
+        count = int(model.body_jntnum[body])
         joints = range(first, first + count)
         if any(model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_FREE) for joint in joints):
             continue
-        freedoms = tuple(_freedom(mujoco, model, data, joint, driven.get(joint)) for joint in joints)
+        freedoms = tuple(
+            _freedom(mujoco, model, data, joint, driven.get(joint)) for joint in joints
+        )
         connections.append(Connection(int(model.body_parentid[body]), body, freedoms))
     connections += [_loop(mujoco, model, data, k) for k in range(model.neq) if model.eq_active0[k]]
     limited = [joint for joint in range(model.njnt) if model.jnt_limited[joint]]
@@ -58,16 +110,20 @@ def _mechanism(mujoco: Any, model: Any) -> Mechanism:
         solids=solids,
         connections=connections,
         gravity=np.array(model.opt.gravity),
-        ranges={_joint_name(model, joint): tuple(model.jnt_range[joint].tolist()) for joint in limited},
+        ranges={
+            _joint_name(model, joint): tuple(model.jnt_range[joint].tolist()) for joint in limited
+        },
         gains=_numeric(model, "joint_pid", 3),
         travel_limit=None if travel is None else float(travel[0]),
     )
 
 
 def _solid(mujoco: Any, model: Any, data: Any, body: int) -> Solid:
+    """Body of a model."""
     turn = data.ximat[body].reshape(3, 3)
     rods = [int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)]
-    first, rod = int(model.body_geomadr[body]), None
+    first = int(model.body_geomadr[body])
+    rod = None
     for geom in range(first, first + int(model.body_geomnum[body])):
         if rod is None and model.geom_type[geom] in rods:
             rod = (2 * float(model.geom_size[geom, 1]), float(model.geom_size[geom, 0]))
@@ -82,13 +138,18 @@ def _solid(mujoco: Any, model: Any, data: Any, body: int) -> Solid:
 
 
 def _freedom(mujoco: Any, model: Any, data: Any, joint: int, actuator: int | None) -> Freedom:
+    """Elementary joint of a model."""
     kind = {
         int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
         int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
         int(mujoco.mjtJoint.mjJNT_BALL): "ball",
     }[int(model.jnt_type[joint])]
-    name, dof = _joint_name(model, joint), int(model.jnt_dofadr[joint])
-    for what, value in (("stiffness", model.jnt_stiffness[joint]), ("armature", model.dof_armature[dof])):
+    name = _joint_name(model, joint)
+    dof = int(model.jnt_dofadr[joint])
+    for what, value in (
+        ("stiffness", model.jnt_stiffness[joint]),
+        ("armature", model.dof_armature[dof]),
+    ):
         if value:
             raise RobotFileError(f"{name} has {what} {value:g}, which no joint has here")
     return Freedom(
@@ -103,11 +164,15 @@ def _freedom(mujoco: Any, model: Any, data: Any, joint: int, actuator: int | Non
 
 
 def _joint_name(model: Any, joint: int) -> str:
+    """Name of a joint."""
     return model.joint(joint).name or f"joint {joint}"
 
 
 def _loop(mujoco: Any, model: Any, data: Any, equality: int) -> Connection:
-    """A loop of two sites or two bodies, as a ball joint or a weld. Raises RobotFileError where it is open at home."""
+    """Loop of two sites or two bodies, as a ball joint or a weld.
+
+    Raises RobotFileError where it is open at home.
+    """
     first, second = (int(ids[equality]) for ids in (model.eq_obj1id, model.eq_obj2id))
     name = model.equality(equality).name or f"equality {equality}"
     if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
@@ -118,23 +183,29 @@ def _loop(mujoco: Any, model: Any, data: Any, equality: int) -> Connection:
     else:
         anchors = model.eq_data[equality].reshape(-1)[:6].reshape(2, 3)
         bodies = zip((first, second), anchors, strict=True)
-        points = [data.xpos[body] + data.xmat[body].reshape(3, 3) @ anchor for body, anchor in bodies]
+        points = [
+            data.xpos[body] + data.xmat[body].reshape(3, 3) @ anchor for body, anchor in bodies
+        ]
     gap = float(np.linalg.norm(points[0] - points[1]))
     if gap > SAME:
-        raise RobotFileError(f"the loop {name} is open by {gap:.3g} m at home, must be closed to {SAME:g} m")
+        raise RobotFileError(
+            f"the loop {name} is open by {gap:.3g} m at home, must be closed to {SAME:g} m"
+        )
     if model.eq_type[equality] == int(mujoco.mjtEq.mjEQ_WELD):
         return Connection(first, second, ())
     return Connection(first, second, (Freedom("ball", name, points[0].copy(), np.full(3, np.nan)),))
 
 
 def _refuse_others(mujoco: Any, model: Any) -> None:
-    """Raise RobotFileError for what closes loops or drives joints in another way."""
+    """Raise RobotFileError for loops that close, or joints that move, in another way."""
     known = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
     for k in range(model.neq):
         if model.eq_active0[k] and model.eq_type[k] not in known:
             kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
             name = model.equality(k).name or k
-            raise RobotFileError(f"equality {name} is of the kind {kind}; loops are connect or weld here")
+            raise RobotFileError(
+                f"equality {name} is of the kind {kind}; loops are connect or weld here"
+            )
     if model.ntendon:
         raise RobotFileError(f"it has {model.ntendon} tendons, which no kind of leg has")
     for k in range(model.nu):
@@ -143,7 +214,7 @@ def _refuse_others(mujoco: Any, model: Any) -> None:
 
 
 def _numeric(model: Any, name: str, count: int) -> np.ndarray | None:
-    """Numbers that the file holds by a name; None where it does not, or others."""
+    """Numbers that the file has under a name, or None."""
     try:
         found = np.array(model.numeric(name).data, dtype=float)
     except KeyError:

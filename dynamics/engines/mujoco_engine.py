@@ -1,4 +1,7 @@
-"""A robot in MuJoCo, put into any state of the closed chain and stepped. The only module that imports MuJoCo."""
+"""Robot in MuJoCo, which is put into any state of the closed chain and stepped.
+
+This is the only module that imports MuJoCo.
+"""
 
 from typing import Any
 
@@ -16,29 +19,38 @@ X = np.array([1.0, 0.0, 0.0])
 
 
 class MujocoMissingError(DynamicsError):
-    """MuJoCo is an optional extra, and it is not installed."""
+    """MuJoCo, which is an optional extra, is not installed."""
 
 
 class MujocoError(DynamicsError):
-    """A model that MuJoCo refuses, or a state at which it gave up."""
+    """Model that MuJoCo refuses, or state at which it gave up."""
 
 
 def import_mujoco() -> Any:
-    """The module mujoco. Raises MujocoMissingError with the way to install it, MujocoError where it does not load.
+    """Import MuJoCo and return the module.
 
-    MuJoCo sets up its renderer when imported; with MUJOCO_GL=egl that fails on the PyOpenGL that pyrender asks for.
+    MuJoCo sets up its renderer at import. With MUJOCO_GL=egl that fails on the PyOpenGL that
+    pyrender asks for. Raises MujocoMissingError with the way to install it, or MujocoError where it
+    does not load.
     """
     try:
         import mujoco
     except ImportError as error:
-        raise MujocoMissingError(f"MuJoCo is not installed ({error}): pip install '.[mujoco]' in a checkout") from None
+        raise MujocoMissingError(
+            f"MuJoCo is not installed ({error}): pip install '.[mujoco]' in a checkout"
+        ) from None
     except AttributeError as error:
-        raise MujocoError(f"MuJoCo does not load ({error}): unset MUJOCO_GL, no picture is needed here") from error
+        raise MujocoError(
+            f"MuJoCo does not load ({error}): unset MUJOCO_GL, no picture is needed here"
+        ) from error
     return mujoco
 
 
 class MujocoRobot:
-    """A robot exported by `mjcf_text`, loaded. Poses, twists and joint coordinates are those of `Robot`."""
+    """Robot in MuJoCo, loaded from the text of `mjcf_text`.
+
+    Poses, twists and joint coordinates are those of `Robot`.
+    """
 
     def __init__(self, robot: Robot, text: str) -> None:
         check_type("robot", robot, Robot, MujocoError)
@@ -54,7 +66,9 @@ class MujocoRobot:
             joints = [self.model.joint(name) for name in robot.joint_names]
             self._parts = parts_of(robot.geometry)
             ends = [end_names(part) for part in self._parts.all if part.last]
-            self._ends = np.array([[self.model.site(one[key]).id for one in ends] for key in ("site1", "site2")])
+            self._ends = np.array(
+                [[self.model.site(one[key]).id for one in ends] for key in ("site1", "site2")]
+            )
             self._bodies = [self.model.body(part.name) for part in self._parts.all]
         except KeyError as error:
             raise MujocoError(f"the model is no export of {robot.name}: {error.args[0]}") from None
@@ -63,7 +77,7 @@ class MujocoRobot:
 
     @property
     def timestep(self) -> float:
-        """Step in s."""
+        """Time step, s."""
         return float(self.model.opt.timestep)
 
     @property
@@ -84,7 +98,7 @@ class MujocoRobot:
 
     @property
     def joint_rates(self) -> np.ndarray:
-        """Their rates (n,), rad/s or m/s."""
+        """Rates of the joint coordinates (n,), rad/s or m/s."""
         return self.data.qvel[self._rate]
 
     @property
@@ -96,7 +110,10 @@ class MujocoRobot:
 
     @property
     def link_spin(self) -> float:
-        """Largest angular velocity about its own axis of a body on a ball joint, rad/s; zero without such bodies."""
+        """Largest angular velocity of a body on a ball joint about its own axis, rad/s.
+
+        It is zero without such bodies.
+        """
         spins = [0.0]
         for part, body in zip(self._parts.all, self._bodies, strict=True):
             if part.segment.joint == "ball":
@@ -107,9 +124,14 @@ class MujocoRobot:
         return max(spins)
 
     def put(self, pose: np.ndarray, twist: np.ndarray) -> None:
-        """Put all bodies where the robot has them at a pose (6,) with a twist (6,), no link spinning (eq. 12)."""
-        pose, twist = floats("pose", pose, (6,)), floats("twist", twist, (6,))
-        frames, platform = self._parts.frames(self._robot, pose, twist), base_from_platform(pose)
+        """Put all bodies where the robot has them at a pose (6,) with a twist (6,).
+
+        No link spins (eq. 12).
+        """
+        pose = floats("pose", pose, (6,))
+        twist = floats("twist", twist, (6,))
+        frames = self._parts.frames(self._robot, pose, twist)
+        platform = base_from_platform(pose)
         data = self.data
         self._mujoco.mj_resetData(self.model, data)
         data.qpos[:7] = [*pose[:3], *quaternion(platform)]
@@ -119,20 +141,25 @@ class MujocoRobot:
         for number, (part, body) in enumerate(zip(self._parts.all, self._bodies, strict=True)):
             if part.segment.actuated:
                 continue
-            at, rate = int(body.jntadr[0]), int(body.dofadr[0])
+            at = int(body.jntadr[0])
+            rate = int(body.dofadr[0])
             at = int(self.model.jnt_qposadr[at])
-            own, before = frames.axes[number], frames.axes[part.before]
+            own = frames.axes[number]
+            before = frames.axes[part.before]
             at_rest = Rotation.from_quat(body.quat, scalar_first=True).as_matrix()
             turned = at_rest.T @ before.T @ own
             spin = own.T @ (frames.spin[number] - frames.spin[part.before])
             if part.segment.joint == "ball":
-                data.qpos[at : at + 4], data.qvel[rate : rate + 3] = quaternion(turned), spin
+                data.qpos[at : at + 4] = quaternion(turned)
+                data.qvel[rate : rate + 3] = spin
                 continue
-            axis, resting = part_axis(part, frames, number), at_rest.T @ part.segment.axis
+            axis = part_axis(part, frames, number)
+            resting = at_rest.T @ part.segment.axis
             if part.segment.joint == "hinge":
-                data.qpos[at], data.qvel[rate] = Rotation.from_matrix(turned).as_rotvec() @ resting, spin @ axis
+                data.qpos[at] = Rotation.from_matrix(turned).as_rotvec() @ resting
+                data.qvel[rate] = spin @ axis
                 continue
-            # Universal: about the axis of the part before, then about x, which is normal to that.
+            # a universal joint turns about the axis of the part before, then about x
             moved = turned[:, 0]
             angle = np.arctan2(np.cross(resting, X) @ moved, moved[0])
             about_x = Rotation.from_rotvec(-angle * resting).as_matrix() @ turned
@@ -141,20 +168,23 @@ class MujocoRobot:
         self._mujoco.mj_forward(self.model, data)
 
     def twist_dot(self, torque: np.ndarray) -> np.ndarray:
-        """Acceleration [h_ddot, omega_dot] (6,), base axes, under torques or forces (n,) in its present state."""
+        """Acceleration [h_ddot, omega_dot] (6,) in the present state, in the axes of the base.
+
+        It is that under torques or forces (n,).
+        """
         self.data.ctrl[:] = floats("torque", torque, (len(self._joint),))
         self._mujoco.mj_forward(self.model, self.data)
         platform = Rotation.from_quat(self.data.qpos[3:7], scalar_first=True).as_matrix()
         return np.concatenate([self.data.qacc[:3], platform @ self.data.qacc[3:6]])
 
     def feed_back(self, stiffness: float, damping: float) -> None:
-        """Let every motor add -stiffness coordinate - damping rate to its control, inside MuJoCo's integrator."""
+        """Add -stiffness coordinate - damping rate to every control inside MuJoCo's integrator."""
         self.model.actuator_biastype[:] = self._mujoco.mjtBias.mjBIAS_AFFINE
         stiffness = real("stiffness", stiffness, MujocoError, least=0)
         damping = real("damping", damping, MujocoError, least=0)
         self.model.actuator_biasprm[:, :3] = [0.0, -stiffness, -damping]
 
     def step(self, control: np.ndarray) -> None:
-        """One step under a control (n,), N m or N."""
+        """Do one step under a control (n,), N m or N."""
         self.data.ctrl[:] = floats("control", control, (len(self._joint),))
         self._mujoco.mj_step(self.model, self.data)

@@ -1,7 +1,7 @@
-"""The robot that a mechanism of another program is, where its legs are of kinds that are known here.
+"""Robot of a mechanism from another program, where its legs are of known kinds.
 
-The platform's frame is at its centre of mass, with the file's axes where its inertia is diagonal in them and a pose can
-say how they are turned, else with principal ones.
+The frame of the platform is at its centre of mass. It has the axes of the file where the inertia of
+the platform is diagonal in them and a pose can describe them, else principal axes.
 """
 
 from collections import Counter
@@ -11,7 +11,14 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from dynamics.engines.mechanism import Mechanism, MechanismLeg, Solid, legs_of, platform_of, simplified
+from dynamics.engines.mechanism import (
+    Mechanism,
+    MechanismLeg,
+    Solid,
+    legs_of,
+    platform_of,
+    simplified,
+)
 from dynamics.errors import RobotFileError
 from dynamics.geometry import RobotGeometry
 from dynamics.inertia import MOMENTS
@@ -21,25 +28,35 @@ from dynamics.legs.leg import Body, Leg, Placement
 from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.jacobians import joint_jacobian
 from dynamics.rigid_body.virtual_work import mass_matrix
-from dynamics.robot_file import ParameterSet, RobotDescription
+from dynamics.robot_file import ParameterSet, RobotDescription, parsed_robot
+from dynamics.robot_text import robot_text
 
 DIAGONAL = 1e-9
-"""Products of inertia below this share of the largest moment are rounding."""
+"""Share of the largest moment below which products of inertia are rounding."""
 
 MOST_TILT = 0.9
-"""Of sin(beta) at home; near 1 angles say nothing. A platform beyond it gets axes nearest to those of the base."""
+"""Largest sin(beta) at home.
 
-OWN_RATE, OWN_DAMPING = 2 * np.pi * 3, 0.7
-"""rad/s, and share of the critical: of the joint PID where a file has none, with the least that a joint feels."""
+Near 1 angles say nothing. A platform beyond it gets the axes nearest to those of the base.
+"""
 
-TRAVEL, TRAVEL_SHARE = 0.5, 0.1
-"""Travel beyond the home coordinates where a file has no ranges: rad, or of the distance from B to A."""
+OWN_RATE = 2 * np.pi * 3
+"""Natural frequency of a joint PID where a file has none, rad/s, at the joint of least inertia."""
+
+OWN_DAMPING = 0.7
+"""Damping ratio of such a joint PID."""
+
+TRAVEL = 0.5
+"""Travel beyond the home coordinates where a file has no ranges, rad."""
+
+TRAVEL_SHARE = 0.1
+"""Travel of actuators that slide, as a share of the distance from B to A."""
 
 
 def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
-    """The robot, with one parameter set `initial`; and what a reader of its file should know.
+    """Robot of a mechanism, with one parameter set `initial`, and remarks on its file.
 
-    Raises RobotFileError, naming leg and body, for a mechanism that is none of the known kinds.
+    Raises RobotFileError, with leg and body, for a mechanism with legs of no known kind.
     """
     plain = simplified(mechanism)
     notes = list(plain.notes)
@@ -51,7 +68,10 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     found = list(legs_of(plain, number, np.column_stack([axes, platform.centre])))
     legs = [_leg(one, k) for k, one in enumerate(found, 1)]
     if not legs:
-        raise RobotFileError(f"it has no legs: no body is between the base and {platform.name}, where most joints meet")
+        raise RobotFileError(
+            f"it has no legs: no body is between the base and {platform.name}, where most joints "
+            "meet"
+        )
     charts = Counter(leg.chart for leg in legs)
     home = (*platform.centre.tolist(), *(Rotation.from_matrix(axes).as_euler("XYZ") + 0.0).tolist())
     chart = Chart(charts.most_common(1)[0][0], home)
@@ -66,7 +86,9 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     rigid[0] = [platform.mass, *moments]
     for k, (one, leg) in enumerate(zip(found, geometry.legs, strict=True)):
         places = [_numbers(place) for place in leg.placements(ca.SX(one.chain.points[-1]))]
-        for body, place, bars, row in zip(leg.bodies, places, one.bodies, layout.of_leg[k], strict=True):
+        for body, place, bars, row in zip(
+            leg.bodies, places, one.bodies, layout.of_leg[k], strict=True
+        ):
             try:
                 rigid[row] = _inertia(body, place, bars, chart.basis[:3])
             except RobotFileError as error:
@@ -75,11 +97,17 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     layout.check(dynamic)
     gains = _gains(geometry, dynamic[layout.rigid]) if plain.gains is None else plain.gains
     if plain.gains is None:
-        notes.append("the file has no joint PID: its gains are chosen for 3 Hz with the least that a joint feels")
-    return RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)}), notes
+        notes.append(
+            "the file has no joint PID: its gains are chosen for 3 Hz with the least that a "
+            "joint feels"
+        )
+    robot = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
+    parsed_robot(robot_text(robot), "the robot")  # whose numbers must be those of a machine
+    return robot, notes
 
 
 def _leg(one: MechanismLeg, number: int) -> Leg:
+    """Leg of a kind, from a leg of the mechanism."""
     try:
         return leg_of(one.chain)
     except RobotFileError as error:
@@ -88,24 +116,31 @@ def _leg(one: MechanismLeg, number: int) -> Leg:
 
 
 def _numbers(place: Placement) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers as text."""
     return np.array(ca.evalf(place.centre)).ravel(), np.array(ca.evalf(place.axes))
 
 
-def _inertia(body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid], ways: np.ndarray) -> list[float]:
-    """Mass and moments of a body of a leg, which may be equal bars, in the axes of its kind.
+def _inertia(
+    body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid], ways: np.ndarray
+) -> list[float]:
+    """Mass and moments of a body of a leg, in the axes of its kind. It may be equal bars.
 
-    ways (3, n): in which the platform can go; along others, and in a body that does not turn, masses may be
-    anywhere. Raises RobotFileError where a centre of mass is elsewhere, and for products of inertia that would do work.
+    ways (3, n): directions in which the platform can go. Along others, and in a body that does not
+    turn, masses may be anywhere. Raises RobotFileError for a centre of mass elsewhere, and for
+    products of inertia that would do work.
     """
     centre, axes = place
-    name, mass = " and ".join(bar.name for bar in bars), sum(bar.mass for bar in bars)
+    name = " and ".join(bar.name for bar in bars)
+    mass = sum(bar.mass for bar in bars)
     if any(abs(bar.mass - bars[0].mass) > SAME * mass for bar in bars):
-        raise RobotFileError(f"the bars {name} differ: {', '.join(f'{bar.mass:g} kg' for bar in bars)}")
+        raise RobotFileError(
+            f"the bars {name} differ: {', '.join(f'{bar.mass:g} kg' for bar in bars)}"
+        )
     off = float(np.linalg.norm((np.mean([bar.centre for bar in bars], axis=0) - centre) @ ways))
     if body.moments and off > SAME:
         raise RobotFileError(
-            f"the centre of mass of {name} is {off:.4g} m from where its kind has it ({body.name}), "
-            f"{np.array2string(centre, precision=6)} at home"
+            f"the centre of mass of {name} is {off:.4g} m from where its kind has it "
+            f"({body.name}), {np.array2string(centre, precision=6)} at home"
         )
     inertia = sum(axes.T @ bar.inertia @ axes for bar in bars)
     moments = np.diagonal(inertia)
@@ -114,15 +149,17 @@ def _inertia(body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid]
     products = np.abs(block - np.diag(np.diagonal(block))).max(initial=0.0)
     if products > SAME * moments.max():
         raise RobotFileError(
-            f"{name} has a product of inertia of {products:.3g} kg m^2 in the axes of its kind ({body.name}), "
-            f"must have moments alone ({', '.join(f'{moment:.3g}' for moment in moments)})"
+            f"{name} has a product of inertia of {products:.3g} kg m^2 in the axes of its kind "
+            f"({body.name}), must have moments alone "
+            f"({', '.join(f'{moment:.3g}' for moment in moments)})"
         )
     return [mass, *moments]
 
 
 def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (3, 3) of the platform and its moments about them (3,)."""
-    own, axes = platform.axes.T @ platform.inertia @ platform.axes, platform.axes
+    """Axes (3, 3) of the platform, and its moments about them (3,)."""
+    own = platform.axes.T @ platform.inertia @ platform.axes
+    axes = platform.axes
     if np.abs(own - np.diag(np.diagonal(own))).max() > DIAGONAL * np.abs(own).max():
         axes = _nearest(axes @ np.linalg.eigh(own)[1], axes)
     if abs(axes[0, 2]) > MOST_TILT:
@@ -131,7 +168,10 @@ def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(axes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The same axes (3, 3) in the order and with the signs that bring them nearest to others; right-handed."""
+    """Axes (3, 3) in the order and with the signs that are nearest to others.
+
+    They are right-handed.
+    """
     cosines = wanted.T @ axes
     order = linear_sum_assignment(-np.abs(cosines))[1]
     aligned = np.diagonal(cosines[:, order])
@@ -142,30 +182,36 @@ def _nearest(axes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Chart:
-    """Chart of a planar robot. Raises RobotFileError where it is not in the plane of x and y."""
+    """Chart of a planar robot. Raises RobotFileError unless it is in the plane of x and y."""
     for number, leg in enumerate(legs, 1):
         lean = np.linalg.norm(leg.segments()[0].axis[:2])
         if lean > SAME:
             raise RobotFileError(
-                f"leg {number} turns about {np.round(leg.segments()[0].axis, 6).tolist()}; those of planar robots turn "
-                "about z"
+                f"leg {number} turns about {np.round(leg.segments()[0].axis, 6).tolist()}; those "
+                "of planar robots turn about z"
             )
     if np.linalg.norm(axes[:2, 2]) > SAME:
-        raise RobotFileError(f"the platform's z is {np.round(axes[:, 2], 6).tolist()}; of planar robots it is along z")
+        raise RobotFileError(
+            f"the platform's z is {np.round(axes[:, 2], 6).tolist()}; of planar robots it is "
+            "along z"
+        )
     return Chart("planar", home)
 
 
-def _travel(plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes: list[str]) -> float:
-    """Travel limit: the ranges of the file, else some way about home."""
+def _travel(
+    plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes: list[str]
+) -> float:
+    """Travel limit from the ranges of the file, else some way about home."""
     limits = []
     for one in found:
-        at_home, span = one.actuated.coordinate, plain.ranges.get(one.actuated.name)
+        at_home = one.actuated.coordinate
+        span = plain.ranges.get(one.actuated.name)
         if span is not None:
             limits.append(min(-span[0], span[1]))
             if limits[-1] <= abs(at_home):
                 raise RobotFileError(
-                    f"{one.actuated.name} has the range {span[0]:g} to {span[1]:g}, which needs zero and home "
-                    f"({at_home:g}) well inside"
+                    f"{one.actuated.name} has the range {span[0]:g} to {span[1]:g}, which needs "
+                    f"zero and home ({at_home:g}) well inside"
                 )
     if limits:
         return float(min(limits))
@@ -176,8 +222,9 @@ def _travel(plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes:
 
 
 def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:
-    """lp, li, ld for what the joint that feels least feels at home."""
-    home, free = ca.SX(geometry.home_pose), geometry.chart.basis
+    """Gains lp, li, ld for what the joint that feels least feels at home."""
+    home = ca.SX(geometry.home_pose)
+    free = geometry.chart.basis
     jacobian = np.array(ca.evalf(joint_jacobian(geometry, home))) @ free
     mass = free.T @ np.array(ca.evalf(mass_matrix(geometry, home, ca.SX(rigid)))) @ free
     felt = 1 / np.diagonal(jacobian @ np.linalg.solve(mass, jacobian.T)).min()

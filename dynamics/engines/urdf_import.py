@@ -1,20 +1,27 @@
-"""A robot from URDF and a YAML file of what URDF cannot say, in the convention of the public example-parallel-robots.
+"""Robot from URDF, and from a YAML file of what URDF cannot say.
 
-URDF holds a tree; its root stands still. The YAML file has closed_loop: pairs of frames that coincide, each the name
-of a link or of a joint (which is where its child is); type: one a pair, "3d" where the points coincide, "6d" where the
-axes do as well; name_mot: the actuated joints; joint_name and joint_type: joints that are something else than URDF
-says, SPHERICAL, FIXED or UJOINT_XY (hinges about x, then y, of the joint's frame). Home is a closed position near all
-coordinates zero.
+The convention is that of the public example-parallel-robots. URDF has a tree, whose root stands
+still. The YAML file has these keys:
+
+- closed_loop: pairs of frames that coincide. A frame is the name of a link, or of a joint, which is
+  at the frame of its child.
+- type: for each pair, "3d" where the points coincide, or "6d" where the axes do, too.
+- name_mot: the actuated joints.
+- joint_name and joint_type: joints that are something else than URDF says: SPHERICAL, FIXED, or
+  UJOINT_XY (hinges about x, then y, of the frame of the joint).
+
+Home is a closed position near all coordinates zero.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
-import yaml
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -22,25 +29,38 @@ from dynamics.checks import shown
 from dynamics.engines.mechanism import Connection, Freedom, Mechanism, Solid
 from dynamics.engines.recognition import recognised
 from dynamics.errors import RobotFileError
+from dynamics.files import LARGEST_XML, LARGEST_YAML, parse_xml, parse_yaml, read_bytes
 from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+MOST = 120
+"""Largest number of links, and of joints, of a robot. The largest one here has some forty."""
+
+MOST_COORDINATES = 90
+"""Largest number of coordinates of all joints. The time to close the loops grows as its square."""
+
 STEPS = 60
-"""At most, to close the loops; one that can be closed takes some ten."""
+"""Largest number of steps to close the loops. Loops that can be closed take some ten."""
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 COORDINATES = {"hinge": 1, "slide": 1, "ball": 3, "weld": 0, "universal": 2, "floating": 6}
-"""Of a joint, by what it is."""
+"""Number of coordinates of each kind of joint."""
 
-KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "fixed": "weld", "floating": "floating"}
-"""Joints by their URDF type."""
+KINDS = {
+    "revolute": "hinge",
+    "continuous": "hinge",
+    "prismatic": "slide",
+    "fixed": "weld",
+    "floating": "floating",
+}
+"""Kinds of joints by their URDF type."""
 
 
 @dataclass(frozen=True)
 class _Joint:
-    """A joint of the tree: its frame in that of the parent (4, 4), and axes (2, 3) in its own."""
+    """Joint of the tree: its frame in that of the parent (4, 4), and axes (2, 3) in its own."""
 
     name: str
     kind: str
@@ -52,7 +72,7 @@ class _Joint:
     span: tuple[float, float] | None
 
     def moved(self, q: np.ndarray) -> np.ndarray:
-        """The child's frame in that of the parent (4, 4) at the joint's coordinates."""
+        """Frame of the child in that of the parent (4, 4) at the joint's coordinates."""
         own = np.eye(4)
         if self.kind in ("ball", "floating"):
             own[:3, :3] = Rotation.from_rotvec(q[-3:]).as_matrix()
@@ -66,15 +86,14 @@ class _Joint:
 
 
 def robot_of_urdf(path: str | Path, closures: str | Path) -> tuple[RobotDescription, list[str]]:
-    """The robot in a URDF file and a YAML file of its closures, and what a reader of it should know.
+    """Robot in a URDF file and a YAML file of its closures, and remarks on the files.
 
-    Raises RobotFileError: a file that cannot be read, loops that do not close, or none of the known kinds.
+    Raises RobotFileError for a file that cannot be read, for loops that do not close, and for legs
+    of no known kind.
     """
     settings = _closures(closures)
-    try:
-        root = Xml.parse(path).getroot()
-    except (OSError, Xml.ParseError) as error:
-        raise RobotFileError(f"cannot read {path}: {error}") from None
+    content = read_bytes(path, str(path), RobotFileError, LARGEST_XML)
+    root = parse_xml(content, str(path), RobotFileError)
     try:
         return recognised(_mechanism(root, settings))
     except RobotFileError as error:
@@ -82,34 +101,61 @@ def robot_of_urdf(path: str | Path, closures: str | Path) -> tuple[RobotDescript
 
 
 def _closures(path: str | Path) -> dict[str, list[Any]]:
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise RobotFileError(f"cannot read {path}: {' '.join(str(error).split())}") from None
-    if not isinstance(content, Mapping) or "closed_loop" not in content or "name_mot" not in content:
-        raise RobotFileError(f"{path} needs closed_loop and name_mot, lists of names; got {shown(content)}")
+    """Settings of the YAML file. Raises RobotFileError."""
+    data = read_bytes(path, str(path), RobotFileError, LARGEST_YAML)
+    content = parse_yaml(data, str(path), RobotFileError)
+    if (
+        not isinstance(content, Mapping)
+        or "closed_loop" not in content
+        or "name_mot" not in content
+    ):
+        raise RobotFileError(
+            f"{path} needs closed_loop and name_mot, lists of names; got {shown(content)}"
+        )
     for key, value in content.items():
         if key not in KEYS or not isinstance(value, list):
             raise RobotFileError(f"{path}: {key} is unknown or no list; valid: {', '.join(KEYS)}")
     settings = {key: list(content.get(key, [])) for key in KEYS}
+    for key in ("type", "name_mot", "joint_name", "joint_type"):
+        for one in settings[key]:
+            if not isinstance(one, str):
+                raise RobotFileError(f"{path}: {key} has {shown(one)}, must be a list of names")
+    for key in ("name_mot", "joint_name"):
+        _require_once(settings[key], f"{path}: {key}")
     settings["type"] = settings["type"] or ["6d"] * len(settings["closed_loop"])
     for first, second in (("closed_loop", "type"), ("joint_name", "joint_type")):
         if len(settings[first]) != len(settings[second]):
-            raise RobotFileError(f"{path}: {len(settings[first])} {first}, but {len(settings[second])} {second}")
+            raise RobotFileError(
+                f"{path}: {len(settings[first])} {first}, but {len(settings[second])} {second}"
+            )
     return settings
 
 
+def _require_once(names: list[str], what: str) -> None:
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise RobotFileError(f"{what} has {shown(twice[0])} more than once")
+
+
 def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
+    """Mechanism of the files."""
+    elements = {kind: root.findall(kind) for kind in ("link", "joint")}
+    for kind, found in elements.items():
+        if len(found) > MOST:
+            raise RobotFileError(f"it has {len(found)} elements {kind}, a robot has at most {MOST}")
+        _require_once([str(element.get("name")) for element in found], f"the name of a {kind}")
     others = dict(zip(settings["joint_name"], settings["joint_type"], strict=True))
-    joints = [_joint(element, others.get(element.get("name"))) for element in root.findall("joint")]
-    links = {str(element.get("name")): element for element in root.findall("link")}
+    joints = [_joint(element, others.get(element.get("name"))) for element in elements["joint"]]
+    links = {str(element.get("name")): element for element in elements["link"]}
     ordered = _from_the_root(links, joints)
     base = ordered[0].parent if ordered else ""
     frames = {joint.name: joint.child for joint in joints} | {name: name for name in links}
     loops = []
     for pair, kind in zip(settings["closed_loop"], settings["type"], strict=True):
         if not (isinstance(pair, list) and len(pair) == 2 and all(name in frames for name in pair)):
-            raise RobotFileError(f"closed_loop {pair} must be two names of links or joints of the URDF")
+            raise RobotFileError(
+                f"closed_loop {pair} must be two names of links or joints of the URDF"
+            )
         if str(kind).lower() not in ("3d", "6d"):
             raise RobotFileError(f"type {kind!r} of closed_loop {pair} is unknown; valid: 3d, 6d")
         loops.append((frames[pair[0]], frames[pair[1]], str(kind).lower() == "6d"))
@@ -117,14 +163,20 @@ def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
         if name not in {joint.name for joint in joints if joint.kind in ("hinge", "slide")}:
             raise RobotFileError(f"name_mot {name} is no joint of the URDF that turns or slides")
     q = _closed(base, ordered, loops)
-    place, slices = _placed(base, ordered, q), _slices(ordered)
+    place = _placed(base, ordered, q)
+    slices = _slices(ordered)
     number = {name: k for k, name in enumerate([base, *(joint.child for joint in ordered)])}
     motors = {name: k for k, name in enumerate(settings["name_mot"])}
     connections = [
         Connection(
             number[joint.parent],
             number[joint.child],
-            _freedoms(joint, place[joint.parent] @ joint.place, q[slices[joint.name]], motors.get(joint.name)),
+            _freedoms(
+                joint,
+                place[joint.parent] @ joint.place,
+                q[slices[joint.name]],
+                motors.get(joint.name),
+            ),
         )
         for joint in ordered
         if joint.kind != "floating"
@@ -138,15 +190,28 @@ def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
 
 
 def _joint(element: Xml.Element, other: str | None) -> _Joint:
-    name, kind = str(element.get("name")), str(element.get("type"))
+    """Joint of an element."""
+    name = str(element.get("name"))
+    kind = str(element.get("type"))
     if kind not in KINDS or element.find("mimic") is not None:
-        raise RobotFileError(f"joint {name} is of type {kind} or mimics another; valid: {', '.join(KINDS)}")
-    own, axes = KINDS[kind], np.array([_numbers(element, "axis", "xyz", (1.0, 0.0, 0.0)), np.zeros(3)])
-    if other is not None and other.startswith("UJOINT_") and set(other[7:]) <= set("XYZ") and len(other) == 9:
-        own, axes = "universal", np.array([np.eye(3)["XYZ".index(letter)] for letter in other[7:]])
+        raise RobotFileError(
+            f"joint {name} is of type {kind} or mimics another; valid: {', '.join(KINDS)}"
+        )
+    own = KINDS[kind]
+    axes = np.array([_numbers(element, "axis", "xyz", (1.0, 0.0, 0.0)), np.zeros(3)])
+    if (
+        other is not None
+        and other.startswith("UJOINT_")
+        and set(other[7:]) <= set("XYZ")
+        and len(other) == 9
+    ):
+        own = "universal"
+        axes = np.array([np.eye(3)["XYZ".index(letter)] for letter in other[7:]])
     elif other is not None:
         if other not in ("SPHERICAL", "FIXED"):
-            raise RobotFileError(f"joint_type {other} of {name} is unknown; valid: SPHERICAL, FIXED, UJOINT_XY")
+            raise RobotFileError(
+                f"joint_type {other} of {name} is unknown; valid: SPHERICAL, FIXED, UJOINT_XY"
+            )
         own = {"SPHERICAL": "ball", "FIXED": "weld"}[other]
     length = np.linalg.norm(axes[0])
     if own in ("hinge", "slide") and not length > 0:
@@ -155,91 +220,129 @@ def _joint(element: Xml.Element, other: str | None) -> _Joint:
     if any(end is None or end.get("link") is None for end in ends):
         raise RobotFileError(f"joint {name} needs parent and child")
     friction = (_number(element, "dynamics", "friction"), _number(element, "dynamics", "damping"))
-    limit, span = element.find("limit"), None
+    limit = element.find("limit")
+    span = None
     if kind != "continuous" and limit is not None and limit.get("lower") and limit.get("upper"):
         span = (_number(element, "limit", "lower"), _number(element, "limit", "upper"))
     parent, child = (str(end.get("link")) for end in ends if end is not None)
-    return _Joint(name, own, parent, child, _origin(element), axes / max(length, 1e-300), friction, span)
+    return _Joint(
+        name, own, parent, child, _origin(element), axes / max(length, 1e-300), friction, span
+    )
 
 
 def _from_the_root(links: Mapping[str, Xml.Element], joints: list[_Joint]) -> list[_Joint]:
-    """The joints so that each comes behind that of its parent. Raises RobotFileError where they make no tree."""
+    """Joints in an order in which each is after that of its parent.
+
+    Raises RobotFileError where they make no tree.
+    """
     children = [joint.child for joint in joints]
     roots = [name for name in links if name not in children]
-    missing = sorted({name for joint in joints for name in (joint.parent, joint.child)} - set(links))
+    missing = sorted(
+        {name for joint in joints for name in (joint.parent, joint.child)} - set(links)
+    )
     if len(roots) != 1 or missing or len(set(children)) != len(children):
         raise RobotFileError(
-            f"the URDF is no tree: roots {', '.join(roots) or 'none'}, unknown links {', '.join(missing) or 'none'}"
+            f"the URDF is no tree: roots {', '.join(roots) or 'none'}, unknown links "
+            f"{', '.join(missing) or 'none'}"
         )
+    below: dict[str, list[int]] = {}
+    for k, joint in enumerate(joints):
+        below.setdefault(joint.parent, []).append(k)
     ordered: list[_Joint] = []
-    known, left = {roots[0]}, list(joints)
-    while left:
-        found = next((joint for joint in left if joint.parent in known), None)
-        if found is None:
-            raise RobotFileError(f"the URDF is no tree: {left[0].child} hangs on itself")
-        ordered.append(found)
-        known.add(found.child)
-        left.remove(found)
+    # a heap, so that of the joints that can come next, the first one in the file does
+    next_ones = list(below.get(roots[0], ()))
+    while next_ones:
+        joint = joints[heappop(next_ones)]
+        ordered.append(joint)
+        for k in below.get(joint.child, ()):
+            heappush(next_ones, k)
+    if len(ordered) < len(joints):
+        raise RobotFileError("the URDF is no tree: some links hang on themselves")
     return ordered
 
 
 def _placed(base: str, joints: list[_Joint], q: np.ndarray) -> dict[str, np.ndarray]:
-    """base_from_link (4, 4) of all links."""
-    place, slices = {base: np.eye(4)}, _slices(joints)
+    """Frames base_from_link (4, 4) of all links."""
+    place = {base: np.eye(4)}
+    slices = _slices(joints)
     for joint in joints:
         place[joint.child] = place[joint.parent] @ joint.moved(q[slices[joint.name]])
     return place
 
 
 def _slices(joints: list[_Joint]) -> dict[str, slice]:
-    """Where the coordinates of each joint stand."""
+    """Places of the coordinates of each joint."""
     ends = np.cumsum([COORDINATES[joint.kind] for joint in joints]).tolist()
-    return {joint.name: slice(end - COORDINATES[joint.kind], end) for joint, end in zip(joints, ends, strict=True)}
+    return {
+        joint.name: slice(end - COORDINATES[joint.kind], end)
+        for joint, end in zip(joints, ends, strict=True)
+    }
 
 
 def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]]) -> np.ndarray:
-    """Coordinates at which all loops are closed. Raises RobotFileError, with the gap, where none are found."""
+    """Coordinates at which all loops are closed. Raises RobotFileError, with the gap."""
 
     def gaps(q: np.ndarray) -> np.ndarray:
-        place, found = _placed(base, joints, q), [np.zeros(1)]
+        place = _placed(base, joints, q)
+        found = [np.zeros(1)]
         for a, b, welded in loops:
             found.append(place[a][:3, 3] - place[b][:3, 3])
             if welded:
-                found.append(Rotation.from_matrix(place[a][:3, :3].T @ place[b][:3, :3]).as_rotvec())
+                found.append(
+                    Rotation.from_matrix(place[a][:3, :3].T @ place[b][:3, :3]).as_rotvec()
+                )
         return np.concatenate(found)
 
     q = np.zeros(sum(COORDINATES[joint.kind] for joint in joints))
+    if len(q) > MOST_COORDINATES:
+        raise RobotFileError(
+            f"its joints have {len(q)} coordinates, a robot has at most {MOST_COORDINATES}"
+        )
     if np.abs(gaps(q)).max() > SAME**2:
         q = least_squares(gaps, q, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=STEPS).x
     worst = float(np.abs(gaps(q)).max())
     if worst > SAME:
-        raise RobotFileError(f"the loops do not close: {worst:.3g} m or rad are left, must be below {SAME:g}")
+        raise RobotFileError(
+            f"the loops do not close: {worst:.3g} m or rad are left, must be below {SAME:g}"
+        )
     return q
 
 
-def _freedoms(joint: _Joint, at: np.ndarray, q: np.ndarray, actuator: int | None) -> tuple[Freedom, ...]:
-    """Elementary joints of a joint whose frame is at a place (4, 4) in the base, at its coordinates."""
-    point, turn = at[:3, 3], at[:3, :3]
+def _freedoms(
+    joint: _Joint, at: np.ndarray, q: np.ndarray, actuator: int | None
+) -> tuple[Freedom, ...]:
+    """Elementary joints of a joint whose frame is at (4, 4) in the base, at its coordinates."""
+    point = at[:3, 3]
+    turn = at[:3, :3]
     first = turn @ joint.axes[0]
     if joint.kind == "ball":
         return (Freedom("ball", joint.name, point, np.full(3, np.nan), friction=joint.friction),)
     if joint.kind == "universal":
         second = turn @ Rotation.from_rotvec(q[0] * joint.axes[0]).apply(joint.axes[1])
         both = zip("12", (first, second), strict=True)
-        return tuple(Freedom("hinge", f"{joint.name} {k}", point, axis, friction=joint.friction) for k, axis in both)
+        return tuple(
+            Freedom("hinge", f"{joint.name} {k}", point, axis, friction=joint.friction)
+            for k, axis in both
+        )
     if joint.kind == "weld":
         return ()
     return (Freedom(joint.kind, joint.name, point, first, float(q[0]), joint.friction, actuator),)
 
 
 def _solid(link: Xml.Element, place: np.ndarray) -> Solid:
-    """A link; one without inertial has no mass. What is drawn of it is the first cylinder that shows it."""
-    name, axes, inertial = str(link.get("name")), place[:3, :3], link.find("inertial")
+    """Body of a link. A link without inertial has no mass.
+
+    What is drawn of it is the first cylinder among its visuals.
+    """
+    name = str(link.get("name"))
+    axes = place[:3, :3]
+    inertial = link.find("inertial")
     shape = link.find("visual/geometry/cylinder")
     rod = None if shape is None else (_float(shape, "length"), _float(shape, "radius"))
     if inertial is None:
         return Solid(name, 0.0, place[:3, 3], np.zeros((3, 3)), axes, rod)
-    own, tensor = place @ _origin(inertial), inertial.find("inertia")
+    own = place @ _origin(inertial)
+    tensor = inertial.find("inertia")
     if tensor is None:
         raise RobotFileError(f"link {name} has an inertial without inertia")
     rows = [[_float(tensor, f"i{min(a, b)}{max(a, b)}") for b in "xyz"] for a in "xyz"]
@@ -248,13 +351,16 @@ def _solid(link: Xml.Element, place: np.ndarray) -> Solid:
 
 
 def _origin(element: Xml.Element) -> np.ndarray:
+    """Frame (4, 4) of an origin."""
     place = np.eye(4)
     turn = Rotation.from_euler("xyz", _numbers(element, "origin", "rpy", (0.0, 0.0, 0.0)))
-    place[:3, :3], place[:3, 3] = turn.as_matrix(), _numbers(element, "origin", "xyz", (0.0, 0.0, 0.0))
+    place[:3, :3] = turn.as_matrix()
+    place[:3, 3] = _numbers(element, "origin", "xyz", (0.0, 0.0, 0.0))
     return place
 
 
 def _numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...]) -> np.ndarray:
+    """Numbers of an attribute."""
     found = element.find(tag)
     text = None if found is None else found.get(key)
     if text is None:
@@ -264,18 +370,25 @@ def _numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...
     except ValueError:
         numbers = np.zeros(0)
     if len(numbers) != len(default) or not np.isfinite(numbers).all():
-        raise RobotFileError(f"{element.get('name') or tag}: {tag} {key} is {text!r}, must be 3 numbers")
+        raise RobotFileError(
+            f"{element.get('name') or tag}: {tag} {key} is {text!r}, must be 3 numbers"
+        )
     return numbers
 
 
 def _number(element: Xml.Element, tag: str, key: str) -> float:
+    """Number of an attribute."""
     found = element.find(tag)
     return 0.0 if found is None else _float(found, key)
 
 
 def _float(element: Xml.Element, key: str) -> float:
+    """Finite number of a text. Raises RobotFileError."""
     text = element.get(key, "0")
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
-        raise RobotFileError(f"{element.tag} {key} is {text!r}, must be a number") from None
+        number = np.nan
+    if not np.isfinite(number):
+        raise RobotFileError(f"{element.tag} {key} is {text!r}, must be a finite number")
+    return number

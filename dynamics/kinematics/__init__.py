@@ -1,1 +1,1 @@
-"""Kinematics of the platform: its coordinates and their rates, the motion of its joints, forward kinematics."""
+"""Kinematics of the platform: coordinates and their rates, motion of its joints, closed loops."""

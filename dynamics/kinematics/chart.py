@@ -1,7 +1,8 @@
-"""Charts: the coordinates of a platform, as many as it has freedoms, and the pose that they mean.
+"""Charts: coordinates of a platform, one for each of its freedoms, and the pose that they mean.
 
-A pose has six entries [x y z alpha beta gamma] (eq. 1) for every robot; the coordinates of a platform with fewer
-freedoms are those of them that it can change, and the others stay what they are at home.
+A pose has the six entries [x y z alpha beta gamma] (eq. 1) for every robot. The coordinates of a
+platform with fewer freedoms are the entries that it can change. The others stay as they are at
+home.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ FREEDOMS = {"free": (0, 1, 2, 3, 4, 5), "translation": (0, 1, 2), "planar": (0, 
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart by its name, for a robot that is at `home` (a pose as six numbers)."""
+    """Chart of a name, for a robot whose pose at home is `home` (six numbers)."""
 
     name: str
     home: tuple[float, ...]
@@ -40,7 +41,10 @@ class Chart:
 
     @property
     def basis(self) -> np.ndarray:
-        """d(pose)/d(coordinates) (6, n), which also spans the twists: rotations are about base axes in every chart."""
+        """Derivative d(pose)/d(coordinates) (6, n), which also spans the twists.
+
+        Rotations are about the axes of the base in every chart.
+        """
         return np.eye(6)[:, list(self.freedoms)]
 
     def pose(self, coordinates: ArrayLike) -> np.ndarray:
@@ -55,17 +59,29 @@ class Chart:
         return poses
 
     def coordinates(self, pose: ArrayLike) -> np.ndarray:
-        """Coordinates (n,) or (N, n) of poses (6,) or (N, 6); what the platform cannot change is not asked for."""
+        """Coordinates (n,) or (N, n) of poses (6,) or (N, 6).
+
+        The entries that the platform cannot change are ignored.
+        """
         values = np.asarray(pose, dtype=float)
-        return values.copy() if len(self.freedoms) == len(POSE_NAMES) else values[..., list(self.freedoms)]
+        return (
+            values.copy()
+            if len(self.freedoms) == len(POSE_NAMES)
+            else values[..., list(self.freedoms)]
+        )
 
     def projected(self, rows: np.ndarray) -> np.ndarray:
-        """What rows (..., 6, k), one for each entry of the twist, say of the coordinates (..., n, k), basis.T @ rows:
-        the same if n is 6."""
+        """Rows (..., n, k) of the coordinates from rows (..., 6, k) of the twist: basis.T @ rows.
+
+        The same array if n is 6.
+        """
         return rows if len(self.freedoms) == len(POSE_NAMES) else rows[..., list(self.freedoms), :]
 
     def lifted(self, values: np.ndarray, axis: int = -1) -> np.ndarray:
-        """Rates or derivatives of coordinates, along an axis of length m, as those of poses; the same if m is 6."""
+        """Values of poses from values of coordinates, along an axis of length m.
+
+        Values are rates or derivatives. The same array if m is 6.
+        """
         if len(self.freedoms) == len(POSE_NAMES):
             return values
         rows = np.moveaxis(values, axis, -1)
@@ -74,7 +90,7 @@ class Chart:
         return np.moveaxis(lifted, -1, axis)
 
     def forbidden(self, pose: ArrayLike) -> np.ndarray:
-        """How far poses (N, 6) are from those that the platform can take, in each entry, m and rad."""
+        """Part of poses (N, 6) that the platform cannot have, in each entry, m and rad."""
         values = np.asarray(pose, dtype=float)
         if len(self.freedoms) == len(POSE_NAMES):
             return np.zeros(values.shape)

@@ -1,7 +1,7 @@
-"""The platform's coordinates and what moves with them, in CasADi: rotation, twist, and the joints A of the legs.
+"""Motion of the platform in CasADi: rotation, twist, and the joints A of the legs.
 
-The coordinates are the pose [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta) Rz(gamma) (eq. 1); eq. 2, 29 and 38
-turn their rates into a twist [h_dot, omega]. A platform with fewer freedoms would have its chart here. Base axes; SI.
+The pose is [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta) Rz(gamma) (eq. 1). Eq. 2, 29 and 38
+turn its rates into a twist [h_dot, omega]. Vectors are in the axes of the base, in SI units.
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,13 @@ from scipy.spatial.transform import Rotation
 
 
 def rotation_matrix(angles: ca.SX) -> ca.SX:
-    """Base-from-platform rotation (3, 3) of the Euler angles [alpha, beta, gamma] in rad (eq. 1)."""
-    ca_, cb, cg = ca.cos(angles[0]), ca.cos(angles[1]), ca.cos(angles[2])
-    sa, sb, sg = ca.sin(angles[0]), ca.sin(angles[1]), ca.sin(angles[2])
+    """Base-from-platform rotation (3, 3) of Euler angles [alpha, beta, gamma], rad (eq. 1)."""
+    ca_ = ca.cos(angles[0])
+    cb = ca.cos(angles[1])
+    cg = ca.cos(angles[2])
+    sa = ca.sin(angles[0])
+    sb = ca.sin(angles[1])
+    sg = ca.sin(angles[2])
     return ca.vertcat(
         ca.horzcat(cb * cg, -cb * sg, sb),
         ca.horzcat(ca_ * sg + cg * sb * sa, ca_ * cg - sb * sa * sg, -cb * sa),
@@ -23,8 +27,9 @@ def rotation_matrix(angles: ca.SX) -> ca.SX:
 
 
 def pose_rate_to_twist(pose: ca.SX) -> ca.SX:
-    """T (6, 6): twist [h_dot, omega] = T pose_dot; the block-diagonal matrix of eq. 29, with J_e of eq. 2."""
-    alpha, beta = pose[3], pose[4]
+    """Matrix T (6, 6) of eq. 29, with twist = T pose_dot and J_e of eq. 2."""
+    alpha = pose[3]
+    beta = pose[4]
     euler_rate_jacobian = ca.vertcat(
         ca.horzcat(1, 0, ca.sin(beta)),
         ca.horzcat(0, ca.cos(alpha), -ca.cos(beta) * ca.sin(alpha)),
@@ -34,9 +39,14 @@ def pose_rate_to_twist(pose: ca.SX) -> ca.SX:
 
 
 def twist_bias(pose: ca.SX, pose_rate: ca.SX) -> ca.SX:
-    """T_dot pose_dot (6,): what twist_dot holds when the pose acceleration is zero (eq. 38)."""
-    ca_, cb, sa, sb = ca.cos(pose[3]), ca.cos(pose[4]), ca.sin(pose[3]), ca.sin(pose[4])
-    da, db, dg = pose_rate[3], pose_rate[4], pose_rate[5]
+    """Vector T_dot pose_dot (6,), which is twist_dot at a pose acceleration of zero (eq. 38)."""
+    ca_ = ca.cos(pose[3])
+    cb = ca.cos(pose[4])
+    sa = ca.sin(pose[3])
+    sb = ca.sin(pose[4])
+    da = pose_rate[3]
+    db = pose_rate[4]
+    dg = pose_rate[5]
     return ca.vertcat(
         ca.SX.zeros(3),
         db * dg * cb,
@@ -46,23 +56,35 @@ def twist_bias(pose: ca.SX, pose_rate: ca.SX) -> ca.SX:
 
 
 def joint_motion(arm: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Velocity and acceleration (3,) of a platform joint A at `arm` (3,) from the platform origin."""
-    omega, omega_dot = twist[3:6], twist_dot[3:6]
+    """Velocity and acceleration (3,) of a platform joint A at `arm` (3,) from the platform
+    origin.
+    """
+    omega = twist[3:6]
+    omega_dot = twist_dot[3:6]
     velocity = twist[0:3] + ca.cross(omega, arm)
-    return velocity, twist_dot[0:3] + ca.cross(omega_dot, arm) + ca.cross(omega, ca.cross(omega, arm))
+    return velocity, twist_dot[0:3] + ca.cross(omega_dot, arm) + ca.cross(
+        omega, ca.cross(omega, arm)
+    )
 
 
 class PlatformJointMotion:
-    """Motion of the joints A (N, 3), m, platform axes, for a pose q (6,), rate and acceleration (6,).
+    """Motion of the joints A (N, 3), m, platform axes, for a pose q, rate and acceleration (6,).
 
-    Lists over the legs: position, velocity, acceleration (3,); gradient dA/dq = d(velocity)/d(rate) (3, 6);
-    gradient_rate d(velocity)/dq (3, 6); acceleration_by_pose d(acceleration)/dq (3, 6).
-    d(acceleration)/d(rate) is twice gradient_rate. Pose, rate and acceleration (`gain`) are symbols.
+    Lists over the legs: position, velocity, acceleration (3,). gradient dA/dq = d(velocity)/d(rate)
+    (3, 6). gradient_rate d(velocity)/dq (3, 6). acceleration_by_pose d(acceleration)/dq (3, 6). The
+    derivative d(acceleration)/d(rate) is twice gradient_rate. Pose, rate and acceleration (`gain`)
+    are symbols.
     """
 
-    def __init__(self, joints: Sequence[ca.SX] | np.ndarray, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> None:
-        self.pose, self.rate, self.gain = pose, rate, acceleration
-        angles, spin, spin_rate = pose[3:6], rate[3:6], acceleration[3:6]
+    def __init__(
+        self, joints: Sequence[ca.SX] | np.ndarray, pose: ca.SX, rate: ca.SX, acceleration: ca.SX
+    ) -> None:
+        self.pose = pose
+        self.rate = rate
+        self.gain = acceleration
+        angles = pose[3:6]
+        spin = rate[3:6]
+        spin_rate = acceleration[3:6]
         rotation = rotation_matrix(angles)
         first = _by_angles(rotation, angles)
         self._second = [_by_angles(matrix, angles) for matrix in first]
@@ -73,18 +95,28 @@ class PlatformJointMotion:
         self.position = [pose[0:3] + rotation @ arm for arm in arms]
         self.velocity = [rate[0:3] + _combine(first, spin) @ arm for arm in arms]
         self.acceleration = [acceleration[0:3] + rotation_second_rate @ arm for arm in arms]
-        self.gradient = [ca.horzcat(ca.SX.eye(3), *[matrix @ arm for matrix in first]) for arm in arms]
-        self.gradient_rate = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in first_rate]) for arm in arms]
-        self.acceleration_by_pose = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in third]) for arm in arms]
+        self.gradient = [
+            ca.horzcat(ca.SX.eye(3), *[matrix @ arm for matrix in first]) for arm in arms
+        ]
+        self.gradient_rate = [
+            ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in first_rate]) for arm in arms
+        ]
+        self.acceleration_by_pose = [
+            ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in third]) for arm in arms
+        ]
 
     def of(self, leg: int) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Position, velocity and acceleration (3,) of the joint of one leg."""
         return self.position[leg], self.velocity[leg], self.acceleration[leg]
 
     def curvature(self, leg: int, force: ca.SX) -> ca.SX:
-        """d(gradient^T force)/dq (6, 6) for a force (3,) held constant at the joint of one leg."""
+        """Derivative d(gradient^T force)/dq (6, 6) for a constant force (3,) at the joint of a
+        leg.
+        """
         arm = self._arms[leg]
-        rows = [ca.horzcat(*[ca.dot(force, matrix @ arm) for matrix in row]) for row in self._second]
+        rows = [
+            ca.horzcat(*[ca.dot(force, matrix @ arm) for matrix in row]) for row in self._second
+        ]
         return ca.diagcat(ca.SX.zeros(3, 3), ca.vertcat(*rows))
 
 

@@ -1,7 +1,8 @@
-"""Kinds of legs: what a leg does as a function of the motion of its platform joint A alone.
+"""Kinds of legs, as functions of the motion of their platform joint A alone.
 
-A kind has its geometry, the kinematics of its bodies, and with those its dynamics (`leg.Leg`). RSS is the one of the
-paper's robot. All that knows which leg it is stands in this room and in robot files.
+A kind has its geometry and the kinematics of its bodies, from which its dynamics follow
+(`leg.Leg`). RSS is the kind of the paper's robot. Everything that depends on the kind of a leg is
+in this room and in robot files.
 """
 
 from dynamics.legs.leg import Leg

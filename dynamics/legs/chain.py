@@ -1,4 +1,4 @@
-"""Which kind of leg a chain of joints is, as other programs describe it: its joints at home, from the base to A."""
+"""Kind of leg of a chain of joints at home, as other programs describe it, from the base to A."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,17 +16,18 @@ from dynamics.legs.rus import RusLeg
 from dynamics.legs.ups import UpsLeg
 
 SAME = 1e-6
-"""Angles (rad) and distances (m) below it are those of numbers that were written with few digits."""
+"""Angles, rad, and distances, m, below which numbers with few digits are equal."""
 
 
 class Chain(NamedTuple):
-    """Joints of a leg at home, base axes, m.
+    """Joints of a leg at home, in the axes of the base, m.
 
-    joints: their kinds (k), "hinge", "slide", "universal" or "ball", with * behind the actuated one; points (k, 3):
-    where they are, the last one A, and of two bars side by side the middle; axes (k, 2, 3): the axis, and of a
-    universal joint its second; coordinate: of the actuated joint; platform_joint: A in platform axes; across (3,): from
-    the first of two bars to the second, zero where there is one; centres (k - 1, 3): centres of mass of the bodies;
-    rods: what is drawn of them, length and radius, None where unknown.
+    joints: their kinds (k), "hinge", "slide", "universal" or "ball", with * after the actuated one.
+    points (k, 3): their places. The last one is A, or the middle of two bars side by side. axes (k,
+    2, 3): the axis, and the second axis of a universal joint. coordinate: that of the actuated
+    joint. platform_joint: A in platform axes. across (3,): from the first of two bars to the
+    second, or zero. centres (k - 1, 3): centres of mass of the bodies. rods: length and radius that
+    are drawn of them, or None.
     """
 
     joints: tuple[str, ...]
@@ -40,25 +41,32 @@ class Chain(NamedTuple):
 
     @property
     def signature(self) -> str:
-        """The joints in words."""
+        """Joints as text."""
         first, *others = self.joints
         return f"{first} 2 x ({' '.join(others)})" if self.across.any() else " ".join(self.joints)
 
 
 def leg_of(chain: Chain) -> Leg:
-    """The leg that has these joints, with the solution of its inverse kinematics that is assembled.
+    """Leg with these joints, in the assembly that they are in.
 
-    Raises RobotFileError, with the kinds there are, for joints that make none, and where they do not stand as they do
-    in that kind, with the number.
+    Raises RobotFileError, with the kinds that there are, for joints that make no kind. Raises it
+    with the number for joints that do not stand as they do in their kind.
     """
     if chain.signature not in SIGNATURES:
-        kinds = ", ".join(f"{one.model_fields['type'].default} = {text}" for text, (one, _) in SIGNATURES.items())
-        raise RobotFileError(f"its joints, {chain.signature}, make no kind of leg (*: actuated); kinds: {kinds}")
+        kinds = ", ".join(
+            f"{one.model_fields['type'].default} = {text}" for text, (one, _) in SIGNATURES.items()
+        )
+        raise RobotFileError(
+            f"its joints, {chain.signature}, make no kind of leg (*: actuated); kinds: {kinds}"
+        )
     kind, fields = SIGNATURES[chain.signature]
     try:
         leg = kind.model_validate(fields(chain) | {"platform_joint": chain.platform_joint})
     except ValidationError as error:
-        said = [f"{'.'.join(map(str, item['loc']))} = {item['input']}: {item['msg']}" for item in error.errors()]
+        said = [
+            f"{'.'.join(map(str, item['loc']))} = {item['input']}: {item['msg']}"
+            for item in error.errors()
+        ]
         raise RobotFileError("; ".join(said)) from None
     branches: list[Leg] = [leg.model_copy(update={"branch": sign}) for sign in (1, -1)]
     off = [float(each.coordinate(ca.SX(chain.points[-1]))) - chain.coordinate for each in branches]
@@ -66,17 +74,23 @@ def leg_of(chain: Chain) -> Leg:
         off = [(value + np.pi) % (2 * np.pi) - np.pi for value in off]
     best = int(np.argmin(np.nan_to_num(np.abs(off), nan=np.inf)))
     if not abs(off[best]) < SAME:
-        raise RobotFileError(f"its coordinate at home, {chain.coordinate:g}, is {off[best]:.3g} from what it should be")
+        raise RobotFileError(
+            f"its coordinate at home, {chain.coordinate:g}, is {off[best]:.3g} from what it "
+            "should be"
+        )
     return branches[best]
 
 
 def _cranked(chain: Chain) -> dict[str, Any]:
-    """A crank, and a link that begins at its tip."""
-    tip, axis = chain.points[1], chain.axes[0, 0]
+    """Fields of a crank with a link that begins at its tip."""
+    tip = chain.points[1]
+    axis = chain.axes[0, 0]
     base = chain.points[0] + ((tip - chain.points[0]) @ axis) * axis
     length = float(np.linalg.norm(tip - base))
     if length < SAME:
-        raise RobotFileError(f"its crank is {length:.3g} m long: its first two joints are on one axis")
+        raise RobotFileError(
+            f"its crank is {length:.3g} m long: its first two joints are on one axis"
+        )
     zero = Rotation.from_rotvec(-chain.coordinate * axis).apply((tip - base) / length)
     zero -= (zero @ axis) * axis
     return {
@@ -90,27 +104,34 @@ def _cranked(chain: Chain) -> dict[str, Any]:
 
 
 def _with_universal_joint(chain: Chain) -> dict[str, Any]:
-    _same_line("the first axis of its universal joint", chain.axes[1, 0], "the crank's", chain.axes[0, 0])
+    """Fields of a crank with a link on a universal joint."""
+    _same_line(
+        "the first axis of its universal joint", chain.axes[1, 0], "the crank's", chain.axes[0, 0]
+    )
     _second_axis_across(chain, 1)
     return _cranked(chain)
 
 
 def _parallelogram(chain: Chain) -> dict[str, Any]:
+    """Fields of a crank with two bars."""
     _same_line("the line from bar to bar", chain.across, "the crank's axis", chain.axes[0, 0])
     return _cranked(chain) | {"bar_distance": float(np.linalg.norm(chain.across))}
 
 
 def _planar(chain: Chain) -> dict[str, Any]:
-    """Hinges along one direction; where on their axes they are said to be does not matter."""
+    """Fields of hinges along one direction. Their places along their axes do not matter."""
     axis = chain.axes[0, 0]
     for joint, name in enumerate(chain.joints):
         if name == "hinge":
-            _same_line(f"the axis of its joint {joint + 1}", chain.axes[joint, 0], "the crank's axis", axis)
+            _same_line(
+                f"the axis of its joint {joint + 1}", chain.axes[joint, 0], "the crank's axis", axis
+            )
     flat = chain.points - np.outer((chain.points - chain.points[-1]) @ axis, axis)
     return _cranked(chain._replace(points=flat))
 
 
 def _sliding(chain: Chain) -> dict[str, Any]:
+    """Fields of a slider with a link."""
     slider, end = chain.points[1:3]
     fields = {
         "base_joint": slider - chain.coordinate * chain.axes[0, 0],
@@ -127,13 +148,18 @@ def _sliding(chain: Chain) -> dict[str, Any]:
 
 
 def _telescopic(chain: Chain) -> dict[str, Any]:
-    """Cylinder and rod; where the file does not say how long they are, home is at mid-stroke of two equal ones."""
+    """Fields of a cylinder with its rod.
+
+    Where the file has no lengths, home is at mid-stroke of two equal ones.
+    """
     base, _, end = chain.points
     length = float(np.linalg.norm(end - base))
     _same_line("its slide", chain.axes[1, 0], "the line through its ends", end - base)
     _second_axis_across(chain, 0)
     if chain.axes[1, 0] @ (end - base) < 0:
-        raise RobotFileError("its coordinate grows as it gets shorter: turn the axis of its slide round")
+        raise RobotFileError(
+            "its coordinate grows as it gets shorter: turn the axis of its slide round"
+        )
     lengths = [length / 1.5 if rod is None else rod[0] for rod in chain.rods]
     along = (end - base) / length
     return {
@@ -149,23 +175,39 @@ def _telescopic(chain: Chain) -> dict[str, Any]:
 
 
 def _drawn(chain: Chain, *names: str) -> dict[str, float]:
-    return {f"{name}_radius": rod[1] for name, rod in zip(names, chain.rods, strict=True) if rod is not None}
+    """Radii of what is drawn."""
+    return {
+        f"{name}_radius": rod[1]
+        for name, rod in zip(names, chain.rods, strict=True)
+        if rod is not None
+    }
 
 
 def _second_axis_across(chain: Chain, joint: int) -> None:
-    """The body on a universal joint has its length across the second axis of that."""
+    """Raise RobotFileError unless the second axis of a joint is normal to the length of its
+    body.
+    """
     along = chain.points[-1] - chain.points[joint]
     off = float(np.arcsin(np.abs(chain.axes[joint, 1] @ along) / np.linalg.norm(along)))
     if off > SAME:
         raise RobotFileError(
-            f"the second axis of its universal joint is {np.degrees(off):.3g} deg from normal to the body on it"
+            f"the second axis of its universal joint is {np.degrees(off):.3g} deg from normal to "
+            "the body on it"
         )
 
 
 def _same_line(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> None:
-    sine = float(np.linalg.norm(np.cross(direction, other)) / np.linalg.norm(direction) / np.linalg.norm(other))
+    """Raise RobotFileError unless two directions agree."""
+    sine = float(
+        np.linalg.norm(np.cross(direction, other))
+        / np.linalg.norm(direction)
+        / np.linalg.norm(other)
+    )
     if sine > SAME:
-        raise RobotFileError(f"{what} is {np.degrees(np.arcsin(min(sine, 1.0))):.3g} deg from {of}, must be along that")
+        raise RobotFileError(
+            f"{what} is {np.degrees(np.arcsin(min(sine, 1.0))):.3g} deg from {of}, must be along "
+            "that"
+        )
 
 
 SIGNATURES: dict[str, tuple[type[Leg], Callable[[Chain], dict[str, Any]]]] = {
@@ -178,4 +220,4 @@ SIGNATURES: dict[str, tuple[type[Leg], Callable[[Chain], dict[str, Any]]]] = {
     "hinge* hinge hinge": (RrrLeg, _planar),
     "hinge* hinge ball": (RrrLeg, _planar),
 }
-"""Kinds of legs by their joints from the base, with what gives their fields."""
+"""Kinds of legs by their joints from the base, with the function that gives their fields."""

@@ -1,5 +1,7 @@
-"""Legs with a slider on the base (P) and a link from that to A, with spherical joints (S) at both ends, or a universal
-one (U) at the slider. The slider does not turn: of its inertia only the mass does work.
+"""Legs with a slider on the base (P) and a link from the slider to A.
+
+The link has spherical joints (S) at both ends, or a universal joint (U) at the slider. The slider
+does not turn, so that only its mass does work.
 """
 
 from __future__ import annotations
@@ -10,35 +12,60 @@ import casadi as ca
 import numpy as np
 from pydantic import Field
 
-from dynamics.legs.leg import Body, Direction, Leg, Length, Placement, Segment, link_axes, universal_spin
+from dynamics.legs.leg import (
+    Body,
+    Direction,
+    Leg,
+    Length,
+    Placement,
+    Segment,
+    link_axes,
+    universal_spin,
+)
 from dynamics.legs.rss import Z
 
 
 class PssLeg(Leg):
-    """A slider that is at B where its coordinate is zero, and a link from that to the platform joint A.
+    """Slider that is at B where its coordinate is zero, and a link from the slider to A.
 
-    The link does not spin about its length. Its x is normal to the direction of the slider and to its length.
+    The link does not spin about its length. Its x is normal to the direction of the slider and to
+    its length.
     """
 
     bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy")))
     prismatic = True
     numbers = (
-        *("base_joint.x", "base_joint.y", "base_joint.z", "slider_axis.u", "slider_axis.v", "link_length"),
+        *(
+            "base_joint.x",
+            "base_joint.y",
+            "base_joint.z",
+            "slider_axis.u",
+            "slider_axis.v",
+            "link_length",
+        ),
         *("platform_joint.x", "platform_joint.y", "platform_joint.z"),
     )
     turned = ("slider_axis",)
     link_joint: ClassVar[str] = "ball"
 
     type: Literal["pss"] = "pss"
-    slider_axis: Direction = Field(description="where the slider goes as its coordinate grows, unit vector, base axes")
+    slider_axis: Direction = Field(
+        description="where the slider goes as its coordinate grows, unit vector, base axes"
+    )
     link_length: Length = Field(description="from the slider to A, m")
-    slider_length: Length = Field(0.040, description="of the slider as it is drawn and hides stickers, m")
-    slider_radius: Length = Field(0.014, description="of the slider as it is drawn and hides stickers, m")
-    link_radius: Length = Field(0.006, description="of the link as it is drawn and hides stickers, m")
+    slider_length: Length = Field(
+        0.040, description="of the slider as it is drawn and hides stickers, m"
+    )
+    slider_radius: Length = Field(
+        0.014, description="of the slider as it is drawn and hides stickers, m"
+    )
+    link_radius: Length = Field(
+        0.006, description="of the link as it is drawn and hides stickers, m"
+    )
 
     @property
     def across_from(self) -> np.ndarray:
-        """What the link's x is normal to, besides its length (3,)."""
+        """Vector (3,) that the x of the link is normal to, besides its length."""
         return self.slider_axis
 
     def lengths(self) -> str:
@@ -53,7 +80,7 @@ class PssLeg(Leg):
         return along - self.side * root
 
     def link(self, position: ca.SX) -> ca.SX:
-        """From the slider to A (3,), m."""
+        """Vector from the slider to A (3,), m."""
         _, across = self._parts(position)
         root = ca.sqrt(self.link_length**2 - ca.dot(across, across))
         return across + self.side * root * self.slider_axis
@@ -80,7 +107,8 @@ class PssLeg(Leg):
         return link * (1 / ca.dot(link, self.slider_axis))
 
     def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
-        gradient, link_rate = self.gradient(position), self._link_rate(position, velocity)
+        gradient = self.gradient(position)
+        link_rate = self._link_rate(position, velocity)
         # link . A_ddot + |link_dot|^2 = link . slider_axis s_ddot: the link keeps its length.
         stretch = ca.dot(link_rate, link_rate) / ca.dot(self.link(position), self.slider_axis)
         return ca.dot(gradient, acceleration) + stretch
@@ -91,43 +119,69 @@ class PssLeg(Leg):
         return [Placement(position - link, ca.SX.eye(3)), Placement(position - link / 2, axes)]
 
     def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
-        return [ca.SX.zeros(3), self._spin(self.link(position), self._link_rate(position, velocity))]
+        return [
+            ca.SX.zeros(3),
+            self._spin(self.link(position), self._link_rate(position, velocity)),
+        ]
 
     def segments(self) -> list[Segment]:
-        origin, end, half = np.zeros(3), self.link_length * Z, self.slider_length / 2 * self.slider_axis
-        slider, link = np.array([-half, half]), np.array([origin, end])
+        origin = np.zeros(3)
+        end = self.link_length * Z
+        half = self.slider_length / 2 * self.slider_axis
+        slider = np.array([-half, half])
+        link = np.array([origin, end])
         return [
-            Segment("slide", self.slider_axis, self.base_joint, origin, slider, self.slider_radius, actuated=True),
-            Segment(self.link_joint, self.across_from, origin, end / 2, link, self.link_radius, end),
+            Segment(
+                "slide",
+                self.slider_axis,
+                self.base_joint,
+                origin,
+                slider,
+                self.slider_radius,
+                actuated=True,
+            ),
+            Segment(
+                self.link_joint, self.across_from, origin, end / 2, link, self.link_radius, end
+            ),
         ]
 
     def _spin(self, link: ca.SX, link_rate: ca.SX) -> ca.SX:
+        """Angular velocity of the link."""
         return ca.cross(link, link_rate) / self.link_length**2
 
     def _link_rate(self, position: ca.SX, velocity: ca.SX) -> ca.SX:
+        """Time derivative of the link."""
         return velocity - ca.dot(self.gradient(position), velocity) * self.slider_axis
 
     def _parts(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Of B->A: the component along the slider's axis, and what is left across it (3,)."""
-        reach, axis = position - self.base_joint, self.slider_axis
+        """Component of B->A along the slider's axis, and the rest of it (3,)."""
+        reach = position - self.base_joint
+        axis = self.slider_axis
         along = ca.dot(reach, axis)
         return along, reach - along * axis
 
 
 class PusLeg(PssLeg):
-    """A slider, and a link on a universal joint at it, so that the link's spin follows. Its x is normal to the first
-    axis of that joint and to its length."""
+    """Slider with a link on a universal joint, which decides the spin of the link.
+
+    The x of the link is normal to the first axis of that joint and to its length.
+    """
 
     bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy", "Izz")))
     link_joint: ClassVar[str] = "universal"
 
     type: Literal["pus"] = "pus"  # type: ignore[assignment]
-    joint_axis: Direction = Field(description="first axis of the universal joint, unit vector, base axes")
+    joint_axis: Direction = Field(
+        description="first axis of the universal joint, unit vector, base axes"
+    )
 
     @property
     def across_from(self) -> np.ndarray:
-        """What the link's x is normal to, besides its length (3,)."""
+        """Vector (3,) that the x of the link is normal to, besides its length."""
         return self.joint_axis
 
     def _spin(self, link: ca.SX, link_rate: ca.SX) -> ca.SX:
-        return universal_spin(self.joint_axis, link / self.link_length, link_rate / self.link_length)
+        """Angular velocity of the link."""
+        return universal_spin(
+            self.joint_axis, link / self.link_length, link_rate / self.link_length
+        )

@@ -1,9 +1,10 @@
 """RSS leg: a crank on the base (R), and a link between two spherical joints (S).
 
-Inverse kinematics in closed form (eq. 3 and 4), and dynamics with the Jacobians of eq. 5-16; their rates, Appendix A of
-the paper, are automatic derivatives (eq. A5 and A6 as printed are not). The vector a from the platform origin to joint
-A is in base axes throughout (eq. 3 and 5 need R a, though the text defines a in platform axes). Centres of mass are at
-mid-length. Forces follow by virtual work as those of any leg do (`Leg`), here in closed form, which is faster.
+The inverse kinematics is in closed form (eq. 3 and 4). The dynamics uses the Jacobians of eq. 5-16.
+Their rates, Appendix A of the paper, are automatic derivatives, because eq. A5 and A6 are wrong as
+printed. The vector a from the platform origin to joint A is in the axes of the base: eq. 3 and 5
+need R a, though the text defines a in platform axes. Centres of mass are at mid-length. Forces are
+those of virtual work, as for any `Leg`, here in closed form, which is faster.
 """
 
 from __future__ import annotations
@@ -16,15 +17,28 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynamics.expressions import symmetric_from_lower
-from dynamics.legs.leg import EXACT, ROUNDED, Body, Direction, Leg, Length, Placement, Segment, link_axes
+from dynamics.legs.leg import (
+    EXACT,
+    ROUNDED,
+    Body,
+    Direction,
+    Leg,
+    Length,
+    Placement,
+    Segment,
+    link_axes,
+)
 
 Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class LegVectors:
-    """One leg, base axes, m: crank angle (rad), axis s, crank w = T - B and link l = A - T, each (3,), and their
-    lengths, which are constants of the robot."""
+    """Vectors of one leg in the axes of the base, m.
+
+    Crank angle (rad), axis s, crank w = T - B and link l = A - T, (3,) each, and their lengths,
+    which are constants of the robot.
+    """
 
     angle: ca.SX
     axis: ca.SX
@@ -36,8 +50,11 @@ class LegVectors:
 
 @dataclass(frozen=True)
 class LegMotion:
-    """Crank acceleration (scalar), second derivatives of crank and link vectors (3,), and the link's angular
-    velocity and acceleration (3,); the link does not spin about its own axis."""
+    """Motion of crank and link.
+
+    Acceleration of the crank, second time derivatives of crank and link vectors (3,), and angular
+    velocity and acceleration of the link (3,). The link does not spin about its own axis.
+    """
 
     crank_acceleration: ca.SX
     tip_acceleration: ca.SX
@@ -47,33 +64,54 @@ class LegMotion:
 
 
 class RssLeg(Leg):
-    """A crank that turns about an axis on the base, and a link from its tip T to the platform joint A."""
+    """Crank that turns about an axis on the base, and a link from its tip T to A."""
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Ixx", "Iyy")))
     prismatic = False
     numbers: ClassVar[tuple[str, ...]] = (
-        *("base_joint.x", "base_joint.y", "base_joint.z", "crank_axis.u", "crank_axis.v", "crank_zero"),
-        *("crank_length", "link_length", "platform_joint.x", "platform_joint.y", "platform_joint.z"),
+        *(
+            "base_joint.x",
+            "base_joint.y",
+            "base_joint.z",
+            "crank_axis.u",
+            "crank_axis.v",
+            "crank_zero",
+        ),
+        *(
+            "crank_length",
+            "link_length",
+            "platform_joint.x",
+            "platform_joint.y",
+            "platform_joint.z",
+        ),
     )
     turned = ("crank_axis", "crank_zero_direction")
     link_joint: ClassVar[str] = "ball"
 
     type: Literal["rss"] = "rss"
     crank_axis: Direction = Field(description="axis of the crank, unit vector, base axes")
-    crank_zero_direction: Direction = Field(description="unit vector from B to the crank's tip at angle zero")
+    crank_zero_direction: Direction = Field(
+        description="unit vector from B to the crank's tip at angle zero"
+    )
     crank_length: Length = Field(description="from B to the crank's tip, m")
     link_length: Length = Field(description="from the crank's tip to A, m")
-    crank_radius: Length = Field(0.010, description="of the crank as it is drawn and hides stickers, m")
-    link_radius: Length = Field(0.006, description="of the link as it is drawn and hides stickers, m")
+    crank_radius: Length = Field(
+        0.010, description="of the crank as it is drawn and hides stickers, m"
+    )
+    link_radius: Length = Field(
+        0.006, description="of the link as it is drawn and hides stickers, m"
+    )
 
     @model_validator(mode="after")
     def _normal(self) -> Self:
-        zero, axis = self.crank_zero_direction, self.crank_axis
+        """Normalise the directions."""
+        zero = self.crank_zero_direction
+        axis = self.crank_axis
         product = float(axis @ zero)
         if abs(product) > ROUNDED:
             raise ValueError(
-                f"crank_zero_direction must be normal to the crank axis; their dot product is {product:.3g}, limit "
-                f"{ROUNDED:g}"
+                "crank_zero_direction must be normal to the crank axis; their dot product is "
+                f"{product:.3g}, limit {ROUNDED:g}"
             )
         if abs(product) > EXACT:
             normal = zero - product * axis
@@ -91,8 +129,13 @@ class RssLeg(Leg):
         return self.model_copy(update={"crank_zero_direction": zero / np.linalg.norm(zero)})
 
     def vectors(self, position: ca.SX) -> LegVectors:
-        """The leg with A at a position: along cos(theta) + across sin(theta) = chord, on the leg's branch."""
-        zero, axis = self.crank_zero_direction, self.crank_axis
+        """Vectors of the leg with A at a position.
+
+        The crank angle solves along cos(theta) + across sin(theta) = chord, on the branch of the
+        leg.
+        """
+        zero = self.crank_zero_direction
+        axis = self.crank_axis
         along, across, chord = self._chord(position)
         square = along**2 + across**2
         root = self.side * ca.sqrt(square - chord**2)
@@ -101,20 +144,25 @@ class RssLeg(Leg):
         sine = (across * chord + along * root) * inverse
         crank = self.crank_length * (cosine * zero + sine * ca.cross(ca.SX(axis), ca.SX(zero)))
         link = position - self.base_joint - crank
-        return LegVectors(ca.atan2(sine, cosine), ca.SX(axis), crank, link, self.crank_length, self.link_length)
+        return LegVectors(
+            ca.atan2(sine, cosine), ca.SX(axis), crank, link, self.crank_length, self.link_length
+        )
 
     def coordinate(self, position: ca.SX) -> ca.SX:
         return self.vectors(position).angle
 
     def reach(self, position: ca.SX) -> ca.SX:
-        """sin^2 of the angle between crank and direction of reach."""
+        """sin^2 of the angle between the crank and its direction of reach."""
         along, across, chord = self._chord(position)
         return 1 - chord**2 / (along**2 + across**2)
 
     def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
         """(|A - T|^2 - link_length^2) / 2."""
-        zero, axis = ca.SX(self.crank_zero_direction), ca.SX(self.crank_axis)
-        crank = self.crank_length * (ca.cos(coordinate) * zero + ca.sin(coordinate) * ca.cross(axis, zero))
+        zero = ca.SX(self.crank_zero_direction)
+        axis = ca.SX(self.crank_axis)
+        crank = self.crank_length * (
+            ca.cos(coordinate) * zero + ca.sin(coordinate) * ca.cross(axis, zero)
+        )
         link = position - self.base_joint - crank
         return (ca.dot(link, link) - self.link_length**2) / 2
 
@@ -123,13 +171,15 @@ class RssLeg(Leg):
 
     def leverage(self, position: ca.SX) -> ca.SX:
         """|J_a1| / (|w| |l|)."""
-        return ca.fabs(crank_leverage(self.vectors(position))) / (self.crank_length * self.link_length)
+        return ca.fabs(crank_leverage(self.vectors(position))) / (
+            self.crank_length * self.link_length
+        )
 
     def gradient(self, position: ca.SX) -> ca.SX:
         return angle_gradient(self.vectors(position))
 
     def line(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """The link, and J_a1."""
+        """Link, and J_a1."""
         leg = self.vectors(position)
         return leg.link, crank_leverage(leg)
 
@@ -139,7 +189,9 @@ class RssLeg(Leg):
     def placements(self, position: ca.SX) -> list[Placement]:
         leg = self.vectors(position)
         x = leg.crank * (1 / leg.crank_length)
-        crank = Placement(leg.crank / 2 + self.base_joint, ca.horzcat(x, ca.cross(leg.axis, x), leg.axis))
+        crank = Placement(
+            leg.crank / 2 + self.base_joint, ca.horzcat(x, ca.cross(leg.axis, x), leg.axis)
+        )
         axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
         return [crank, Placement(leg.crank + leg.link / 2 + self.base_joint, axes)]
 
@@ -150,22 +202,40 @@ class RssLeg(Leg):
         return [rate * leg.axis, ca.cross(leg.link, link_rate) / leg.link_length**2]
 
     def driven_inertia(self, body: np.ndarray) -> float:
-        """Of the crank about its axis."""
+        """Inertia of the crank about its axis."""
         return float(body[3] + body[0] * self.crank_length**2 / 4)
 
     def segments(self) -> list[Segment]:
-        origin, tip, end = np.zeros(3), np.array([self.crank_length, 0, 0]), self.link_length * Z
+        origin = np.zeros(3)
+        tip = np.array([self.crank_length, 0, 0])
+        end = self.link_length * Z
         crank = np.array([origin, tip])
         return [
-            Segment("hinge", self.crank_axis, self.base_joint, tip / 2, crank, self.crank_radius, actuated=True),
-            Segment(self.link_joint, Z, tip, end / 2, np.array([origin, end]), self.link_radius, end),
+            Segment(
+                "hinge",
+                self.crank_axis,
+                self.base_joint,
+                tip / 2,
+                crank,
+                self.crank_radius,
+                actuated=True,
+            ),
+            Segment(
+                self.link_joint, Z, tip, end / 2, np.array([origin, end]), self.link_radius, end
+            ),
         ]
 
-    def force(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM) -> ca.SX:
-        leg, crank, link = self.vectors(position), rigid[0:4], rigid[4:8]
+    def force(
+        self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM
+    ) -> ca.SX:
+        leg = self.vectors(position)
+        crank = rigid[0:4]
+        link = rigid[4:8]
         motion = leg_motion(leg, velocity, acceleration)
-        gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
-        # The crank turns about its own z alone, and a link without spin about l does no work against Izz.
+        gradient = angle_gradient(leg)
+        tangent = ca.cross(leg.axis, leg.crank)
+        # The crank turns about its own z alone, and a link without spin about l does no work
+        # against Izz.
         lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
         torque = crank[0] * lever + crank[3] * motion.crank_acceleration
         pull = link[0] * (motion.tip_acceleration + motion.link_acceleration / 2 - gravity) / 2
@@ -173,17 +243,23 @@ class RssLeg(Leg):
         for inertia, (direction, weight) in zip((link[1], link[2]), _link_xy(leg), strict=True):
             spin = ca.dot(direction, motion.angular_velocity)
             turning = ca.dot(direction, motion.angular_acceleration)
-            moment += (inertia * weight) * (direction * turning + ca.cross(motion.angular_velocity, direction) * spin)
+            moment += (inertia * weight) * (
+                direction * turning + ca.cross(motion.angular_velocity, direction) * spin
+            )
         turn = ca.cross(moment, leg.link) * (1 / leg.link_length**2)
         return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
 
     def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:
-        leg, crank, link = self.vectors(position), rigid[0:4], rigid[4:8]
-        gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
+        leg = self.vectors(position)
+        crank = rigid[0:4]
+        link = rigid[4:8]
+        gradient = angle_gradient(leg)
+        tangent = ca.cross(leg.axis, leg.crank)
         reflected = crank[3] + (crank[0] + link[0]) * (leg.crank_length**2 / 4)
         half = gradient @ (link[0] / 4 * tangent).T
         total = reflected * (gradient @ gradient.T) + link[0] / 4 * ca.SX.eye(3) + half + half.T
-        # Turning about x moves A along -y and the other way round, less what the crank takes up (eq. 13).
+        # Turning about x moves A along -y and the other way round, less what the crank takes up
+        # (eq. 13).
         x, y = _link_xy(leg)
         for inertia, (direction, weight) in ((link[1], y), (link[2], x)):
             row = direction - gradient * ca.dot(tangent, direction)
@@ -191,20 +267,25 @@ class RssLeg(Leg):
         return symmetric_from_lower(total)
 
     def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Components of B->A along and across the crank's zero direction, and the one that the link length asks for."""
+        """Components of B->A along and across the zero direction of the crank, and the chord.
+
+        The chord is the component that the length of the link asks for.
+        """
         reach = position - self.base_joint
         zero = self.crank_zero_direction
         across = ca.cross(ca.SX(self.crank_axis), ca.SX(zero))
-        radius, length = self.crank_length, self.link_length
+        radius = self.crank_length
+        length = self.link_length
         chord = (ca.dot(reach, reach) + radius**2 - length**2) / (2 * radius)
         return ca.dot(reach, zero), ca.dot(reach, across), chord
 
 
 class ParallelogramLeg(RssLeg):
-    """A crank and, as its link, two equal bars side by side that keep the platform from turning (Delta robots).
+    """Crank with two equal bars as its link, which keep the platform from turning (Delta robots).
 
-    As the platform does not turn, neither does the line between the ends of the bars: both move as the link of an RSS
-    leg does, and the parameters of `link` are those of the two together, its moments the sum of their own.
+    The platform does not turn, so that the line between the ends of the bars does not turn either.
+    Both bars move as the link of an RSS leg does. The parameters of `link` are those of the two
+    bars together, and its moments are the sum of theirs.
     """
 
     chart: ClassVar[str] = "translation"
@@ -212,13 +293,13 @@ class ParallelogramLeg(RssLeg):
     bar_distance: Length = Field(description="between the two bars of the parallelogram, m")
 
     def segments(self) -> list[Segment]:
-        """The bars stand side by side along the crank's axis."""
+        """Bodies as a chain. The bars are side by side along the crank's axis."""
         crank, link = super().segments()
         return [crank, link._replace(copies=np.outer([-0.5, 0.5], self.bar_distance * Z))]
 
 
 class RrrLeg(RssLeg):
-    """A crank and a link in one plane, all three joints hinges normal to that (planar robots)."""
+    """Crank and link in one plane. All three joints are hinges normal to it (planar robots)."""
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Iyy",)))
     numbers: ClassVar[tuple[str, ...]] = (
@@ -231,18 +312,22 @@ class RrrLeg(RssLeg):
 
 
 def crank_leverage(leg: LegVectors) -> ca.SX:
-    """Diagonal entry of J_a1, m^2: (w x l) . s (eq. 7). Zero where the leg is singular."""
+    """Diagonal entry of J_a1, m^2: (w x l) . s (eq. 7). It is zero where the leg is singular."""
     return ca.dot(ca.cross(leg.crank, leg.link), leg.axis)
 
 
 def angle_gradient(leg: LegVectors) -> ca.SX:
-    """l / J_a1 (3,), 1/m: gradient of the crank angle with respect to A, and force at A of a unit torque (eq. 8)."""
+    """Gradient l / J_a1 (3,), 1/m, of the crank angle with respect to A.
+
+    It is also the force at A of a unit torque (eq. 8).
+    """
     return leg.link * (1 / crank_leverage(leg))
 
 
 def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMotion:
     """Motion of crank and link for a velocity (3,) and an acceleration (3,) of A."""
-    gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
+    gradient = angle_gradient(leg)
+    tangent = ca.cross(leg.axis, leg.crank)
     rate = ca.dot(gradient, velocity)
     link_rate = velocity - rate * tangent
     # l . A_ddot + |l_dot|^2 = l . w_ddot: the link keeps its length.
@@ -261,7 +346,10 @@ def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMoti
 
 
 def _link_xy(leg: LegVectors) -> list[tuple[ca.SX, ca.SX]]:
-    """Along the x and y of the link's axes (see `link_axes`) a vector (3,), and 1 over its square."""
+    """Pairs for the x and the y of the link's axes (see `link_axes`).
+
+    Each is a vector (3,) along the axis and 1 over its square.
+    """
     across = ca.cross(leg.axis, leg.link)
     weight = 1 / ca.dot(across, across)
     return [(across, weight), (ca.cross(leg.link, across), weight * (1 / leg.link_length**2))]

@@ -1,7 +1,8 @@
-"""RUS leg: a crank on the base (R), and a link between a universal joint (U) at its tip and a spherical one (S) at A.
+"""RUS leg: a crank on the base (R), and a link from a universal joint (U) at its tip to A (S).
 
-The first axis of the universal joint is parallel to that of the crank, so both keep their direction in base axes, and
-the link turns about that and about its own x. Its spin about its length follows, and all three of its moments do work.
+The first axis of the universal joint is parallel to that of the crank. Both keep their direction in
+the axes of the base, and the link turns about that and about its own x. Its spin about its length
+follows, and all three of its moments do work.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dynamics.legs.rss import RssLeg, angle_gradient
 
 
 class RusLeg(RssLeg):
-    """A crank that turns about an axis on the base, and a link on a universal joint at its tip T."""
+    """Crank that turns about an axis on the base, and a link on a universal joint at its tip T."""
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Ixx", "Iyy", "Izz")))
     link_joint: ClassVar[str] = "universal"
@@ -28,9 +29,11 @@ class RusLeg(RssLeg):
         spin = universal_spin(leg.axis, leg.link / leg.link_length, link_rate / leg.link_length)
         return [rate * leg.axis, spin]
 
-    # By virtual work as any leg: the closed forms of RSS are those of a link that does not spin.
+    # the closed forms of RSS are those of a link that does not spin
 
-    def force(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM) -> ca.SX:
+    def force(
+        self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM
+    ) -> ca.SX:
         return Leg.force(self, position, velocity, acceleration, rigid, gravity)
 
     def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:

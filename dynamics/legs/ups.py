@@ -1,7 +1,8 @@
-"""UPS leg of Gough-Stewart platforms: a universal joint (U) at B, a cylinder and its rod (P), a spherical one (S) at A.
+"""UPS leg of Gough-Stewart platforms: a universal joint (U) at B, cylinder and rod (P), A (S).
 
-The first axis of the universal joint stands still on the base; the leg turns about that and about its own x. Cylinder
-and rod turn alike, so of their moments only the sums do work, all three of them.
+The first axis of the universal joint stands still on the base. The leg turns about that and about
+its own x. Cylinder and rod turn alike, so that only the sums of their moments do work, all three of
+them.
 """
 
 from __future__ import annotations
@@ -12,12 +13,21 @@ import casadi as ca
 import numpy as np
 from pydantic import Field
 
-from dynamics.legs.leg import Body, Direction, Leg, Length, Placement, Segment, link_axes, universal_spin
+from dynamics.legs.leg import (
+    Body,
+    Direction,
+    Leg,
+    Length,
+    Placement,
+    Segment,
+    link_axes,
+    universal_spin,
+)
 from dynamics.legs.rss import Z
 
 
 class UpsLeg(Leg):
-    """A cylinder on the base and a rod that slides in it and ends in the platform joint A."""
+    """Cylinder on the base, and a rod that slides in it and ends in the platform joint A."""
 
     bodies = (Body("cylinder", ("Ixx", "Iyy", "Izz")), Body("rod", ("Ixx", "Iyy", "Izz")))
     prismatic = True
@@ -27,23 +37,33 @@ class UpsLeg(Leg):
     )
 
     type: Literal["ups"] = "ups"
-    joint_axis: Direction = Field(description="first axis of the universal joint, unit vector, base axes")
+    joint_axis: Direction = Field(
+        description="first axis of the universal joint, unit vector, base axes"
+    )
     zero_length: Length = Field(description="from B to A where the coordinate is zero, m")
     cylinder_centre: Length = Field(description="from B to the centre of mass of the cylinder, m")
     rod_centre: Length = Field(description="from A back to the centre of mass of the rod, m")
     cylinder_length: Length = Field(description="of the cylinder from B on, m")
     rod_length: Length = Field(description="of the rod from A back, m")
-    cylinder_radius: Length = Field(0.014, description="of the cylinder as it is drawn and hides stickers, m")
+    cylinder_radius: Length = Field(
+        0.014, description="of the cylinder as it is drawn and hides stickers, m"
+    )
     rod_radius: Length = Field(0.008, description="of the rod as it is drawn and hides stickers, m")
 
     @property
     def stroke(self) -> tuple[float, float]:
-        """Shortest and longest distance of A from B, m: neither end sticks out behind, and the rod stays in."""
+        """Shortest and longest distance of A from B, m.
+
+        Neither end sticks out behind, and the rod stays in the cylinder.
+        """
         return max(self.cylinder_length, self.rod_length), self.cylinder_length + self.rod_length
 
     def lengths(self) -> str:
         shortest, longest = self.stroke
-        return f"leg {shortest:g} to {longest:g} m (cylinder {self.cylinder_length:g}, rod {self.rod_length:g})"
+        return (
+            f"leg {shortest:g} to {longest:g} m (cylinder {self.cylinder_length:g}, rod "
+            f"{self.rod_length:g})"
+        )
 
     def shifted(self, by: float) -> Self:
         return self.model_copy(update={"zero_length": self.zero_length + by})
@@ -53,7 +73,7 @@ class UpsLeg(Leg):
         return ca.norm_2(position - self.base_joint) - self.zero_length + beyond
 
     def reach(self, position: ca.SX) -> ca.SX:
-        """1 at mid-stroke, 0 at both of its ends."""
+        """1 at mid-stroke, 0 at both ends of the stroke."""
         shortest, longest = self.stroke
         length = ca.norm_2(position - self.base_joint)
         return (length - shortest) * (longest - length) * (2 / (longest - shortest)) ** 2
@@ -68,7 +88,7 @@ class UpsLeg(Leg):
         return along * (1 / ca.norm_2(along))
 
     def leverage(self, position: ca.SX) -> ca.SX:
-        """1: the actuator pushes along the leg."""
+        """1, because the actuator pushes along the leg."""
         return ca.SX(1)
 
     def gradient(self, position: ca.SX) -> ca.SX:
@@ -89,15 +109,25 @@ class UpsLeg(Leg):
 
     def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
         along = position - self.base_joint
-        # The part of the velocity along the leg drops out of both dot products there.
+        # the part of the velocity along the leg drops out of both dot products
         inverse = 1 / ca.norm_2(along)
         return 2 * [universal_spin(self.joint_axis, along * inverse, velocity * inverse)]
 
     def segments(self) -> list[Segment]:
-        origin, cylinder, rod = np.zeros(3), self.cylinder_length * Z, -self.rod_length * Z
-        centres, zero = (self.cylinder_centre * Z, -self.rod_centre * Z), self.zero_length * Z
+        origin = np.zeros(3)
+        cylinder = self.cylinder_length * Z
+        rod = -self.rod_length * Z
+        centres = (self.cylinder_centre * Z, -self.rod_centre * Z)
+        zero = self.zero_length * Z
         ends = np.array([origin, cylinder]), np.array([rod, origin])
         return [
-            Segment("universal", self.joint_axis, self.base_joint, centres[0], ends[0], self.cylinder_radius),
+            Segment(
+                "universal",
+                self.joint_axis,
+                self.base_joint,
+                centres[0],
+                ends[0],
+                self.cylinder_radius,
+            ),
             Segment("slide", Z, zero, centres[1], ends[1], self.rod_radius, origin, actuated=True),
         ]

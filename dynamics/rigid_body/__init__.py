@@ -1,1 +1,1 @@
-"""The rigid robot in CasADi: virtual-work dynamics in twists, and the equation of motion in pose coordinates."""
+"""Rigid robot in CasADi: virtual work in twists, and the equation of motion in coordinates."""

@@ -1,13 +1,12 @@
-"""Equation of motion in the platform's coordinates and its derivatives, as the closed-loop integrator evaluates them
-(CasADi).
+"""Equation of motion in the platform's coordinates, and its derivatives, in CasADi.
 
-With q the coordinates (the pose, or what of it the chart leaves free), the wrench balance is premultiplied by T^T
-(twist = T q_dot, eq. 29):
+The integrator of the closed loop evaluates them. Let q be the coordinates, which are the pose or
+what the chart leaves free of it. The wrench balance is multiplied by T^T (twist = T q_dot, eq. 29):
 
     M(q) q_ddot + b(q, q_dot) = J_theta^T (torque - friction)
 
-Legs enter through the motion of their platform joints A only, so derivatives are formed leg by leg with respect to
-three vectors of length 3 and chained through dA/dq.
+Legs enter through the motion of their platform joints A only. Derivatives are therefore formed leg
+by leg with respect to three vectors of length 3, and chained through dA/dq.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +17,12 @@ import numpy as np
 from dynamics.compiled.lanes import ColumnFunction, PartedFunction
 from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import AnyGeometry
-from dynamics.kinematics.platform import PlatformJointMotion, joint_motion, pose_rate_to_twist, twist_bias
+from dynamics.kinematics.platform import (
+    PlatformJointMotion,
+    joint_motion,
+    pose_rate_to_twist,
+    twist_bias,
+)
 from dynamics.legs.leg import Leg
 from dynamics.parameters import LANES, parameter_layout
 from dynamics.rigid_body.accelerations import (
@@ -34,10 +38,13 @@ from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:
-    """What the closed loop integrates."""
-    size, layout = len(geometry.chart.freedoms), parameter_layout(geometry.legs)
-    motion, free = equation_of_motion(geometry), free_acceleration(size, layout.joints)
-    responding, derivatives = response(size), motion_derivatives(geometry)
+    """Functions that the closed loop integrates."""
+    size = len(geometry.chart.freedoms)
+    layout = parameter_layout(geometry.legs)
+    motion = equation_of_motion(geometry)
+    free = free_acceleration(size, layout.joints)
+    responding = response(size)
+    derivatives = motion_derivatives(geometry)
     return [
         motion,
         motion_in_lanes(motion),
@@ -54,17 +61,28 @@ def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction
 
 
 def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
-    """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,), its rate (n,),
-    and the factor of M (m, m), see `factored`."""
-    layout, (q, rate) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate")
-    (pose, pose_rate, _), free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
-    to_twist, gravity = pose_rate_to_twist(pose), ca.DM(geometry.gravity)
-    twist, twist_dot, freely = to_twist @ pose_rate, twist_bias(pose, pose_rate), to_twist @ free
+    """Function (q, rate (m,), rigid (p,)) of the equation of motion.
+
+    It returns M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,), its rate (n,),
+    and the factor of M (m, m) (see `factored`).
+    """
+    layout = parameter_layout(geometry.legs)
+    q, rate = _coordinates(geometry, "q", "rate")
+    pose, pose_rate, _ = _poses(geometry, q, rate, 0 * rate)
+    free = freedoms(geometry)
+    to_twist = pose_rate_to_twist(pose)
+    gravity = ca.DM(geometry.gravity)
+    twist = to_twist @ pose_rate
+    twist_dot = twist_bias(pose, pose_rate)
+    freely = to_twist @ free
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
-    (legs, sides), parts = _legs(geometry), []
+    legs, sides = _legs(geometry)
+    parts = []
     for number, (leg, arm) in enumerate(zip(legs, platform_arms(geometry, pose), strict=True)):
-        own, position = rigid[layout.leg_rows(number)], pose[0:3] + arm
-        moving, to_joint = joint_motion(arm, twist, twist_dot), ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
+        own = rigid[layout.leg_rows(number)]
+        position = pose[0:3] + arm
+        moving = joint_motion(arm, twist, twist_dot)
+        to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         mass = symmetric_from_lower(to_joint.T @ leg.mass(position, own) @ to_joint)
         force = leg.force(position, *moving, own, gravity)
         row = leg.gradient(position).T @ to_joint @ freely
@@ -73,20 +91,31 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     mass = platform_mass(pose, rigid[0:4])
     bias = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
 
-    def end(masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]) -> list[ca.SX]:
+    def end(
+        masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]
+    ) -> list[ca.SX]:
         total = symmetric_from_lower(freely.T @ symmetric_from_lower(sum(masses, mass)) @ freely)
-        return [total, freely.T @ sum(forces, bias), *(ca.vertcat(*row) for row in rows), factored(total)]
+        return [
+            total,
+            freely.T @ sum(forces, bias),
+            *(ca.vertcat(*row) for row in rows),
+            factored(total),
+        ]
 
     return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides)
 
 
 def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
-    """q (m,) -> J_theta (n, m), all that the servo asks for at a pose that is measured."""
-    (q,), (legs, sides) = _coordinates(geometry, "q"), _legs(geometry)
+    """Function q (m,) -> J_theta (n, m), which the servo needs at a measured pose."""
+    (q,) = _coordinates(geometry, "q")
+    legs, sides = _legs(geometry)
     pose = _poses(geometry, q, 0 * q, 0 * q)[0]
-    freely, parts = pose_rate_to_twist(pose) @ freedoms(geometry), []
+    freely = pose_rate_to_twist(pose) @ freedoms(geometry)
+    parts = []
     for leg, arm in zip(legs, platform_arms(geometry, pose), strict=True):
-        parts.append([leg.gradient(pose[0:3] + arm).T @ ca.horzcat(ca.SX.eye(3), -ca.skew(arm)) @ freely])
+        parts.append(
+            [leg.gradient(pose[0:3] + arm).T @ ca.horzcat(ca.SX.eye(3), -ca.skew(arm)) @ freely]
+        )
 
     def end(rows: Sequence[ca.SX]) -> list[ca.SX]:
         return [ca.vertcat(*rows)]
@@ -95,30 +124,40 @@ def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
 
 
 def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
-    """The equation of motion of several states at once, of one robot with the same parameters: in each column pose and
-    rate (m,); then J_theta_dot rate (n,), theta (n,), its rate (n,), the factor of M (m, m), b (m,), J_theta (n, m)."""
+    """Function of the equation of motion for several states of one robot at once.
+
+    Each column has pose and rate (m,), and then J_theta_dot rate (n,), theta (n,), its rate (n,),
+    the factor of M (m, m), b (m,) and J_theta (n, m).
+    """
     whole = motion.whole
     inputs = whole.sx_in()
-    (q, rate, *shared), (_, bias, jacobian, *joints, factor) = inputs, whole.call(inputs)
+    q, rate, *shared = inputs
+    _, bias, jacobian, *joints, factor = whole.call(inputs)
     found = ca.Function("motion_in_lanes", [*shared, q, rate], [*joints, factor, bias, jacobian])
     return ColumnFunction(found, len(shared), LANES, LANES)
 
 
 def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
-    """(q, rate, acceleration (m,), torque (n,), rigid (p,)) -> derivatives at fixed acceleration and net joint torque.
+    """Function (q, rate, acceleration (m,), torque (n,), rigid (p,)) of derivatives.
 
-    Of the residual M q_ddot + b - J_theta^T torque: with respect to q (m, m), rate (m, m) and rigid (m, p). Of the
-    joint accelerations: with respect to q (n, m) and rate (n, m); the latter is 2 J_theta_dot.
-    The linear solve for q_ddot is left to the caller and never differentiated.
+    Acceleration and net joint torque are fixed. It returns the derivatives of M q_ddot + b -
+    J_theta^T torque with respect to q (m, m), rate (m, m) and rigid (m, p), and those of the joint
+    accelerations with respect to q (n, m) and rate (n, m). The last one is 2 J_theta_dot. The
+    caller solves for q_ddot, and that is never differentiated.
     """
     q, rate, acceleration = _coordinates(geometry, "q", "rate", "gain")
     motion = _poses(geometry, q, rate, acceleration)
-    return _derivatives("motion_derivatives", geometry, [q, rate, acceleration], motion, ca.DM(geometry.gravity))
+    return _derivatives(
+        "motion_derivatives", geometry, [q, rate, acceleration], motion, ca.DM(geometry.gravity)
+    )
 
 
 def stop_derivatives(geometry: AnyGeometry) -> PartedFunction:
-    """(q, change of rate (m,), impulse (n,), rigid (p,)) -> derivatives of M change - J_theta^T impulse with respect
-    to q (m, m), rate (m, m), which is none, and rigid (m, p): of a motion from rest without gravity."""
+    """Function (q, change of rate (m,), impulse (n,), rigid (p,)) of derivatives at a stop.
+
+    It returns those of M change - J_theta^T impulse with respect to q (m, m), rate (m, m), which
+    are zero, and rigid (m, p). The motion is one from rest without gravity.
+    """
     q, change = _coordinates(geometry, "q", "change")
     motion = _poses(geometry, q, 0 * q, change)
     return _derivatives("stop_derivatives", geometry, [q, change], motion, ca.DM.zeros(3), 3)
@@ -132,62 +171,101 @@ def _derivatives(
     gravity: ca.DM,
     count: int = 5,
 ) -> PartedFunction:
-    """The first `count` of the derivatives of `motion_derivatives` at a motion that follows from coordinates."""
-    layout, free = parameter_layout(geometry.legs), freedoms(geometry)
-    torque, rigid = ca.SX.sym("torque", layout.joints), ca.SX.sym("rigid", layout.rigid.stop)
-    joints, (legs, sides), parts = _joints(geometry), _legs(geometry), []
+    """Function of the first `count` derivatives of `motion_derivatives`.
+
+    The motion follows from coordinates.
+    """
+    layout = parameter_layout(geometry.legs)
+    free = freedoms(geometry)
+    torque = ca.SX.sym("torque", layout.joints)
+    rigid = ca.SX.sym("rigid", layout.rigid.stop)
+    joints = _joints(geometry)
+    legs, sides = _legs(geometry)
+    parts = []
     for number, leg in enumerate(legs):
-        own, gradient = rigid[layout.leg_rows(number)], joints.gradient[number]
-        local, net_force, force, joint = _leg_derivatives(leg, joints.of(number), torque[number], own, gravity)
+        own = rigid[layout.leg_rows(number)]
+        gradient = joints.gradient[number]
+        local, net_force, force, joint = _leg_derivatives(
+            leg, joints.of(number), torque[number], own, gravity
+        )
         by_pose = gradient.T @ _by_pose(force, joints, number) + joints.curvature(number, net_force)
         by_rate = gradient.T @ _by_rate(force, joints, number)
         of_joint = [_by_pose(joint, joints, number) @ free, _by_rate(joint, joints, number) @ free]
-        of_leg = [free.T @ by_pose @ free, free.T @ by_rate @ free, free.T @ gradient.T @ local, *of_joint]
+        of_leg = [
+            free.T @ by_pose @ free,
+            free.T @ by_rate @ free,
+            free.T @ gradient.T @ local,
+            *of_joint,
+        ]
         parts.append(of_leg[:count])
     platform = _platform_columns(joints, gravity)
-    alone = [free.T @ ca.jacobian(platform @ rigid[0:4], of) @ free for of in (joints.pose, joints.rate)]
+    alone = [
+        free.T @ ca.jacobian(platform @ rigid[0:4], of) @ free for of in (joints.pose, joints.rate)
+    ]
 
     def end(
-        by_pose: Sequence[ca.SX], by_rate: Sequence[ca.SX], local: Sequence[ca.SX], *of_joints: Sequence[ca.SX]
+        by_pose: Sequence[ca.SX],
+        by_rate: Sequence[ca.SX],
+        local: Sequence[ca.SX],
+        *of_joints: Sequence[ca.SX],
     ) -> list[ca.SX]:
         columns = ca.SX.zeros(free.shape[1], layout.rigid.stop)
         columns[:, 0:4] = free.T @ platform
         for number, own in enumerate(local):
             columns[:, layout.leg_rows(number)] = own
-        return [sum(by_pose, alone[0]), sum(by_rate, alone[1]), columns, *(ca.vertcat(*rows) for rows in of_joints)]
+        return [
+            sum(by_pose, alone[0]),
+            sum(by_rate, alone[1]),
+            columns,
+            *(ca.vertcat(*rows) for rows in of_joints),
+        ]
 
     inputs = [*coordinates, torque, rigid, *geometry.symbols]
-    return _parted(name, inputs, parts, end, sides, ([joints.pose, joints.rate, joints.gain], motion))
+    return _parted(
+        name, inputs, parts, end, sides, ([joints.pose, joints.rate, joints.gain], motion)
+    )
 
 
 def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
-    """(q, g) -> d(J_theta g)/dq (n, m) for a constant rate g (m,)."""
+    """Function (q, g) -> d(J_theta g)/dq (n, m) for a constant rate g (m,)."""
     q, rate = _coordinates(geometry, "q", "rate")
-    motion, joints, rows = _poses(geometry, q, rate, 0 * rate), _joints(geometry), []
+    motion = _poses(geometry, q, rate, 0 * rate)
+    joints = _joints(geometry)
+    rows = []
     for number, leg in enumerate(geometry.legs):
         position = ca.SX.sym("position", 3)
         gradient = leg.gradient(position)
-        curvature = ca.substitute(ca.jacobian(gradient, position), position, joints.position[number])
+        curvature = ca.substitute(
+            ca.jacobian(gradient, position), position, joints.position[number]
+        )
         at_joint = ca.substitute(gradient, position, joints.position[number])
         along = joints.velocity[number].T @ curvature @ joints.gradient[number]
         rows.append(at_joint.T @ joints.gradient_rate[number] + along)
     outputs = [ca.vertcat(*rows) @ freedoms(geometry)]
-    return function("rate_map_derivative", [q, rate, *geometry.symbols], _at(joints, outputs, *motion))
+    return function(
+        "rate_map_derivative", [q, rate, *geometry.symbols], _at(joints, outputs, *motion)
+    )
 
 
 def _coordinates(geometry: AnyGeometry, *names: str) -> list[ca.SX]:
+    """Symbol of the coordinates."""
     return [ca.SX.sym(name, len(geometry.chart.freedoms)) for name in names]
 
 
-def _poses(geometry: AnyGeometry, q: ca.SX, rate: ca.SX, acceleration: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Pose (6,), its rate and its acceleration of coordinates (m,) and theirs."""
+def _poses(
+    geometry: AnyGeometry, q: ca.SX, rate: ca.SX, acceleration: ca.SX
+) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Pose (6,), pose rate and pose acceleration of coordinates (m,) and their derivatives."""
     free = freedoms(geometry)
     at_home = ca.SX(ca.DM(geometry.chart.pose(np.zeros(free.shape[1]))))
     return at_home + free @ q, ca.densify(free @ rate), ca.densify(free @ acceleration)
 
 
 def _joints(geometry: AnyGeometry) -> PlatformJointMotion:
-    return PlatformJointMotion(geometry.platform_joints, *[ca.SX.sym(name, 6) for name in ("pose", "rate", "gain")])
+    """Motion of the joints A."""
+    return PlatformJointMotion(
+        geometry.platform_joints, *[ca.SX.sym(name, 6) for name in ("pose", "rate", "gain")]
+    )
 
 
 def _parted(
@@ -198,10 +276,15 @@ def _parted(
     sides: tuple[ca.SX, np.ndarray],
     at: tuple[Sequence[ca.SX], Sequence[ca.SX]] = ((), ()),
 ) -> PartedFunction:
-    """A function of what each leg has of its own, some expressions a leg, and of what becomes of them: `end` gets the
-    first of all legs, the second, and so on; symbols are replaced `at` values."""
+    """Function of expressions that each leg has, and of what follows from them.
+
+    `end` gets the first expression of all legs, then the second, and so on. Symbols are replaced by
+    the values `at`.
+    """
     columns = [ca.vertcat(*(ca.densify(ca.vec(one)) for one in part)) for part in parts]
-    symbols = [ca.SX.sym(f"leg{number}", column.numel()) for number, column in enumerate(columns, 1)]
+    symbols = [
+        ca.SX.sym(f"leg{number}", column.numel()) for number, column in enumerate(columns, 1)
+    ]
     outputs = end(*zip(*map(_shaped, symbols, parts), strict=True))
     return PartedFunction(
         function(f"{name}_parts", [*inputs, sides[0]], ca.substitute(columns, *map(list, at))),
@@ -211,14 +294,19 @@ def _parted(
 
 
 def _shaped(column: ca.SX, like: list[ca.SX]) -> list[ca.SX]:
-    """The entries of a column in matrices of the shapes of others."""
+    """Entries of a column in matrices of the shapes of others."""
     ends = np.cumsum([0, *(one.numel() for one in like)]).tolist()
-    return [ca.reshape(own, *one.shape) for own, one in zip(ca.vertsplit(column, ends), like, strict=True)]
+    return [
+        ca.reshape(own, *one.shape)
+        for own, one in zip(ca.vertsplit(column, ends), like, strict=True)
+    ]
 
 
 def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
-    """The legs with symbols for the branches that they are on, so that legs which differ in a sign are alike; and these
-    with their values."""
+    """Legs with symbols for their branches, and these symbols with their values.
+
+    Legs that differ in a sign are thus alike.
+    """
     sides = ca.SX.sym("sides", len(geometry.legs))
     pairs = zip(geometry.legs, ca.vertsplit(sides), strict=True)
     values = np.array([leg.side for leg in geometry.legs], dtype=float)
@@ -226,16 +314,21 @@ def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
 
 
 def _at(joints: PlatformJointMotion, outputs: list[ca.SX], *motion: ca.SX) -> list[ca.SX]:
-    """Expressions in pose, rate and acceleration of the platform at others."""
+    """Expressions in the motion of the platform, at another motion."""
     return ca.substitute(outputs, [joints.pose, joints.rate, joints.gain], list(motion))
 
 
 def _leg_derivatives(
     leg: Leg, motion: tuple[ca.SX, ca.SX, ca.SX], torque: ca.SX, own: ca.SX, gravity: ca.DM
 ) -> tuple[ca.SX, ca.SX, list[ca.SX], list[ca.SX]]:
-    """Columns (3, p) of the leg's own parameters, net force (3,), and derivatives of that force and of theta_ddot with
-    respect to position, velocity and acceleration of A."""
-    position, velocity, acceleration = (ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration"))
+    """Columns (3, p) of a leg's own parameters, net force (3,), and derivatives.
+
+    The derivatives are those of the force and of theta_ddot with respect to position, velocity and
+    acceleration of A.
+    """
+    position, velocity, acceleration = (
+        ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration")
+    )
     moving = leg.force(position, velocity, acceleration, own, gravity)
     unit = ca.SX.sym("parameters", own.numel())
     columns = ca.jacobian(leg.force(position, velocity, acceleration, unit, gravity), unit)
@@ -258,6 +351,7 @@ def _leg_derivatives(
 
 
 def _by_pose(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
+    """Derivatives with respect to the pose, from those with respect to the motion of A."""
     by_position, by_velocity, by_acceleration = rows
     return (
         by_position @ joints.gradient[leg]
@@ -267,11 +361,13 @@ def _by_pose(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
 
 
 def _by_rate(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
+    """Derivatives with respect to the pose rate, from those with respect to the motion of A."""
     _, by_velocity, by_acceleration = rows
     return by_velocity @ joints.gradient[leg] + 2 * by_acceleration @ joints.gradient_rate[leg]
 
 
 def _platform_columns(joints: PlatformJointMotion, gravity: ca.DM) -> ca.SX:
+    """Columns of the platform's own parameters."""
     to_twist = pose_rate_to_twist(joints.pose)
     twist_dot = to_twist @ joints.gain + twist_bias(joints.pose, joints.rate)
     return to_twist.T @ platform_columns(joints.pose, to_twist @ joints.rate, twist_dot, gravity)

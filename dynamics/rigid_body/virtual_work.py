@@ -1,16 +1,23 @@
-"""Virtual-work dynamics (eq. 17-26), in CasADi: sums over platform and legs, and the functions that `Robot` evaluates.
+"""Virtual-work dynamics (eq. 17-26) in CasADi, as sums over platform and legs.
 
-Wrenches act at the platform origin, base axes.
+The functions are those that `Robot` evaluates. Wrenches act at the platform origin, in the axes of
+the base.
 
-Signs: the paper's eq. 20 carries M, C, G of the fictitious forces (negative masses, G = +m g) into eq. 23; here M is
-positive definite, G the wrench that holds the robot up, and tau_g = M twist_dot + C twist + G + tau_f as in eq. 17.
+The paper's eq. 20 carries M, C and G of the fictitious forces into eq. 23, with negative masses and
+G = +m g. Here M is positive definite, G is the wrench that holds the robot up, and tau_g = M
+twist_dot + C twist + G + tau_f as in eq. 17.
 """
 
 import casadi as ca
 
 from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import AnyGeometry
-from dynamics.kinematics.platform import joint_motion, pose_rate_to_twist, rotation_matrix, twist_bias
+from dynamics.kinematics.platform import (
+    joint_motion,
+    pose_rate_to_twist,
+    rotation_matrix,
+    twist_bias,
+)
 from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.jacobians import (
     freedoms,
@@ -25,23 +32,31 @@ from dynamics.rigid_body.jacobians import (
 )
 
 
-def rigid_body_regressor(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
+def rigid_body_regressor(
+    geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX
+) -> ca.SX:
     """Columns of Gamma (6, p) for the inertial parameters of platform and legs (eq. 25)."""
-    gravity, layout = ca.DM(geometry.gravity), parameter_layout(geometry.legs)
+    gravity = ca.DM(geometry.gravity)
+    layout = parameter_layout(geometry.legs)
     columns = ca.SX.zeros(6, layout.rigid.stop)
     columns[:, 0:4] = platform_columns(pose, twist, twist_dot, gravity)
-    for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
+    for number, (leg, arm) in enumerate(
+        zip(geometry.legs, platform_arms(geometry, pose), strict=True)
+    ):
         rows = layout.leg_rows(number)
         own = ca.SX.sym("parameters", len(rows))
         force = leg.force(pose[0:3] + arm, *joint_motion(arm, twist, twist_dot), own, gravity)
-        forces = ca.jacobian(force, own)  # in which it is linear
+        # the force is linear in the parameters
+        forces = ca.jacobian(force, own)
         columns[:, rows] = ca.vertcat(forces, ca.skew(arm) @ forces)
     return columns
 
 
 def platform_columns(pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM) -> ca.SX:
     """Wrench (6, 4) of the platform alone for unit mass, Ixx, Iyy, Izz about its own axes."""
-    frame, omega, omega_dot = rotation_matrix(pose[3:6]), twist[3:6], twist_dot[3:6]
+    frame = rotation_matrix(pose[3:6])
+    omega = twist[3:6]
+    omega_dot = twist_dot[3:6]
     moments = []
     for axis in range(3):
         direction = frame[:, axis]
@@ -51,11 +66,19 @@ def platform_columns(pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM
     return ca.horzcat(mass, ca.vertcat(ca.SX.zeros(3, 3), ca.horzcat(*moments)))
 
 
-def inertial_wrench(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX) -> ca.SX:
-    """M twist_dot + C twist + G (6,) for the inertial parameters `rigid`: the regressor times them, without it."""
-    gravity, layout = ca.DM(geometry.gravity), parameter_layout(geometry.legs)
+def inertial_wrench(
+    geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX
+) -> ca.SX:
+    """Wrench M twist_dot + C twist + G (6,) for inertial parameters `rigid`.
+
+    It is the product of the regressor and the parameters, without the regressor.
+    """
+    gravity = ca.DM(geometry.gravity)
+    layout = parameter_layout(geometry.legs)
     total = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
-    for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
+    for number, (leg, arm) in enumerate(
+        zip(geometry.legs, platform_arms(geometry, pose), strict=True)
+    ):
         motion = joint_motion(arm, twist, twist_dot)
         force = leg.force(pose[0:3] + arm, *motion, rigid[layout.leg_rows(number)], gravity)
         total += ca.vertcat(force, ca.cross(arm, force))
@@ -63,9 +86,12 @@ def inertial_wrench(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot:
 
 
 def mass_matrix(geometry: AnyGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
-    """M (6, 6) of eq. 23, symmetric positive definite for positive parameters."""
-    total, layout = platform_mass(pose, rigid[0:4]), parameter_layout(geometry.legs)
-    for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
+    """Matrix M (6, 6) of eq. 23, symmetric and positive definite for positive parameters."""
+    total = platform_mass(pose, rigid[0:4])
+    layout = parameter_layout(geometry.legs)
+    for number, (leg, arm) in enumerate(
+        zip(geometry.legs, platform_arms(geometry, pose), strict=True)
+    ):
         at_joint = leg.mass(pose[0:3] + arm, rigid[layout.leg_rows(number)])
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         total += to_joint.T @ at_joint @ to_joint
@@ -73,11 +99,16 @@ def mass_matrix(geometry: AnyGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
 
 
 def coriolis_matrix(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
-    """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench."""
-    frame, omega, layout = rotation_matrix(pose[3:6]), twist[3:6], parameter_layout(geometry.legs)
+    """Matrix C (6, 6) of eq. 23. C twist is the Coriolis and centrifugal wrench."""
+    frame = rotation_matrix(pose[3:6])
+    omega = twist[3:6]
+    layout = parameter_layout(geometry.legs)
     total = ca.diagcat(ca.SX.zeros(3, 3), ca.skew(omega) @ frame @ ca.diag(rigid[1:4]) @ frame.T)
-    for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
-        own, position = rigid[layout.leg_rows(number)], pose[0:3] + arm
+    for number, (leg, arm) in enumerate(
+        zip(geometry.legs, platform_arms(geometry, pose), strict=True)
+    ):
+        own = rigid[layout.leg_rows(number)]
+        position = pose[0:3] + arm
         coriolis = leg.coriolis(position, twist[0:3] + ca.cross(omega, arm), own)
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         to_joint_rate = ca.horzcat(ca.SX.zeros(3, 3), -ca.skew(ca.cross(omega, arm)))
@@ -92,9 +123,12 @@ def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
 
 
 def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
-    """Functions of pose and its rates alone: joint coordinates, reach, Jacobians, twist conversions."""
-    pose, rate, acceleration = ca.SX.sym("pose", 6), ca.SX.sym("pose_rate", 6), ca.SX.sym("pose_acceleration", 6)
-    twist, theta = ca.SX.sym("twist", 6), ca.SX.sym("theta", len(geometry.legs))
+    """Functions of the pose and its rates: joints, reach, Jacobians, conversions of twists."""
+    pose = ca.SX.sym("pose", 6)
+    rate = ca.SX.sym("pose_rate", 6)
+    acceleration = ca.SX.sym("pose_acceleration", 6)
+    twist = ca.SX.sym("twist", 6)
+    theta = ca.SX.sym("theta", len(geometry.legs))
     to_twist = pose_rate_to_twist(pose)
     return [
         function(
@@ -102,8 +136,16 @@ def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
             [pose, *geometry.symbols],
             [joint_coordinates(geometry, pose), reach_margin(geometry, pose)],
         ),
-        function("loop_closure", [pose, theta, *geometry.symbols], list(loop_closure(geometry, pose, theta))),
-        function("singularity_measures", [pose, *geometry.symbols], list(singularity_measures(geometry, pose))),
+        function(
+            "loop_closure",
+            [pose, theta, *geometry.symbols],
+            list(loop_closure(geometry, pose, theta)),
+        ),
+        function(
+            "singularity_measures",
+            [pose, *geometry.symbols],
+            list(singularity_measures(geometry, pose)),
+        ),
         function("joint_jacobian", [pose, *geometry.symbols], [joint_jacobian(geometry, pose)]),
         function("pose_jacobian", [pose, *geometry.symbols], [pose_jacobian(geometry, pose)]),
         function("twist", [pose, rate, *geometry.symbols], [to_twist @ rate]),
@@ -113,19 +155,25 @@ def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
             [to_twist @ acceleration + twist_bias(pose, rate)],
         ),
         function("pose_rate", [pose, twist, *geometry.symbols], [ca.solve(to_twist, twist)]),
-        function("placements", [pose, twist, *geometry.symbols], [placements(geometry, pose, twist)]),
+        function(
+            "placements", [pose, twist, *geometry.symbols], [placements(geometry, pose, twist)]
+        ),
     ]
 
 
 def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
-    """M, C, G, friction, regressor (eq. 23-26), inverse dynamics (eq. 17) and forward dynamics (eq. 40).
+    """Functions M, C, G, friction, regressor (eq. 23-26), inverse and forward dynamics (eq. 17,
+    40).
 
-    Wrenches have six entries; those that the chart forbids are carried by the legs, and drop out where torques balance
-    the others.
+    Wrenches have six entries. The legs carry those that the chart forbids, and they drop out where
+    torques balance the others.
     """
     layout = parameter_layout(geometry.legs)
-    pose, twist, twist_dot = ca.SX.sym("pose", 6), ca.SX.sym("twist", 6), ca.SX.sym("twist_dot", 6)
-    torque, xi = ca.SX.sym("torque", layout.joints), ca.SX.sym("parameters", len(layout.dynamic_names))
+    pose = ca.SX.sym("pose", 6)
+    twist = ca.SX.sym("twist", 6)
+    twist_dot = ca.SX.sym("twist_dot", 6)
+    torque = ca.SX.sym("torque", layout.joints)
+    xi = ca.SX.sym("parameters", len(layout.dynamic_names))
     rigid = xi[layout.rigid]
     jacobian = joint_jacobian(geometry, pose)
     velocity = jacobian @ twist
@@ -136,15 +184,19 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     mass = mass_matrix(geometry, pose, rigid)
     free = freedoms(geometry)
     diagonal, upper, order = ca.ldl(symmetric_from_lower(free.T @ mass @ free))
-    acceleration = free @ ca.ldl_solve(free.T @ (jacobian.T @ (torque - friction) - bias), diagonal, upper, order)
-    # Coulomb, then viscous friction: eq. 24 without its stray second v_E.
+    acceleration = free @ ca.ldl_solve(
+        free.T @ (jacobian.T @ (torque - friction) - bias), diagonal, upper, order
+    )
+    # Coulomb and viscous friction of eq. 24, without its stray second v_E
     rubbing = [jacobian.T @ ca.diag(ca.sign(velocity)), jacobian.T @ ca.diag(velocity)]
     regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), *rubbing)
     torques = ca.solve((jacobian @ free).T, free.T @ inertial) + friction
     return [
         function("mass_matrix", [pose, xi, *geometry.symbols], [mass]),
         function(
-            "coriolis_matrix", [pose, twist, xi, *geometry.symbols], [coriolis_matrix(geometry, pose, twist, rigid)]
+            "coriolis_matrix",
+            [pose, twist, xi, *geometry.symbols],
+            [coriolis_matrix(geometry, pose, twist, rigid)],
         ),
         function("gravity_wrench", [pose, xi, *geometry.symbols], [holding]),
         function("friction_wrench", [pose, twist, xi, *geometry.symbols], [jacobian.T @ friction]),
@@ -155,5 +207,5 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
 
 
 def robot_functions(geometry: AnyGeometry) -> list[ca.Function]:
-    """All that `Robot` evaluates."""
+    """Functions that `Robot` evaluates."""
     return kinematic_functions(geometry) + dynamic_functions(geometry)

@@ -1,4 +1,6 @@
-"""What the tests of the dynamics share: the robot, random states, and oracles that do not use the package."""
+"""What the tests of the dynamics share: the robot, random states, and oracles that do not use the
+package.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,8 +18,23 @@ from dynamics.geometry import RobotGeometry
 
 BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
 METHODS = (
-    *("inverse_kinematics", "reach_margin", "joint_jacobian", "pose_jacobian", "twist", "twist_dot", "pose_rate"),
-    *("mass_matrix", "coriolis_matrix", "gravity_wrench", "friction_wrench", "static_torque", "regressor"),
+    *(
+        "inverse_kinematics",
+        "reach_margin",
+        "joint_jacobian",
+        "pose_jacobian",
+        "twist",
+        "twist_dot",
+        "pose_rate",
+    ),
+    *(
+        "mass_matrix",
+        "coriolis_matrix",
+        "gravity_wrench",
+        "friction_wrench",
+        "static_torque",
+        "regressor",
+    ),
     *("inverse_dynamics", "forward_dynamics"),
 )
 """Of a robot, which take rows or batches of them."""
@@ -70,7 +87,9 @@ def random_states(robot: dynamics.Robot, count: int, seed: int) -> States:
     rng = np.random.default_rng(seed)
     scale = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
     pose = robot.home_pose + BOX * rng.uniform(-1, 1, (count, 6))
-    return States(pose, scale * rng.standard_normal((count, 6)), 10 * scale * rng.standard_normal((count, 6)))
+    return States(
+        pose, scale * rng.standard_normal((count, 6)), 10 * scale * rng.standard_normal((count, 6))
+    )
 
 
 @pytest.fixture(scope="session")
@@ -85,7 +104,9 @@ def base_from_platform(pose: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Legs:
-    """Crank tips T, platform joints A (6, 3) and crank axes, from crank angles and the geometry alone."""
+    """Crank tips T, platform joints A (6, 3) and crank axes, from crank angles and the geometry
+    alone.
+    """
 
     tip: np.ndarray
     joint: np.ndarray
@@ -98,7 +119,9 @@ def of_legs(geometry: RobotGeometry, name: str) -> np.ndarray:
 
 
 def place_legs(geometry: RobotGeometry, pose: np.ndarray, theta: np.ndarray) -> Legs:
-    """Where the legs of a geometry are at a pose (6,) with crank angles (6,), whether they close or not."""
+    """Where the legs of a geometry are at a pose (6,) with crank angles (6,), whether they close or
+    not.
+    """
     cosine, sine = np.cos(theta)[:, None], np.sin(theta)[:, None]
     zero = of_legs(geometry, "crank_zero_direction")
     across = np.cross(of_legs(geometry, "crank_axis"), zero)
@@ -132,11 +155,17 @@ def derivative(function: Callable[[float], np.ndarray], h: float = 1e-3) -> np.n
 def motion(robot: dynamics.Robot) -> Callable[[float], np.ndarray]:
     """Pose, its rate and its acceleration (3, 6) at a time of a smooth motion through the box."""
     rng = np.random.default_rng(11)
-    amplitude, frequency, phase = BOX * rng.uniform(0.5, 1, 6), rng.uniform(4, 9, 6), rng.uniform(0, 6, 6)
+    amplitude, frequency, phase = (
+        BOX * rng.uniform(0.5, 1, 6),
+        rng.uniform(4, 9, 6),
+        rng.uniform(0, 6, 6),
+    )
 
     def at(t: float) -> np.ndarray:
         wave = amplitude * np.exp(1j * (frequency * t + phase))
-        return np.array([robot.home_pose + wave.imag, (frequency * wave).real, -(frequency**2 * wave).imag])
+        return np.array(
+            [robot.home_pose + wave.imag, (frequency * wave).real, -(frequency**2 * wave).imag]
+        )
 
     return at
 
@@ -148,20 +177,28 @@ def at_rest(pose: np.ndarray, frames: int) -> closed_loop.Reference:
 
 @dataclass(frozen=True)
 class Loop:
-    """Closed-loop runs of one robot: references, settings and parameters (67,) that serve where no others are given."""
+    """Closed-loop runs of one robot: references, settings and parameters (67,) that serve where no
+    others are given.
+    """
 
     robot: dynamics.Robot
     parameters: np.ndarray
 
-    def reference(self, frames: int, rate_hz: float = 60.0, scale: float = 1.0) -> closed_loop.Reference:
+    def reference(
+        self, frames: int, rate_hz: float = 60.0, scale: float = 1.0
+    ) -> closed_loop.Reference:
         """A smooth motion that starts at rest at home: sines under an envelope."""
         t = np.arange(frames)[:, None] / rate_hz
         amplitude = scale * np.array([6e-3, 5e-3, 4e-3, 0.02, 0.015, 0.02])
         frequency = 2 * np.pi * np.array([0.9, 1.2, 1.5, 1.05, 1.35, 0.75])
-        envelope, slope = 1 - np.exp(-((t / 0.4) ** 3)), 3 * t**2 / 0.4**3 * np.exp(-((t / 0.4) ** 3))
+        envelope, slope = (
+            1 - np.exp(-((t / 0.4) ** 3)),
+            3 * t**2 / 0.4**3 * np.exp(-((t / 0.4) ** 3)),
+        )
         wave, wave_rate = np.sin(frequency * t), frequency * np.cos(frequency * t)
         return closed_loop.Reference(
-            self.robot.home_pose + amplitude * envelope * wave, amplitude * (envelope * wave_rate + slope * wave)
+            self.robot.home_pose + amplitude * envelope * wave,
+            amplitude * (envelope * wave_rate + slope * wave),
         )
 
     def settings(
@@ -175,7 +212,9 @@ class Loop:
         elasticity: closed_loop.JointElasticity | None = None,
         drives: closed_loop.Drives = PID,
     ) -> closed_loop.LoopSettings:
-        """The paper's servo gains; 60 Hz, no delay, zero hold, exact friction unless told otherwise."""
+        """The paper's servo gains; 60 Hz, no delay, zero hold, exact friction unless told
+        otherwise.
+        """
         name = "smoothed" if smoothing_velocity else "coulomb_viscous"
         return closed_loop.LoopSettings(
             closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4),
@@ -191,17 +230,32 @@ class Loop:
         reference: closed_loop.Reference | int,
         settings: closed_loop.LoopSettings | None = None,
         parameters: np.ndarray | None = None,
+        *,
+        sensitivities: bool = False,
+        start_sensitivities: bool = False,
+        lost: np.ndarray | None = None,
+        noise: np.ndarray | None = None,
         **options: object,
     ) -> closed_loop.ClosedLoopRun:
-        """One run; a number of frames stands for the reference with so many."""
+        """One run, by commands, a controller or the servo as the options have it; a number of
+        frames stands for the reference with so many.
+        """
         reference = self.reference(reference) if isinstance(reference, int) else reference
         parameters = self.parameters if parameters is None else parameters
-        return closed_loop.simulate(self.robot, parameters, reference, settings or self.settings(), **options)
+        way = next((way for way in ("commands", "controller") if way in options), "servo")
+        options = {"sensor": closed_loop.IdealSensor(lost, noise)} | options
+        if sensitivities or start_sensitivities:
+            options["by_start"] = start_sensitivities
+        verb = "differentiate" if "by_start" in options else "simulate"
+        run = getattr(closed_loop, f"{verb}_{way}")
+        return run(self.robot, parameters, reference, settings or self.settings(), **options)
 
     def half_way(
         self, frames: int, frame: int, settings: closed_loop.LoopSettings
     ) -> tuple[closed_loop.Reference, closed_loop.StartState]:
-        """The reference from a frame on, and the state that a run over all its frames has reached there."""
+        """The reference from a frame on, and the state that a run over all its frames has reached
+        there.
+        """
         reference = self.reference(frames)
         rest = closed_loop.Reference(reference.poses[frame:], reference.rates[frame:])
         return rest, self.run(reference, settings).state_at(frame)
@@ -222,7 +276,9 @@ RECORDS = (
 )
 
 
-def assert_same(compiled: closed_loop.ClosedLoopRun, plain: closed_loop.ClosedLoopRun, tolerance: float = 1e-9) -> None:
+def assert_same(
+    compiled: closed_loop.ClosedLoopRun, plain: closed_loop.ClosedLoopRun, tolerance: float = 1e-9
+) -> None:
     """All that both paths record and derive, each to a share of its own largest entry."""
     assert compiled.events == plain.events
     for name in ("time", "measured_ok"):
@@ -230,11 +286,19 @@ def assert_same(compiled: closed_loop.ClosedLoopRun, plain: closed_loop.ClosedLo
     for name in RECORDS:
         ours, other = getattr(compiled, name), getattr(plain, name)
         if other is not None:
-            np.testing.assert_allclose(ours, other, atol=tolerance * np.nanmax(np.abs(other)), rtol=0, err_msg=name)
-    for name in ("pose_sensitivity", "start_sensitivity", "end_sensitivity", "end_start_sensitivity"):
+            np.testing.assert_allclose(
+                ours, other, atol=tolerance * np.nanmax(np.abs(other)), rtol=0, err_msg=name
+            )
+    for name in (
+        "pose_sensitivity",
+        "start_sensitivity",
+        "end_sensitivity",
+        "end_start_sensitivity",
+    ):
         ours, other = getattr(compiled, name), getattr(plain, name)
         if other is not None:
-            # By kind of row, as positions and rates differ in size; what is zero in exact arithmetic holds rounding.
+            # By kind of row, as positions and rates differ in size; what is zero in exact
+            # arithmetic holds rounding.
             kinds = (-1, 6) if other.ndim == 3 else (4, 6)
             ours, other = (values.reshape(*kinds, other.shape[-1]) for values in (ours, other))
             largest = np.abs(other).max(axis=(0, 1) if kinds[0] < 0 else 1, keepdims=True)

@@ -13,8 +13,8 @@ from dynamics.kinematics.chart import Chart
 from dynamics.legs.ups import UpsLeg
 from dynamics.rigid_body.virtual_work import kinematic_functions
 
-# P. Dietmaier, The Stewart-Gough platform of general geometry can have 40 real postures, Advances in Robot Kinematics,
-# 1998: joints of the base, of the platform, and lengths of the legs.
+# P. Dietmaier, The Stewart-Gough platform of general geometry can have 40 real postures, Advances
+# in Robot Kinematics, 1998: joints of the base, of the platform, and lengths of the legs.
 BASE = np.array(
     [
         [0, 0, 0],
@@ -68,10 +68,17 @@ def test_all_forty_assembly_modes_of_dietmaiers_platform_are_found_and_close():
         for base, platform, length in zip(BASE, PLATFORM, LENGTHS, strict=True)
     ]
     geometry = RobotGeometry(tuple(legs), Chart("free", tuple(home)), 0.1, np.array([0, 0, -9.81]))
-    functions = compiled_functions(geometry.digest + b"kinematics", lambda: kinematic_functions(geometry), ())
-    modes = forward_kinematics.assembly_modes(functions, geometry.chart, np.zeros(6), np.zeros(3), 2.0, 4000, 0)
+    functions = compiled_functions(
+        geometry.digest + b"kinematics", lambda: kinematic_functions(geometry), ()
+    )
+    modes = forward_kinematics.assembly_modes(
+        functions, geometry.chart, np.zeros(6), np.zeros(3), 2.0, 4000, 0
+    )
     assert len(modes) == 40
     np.testing.assert_allclose([_gaps(mode) for mode in modes], 0, atol=1e-11)
     turns = Rotation.from_euler("XYZ", modes[:, 3:])
     for a, b in itertools.combinations(range(40), 2):
-        assert np.abs(modes[a, :3] - modes[b, :3]).max() + (turns[a].inv() * turns[b]).magnitude() > 1e-3
+        assert (
+            np.abs(modes[a, :3] - modes[b, :3]).max() + (turns[a].inv() * turns[b]).magnitude()
+            > 1e-3
+        )

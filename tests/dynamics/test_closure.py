@@ -1,4 +1,6 @@
-"""Geometric numbers of every kind of leg, and where loops close when they are off: against the inverse kinematics."""
+"""Geometric numbers of every kind of leg, and where loops close when they are off: against the
+inverse kinematics.
+"""
 
 import casadi as ca
 import numpy as np
@@ -16,9 +18,15 @@ OFF_M, OFF_RAD = 1e-4, 1e-3
 
 
 def mixed():
-    """Cranks with links on ball joints, on universal joints, and on both; they share a chart and a unit."""
-    legs = [dynamics.load_robot(name).geometry.legs[k] for k, name in enumerate(3 * ("rss6", "rus6"))]
-    return RobotGeometry(tuple(legs), Chart("free", (0, 0, 0.2, 0, 0, 0)), 0.9948, np.array([0, 0, -9.81]))
+    """Cranks with links on ball joints, on universal joints, and on both; they share a chart and a
+    unit.
+    """
+    legs = [
+        dynamics.load_robot(name).geometry.legs[k] for k, name in enumerate(3 * ("rss6", "rus6"))
+    ]
+    return RobotGeometry(
+        tuple(legs), Chart("free", (0, 0, 0.2, 0, 0, 0)), 0.9948, np.array([0, 0, -9.81])
+    )
 
 
 @pytest.fixture(scope="module", params=[*SLOW_ROBOTS, "mixed"])
@@ -48,13 +56,20 @@ def test_numbers_are_moved_by_what_their_deviations_say(geometry):
     off = drawn_deviations(geometry)
     moved = geometry.moved(off)
     np.testing.assert_allclose(moved.deviations_from(geometry), off, rtol=0, atol=1e-15)
-    assert len(geometry.number_names) == len(geometry.number_units) == len(set(geometry.number_names)) == len(off)
+    assert (
+        len(geometry.number_names)
+        == len(geometry.number_units)
+        == len(set(geometry.number_names))
+        == len(off)
+    )
     places = [k for k, name in enumerate(geometry.number_names) if name.endswith("base_joint.x")]
     np.testing.assert_array_equal(moved.base_joints[:, 0] - geometry.base_joints[:, 0], (geometry.numbers + off)[places]
                                   - geometry.numbers[places])  # fmt: skip
     for leg, nominal in zip(moved.legs, geometry.legs, strict=True):
         if leg.turned:
-            turned = np.arccos(np.clip(getattr(leg, leg.turned[0]) @ getattr(nominal, leg.turned[0]), -1, 1))
+            turned = np.arccos(
+                np.clip(getattr(leg, leg.turned[0]) @ getattr(nominal, leg.turned[0]), -1, 1)
+            )
             own = dict(zip(leg.numbers, off[: len(leg.numbers)], strict=True))
             off = off[len(leg.numbers) :]
             tilt = np.hypot(own.get(f"{leg.turned[0]}.u", 0), own.get(f"{leg.turned[0]}.v", 0))
@@ -72,12 +87,18 @@ def test_a_shifted_robot_reads_that_much_less_everywhere(geometry):
 def test_loops_close_where_the_inverse_kinematics_of_the_moved_robot_says(geometry):
     off, (joints, start) = drawn_deviations(geometry), joints_and_start(geometry)
     poses = Closure(geometry).poses(joints, off, start)
-    np.testing.assert_allclose(inverse_kinematics(geometry.moved(off), poses), joints, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        inverse_kinematics(geometry.moved(off), poses), joints, rtol=0, atol=1e-11
+    )
     np.testing.assert_array_equal(geometry.chart.forbidden(poses), 0)
 
 
 def test_derivatives_of_closed_loops_are_those_of_differences(geometry):
-    closure, off, (joints, start) = Closure(geometry), drawn_deviations(geometry), joints_and_start(geometry)
+    closure, off, (joints, start) = (
+        Closure(geometry),
+        drawn_deviations(geometry),
+        joints_and_start(geometry),
+    )
     poses = closure.poses(joints, off, start)
     by_numbers, by_joints = closure.derivatives(poses, joints, off)
     coordinates = geometry.chart.coordinates

@@ -1,4 +1,6 @@
-"""Machine code against CasADi's virtual machine; its cache: content as key, whole files of our own only."""
+"""Machine code against CasADi's virtual machine; its cache: content as key, whole files of our own
+only.
+"""
 
 import os
 import subprocess
@@ -26,7 +28,22 @@ from dynamics.rigid_body.virtual_work import robot_functions
 from dynamics.robot_functions import HOT
 from tests.dynamics.conftest import BOX
 
-SPECIAL = (0.0, -0.0, 1.0, -1.0, 2.0, 3.0, 0.5, -2.5, 1e-310, 1e308, -1e308, np.inf, -np.inf, np.nan)
+SPECIAL = (
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    2.0,
+    3.0,
+    0.5,
+    -2.5,
+    1e-310,
+    1e308,
+    -1e308,
+    np.inf,
+    -np.inf,
+    np.nan,
+)
 X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 OPERATIONS = [name for name in (*MEANING, *CALLED) if name in NAMES.values()]
 
@@ -48,8 +65,8 @@ def square(build=_square, content=b"square"):
 
 
 def test_every_function_of_a_robot_is_that_of_the_virtual_machine(robot):
-    """All outputs, bit by bit, at a batch of random states with a single row of parameters; those of inner loops may
-    round otherwise."""
+    """All outputs, bit by bit, at a batch of random states with a single row of parameters; those
+    of inner loops may round otherwise."""
     rng, names = np.random.default_rng(6), []
     for given in [*robot_functions(robot.geometry), *motion_functions(robot.geometry)]:
         if isinstance(given, ColumnFunction) or getattr(given, "side_by_side", 1) > 1:
@@ -61,30 +78,48 @@ def test_every_function_of_a_robot_is_that_of_the_virtual_machine(robot):
         first = [pose] if sizes[0] == 6 else []
         inputs = [
             *first,
-            *[rng.normal(size=(5, size)) if size == 6 else rng.uniform(size=(1, size)) for size in sizes[len(first) :]],
+            *[
+                rng.normal(size=(5, size)) if size == 6 else rng.uniform(size=(1, size))
+                for size in sizes[len(first) :]
+            ],
         ]
         found = robot.functions[function.name()](*inputs)
         for row in range(5):
-            at = [part[row % len(part)].reshape(function.size_in(k)) for k, part in enumerate(inputs)]
+            at = [
+                part[row % len(part)].reshape(function.size_in(k)) for k, part in enumerate(inputs)
+            ]
             expected = function.call([*map(ca.DM, at)])
             for ours, theirs in zip(found, expected, strict=True):
                 rounding = 1e-12 * np.abs(theirs.full()).max() if function.name() in HOT else 0.0
-                np.testing.assert_allclose(ours[row], theirs.full(), 0.0, rounding, err_msg=function.name())
+                np.testing.assert_allclose(
+                    ours[row], theirs.full(), 0.0, rounding, err_msg=function.name()
+                )
                 assert ours[row].shape == theirs.shape
         names.append(function.name())
     assert sorted(robot.functions) == sorted(names)
 
 
-ANGLES = np.concatenate([np.linspace(-10, 10, 20_001), np.linspace(-1e5, 1e5, 20_000), [0.0, 1e-9, -1e-300, np.nan]])
-PLACES = np.random.default_rng(2).normal(size=(2, 40_000)) * 10 ** np.random.default_rng(3).uniform(-9, 9, (2, 40_000))
-ON_AXES = np.array([[0.0, 0.0, 1.0, -1.0, 1.0, -1.0, 1e-300], [1.0, -1.0, 0.0, 0.0, 1.0, -1.0, -1e300]])
+ANGLES = np.concatenate(
+    [np.linspace(-10, 10, 20_001), np.linspace(-1e5, 1e5, 20_000), [0.0, 1e-9, -1e-300, np.nan]]
+)
+PLACES = np.random.default_rng(2).normal(size=(2, 40_000)) * 10 ** np.random.default_rng(3).uniform(
+    -9, 9, (2, 40_000)
+)
+ON_AXES = np.array(
+    [[0.0, 0.0, 1.0, -1.0, 1.0, -1.0, 1e-300], [1.0, -1.0, 0.0, 0.0, 1.0, -1.0, -1e300]]
+)
 
 
 def test_angles_in_inner_loops_are_those_of_the_c_library(own_cache):
     """Sines to a unit in the last place of one, arctangents to one of the angle."""
-    hot = [ca.Function("turning", [X], [ca.sin(X), ca.cos(X)]), ca.Function("angle", [X, Y], [ca.atan2(X, Y)])]
+    hot = [
+        ca.Function("turning", [X], [ca.sin(X), ca.cos(X)]),
+        ca.Function("angle", [X, Y], [ca.atan2(X, Y)]),
+    ]
     found = compiled_functions(b"angles", lambda: hot, ("turning", "angle"))
-    for ours, theirs in zip(found["turning"](ANGLES[:, None]), (np.sin(ANGLES), np.cos(ANGLES)), strict=True):
+    for ours, theirs in zip(
+        found["turning"](ANGLES[:, None]), (np.sin(ANGLES), np.cos(ANGLES)), strict=True
+    ):
         np.testing.assert_allclose(ours[:, 0, 0], theirs, 0.0, 2.3e-16)
     across, along = np.hstack([PLACES, ON_AXES])
     (angles,) = found["angle"](across[:, None], along[:, None])
@@ -94,39 +129,65 @@ def test_angles_in_inner_loops_are_those_of_the_c_library(own_cache):
 def test_quotients_by_one_number_in_inner_loops_take_one_division(own_cache):
     quotients = ca.Function("f", [X, Y], [X / Y, (X + 1) / Y, 1 / Y, 2 / X])
     found = quickened(graph_of(quotients))
-    assert sorted(node.operation for node in found.nodes if node.operation in ("DIV", "INV")) == ["DIV", "INV"]
-    ours = compiled_functions(b"quotients", lambda: [quotients], ("f",))["f"](np.array([[3.0]]), np.array([[7.0]]))
+    assert sorted(node.operation for node in found.nodes if node.operation in ("DIV", "INV")) == [
+        "DIV",
+        "INV",
+    ]
+    ours = compiled_functions(b"quotients", lambda: [quotients], ("f",))["f"](
+        np.array([[3.0]]), np.array([[7.0]])
+    )
     np.testing.assert_allclose(np.ravel(ours), [3 / 7, 4 / 7, 1 / 7, 2 / 3], 4.5e-16, 0.0)
 
 
 def test_sums_of_products_in_inner_loops_are_rounded_once(own_cache):
-    """Against fractions, where the product alone would be rounded; either factor or the sum may be negative."""
+    """Against fractions, where the product alone would be rounded; either factor or the sum may be
+    negative.
+    """
     x, y, z = (ca.SX.sym(name) for name in "xyz")
     sums = ca.Function("f", [x, y, z], [x * y + z, z - x * y, x * y - z, z + x * x])
     assert [node.operation for node in quickened(graph_of(sums)).nodes].count("FMA") == 4
     given = np.random.default_rng(4).normal(size=(200, 3)) * [1.0, 1.0, 1e-9]
-    found = compiled_functions(b"sums", lambda: [sums], ("f",))["f"](*(column[:, None] for column in given.T))
-    for row, (a, b, c) in enumerate([[Fraction(value) for value in values] for values in given.tolist()]):
+    found = compiled_functions(b"sums", lambda: [sums], ("f",))["f"](
+        *(column[:, None] for column in given.T)
+    )
+    for row, (a, b, c) in enumerate(
+        [[Fraction(value) for value in values] for values in given.tolist()]
+    ):
         exact = [a * b + c, c - a * b, a * b - c, c + a * a]
         assert [float(part[row, 0, 0]) for part in found] == [float(one) for one in exact]
 
 
 @pytest.mark.parametrize("width", [1, 8, 13])
 def test_a_function_of_columns_is_that_of_the_virtual_machine_column_by_column(robot, width):
-    """But for rounding, as far as it was asked for and to the end of that vector; what is behind stays."""
-    given, rng = slope_derivative(robot.layout, len(robot.coordinate_names)), np.random.default_rng(8)
+    """But for rounding, as far as it was asked for and to the end of that vector; what is behind
+    stays.
+    """
+    given, rng = (
+        slope_derivative(robot.layout, len(robot.coordinate_names)),
+        np.random.default_rng(8),
+    )
     inputs = [rng.normal(size=given.function.size_in(k)) for k in range(given.common)]
     rows = rng.normal(
-        size=(sum(given.function.nnz_in(k) for k in range(given.common, given.function.n_in())), given.room)
+        size=(
+            sum(given.function.nnz_in(k) for k in range(given.common, given.function.n_in())),
+            given.room,
+        )
     )
-    into = np.full((sum(given.function.nnz_out(k) for k in range(given.function.n_out())), given.room), 7.0)
-    common = np.repeat(np.concatenate([part.ravel() for part in inputs]), given.apart)  # what is between is not read
+    into = np.full(
+        (sum(given.function.nnz_out(k) for k in range(given.function.n_out())), given.room), 7.0
+    )
+    # what is between is not read
+    common = np.repeat(np.concatenate([part.ravel() for part in inputs]), given.apart)
     common[np.arange(len(common)) % given.apart > 0] = np.nan
     plain(call_columns_of)(robot.functions["slope_derivative"].address, common, rows, into, width)
-    ends = np.cumsum([given.function.nnz_in(k) for k in range(given.common, given.function.n_in())])[:-1]
+    ends = np.cumsum(
+        [given.function.nnz_in(k) for k in range(given.common, given.function.n_in())]
+    )[:-1]
     last = -(-width // given.lanes) * given.lanes
     for column in range(last):
-        expected = given.function.call([*map(ca.DM, inputs), *map(ca.DM, np.split(rows[:, column], ends))])
+        expected = given.function.call(
+            [*map(ca.DM, inputs), *map(ca.DM, np.split(rows[:, column], ends))]
+        )
         expected = np.concatenate([part.full().ravel() for part in expected])
         np.testing.assert_allclose(into[:, column], expected, 1e-13, 1e-13 * np.abs(expected).max())
     assert (into[:, last:] == 7.0).all()
@@ -141,24 +202,34 @@ def call_columns_of(address, common, rows, into, width):
 def test_every_operation_is_that_of_the_virtual_machine_whatever_its_arguments(own_cache, name):
     """Bit by bit, signs of zeros included, on all pairs of special and of random numbers."""
     function, x, y = machine_function(name)
-    found = compiled_functions(name.encode(), lambda: [function])["f"](x[:, None], y[:, None])[0].ravel()
+    found = compiled_functions(name.encode(), lambda: [function])["f"](x[:, None], y[:, None])[
+        0
+    ].ravel()
     check_bits(found, function(ca.DM(x).T, ca.DM(y).T).full().ravel())
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_operations_in_lanes_are_those_one_by_one(own_cache, name):
-    """Bit by bit as above, of three parts alike, and a fourth that is not and has the same operation inside; and for
-    four sets of inputs side by side."""
+    """Bit by bit as above, of three parts alike, and a fourth that is not and has the same
+    operation inside; and for four sets of inputs side by side."""
     function, x, y = machine_function(name)
     z, (p, q, r) = np.roll(x, 5), (ca.SX.sym(name) for name in "pqr")
     alike = [function(first, second) for first, second in ((p, q), (q, r), (r, p))]
-    parts = ca.Function("parts", [p, q, r, ca.SX.sym("none", 0)], [*alike, ca.cos(function(q, p)) * r])
+    parts = ca.Function(
+        "parts", [p, q, r, ca.SX.sym("none", 0)], [*alike, ca.cos(function(q, p)) * r]
+    )
     columns = [ca.SX.sym("column") for _ in range(4)]
     end = ca.Function("f", [p, q, r, *columns], [ca.vertcat(*columns)])
     given = PartedFunction(parts, end, np.zeros(0))
-    assert sorted(group.lanes for group in lane_groups(graph_of(parts, np.zeros(0)))) == [(0, 1, 2), (3,)]
+    assert sorted(group.lanes for group in lane_groups(graph_of(parts, np.zeros(0)))) == [
+        (0, 1, 2),
+        (3,),
+    ]
     machine = compiled_functions(name.encode(), lambda: [given, given.beside(4, "four")])
-    found, expected = machine["f"](x[:, None], y[:, None], z[:, None])[0][..., 0], given.whole(*map(_row, (x, y, z)))
+    found, expected = (
+        machine["f"](x[:, None], y[:, None], z[:, None])[0][..., 0],
+        given.whole(*map(_row, (x, y, z))),
+    )
     check_bits(found, expected.full().T)
     inputs, outputs = np.zeros((3, 4)), np.zeros((4, 4))
     four = machine["four"].bound_to(inputs, outputs)
@@ -173,10 +244,16 @@ def _row(values):
 
 
 def machine_function(name):
-    """A function of x and y with this operation in it, and all pairs of special and of random numbers."""
+    """A function of x and y with this operation in it, and all pairs of special and of random
+    numbers.
+    """
     code = next(code for code, known in NAMES.items() if known == name)
-    ways = [ca.Function("f", [X, Y], [f()]) for f in (lambda: ca.SX.binary(code, X, Y), lambda: X**2.7)]
-    function = next(f for f in ways if code in [f.instruction_id(k) for k in range(f.n_instructions())])
+    ways = [
+        ca.Function("f", [X, Y], [f()]) for f in (lambda: ca.SX.binary(code, X, Y), lambda: X**2.7)
+    ]
+    function = next(
+        f for f in ways if code in [f.instruction_id(k) for k in range(f.n_instructions())]
+    )
     values = np.array([*SPECIAL, *np.random.default_rng(1).normal(size=6)])
     return function, *(part.ravel() for part in np.meshgrid(values, values))
 
@@ -190,10 +267,22 @@ def check_bits(found, expected):
 @pytest.mark.parametrize(
     ("function", "words"),
     [
-        (ca.Function("odd", [X], [ca.erf(X)]), "odd: no machine code for the operation ERF; known: ACOS, ADD, "),
-        (ca.Function("odd", [ca.MX.sym("x")], [ca.MX(1.0)]), "only SX functions .*: odd is MXFunction"),
-        (ca.Function("odd", [X], [ca.diag(ca.vertcat(X, X))]), "only dense matrices .*: odd has one of 2x2,2nz"),
-        (ca.Function("odd", [ca.SX.sym("x", ca.Sparsity.upper(2))], [ca.SX(1.0)]), "odd has one of 2x2,3nz"),
+        (
+            ca.Function("odd", [X], [ca.erf(X)]),
+            "odd: no machine code for the operation ERF; known: ACOS, ADD, ",
+        ),
+        (
+            ca.Function("odd", [ca.MX.sym("x")], [ca.MX(1.0)]),
+            "only SX functions .*: odd is MXFunction",
+        ),
+        (
+            ca.Function("odd", [X], [ca.diag(ca.vertcat(X, X))]),
+            "only dense matrices .*: odd has one of 2x2,2nz",
+        ),
+        (
+            ca.Function("odd", [ca.SX.sym("x", ca.Sparsity.upper(2))], [ca.SX(1.0)]),
+            "odd has one of 2x2,3nz",
+        ),
     ],
 )
 def test_what_cannot_be_translated_is_named(own_cache, function, words):
@@ -203,7 +292,9 @@ def test_what_cannot_be_translated_is_named(own_cache, function, words):
 
 
 def test_code_is_compiled_once_per_content(own_cache):
-    """The second request builds nothing; other content is another file; nobody else may read or write them."""
+    """The second request builds nothing; other content is another file; nobody else may read or
+    write them.
+    """
     build = Mock(side_effect=_square)
     assert square(build) == square(build) == [9.0, 16.0]
     build.assert_called_once()
@@ -216,8 +307,15 @@ def test_code_is_compiled_once_per_content(own_cache):
 @pytest.mark.slow
 def test_two_processes_that_compile_at_once_leave_one_whole_file(own_cache):
     """Both end well, and no temporary file is left behind."""
-    load = "import casadi as ca, numpy as np\nfrom dynamics.compiled.machine_code import compiled_functions\n"
-    command = [sys.executable, "-c", "\n".join([load, getsource(_square), getsource(square), "print(square())"])]
+    load = (
+        "import casadi as ca, numpy as np\nfrom dynamics.compiled.machine_code import "
+        "compiled_functions\n"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        "\n".join([load, getsource(_square), getsource(square), "print(square())"]),
+    ]
     run = {"stdout": subprocess.PIPE, "text": True, "cwd": Path(__file__).parents[2]}
     processes = [subprocess.Popen(command, **run) for _ in range(2)]
     assert [process.communicate(timeout=60)[0] for process in processes] == ["[9.0, 16.0]\n"] * 2
@@ -279,19 +377,29 @@ def test_kernels_are_kept_in_the_same_files(own_cache):
 
 def test_where_numba_is_switched_off_the_plain_lines_run(loop):
     code = (
-        "from tests.dynamics.conftest import Loop; import dynamics; robot = dynamics.load_robot('rss6');"
-        "run = Loop(robot, robot.parameter_sets['identified'].vector).run(3); print(run.pose[-1].tolist())"
+        "from tests.dynamics.conftest import Loop; import dynamics; robot = "
+        "dynamics.load_robot('rss6');"
+        "run = Loop(robot, robot.parameter_sets['identified'].vector).run(3); "
+        "print(run.pose[-1].tolist())"
     )
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     folder = Path(__file__).parents[2]
     done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, cwd=folder, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        env=environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert eval(done.stdout) == loop.run(3).pose[-1].tolist()
 
 
-def test_everything_works_in_memory_after_one_warning_where_nothing_can_be_written(tmp_path, monkeypatch):
-    """Each function is compiled whenever it is asked for; that is said in one line, and only once."""
+def test_everything_works_in_memory_after_one_warning_where_nothing_can_be_written(
+    tmp_path, monkeypatch
+):
+    """Each function is compiled whenever it is asked for; that is said in one line, and only
+    once."""
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "file" / "no_folder"))
     with warnings.catch_warnings(record=True) as caught:
@@ -308,18 +416,23 @@ import sys
 from numba import typeof
 from numba.core.itanium_mangler import mangle_type_or_value
 import dynamics.compiled.kernel
-from dynamics.closed_loop.memory import empty_memory
-from dynamics.closed_loop.problem import Sizes
+from dynamics.closed_loop.run_memory import empty_memory
+from dynamics.closed_loop.problem import (Sizes,)
 for number in map(int, sys.argv[1:]):
-    print(number, *[mangle_type_or_value(typeof(part)) for part in empty_memory(Sizes(number, number, 10 * number))])
+    print(number, *[mangle_type_or_value(typeof(part)) for part in empty_memory(Sizes(number,
+    number, 10 * number))])
 """
 
 
 @pytest.mark.slow
 def test_kernels_of_robots_of_other_sizes_have_other_symbols_and_the_same_in_every_process():
-    """Whatever was compiled before: kernels from the cache, of several processes, stand beside each other."""
+    """Whatever was compiled before: kernels from the cache, of several processes, stand beside each
+    other.
+    """
     first, second = (
-        subprocess.run([sys.executable, "-c", SYMBOLS, *order], capture_output=True, text=True, check=True).stdout
+        subprocess.run(
+            [sys.executable, "-c", SYMBOLS, *order], capture_output=True, text=True, check=True
+        ).stdout
         for order in (("6", "3"), ("3", "6"))
     )
     assert sorted(first.splitlines()) == sorted(second.splitlines())

@@ -1,4 +1,6 @@
-"""What the loop integrates, joints rigid or elastic, against energy and an ODE solver on the twist-space model."""
+"""What the loop integrates, joints rigid or elastic, against energy and an ODE solver on the
+twist-space model.
+"""
 
 import numpy as np
 import pytest
@@ -25,12 +27,18 @@ def frictionless(identified):
 
 
 def _potential(pose, motors, stiffness, parameters, robot, legs_at):
-    """Energy of gravity and springs, J, from heights and crank angles; rods have their centres at mid-length."""
+    """Energy of gravity and springs, J, from heights and crank angles; rods have their centres at
+    mid-length.
+    """
     legs = legs_at(pose)
     crank_mass, link_mass = parameters[4:28:4], parameters[28:52:4]
     tip, joint, foot = legs.tip[:, 2], legs.joint[:, 2], robot.geometry.base_joints[:, 2]
-    heights = parameters[0] * pose[2] + crank_mass @ (foot + tip) / 2 + link_mass @ (tip + joint) / 2
-    return GRAVITY * heights + stiffness / 2 * np.sum((motors - robot.inverse_kinematics(pose)) ** 2)
+    heights = (
+        parameters[0] * pose[2] + crank_mass @ (foot + tip) / 2 + link_mass @ (tip + joint) / 2
+    )
+    return GRAVITY * heights + stiffness / 2 * np.sum(
+        (motors - robot.inverse_kinematics(pose)) ** 2
+    )
 
 
 def _least_energy(start, *arguments):
@@ -45,14 +53,19 @@ def _least_energy(start, *arguments):
     return start + scale * fsolve(slope, np.zeros(6), xtol=1e-10)
 
 
-def test_the_equilibrium_and_a_load_on_it_are_at_the_pose_of_least_energy(loop, robot, frictionless, legs_at):
-    """In equilibrium nothing moves. Motors held where they are, 8 kg put on the platform: after the vibration has died
-    the sum of the energies of gravity and springs is least; the cranks have given way by torque over stiffness."""
+def test_the_equilibrium_and_a_load_on_it_are_at_the_pose_of_least_energy(
+    loop, robot, frictionless, legs_at
+):
+    """In equilibrium nothing moves. Motors held where they are, 8 kg put on the platform: after the
+    vibration has died the sum of the energies of gravity and springs is least; the cranks have
+    given way by torque over stiffness."""
     stiff_loop, settings = frictionless.copy(), loop.settings(steps=80, elasticity=SOFT)
     stiff_loop[64:] = 40.0, 200.0, 0.5
     pose = robot.home_pose + np.array([2e-3, -1e-3, 1e-3, 0.01, -0.005, 0.01])
     start = closed_loop.equilibrium(robot, stiff_loop, pose, settings.servo, elasticity=SOFT)
-    least = _least_energy(pose + 1e-5, start.motor_angle, SOFT.stiffness, stiff_loop[:64], robot, legs_at)
+    least = _least_energy(
+        pose + 1e-5, start.motor_angle, SOFT.stiffness, stiff_loop[:64], robot, legs_at
+    )
     np.testing.assert_allclose(least, pose, atol=1e-8)
     reference = at_rest(pose, 300)
     np.testing.assert_allclose(
@@ -67,17 +80,21 @@ def test_the_equilibrium_and_a_load_on_it_are_at_the_pose_of_least_energy(loop, 
     assert np.abs(sunk - pose)[2] > 1e-4
     np.testing.assert_allclose(run.pose[-1], sunk, atol=1e-8)
     given_way = run.motor_angle[-1] - robot.inverse_kinematics(run.pose[-1])
-    np.testing.assert_allclose(given_way, robot.static_torque(run.pose[-1], loaded[:64]) / SOFT.stiffness, atol=1e-8)
+    np.testing.assert_allclose(
+        given_way, robot.static_torque(run.pose[-1], loaded[:64]) / SOFT.stiffness, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("el", [SOFT, None], ids=["elastic", "rigid"])
 def test_motion_is_that_of_the_twist_space_model(loop, robot, identified, frictionless, el):
-    """Three frames of moving commands against DOP853 on forward dynamics (eq. 40) under joint PID (eq. 31): with the
-    springs as its actuators, or with smoothed dry friction in rigid joints."""
+    """Three frames of moving commands against DOP853 on forward dynamics (eq. 40) under joint PID
+    (eq. 31): with the springs as its actuators, or with smoothed dry friction in rigid joints."""
     frames, smoothing = 3, None if el else 0.05
     values = frictionless if el else identified
     settings = loop.settings(steps=200, elasticity=el, smoothing_velocity=smoothing)
-    run = loop.run(frames, settings, values, commands=0.02 * np.sin(np.arange(frames))[:, None] * np.ones(6))
+    run = loop.run(
+        frames, settings, values, commands=0.02 * np.sin(np.arange(frames))[:, None] * np.ones(6)
+    )
     lp, li, ld = values[64:]
     carried, coulomb, viscous = values[:64].copy(), values[LAYOUT.coulomb], values[LAYOUT.viscous]
     carried[52:] = 0.0
@@ -88,11 +105,18 @@ def test_motion_is_that_of_the_twist_space_model(loop, robot, identified, fricti
         pose, twist, motor, rate, integral = x.reshape(5, 6)
         crank, crank_rate = robot.inverse_kinematics(pose), robot.joint_jacobian(pose) @ twist
         motor, rate = (motor, rate) if el else (crank, crank_rate)
-        torque = lp * (command - motor) + ld * (command_rate - rate) + li * integral - viscous * rate
+        torque = (
+            lp * (command - motor) + ld * (command_rate - rate) + li * integral - viscous * rate
+        )
         torque -= 0 if el else coulomb * np.tanh(rate / smoothing)
         spring = el.stiffness * (motor - crank) + el.damping * (rate - crank_rate) if el else torque
-        motion = (robot.pose_rate(pose, twist), robot.forward_dynamics(pose, twist, spring, carried))
-        return np.concatenate([*motion, rate, (torque - spring) / SOFT.motor_inertia, command - motor])
+        motion = (
+            robot.pose_rate(pose, twist),
+            robot.forward_dynamics(pose, twist, spring, carried),
+        )
+        return np.concatenate(
+            [*motion, rate, (torque - spring) / SOFT.motor_inertia, command - motor]
+        )
 
     start, before = run.start, run.start.commands[-1]
     motor, rest = (start.motor_angle if el else np.zeros(6)), np.zeros(6)
@@ -104,14 +128,18 @@ def test_motion_is_that_of_the_twist_space_model(loop, robot, identified, fricti
         x, before = solution.y[:, -1], command
         pose, twist, motor, rate, _ = x.reshape(5, 6)
         np.testing.assert_allclose(run.pose[k + 1], pose, atol=1e-10)
-        np.testing.assert_allclose(robot.twist(run.pose[k + 1], run.pose_rate[k + 1]), twist, atol=1e-8)
+        np.testing.assert_allclose(
+            robot.twist(run.pose[k + 1], run.pose_rate[k + 1]), twist, atol=1e-8
+        )
         if el:
             np.testing.assert_allclose(run.motor_angle[k + 1], motor, atol=1e-9)
             np.testing.assert_allclose(run.motor_rate[k + 1], rate, atol=1e-6)
 
 
 def test_stiff_springs_give_the_rigid_run_to_first_order(loop, frictionless):
-    """The difference halves with the compliance: the order between stiffnesses of 1, 2 and 4e4 N m/rad is 1."""
+    """The difference halves with the compliance: the order between stiffnesses of 1, 2 and 4e4 N
+    m/rad is 1.
+    """
     rigid, misses = loop.run(30, loop.settings(steps=80), frictionless), []
     for stiffness in (1e4, 2e4, 4e4):
         settings = loop.settings(steps=200, elasticity=JointElasticity(stiffness, 3e-4, 0.02))

@@ -1,4 +1,6 @@
-"""Inertias that no rigid body has: named, changed as little as can be, and what that does to the motion."""
+"""Inertias that no rigid body has: named, changed as little as can be, and what that does to the
+motion.
+"""
 
 import itertools
 
@@ -10,38 +12,57 @@ from hypothesis import strategies as st
 from dynamics import load_robot
 from dynamics.engines.mjcf import mjcf_text
 from dynamics.errors import ParameterError
-from dynamics.inertia import UnphysicalInertiaError, acceleration_changes, physical_inertias, travel_states
+from dynamics.inertia import (
+    UnphysicalInertiaError,
+    acceleration_changes,
+    physical_inertias,
+    travel_states,
+)
 
 LAYOUT = load_robot("rss6").layout
 moments = st.floats(0, 1) | st.sampled_from([0.0, 1e-12, 1e-6])
 
 
-def test_inertias_that_no_body_has_are_refused_by_name_or_changed_so_that_the_motion_does_not_feel_it(robot, states):
+def test_inertias_that_no_body_has_are_refused_by_name_or_changed_so_that_the_motion_does_not_feel_it(
+    robot, states
+):
     with pytest.raises(ParameterError) as caught:
         mjcf_text(robot)
     assert type(caught.value) is UnphysicalInertiaError
     text = str(caught.value)
-    assert "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + Iyy 0.000229" in text
+    assert (
+        "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + Iyy 0.000229"
+        in text
+    )
     assert "link6: Izz 0.00213 > Ixx 0.000523 + Iyy 0.000523" in text
     assert "--allow-unphysical-inertia" in text
     text = mjcf_text(robot, allow_unphysical_inertia=True)
     assert "link5, link6: Izz 0.00213 to 0.001046" in text
     assert "do not alter the motion" in text
     changed, torques = robot.nominal_parameters.copy(), np.ones((300, 6))
-    changed[robot.layout.rigid] = physical_inertias(robot.layout, changed, allow_changes=True).values.ravel()
+    changed[robot.layout.rigid] = physical_inertias(
+        robot.layout, changed, allow_changes=True
+    ).values.ravel()
     assert not np.array_equal(changed, robot.nominal_parameters)
-    ours, theirs = (robot.forward_dynamics(states.pose, states.twist, torques, values) for values in (None, changed))
+    ours, theirs = (
+        robot.forward_dynamics(states.pose, states.twist, torques, values)
+        for values in (None, changed)
+    )
     np.testing.assert_allclose(theirs, ours, rtol=1e-11)
 
 
 def test_effect_of_a_platform_inertia_is_the_share_it_adds_where_the_legs_weigh_nothing(robot):
-    """Euler's equation: with all moments e larger, the same moment of force turns the body 1 - 1/(1 + e) less."""
+    """Euler's equation: with all moments e larger, the same moment of force turns the body 1 - 1/(1
+    + e) less.
+    """
     values = np.full(64, 1e-9)
     values[:4] = [24, 0.16, 0.16, 0.16]  # round, so that nothing else turns it
     inertias = robot.layout.bodies_of(values).copy()
     assert acceleration_changes(robot, values, inertias) == {}
     inertias[0, 1:] *= 1.05
-    assert acceleration_changes(robot, values, inertias) == {"platform": pytest.approx(1 - 1 / 1.05, rel=1e-5)}
+    assert acceleration_changes(robot, values, inertias) == {
+        "platform": pytest.approx(1 - 1 / 1.05, rel=1e-5)
+    }
 
 
 def test_effect_is_measured_all_over_the_travel(robot):
@@ -71,7 +92,9 @@ def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
 
 @pytest.mark.filterwarnings("error")
 def test_the_largest_moments_are_changed_as_small_ones_are():
-    """Powers of two scale without rounding: up to the largest floats the result is the same, without overflow."""
+    """Powers of two scale without rounding: up to the largest floats the result is the same,
+    without overflow.
+    """
     given_ = np.tile([0.5, 0.1, 0.2, 0.8], 13)
     expected = physical_inertias(LAYOUT, given_, allow_changes=True).values
     largest = physical_inertias(LAYOUT, given_ * 2.0**1023 * 2, allow_changes=True).values

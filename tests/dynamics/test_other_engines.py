@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoMissingError, MujocoRobot
 from dynamics.inertia import physical_inertias, travel_states
-from dynamics.robot import Robot, load_robot
-from dynamics.robot_file import RobotDescription
+from dynamics.robot import load_robot
 from tests.dynamics.conftest import SLOW_ROBOTS
 
 
@@ -21,13 +20,17 @@ def mujoco():
 
 
 def exported(robot, parameters=None, **options):
-    return MujocoRobot(robot, mjcf_text(robot, parameters, allow_unphysical_inertia=True, **options))
+    return MujocoRobot(
+        robot, mjcf_text(robot, parameters, allow_unphysical_inertia=True, **options)
+    )
 
 
 def as_exported(robot, values):
     """Parameters (p,) with the inertias that the export writes."""
     changed = values.copy()
-    changed[robot.layout.rigid] = physical_inertias(robot.layout, values, allow_changes=True).values.ravel()
+    changed[robot.layout.rigid] = physical_inertias(
+        robot.layout, values, allow_changes=True
+    ).values.ravel()
     return changed
 
 
@@ -59,7 +62,9 @@ def test_model_has_exactly_the_parameters_and_closed_loops_at_home(mujoco, robot
 
 @pytest.mark.parametrize("name", ["initial", "identified"])
 def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, states, name):
-    """At rest, under random torques: 1 - impedance is the share of the loop forces that MuJoCo leaves out."""
+    """At rest, under random torques: 1 - impedance is the share of the loop forces that MuJoCo
+    leaves out.
+    """
     values = as_exported(robot, robot.parameter_sets[name].dynamic)
     values[robot.layout.coulomb] = 0.0
     torques = 5 * np.random.default_rng(5).standard_normal((30, 6))
@@ -70,7 +75,9 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
         for pose, torque, acceleration in zip(states.pose[:30], torques, ours, strict=True):
             engine.put(pose, np.zeros(6))
             assert engine.closure_error < 1e-14
-            errors.append(np.abs(engine.twist_dot(torque) - acceleration).max() / np.abs(acceleration).max())
+            errors.append(
+                np.abs(engine.twist_dot(torque) - acceleration).max() / np.abs(acceleration).max()
+            )
         worst[impedance] = max(errors)
     assert worst[0.9999] < 3e-4
     assert worst[0.999] / worst[0.9999] == pytest.approx(10, rel=0.1)
@@ -78,7 +85,9 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
 
 @pytest.mark.parametrize("name", SLOW_ROBOTS)
 def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, name):
-    """With MuJoCo's bodies in loops that are closed exactly (not by its springs), moving, with friction: to 1e-9."""
+    """With MuJoCo's bodies in loops that are closed exactly (not by its springs), moving, with
+    friction: to 1e-9.
+    """
     robot = load_robot(name)
     for chosen in robot.parameter_sets.values():
         values = as_exported(robot, chosen.dynamic)
@@ -93,7 +102,9 @@ def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(muj
 
 
 def acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque):
-    """twist_dot of MuJoCo's bodies with the loop equations solved as they stand: M a - J^T f = Q, J a = -J_dot v."""
+    """twist_dot of MuJoCo's bodies with the loop equations solved as they stand: M a - J^T f = Q, J
+    a = -J_dot v.
+    """
     engine.put(pose, twist)
     model, data = engine.model, engine.data
     size, count = model.nv, 3 * model.neq
@@ -118,7 +129,9 @@ def acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque):
 
 
 def test_resting_robot_stays_in_its_dry_friction(mujoco, robot):
-    """Half the breakaway torque on every crank for 1 s: MuJoCo's stiff dry friction creeps by less than 0.1 um."""
+    """Half the breakaway torque on every crank for 1 s: MuJoCo's stiff dry friction creeps by less
+    than 0.1 um.
+    """
     values = robot.parameter_sets["identified"].dynamic
     engine = exported(robot, values)
     engine.put(robot.home_pose, np.zeros(6))
@@ -143,10 +156,11 @@ def test_file_is_valid_xml_whatever_the_source_and_the_robot_are_called(robot, t
         ("nul\0 escape\x1b half\udc80 none\uffff", "nul? escape? half? none?"),
         ("Gr\u00f6\u00dfe \U0001f600\ttab", "Gr\u00f6\u00dfe \U0001f600\ttab"),
     ):
-        named = Robot(RobotDescription(source, robot.geometry, robot.parameter_sets))
-        text = mjcf_text(named, allow_unphysical_inertia=True, source=source)
+        text = mjcf_text(robot, allow_unphysical_inertia=True, source=source)
         (tmp_path / "model.xml").write_text(text, encoding="utf-8")
-        root = Xml.parse(tmp_path / "model.xml", Xml.XMLParser(target=Xml.TreeBuilder(insert_comments=True))).getroot()
+        root = Xml.parse(
+            tmp_path / "model.xml", Xml.XMLParser(target=Xml.TreeBuilder(insert_comments=True))
+        ).getroot()
         assert written in root[0].text
         assert len(list(root.iter("body"))) == 13
 

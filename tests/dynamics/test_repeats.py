@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop
-from dynamics.closed_loop import simulate_repeats
+from dynamics.closed_loop import repeat_commands, repeat_servo
 from dynamics.errors import SimulationError
 from tests.dynamics.conftest import assert_same
 
@@ -31,18 +31,34 @@ def _alone(loop, reference, settings, noise, **options):
     ("settings", "options"),
     [
         ({}, {}),
-        (LATE, {"lost": np.isin(np.arange(FRAMES), (0, 5, 9, 10)), "latencies": np.linspace(0, 0.05, FRAMES)}),
+        (
+            LATE,
+            {
+                "lost": np.isin(np.arange(FRAMES), (0, 5, 9, 10)),
+                "latencies": np.linspace(0, 0.05, FRAMES),
+            },
+        ),
         ({"friction": STRIBECK, "drives": LIMITED}, {}),
         ({"smoothing_velocity": 0.05, "steps": 2}, {"commands": COMMANDS}),
         ({"elasticity": SOFT, "rate_hz": 240.0, "steps": 5, **LATE}, {}),
     ],
-    ids=["paper", "late and lost", "Stribeck and torque limit", "smoothed, logged commands", "elastic"],
+    ids=[
+        "paper",
+        "late and lost",
+        "Stribeck and torque limit",
+        "smoothed, logged commands",
+        "elastic",
+    ],
 )
 def test_runs_together_are_those_one_by_one(loop, settings, options):
-    """More runs than lanes, so that some have company and some have not; all have events of their own."""
+    """More runs than lanes, so that some have company and some have not; all have events of their
+    own.
+    """
     settings, reference = loop.settings(**settings), loop.reference(FRAMES)
     noises = _noises(11)
-    together = simulate_repeats(loop.robot, loop.parameters, reference, settings, noises, **options)
+    repeat = repeat_commands if "commands" in options else repeat_servo
+    given = loop.robot, loop.parameters, reference, settings
+    together = repeat(*given, noises=noises, **options)
     assert len(together) == len(noises)
     for one, noise in zip(together, noises, strict=True):
         assert_same(one, _alone(loop, reference, settings, noise, **options), 1e-12)
@@ -52,8 +68,16 @@ def test_runs_together_are_those_one_by_one(loop, settings, options):
 
 def test_compiled_lanes_equal_plain_lanes(loop):
     """The same lines, a few frames of them."""
-    given = loop.robot, loop.parameters, loop.reference(5, scale=20.0), loop.settings(), _noises(3, 5)
-    for compiled, plain in zip(simulate_repeats(*given), simulate_repeats(*given, compiled=False), strict=True):
+    given = (
+        loop.robot,
+        loop.parameters,
+        loop.reference(5, scale=20.0),
+        loop.settings(),
+        _noises(3, 5),
+    )
+    for compiled, plain in zip(
+        repeat_servo(*given), repeat_servo(*given, compiled=False), strict=True
+    ):
         assert_same(compiled, plain)
 
 
@@ -61,7 +85,7 @@ def test_a_run_that_fails_leaves_the_others_alone_and_says_what_it_says_alone(lo
     """A gross error in some runs, at frames of their own."""
     reference, noises = loop.reference(30), _noises(9, 30)
     noises[2, 3], noises[5, 20:] = 1.0, 0.05 * np.random.default_rng(1).standard_normal((10, 6))
-    together = simulate_repeats(loop.robot, loop.parameters, reference, loop.settings(), noises)
+    together = repeat_servo(loop.robot, loop.parameters, reference, loop.settings(), noises)
     for number, (one, noise) in enumerate(zip(together, noises, strict=True)):
         alone = _alone(loop, reference, loop.settings(), noise)
         if number in (2, 5):
@@ -73,4 +97,6 @@ def test_a_run_that_fails_leaves_the_others_alone_and_says_what_it_says_alone(lo
 
 def test_noises_of_another_shape_are_refused(loop):
     with pytest.raises(SimulationError, match=r"noises must have shape \(N, 30, 6\)"):
-        simulate_repeats(loop.robot, loop.parameters, loop.reference(30), loop.settings(), np.zeros((30, 6)))
+        repeat_servo(
+            loop.robot, loop.parameters, loop.reference(30), loop.settings(), np.zeros((30, 6))
+        )

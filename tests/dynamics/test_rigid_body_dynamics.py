@@ -15,12 +15,16 @@ def parameters(request, robot):
 
 
 def test_parts_regressor_and_inverse_dynamics_agree(robot, states, parameters):
-    """M twist_dot + C twist + G + friction, from the paper's 6x6 Jacobians, equals Gamma Xi and J^T torque, formed
-    from the motion of the platform joints alone: two derivations of one wrench, with other parameters at each state.
-    M is symmetric and positive definite; at rest there is no friction (sign(0) = 0)."""
+    """M twist_dot + C twist + G + friction, from the paper's 6x6 Jacobians, equals Gamma Xi and J^T
+    torque, formed from the motion of the platform joints alone: two derivations of one wrench, with
+    other parameters at each state. M is symmetric and positive definite; at rest there is no
+    friction (sign(0) = 0)."""
     pose, twist, twist_dot = states.pose, states.twist, states.twist_dot
     parameters = parameters * np.random.default_rng(6).uniform(0.5, 2, (len(pose), 64))
-    mass, coriolis = robot.mass_matrix(pose, parameters), robot.coriolis_matrix(pose, twist, parameters)
+    mass, coriolis = (
+        robot.mass_matrix(pose, parameters),
+        robot.coriolis_matrix(pose, twist, parameters),
+    )
     np.testing.assert_allclose(mass, mass.transpose(0, 2, 1), atol=1e-12)
     assert np.linalg.eigvalsh(mass).min() > 0.1
     parts = (mass @ twist_dot[..., None] + coriolis @ twist[..., None])[..., 0]
@@ -38,7 +42,9 @@ def test_parts_regressor_and_inverse_dynamics_agree(robot, states, parameters):
 
 
 def test_forward_dynamics_inverts_inverse_dynamics(robot, states, parameters):
-    """forward(inverse(twist_dot)) = twist_dot to 1e-11 relative, in a batch, one by one and by the fast function."""
+    """forward(inverse(twist_dot)) = twist_dot to 1e-11 relative, in a batch, one by one and by the
+    fast function.
+    """
     pose, twist, twist_dot = states.pose, states.twist, states.twist_dot
     torque = robot.inverse_dynamics(pose, twist, twist_dot, parameters)
     back = robot.forward_dynamics(pose, twist, torque, parameters)
@@ -51,12 +57,19 @@ def test_forward_dynamics_inverts_inverse_dynamics(robot, states, parameters):
 
 
 def test_batches_equal_single_calls(robot, states, parameters):
-    """Every method gives for row n of a batch what it gives for that row alone; parameters may be a batch too."""
-    given = {"pose": states.pose[:4], "parameters": parameters * np.array([[1.0], [1.1], [1.2], [1.3]])}
+    """Every method gives for row n of a batch what it gives for that row alone; parameters may be a
+    batch too.
+    """
+    given = {
+        "pose": states.pose[:4],
+        "parameters": parameters * np.array([[1.0], [1.1], [1.2], [1.3]]),
+    }
     given |= dict.fromkeys(("twist", "pose_rate"), states.twist[:4])
     given |= dict.fromkeys(("twist_dot", "pose_acceleration", "torque"), states.twist_dot[:4])
     for name in METHODS:
-        arguments = [given[argument] for argument in inspect.signature(getattr(robot, name)).parameters]
+        arguments = [
+            given[argument] for argument in inspect.signature(getattr(robot, name)).parameters
+        ]
         batch = getattr(robot, name)(*arguments)
         rows = [getattr(robot, name)(*row) for row in zip(*arguments, strict=True)]
         np.testing.assert_allclose(batch, rows, rtol=1e-13, atol=1e-13, err_msg=name)
@@ -73,8 +86,8 @@ def _angular_velocity(axes_at):
 def test_mass_matrix_gives_the_kinetic_energy_and_gravity_the_power_of_the_13_bodies(
     robot, legs_at, motion, parameters
 ):
-    """1/2 v^T M v is the sum over platform, cranks and links, and G . v the rate of sum(m g z), with bodies moved by
-    finite differences (1e-9 relative)."""
+    """1/2 v^T M v is the sum over platform, cranks and links, and G . v the rate of sum(m g z),
+    with bodies moved by finite differences (1e-9 relative)."""
     masses = parameters[:52:4]
 
     def centres(pose):
@@ -86,27 +99,42 @@ def test_mass_matrix_gives_the_kinetic_energy_and_gravity_the_power_of_the_13_bo
         speeds = derivative(lambda d, t=t: centres(motion(t + d)[0]))
         platform = _angular_velocity(lambda d, t=t: base_from_platform(motion(t + d)[0]))
         cranks = derivative(lambda d, t=t: robot.inverse_kinematics(motion(t + d)[0]))
-        links = _angular_velocity(lambda d, t=t: link_axes(robot.geometry, legs_at(motion(t + d)[0])))
-        kinetic = masses @ np.sum(speeds**2, axis=1) + parameters[1:4] @ platform**2 + parameters[7:28:4] @ cranks**2
+        links = _angular_velocity(
+            lambda d, t=t: link_axes(robot.geometry, legs_at(motion(t + d)[0]))
+        )
+        kinetic = (
+            masses @ np.sum(speeds**2, axis=1)
+            + parameters[1:4] @ platform**2
+            + parameters[7:28:4] @ cranks**2
+        )
         kinetic += parameters[29:52:4] @ links[:, 0] ** 2 + parameters[30:52:4] @ links[:, 1] ** 2
         twist = robot.twist(pose, rate)
-        np.testing.assert_allclose(twist @ robot.mass_matrix(pose, parameters) @ twist, kinetic, rtol=1e-9)
+        np.testing.assert_allclose(
+            twist @ robot.mass_matrix(pose, parameters) @ twist, kinetic, rtol=1e-9
+        )
         power = -masses @ speeds @ robot.geometry.gravity
         np.testing.assert_allclose(robot.gravity_wrench(pose, parameters) @ twist, power, rtol=1e-9)
 
 
-def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, legs_at, motion, parameters):
-    """A link that never spins (eq. 12) but keeps its x axis normal to the crank axis is no rigid body if Ixx != Iyy:
-    v^T (M_dot - 2 C) v is then 2 spin (Ixx - Iyy) omega_x omega_y, where spin is how fast the axes turn about z. With
-    Ixx = Iyy in every link M_dot - 2 C is skew-symmetric. M_dot is taken by finite differences."""
+def test_links_without_spin_break_the_energy_balance_by_a_known_amount(
+    robot, legs_at, motion, parameters
+):
+    """A link that never spins (eq. 12) but keeps its x axis normal to the crank axis is no rigid
+    body if Ixx != Iyy: v^T (M_dot - 2 C) v is then 2 spin (Ixx - Iyy) omega_x omega_y, where spin
+    is how fast the axes turn about z. With Ixx = Iyy in every link M_dot - 2 C is skew-symmetric.
+    M_dot is taken by finite differences."""
     round_links = parameters.copy()
     round_links[30:52:4] = round_links[29:52:4]
     for t in np.linspace(0, 3, 7):
         pose, rate, _ = motion(t)
         twist = robot.twist(pose, rate)
-        omega = _angular_velocity(lambda d, t=t: link_axes(robot.geometry, legs_at(motion(t + d)[0])))
+        omega = _angular_velocity(
+            lambda d, t=t: link_axes(robot.geometry, legs_at(motion(t + d)[0]))
+        )
         for values in (parameters, round_links):
-            mass_rate = derivative(lambda d, t=t, values=values: robot.mass_matrix(motion(t + d)[0], values))
+            mass_rate = derivative(
+                lambda d, t=t, values=values: robot.mass_matrix(motion(t + d)[0], values)
+            )
             skew = mass_rate - 2 * robot.coriolis_matrix(pose, twist, values)
             expected = 2 * np.sum((values[29:52:4] - values[30:52:4]) * omega.prod(axis=1))
             np.testing.assert_allclose(twist @ skew @ twist, expected, atol=2e-11)

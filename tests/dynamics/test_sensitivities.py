@@ -1,4 +1,5 @@
-"""Derivatives of runs with respect to the 67 parameters and the start, and runs from a given state."""
+"""Derivatives of runs with respect to the 67 parameters and the start, and runs from a given
+state."""
 
 from dataclasses import replace
 
@@ -14,7 +15,11 @@ CASES = {
     "exact friction": ({}, range(67), 1e-6),
     "logged commands": ({}, range(0, 67, 3), 1e-6),
     "linear hold, 1.3 frames of delay": (LATE, range(2, 67, 3), 1e-6),
-    "Stribeck friction": ({"friction": FrictionLaw("stribeck", None, 1.3, 0.1)}, range(1, 67, 3), 1e-6),
+    "Stribeck friction": (
+        {"friction": FrictionLaw("stribeck", None, 1.3, 0.1)},
+        range(1, 67, 3),
+        1e-6,
+    ),
     "smoothed friction": ({"smoothing_velocity": 0.05}, range(0, 67, 3), 1e-6),
     "exact friction, 16 steps": ({"steps": 16}, range(0, 67, 9), 1e-6),
     "exact friction, 2 steps": ({"steps": 2}, (0, 2, 3, 12), 1e-7),
@@ -35,8 +40,9 @@ def _central(values, step):
 def _assert_derivative(run, parameters, index, ours, tolerance):
     """A sensitivity (frames, 6) is the derivative of the poses to a share of its own largest entry.
 
-    Steps that move the poses by 1e-7, 1e-8, 1e-6 (m, rad) are tried; one must pass. Rounding in the poses, 1e-15, is
-    then 1e-7 at most; where a step changes the pattern of events the poses have a kink.
+    Steps that move the poses by 1e-7, 1e-8, 1e-6 (m, rad) are tried; one must pass. Rounding in the
+    poses, 1e-15, is then 1e-7 at most; where a step changes the pattern of events the poses have a
+    kink.
     """
     largest, misses, unit = np.abs(ours).max(), [], np.eye(67)[index]
     if largest == 0:  # an inertia about an axis that nothing turns about
@@ -56,8 +62,9 @@ def _assert_derivative(run, parameters, index, ours, tolerance):
 
 @pytest.mark.parametrize("case", CASES)
 def test_sensitivities_are_finite_differences_of_the_run(loop, case):
-    """Within one pattern of events the poses are smooth in the parameters, and the sensitivities are their derivatives
-    at the usual 4 steps a frame: steps that events cut are differentiated as they are computed."""
+    """Within one pattern of events the poses are smooth in the parameters, and the sensitivities
+    are their derivatives at the usual 4 steps a frame: steps that events cut are differentiated as
+    they are computed."""
     settings, reference, given = loop.settings(**CASES[case][0]), loop.reference(45), {}
     if case == "logged commands":
         given["commands"] = loop.run(reference, settings).command
@@ -72,11 +79,15 @@ def test_sensitivities_are_finite_differences_of_the_run(loop, case):
     base = run(loop.parameters, sensitivities=True)
     assert (base.events > 10) == (case != "smoothed friction")
     for index in CASES[case][1]:
-        _assert_derivative(run, loop.parameters, index, base.pose_sensitivity[:, :, index], CASES[case][2])
+        _assert_derivative(
+            run, loop.parameters, index, base.pose_sensitivity[:, :, index], CASES[case][2]
+        )
 
 
 def test_a_common_factor_of_all_parameters_cannot_be_seen(loop):
-    """Xi and (lp, li, ld) times c leave every pose unchanged; the sensitivity along that direction vanishes."""
+    """Xi and (lp, li, ld) times c leave every pose unchanged; the sensitivity along that direction
+    vanishes.
+    """
     base = loop.run(60, sensitivities=True)
     scaled = loop.run(60, parameters=1.7 * loop.parameters)
     np.testing.assert_allclose(scaled.pose, base.pose, atol=1e-12)
@@ -87,13 +98,18 @@ def test_a_common_factor_of_all_parameters_cannot_be_seen(loop):
 
 def _moved(start, direction):
     """The start state, moved by a vector of its 24 entries."""
-    changes = {name: getattr(start, name) + part for name, part in zip(ENTRIES, np.split(direction, 4), strict=True)}
+    changes = {
+        name: getattr(start, name) + part
+        for name, part in zip(ENTRIES, np.split(direction, 4), strict=True)
+    }
     return replace(start, **changes)
 
 
 @pytest.mark.parametrize("timing", [*TIMINGS, "elastic joints"])
 def test_a_run_from_the_state_of_another_repeats_its_rest(loop, timing):
-    """Bit by bit: the state is complete. Joints stick at some of these frames, and commands are on their way."""
+    """Bit by bit: the state is complete. Joints stick at some of these frames, and commands are on
+    their way.
+    """
     elastic = {"steps": 80, "elasticity": closed_loop.JointElasticity(500.0, 3e-4, 0.02)}
     settings = loop.settings(**TIMINGS.get(timing, elastic))
     run = loop.run(45, settings)
@@ -102,11 +118,15 @@ def test_a_run_from_the_state_of_another_repeats_its_rest(loop, timing):
         reference, start = loop.half_way(45, frame, settings)
         rest = loop.run(reference, settings, start=start)
         for name in RECORDS if timing == "elastic joints" else RECORDS[:-2]:
-            np.testing.assert_array_equal(getattr(rest, name), getattr(run, name)[frame:], err_msg=name)
+            np.testing.assert_array_equal(
+                getattr(rest, name), getattr(run, name)[frame:], err_msg=name
+            )
 
 
 @pytest.mark.parametrize("hold", ["zero", "linear"])
-def test_a_state_with_the_latencies_of_its_commands_goes_on_where_each_frame_has_its_own(loop, hold):
+def test_a_state_with_the_latencies_of_its_commands_goes_on_where_each_frame_has_its_own(
+    loop, hold
+):
     """Bit by bit, also where a command that was issued long before arrives after the state."""
     settings, frames = loop.settings(latency_s=1.3 / 60, hold=hold), 45
     latencies = np.random.default_rng(3).uniform(0.0, 4.2, frames) / 60
@@ -115,13 +135,19 @@ def test_a_state_with_the_latencies_of_its_commands_goes_on_where_each_frame_has
     for frame in (3, FRAME, 33):
         reference, start = loop.half_way(frames, frame, settings)[0], run.state_at(frame)
         before = np.concatenate([[settings.timing.latency_s], latencies[:frame]])
-        rest = loop.run(reference, settings, start=replace(start, latencies=before), latencies=latencies[frame:])
+        rest = loop.run(
+            reference, settings, start=replace(start, latencies=before), latencies=latencies[frame:]
+        )
         for name in RECORDS[:-2]:
-            np.testing.assert_array_equal(getattr(rest, name), getattr(run, name)[frame:], err_msg=name)
+            np.testing.assert_array_equal(
+                getattr(rest, name), getattr(run, name)[frame:], err_msg=name
+            )
 
 
 def test_the_default_start_is_the_equilibrium(robot, loop):
-    """Given or not, it is the same start, and the sensitivities contain that it follows the parameters."""
+    """Given or not, it is the same start, and the sensitivities contain that it follows the
+    parameters.
+    """
     reference, settings = loop.reference(20), loop.settings()
     start = closed_loop.equilibrium(robot, loop.parameters, reference.poses[0], settings.servo)
     given, default = (loop.run(reference, start=s, sensitivities=True) for s in (start, None))
@@ -130,13 +156,19 @@ def test_the_default_start_is_the_equilibrium(robot, loop):
     fixed = replace(start, joint_integral_sensitivity=np.zeros((6, 67)))
     held = loop.run(reference, start=fixed, sensitivities=True)
     assert np.abs(held.pose_sensitivity[-1] - default.pose_sensitivity[-1]).max() > 0
-    through = loop.run(reference, start=start, start_sensitivities=True).start_sensitivity[:, :, 12:18]
+    through = loop.run(reference, start=start, start_sensitivities=True).start_sensitivity[
+        :, :, 12:18
+    ]
     through = through @ start.joint_integral_sensitivity
-    np.testing.assert_allclose(held.pose_sensitivity + through, default.pose_sensitivity, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        held.pose_sensitivity + through, default.pose_sensitivity, rtol=1e-9, atol=1e-12
+    )
 
 
 def _directions(robot, start):
-    """Unit moves of pose and integrals, and pose rates that turn one joint by 1 rad/s; which of these joints stick."""
+    """Unit moves of pose and integrals, and pose rates that turn one joint by 1 rad/s; which of
+    these joints stick.
+    """
     jacobian = robot.pose_jacobian(start.pose)
     rates = np.zeros((6, 24))
     rates[:, 6:12] = np.linalg.inv(jacobian).T
@@ -147,16 +179,21 @@ def _directions(robot, start):
 
 @pytest.mark.parametrize("timing", [*TIMINGS, "sticking"])
 def test_start_sensitivities_are_finite_differences_of_the_run(robot, loop, timing):
-    """To 1e-6 of the largest, for every pose, integral and velocity of a joint that slips at the start. The velocity
-    of one that sticks is lost after a path that grows with its square: extrapolating from two steps takes that kink
-    out. It also cuts a step, which changes the error of the integrator: hence 16 steps a frame."""
+    """To 1e-6 of the largest, for every pose, integral and velocity of a joint that slips at the
+    start. The velocity of one that sticks is lost after a path that grows with its square:
+    extrapolating from two steps takes that kink out. It also cuts a step, which changes the error
+    of the integrator: hence 16 steps a frame."""
     settings = loop.settings(**TIMINGS.get(timing, {"steps": 16}))
     reference, start = loop.half_way(45, FRAME, settings)
-    by_start = loop.run(reference, settings, start=start, start_sensitivities=True).start_sensitivity
+    by_start = loop.run(
+        reference, settings, start=start, start_sensitivities=True
+    ).start_sensitivity
 
     def difference(direction, step):
         moves = {n: _moved(start, n * step * direction) for n in (-2, -1, 1, 2)}
-        return _central({n: loop.run(reference, settings, start=moved).pose for n, moved in moves.items()}, step)
+        return _central(
+            {n: loop.run(reference, settings, start=moved).pose for n, moved in moves.items()}, step
+        )
 
     slipping, sticking = _directions(robot, start)
     assert (len(slipping), len(sticking)) == (22, 2)
@@ -174,7 +211,9 @@ def test_start_sensitivities_are_finite_differences_of_the_run(robot, loop, timi
 
 @pytest.mark.parametrize("timing", TIMINGS)
 def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, loop, timing):
-    """All 24 entries of the last frame's state, by finite differences of runs along the start and the parameters."""
+    """All 24 entries of the last frame's state, by finite differences of runs along the start and
+    the parameters.
+    """
     settings = loop.settings(**TIMINGS[timing])
     reference, start = loop.half_way(45, FRAME, settings)
 
@@ -187,10 +226,14 @@ def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, loop, t
     assert run.end_sensitivity.shape == (24, 67)
     assert run.end_start_sensitivity.shape == (24, 24)
     moves = [(direction, np.zeros(67)) for direction in _directions(robot, start)[0]]
-    moves += [(np.zeros(24), loop.parameters * np.eye(67)[k]) for k in (0, 1, 7, 28, 29, *range(52, 67))]
+    moves += [
+        (np.zeros(24), loop.parameters * np.eye(67)[k]) for k in (0, 1, 7, 28, 29, *range(52, 67))
+    ]
     for move, change in moves:
         ours = run.end_start_sensitivity @ move + run.end_sensitivity @ change
-        scale = np.maximum(np.abs(ours).reshape(4, 6).max(axis=1).repeat(6), 1e-3 * np.abs(ours).max())
+        scale = np.maximum(
+            np.abs(ours).reshape(4, 6).max(axis=1).repeat(6), 1e-3 * np.abs(ours).max()
+        )
         misses = []
         for step in (1e-7, 1e-8, 1e-9):
             h = step / np.abs(ours[:6]).max()

@@ -1,4 +1,6 @@
-"""Robots as URDF and YAML of their closures, in the convention that `urdf_import` reads; written body by body."""
+"""Robots as URDF and YAML of their closures, in the convention that `urdf_import` reads; written
+body by body.
+"""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -7,11 +9,15 @@ from dynamics.bodies import parts_of
 
 
 def urdf_of(robot, values, platform_on_a_leg):
-    """Texts of a robot with parameters (p,). The platform floats, or hangs on the first leg by a spherical joint.
+    """Texts of a robot with parameters (p,). The platform floats, or hangs on the first leg by a
+    spherical joint.
 
     Actuated joints are written at zero, passive ones as they are at home.
     """
-    parts, home = parts_of(robot.geometry).all, parts_of(robot.geometry).frames(robot, robot.home_pose)
+    parts, home = (
+        parts_of(robot.geometry).all,
+        parts_of(robot.geometry).frames(robot, robot.home_pose),
+    )
     at_home, bodies = robot.inverse_kinematics(robot.home_pose), robot.layout.bodies_of(values)
     dry, viscous = values[robot.layout.coulomb].tolist(), values[robot.layout.viscous].tolist()
     turn = Rotation.from_euler("XYZ", robot.home_pose[3:]).as_matrix()
@@ -41,17 +47,30 @@ def urdf_of(robot, values, platform_on_a_leg):
         lines.append(joint(name, kind, before, part.name, places, axis, turned, more))
         if part.last:
             end = home.origin[number] + home.axes[number] @ segment.end
-            places[f"end_{part.name}"], places[f"seat_{part.name}"] = (end, home.axes[number]), (end, turn)
+            places[f"end_{part.name}"], places[f"seat_{part.name}"] = (
+                (end, home.axes[number]),
+                (end, turn),
+            )
             lines += [link(f"end_{part.name}"), link(f"seat_{part.name}")]
-            lines.append(joint(f"to_end_{part.name}", "fixed", part.name, f"end_{part.name}", places))
+            lines.append(
+                joint(f"to_end_{part.name}", "fixed", part.name, f"end_{part.name}", places)
+            )
             if platform_on_a_leg and not loops and "hanging" not in balls:
                 balls.append("hanging")
-                lines.append(joint("hanging", "revolute", f"end_{part.name}", f"seat_{part.name}", places))
+                lines.append(
+                    joint("hanging", "revolute", f"end_{part.name}", f"seat_{part.name}", places)
+                )
                 lines.append(joint("to_platform", "fixed", f"seat_{part.name}", "platform", places))
             else:
-                lines.append(joint(f"to_seat_{part.name}", "fixed", "platform", f"seat_{part.name}", places))
+                lines.append(
+                    joint(f"to_seat_{part.name}", "fixed", "platform", f"seat_{part.name}", places)
+                )
                 loops.append([f"end_{part.name}", f"seat_{part.name}"])
-    closures = {"closed_loop": loops, "type": ["3d"] * len(loops), "name_mot": list(robot.joint_names)}
+    closures = {
+        "closed_loop": loops,
+        "type": ["3d"] * len(loops),
+        "name_mot": list(robot.joint_names),
+    }
     closures |= {"joint_name": balls, "joint_type": ["SPHERICAL"] * len(balls)}
     text = "\n".join(['<robot name="made">', *lines, "</robot>"])
     return text, "\n".join(f"{key}: {value}" for key, value in closures.items())
@@ -63,7 +82,9 @@ def link(name, inertia=None, centre=(0, 0, 0)):
     mass, x, y, z = inertia.tolist()
     tensor = f'<inertia ixx="{x!r}" iyy="{y!r}" izz="{z!r}" ixy="0" ixz="0" iyz="0"/>'
     place = f'<origin xyz="{numbers(centre)}"/>'
-    return f'<link name="{name}"><inertial>{place}<mass value="{mass!r}"/>{tensor}</inertial></link>'
+    return (
+        f'<link name="{name}"><inertial>{place}<mass value="{mass!r}"/>{tensor}</inertial></link>'
+    )
 
 
 def joint(name, kind, parent, child, places, axis=(1, 0, 0), turned=0.0, more=""):

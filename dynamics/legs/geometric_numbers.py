@@ -1,9 +1,10 @@
-"""The geometric numbers of a leg: what decides where it lets its platform joint A be, and a leg with other ones.
+"""Geometric numbers of a leg: those that decide where it lets its platform joint A be.
 
-Each kind names its own (`Leg.numbers`): coordinates of its joints, lengths, and small turns of its axis, m and rad. A
-turn is counted from the leg at hand, about its own directions: `u` and `v` are across the axis, of a crank along its
-zero direction and across that, and `crank_zero` is about the axis. So the numbers of a leg are those of another plus a
-vector of deviations, and deviations may be symbols, whose leg has derivatives.
+Each kind names its own (`Leg.numbers`): coordinates of its joints and lengths, m, and small turns
+of its axis, rad. A turn is counted from the leg itself, about its own directions. `u` and `v` are
+across the axis; for a crank they are along its zero direction and across it. `crank_zero` is about
+the axis. The numbers of a leg are thus those of another leg plus a vector of deviations. Deviations
+may be symbols, which gives a leg with derivatives.
 """
 
 from typing import Any, TypeVar
@@ -19,7 +20,7 @@ from dynamics.legs.leg import Leg
 AnyKind = TypeVar("AnyKind", bound=Leg)
 POINTS = ("base_joint", "platform_joint")
 MOST_NUMBERS = 11
-"""A leg of any built-in kind has so many at most."""
+"""Largest number of geometric numbers of a leg of any built-in kind."""
 
 
 def unit_of(number: str) -> str:
@@ -28,35 +29,48 @@ def unit_of(number: str) -> str:
 
 
 def values(leg: Leg) -> np.ndarray:
-    """The numbers (k,) of a leg, m; its turns are zero."""
+    """Numbers (k,) of a leg, m. Its turns are zero."""
     return np.array([_value(leg, name) for name in leg.numbers])
 
 
 def moved(leg: AnyKind, deviations: ArrayLike | ca.SX) -> AnyKind:
-    """The leg with numbers that are off by deviations (k,), m and rad.
+    """Leg with numbers that are changed by deviations (k,), m and rad.
 
-    With symbols for deviations it is one of symbols, whose expressions have derivatives, and no more than these.
+    Deviations that are symbols give a leg of symbols. Its expressions have derivatives, and nothing
+    else of it works.
     """
-    by = deviations if isinstance(deviations, ca.SX) else ca.SX(ca.DM(np.asarray(deviations, dtype=float)))
+    by = (
+        deviations
+        if isinstance(deviations, ca.SX)
+        else ca.SX(ca.DM(np.asarray(deviations, dtype=float)))
+    )
     off = dict(zip(leg.numbers, ca.vertsplit(by), strict=True))
     changes: dict[str, Any] = {
-        field: getattr(leg, field) + ca.vertcat(*[off.get(f"{field}.{axis}", ca.SX(0)) for axis in "xyz"])
+        field: getattr(leg, field)
+        + ca.vertcat(*[off.get(f"{field}.{axis}", ca.SX(0)) for axis in "xyz"])
         for field in POINTS
     }
-    changes |= {name: getattr(leg, name) + off[name] for name in leg.numbers if "." not in name and not _is_turn(name)}
+    changes |= {
+        name: getattr(leg, name) + off[name]
+        for name in leg.numbers
+        if "." not in name and not _is_turn(name)
+    }
     if leg.turned:
         turns = [off.get(name, ca.SX(0)) for name in _turns(leg)]
         frame = ca.SX(_frame(leg)) @ rotation_matrix(ca.vertcat(*turns))
-        changes |= {field: frame[:, column] for field, column in zip(leg.turned, (2, 0), strict=False)}
+        changes |= {
+            field: frame[:, column] for field, column in zip(leg.turned, (2, 0), strict=False)
+        }
     return leg.model_copy(update={field: _number(value) for field, value in changes.items()})
 
 
 def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
-    """How far the numbers of a leg are from those of a nominal one of its kind (k,), m and rad; undoes `moved`."""
+    """Deviations (k,) of a leg from a nominal one of its kind, m and rad. They undo `moved`."""
     off = dict(zip(leg.numbers, values(leg) - values(nominal), strict=True))
     if leg.turned:
         between = _frame(nominal).T @ _frame(leg)
-        if len(leg.turned) == 1:  # of an axis alone: Rx(u) Ry(v) z
+        # a leg that turns its axis alone: Rx(u) Ry(v) z
+        if len(leg.turned) == 1:
             x, y, z = between[:, 2]
             turns = [np.arctan2(-y, z), np.arcsin(x), 0.0]
         else:
@@ -66,14 +80,17 @@ def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
 
 
 def _turns(leg: Leg) -> tuple[str, str, str]:
+    """Turns of a leg."""
     return f"{leg.turned[0]}.u", f"{leg.turned[0]}.v", "crank_zero"
 
 
 def _is_turn(number: str) -> bool:
+    """Return True for a number that is a turn."""
     return number == "crank_zero" or number.endswith((".u", ".v"))
 
 
 def _value(leg: Leg, number: str) -> float:
+    """Number of a leg."""
     field, _, entry = number.partition(".")
     if _is_turn(number):
         return 0.0
@@ -82,8 +99,10 @@ def _value(leg: Leg, number: str) -> float:
 
 
 def _frame(leg: Leg) -> np.ndarray:
-    """Right-handed axes (3, 3) as columns, the last one the leg's axis, the first one its zero direction if it has
-    one."""
+    """Right-handed axes (3, 3) of a leg, as columns.
+
+    The last one is the axis of the leg. The first one is its zero direction, if it has one.
+    """
     axis = getattr(leg, leg.turned[0])
     if len(leg.turned) == 2:
         first = getattr(leg, leg.turned[1])
@@ -94,7 +113,7 @@ def _frame(leg: Leg) -> np.ndarray:
 
 
 def _number(value: ca.SX) -> Any:
-    """An expression without symbols as what a field holds."""
+    """Number of an expression without symbols."""
     if not value.is_constant():
         return value
     array = np.array(ca.DM(value)).ravel()

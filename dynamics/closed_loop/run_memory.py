@@ -1,0 +1,337 @@
+"""Memory of a closed-loop run, as its kernels see it.
+
+A run allocates nothing. All that its kernels work on lies in four records that are made before it:
+NumPy structured scalars whose fields are numbers, arrays of fixed size, and further records. Numba
+compiles a kernel for the types of its arguments, so that the type of a record holds all sizes of
+the robot: one set of compiled kernels then serves every robot of the same sizes, whatever its
+numbers, and the compiler knows every length. `LAYOUT` lists the fields, `_lengths` says how long
+each dimension is, and `record_type` makes a NumPy type of both.
+
+The order of fields matters where a comment says so: a function of a robot (`robot.functions`)
+writes its outputs one after the other, straight into the fields of a record.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dynamics.closed_loop.command_schedule import CommandSchedule
+from dynamics.closed_loop.joints import FRICTION
+from dynamics.closed_loop.loop_settings import (
+    MAX_DELAY_FRAMES,
+)
+from dynamics.closed_loop.problem import (
+    LoopProblem,
+    Sizes,
+)
+from dynamics.parameters import LANES, room_for_derivatives
+
+LINE = 64
+"""Bytes in a line of a processor's cache."""
+
+
+class Plan(NamedTuple):
+    """Arrays that a run reads at its frames, one row each. They have no rows where not given."""
+
+    reference: np.ndarray
+    reference_rate: np.ndarray
+    commands: np.ndarray
+    feedforward: np.ndarray
+    lost: np.ndarray
+    noise: np.ndarray
+    start_commands: np.ndarray
+    start_integral_sensitivity: np.ndarray
+    start_servo_sensitivity: np.ndarray
+    start_command_sensitivity: np.ndarray
+    spans: CommandSchedule
+
+
+class Record(NamedTuple):
+    """Arrays that a run writes, as `ClosedLoopRun` describes them, with poses as coordinates."""
+
+    pose: np.ndarray
+    pose_rate: np.ndarray
+    torque: np.ndarray
+    command: np.ndarray
+    measured: np.ndarray
+    measured_ok: np.ndarray
+    joint_integral: np.ndarray
+    servo_integral: np.ndarray
+    pose_sensitivity: np.ndarray
+    start_sensitivity: np.ndarray
+    end_sensitivity: np.ndarray
+    end_start_sensitivity: np.ndarray
+    motor_angle: np.ndarray
+    motor_rate: np.ndarray
+    filtered_rate: np.ndarray
+
+
+def empty_record(problem: LoopProblem, runs: int = 1) -> Record:
+    """Record of runs, one after the other. What is not asked for has no rows or no columns."""
+    sizes = problem.sizes
+    frames = runs * problem.frames
+    joints = sizes.joints
+    coordinates = sizes.coordinates
+    parameters = len(problem.columns) if problem.sensitivities else 0
+    start = sizes.start if problem.start_sensitivities else 0
+    elastic_frames = frames if problem.settings.elasticity else 0
+    filtered_frames = frames if sizes.filters else 0
+    return Record(
+        pose=np.zeros((frames, coordinates)),
+        pose_rate=np.zeros((frames, coordinates)),
+        torque=np.zeros((frames, joints)),
+        command=np.zeros((frames, joints)),
+        measured=np.zeros((frames, coordinates)),
+        measured_ok=np.zeros(frames, bool),
+        joint_integral=np.zeros((frames, joints)),
+        servo_integral=np.zeros((frames, coordinates)),
+        pose_sensitivity=np.zeros((frames, coordinates, parameters)),
+        start_sensitivity=np.zeros((frames, coordinates, start)),
+        end_sensitivity=np.zeros((sizes.start, parameters)),
+        end_start_sensitivity=np.zeros((sizes.start, start)),
+        motor_angle=np.zeros((elastic_frames, joints)),
+        motor_rate=np.zeros((elastic_frames, joints)),
+        filtered_rate=np.zeros((filtered_frames, joints)),
+    )
+
+
+class Memory(NamedTuple):
+    """Records of one run.
+
+    task: what does not change during a run, such as the addresses of compiled functions, the laws,
+    parameters and gains. now: state of the integrator. evaluations (5,): everything known at the
+    stages of a step and at its end, where rows of stuck joints come in the order of `now.stuck`.
+    tangent: derivatives, with a row for each unknown, and columns for the parameters, for the start
+    state, and for the length of a step that an event cuts.
+    """
+
+    task: Any
+    now: Any
+    evaluations: np.ndarray
+    tangent: Any
+
+
+class Fields(NamedTuple):
+    """Neighbouring fields of a record that have the same type and dimensions."""
+
+    names: str
+    kind: str
+    dimensions: tuple[str, ...]
+
+
+def reals(names: str, *dimensions: str) -> Fields:
+    """Fields of real numbers, single ones where there are no dimensions."""
+    return Fields(names, "f8", dimensions)
+
+
+def integers(names: str, *dimensions: str) -> Fields:
+    """Fields of integers, single ones where there are no dimensions."""
+    return Fields(names, "i8", dimensions)
+
+
+def part(name: str) -> Fields:
+    """Field that is a record of its own, with the layout of its name."""
+    return Fields(name, "record", ())
+
+
+LAYOUT: dict[str, tuple[Fields, ...]] = {
+    "task": (
+        # addresses of functions of the robot, then of kernels
+        integers("equation_of_motion motion_in_lanes free_acceleration acceleration_in_lanes"),
+        integers("response stage_derivatives stop_derivatives rate_map_derivative"),
+        integers("slope_derivative servo_jacobian"),
+        integers("evaluate_terms evaluate decide_modes stop_joints slope_tangent stop_tangent"),
+        # what is asked for
+        integers("sensitivities servo_knows measured"),
+        # law of the drives, with its gains
+        reals("lp li ld lx rate_weight"),
+        reals("lx_by reads", "gain"),
+        # servo, elastic joints, timing, limits
+        reals("kp kd ki stiffness damping motor_inertia period"),
+        integers("torques"),
+        reals("torque_limit filter_time"),
+        # parameters of the robot, and the places of those that derivatives are shown for
+        integers("shown"),
+        integers("pivots", "rigid"),
+        reals("rigid", "rigid"),
+        reals("coulomb viscous", "joint"),
+        part("friction"),
+    ),
+    "now": (
+        part("stages"),
+        part("known"),
+        part("served"),
+        part("stopping"),
+        # joints: -1, 0 (stuck) or 1 for the direction of slip; the numbers of stuck ones
+        integers("mode stuck", "joint"),
+        # counters and switches
+        integers("ramping moved events events_left start_moves time_moves length_moves"),
+        integers("width parameters step_column"),
+        # state, commands and servo
+        reals("elapsed"),
+        reals("state", "state"),
+        reals("command command_slope command_rate last_command", "joint"),
+        reals("last_measured servo_integral demand change", "coordinate"),
+        reals("pose_and_rate", "rate map input"),
+        reals("rate_map", "joint", "coordinate"),
+        # place of the integrator: frame, span, step
+        integers("first_row status unknowns frame span steps grid"),
+        reals("duration target"),
+        integers("purpose"),
+        reals("length"),
+        # search for an event within a step
+        integers("trials"),
+        reals("cut low high low_margin high_margin half_margin"),
+        reals("tried tried_margin tried_crossing", "trial point"),
+    ),
+    "known": (
+        # outputs of `equation_of_motion` in its order
+        reals("mass", "coordinate", "coordinate"),
+        reals("bias", "coordinate"),
+        reals("jacobian", "joint", "coordinate"),
+        reals("bias_acceleration angle velocity", "joint"),
+        reals("factor", "coordinate", "coordinate"),
+        reals("inputs", "motion input"),
+        integers("valid"),
+    ),
+    "served": (
+        reals("jacobian", "joint", "coordinate"),
+        reals("inputs", "servo input"),
+    ),
+    "stages": (
+        # outputs of `stage_derivatives` for all stages of a step
+        reals("by_pose by_rate", "coordinate", "coordinate", "stage"),
+        reals("columns", "coordinate", "rigid", "stage"),
+        reals("crank_by_pose crank_by_rate", "joint", "coordinate", "stage"),
+        # then what else the columns of `slope_derivative` have in common
+        reals("jacobian pushing", "joint", "coordinate", "stage"),
+        reals("factor", "coordinate", "coordinate", "stage"),
+        reals("damping by_error by_integral by_command_rate", "joint", "stage"),
+        reals("inputs", "stage input", "stage"),
+    ),
+    "stopping": (
+        # outputs of `stop_derivatives`
+        reals("by_pose by_rate", "coordinate", "coordinate"),
+        reals("columns", "coordinate", "rigid"),
+        reals("inputs", "stop input"),
+    ),
+    "evaluation": (
+        # inputs of `response` and, from the factor on, of `free_acceleration`, in their order
+        reals("row", "coordinate"),
+        reals("factor", "coordinate", "coordinate"),
+        reals("bias", "coordinate"),
+        reals("jacobian", "joint", "coordinate"),
+        reals("push", "joint"),
+        # state and its time derivative
+        reals("state slope", "state"),
+        reals("time"),
+        # joints; angle and velocity of elastic ones are those of their motors
+        reals("bias_acceleration angle velocity spring error torque net_torque", "joint"),
+        reals("stick_force force", "joint"),
+        # answer of the stuck joints to forces at each other
+        reals("response", "joint", "coordinate"),
+        reals("compliance stuck_factor", "joint", "joint"),
+    ),
+    "lanes": (
+        # inputs of `motion_in_lanes`, then its outputs; from the factor on, the inputs of
+        # `acceleration_in_lanes`, then its outputs
+        reals("states", "coordinate and rate", "lane"),
+        reals("bias_acceleration angle velocity", "joint", "lane"),
+        reals("factor", "coordinate", "coordinate", "lane"),
+        reals("bias", "coordinate", "lane"),
+        reals("jacobian", "joint", "coordinate", "lane"),
+        reals("push", "joint", "lane"),
+        reals("row acceleration response", "coordinate", "lane"),
+        integers("asked", "lane"),
+        reals("shared", "shared input"),
+    ),
+    "tangent": (
+        # rows of `slope_derivative`
+        reals("trial", "trial row", "column"),
+        reals("acting command_rate", "joint", "column"),
+        reals("push", "coordinate", "column"),
+        reals("direct", "joint", "column"),
+        # its results at each stage; slopes of filtered rates come before the torques
+        reals("k", "stage", "stage row", "column"),
+        # derivatives of the state, and of filtered rates in a trial
+        reals("x", "unknown", "column"),
+        reals("filtered", "filtered row", "column"),
+        # derivatives of commands on their way; the last entry is for those of the start
+        reals("issued", "command on its way", "joint", "column"),
+        reals("time length stage_time margin", "column"),
+        reals("command command_slope last_command force", "joint", "column"),
+        reals("last_measured integral demand moved", "coordinate", "column"),
+    ),
+}
+"""Fields of each record. The mass matrix is kept as its Cholesky factor, `factor`."""
+
+
+def _lengths(sizes: Sizes) -> dict[str, int]:
+    """Length of every dimension in `LAYOUT`."""
+    joints = sizes.joints
+    coordinates = sizes.coordinates
+    filters = sizes.filters
+    # the last inputs of a function of the robot are numbers of its geometry
+    numbers = sizes.geometry
+    fixed = sizes.rigid + numbers
+    moving = 2 * coordinates + joints
+    return {
+        "joint": joints,
+        "coordinate": coordinates,
+        "coordinate and rate": 2 * coordinates,
+        "rigid": sizes.rigid,
+        "gain": 3,
+        "stage": 4,
+        "trial point": 4,
+        "lane": LANES,
+        # coordinates, rates, integrals, filtered rates, motor angles, motor rates
+        "state": moving + filters + 2 * joints,
+        # those that have derivatives, which are of rigid joints
+        "unknown": moving + filters,
+        "trial row": moving,
+        "filtered row": max(filters, 1),
+        # slopes of coordinates' rates, joints' integrals and filtered rates, and the torques
+        "stage row": moving + joints + filters,
+        "column": room_for_derivatives(sizes.parameters, sizes.start),
+        "command on its way": MAX_DELAY_FRAMES + 3,
+        "servo input": coordinates + numbers,
+        "rate map input": 2 * coordinates + numbers,
+        "shared input": fixed,
+        "motion input": 2 * coordinates + fixed,
+        # coordinates, rates, accelerations, torques
+        "stage input": 3 * coordinates + joints + fixed,
+        # coordinates, accelerations, torques
+        "stop input": moving + fixed,
+    }
+
+
+@lru_cache(maxsize=64)
+def record_type(name: str, sizes: Sizes) -> np.dtype:
+    """NumPy type of a record of a robot with given sizes."""
+    length = _lengths(sizes)
+    fields: list[Any] = []
+    for names, kind, dimensions in LAYOUT[name]:
+        if kind == "record":
+            fields.append((names, FRICTION if names == "friction" else record_type(names, sizes)))
+            continue
+        shape = tuple(length[dimension] for dimension in dimensions)
+        fields += [(field, kind, shape) for field in names.split()]
+    return np.dtype((np.record, fields))
+
+
+def empty_memory(sizes: Sizes) -> Memory:
+    """Memory for one run of a robot with given sizes, filled with zeros."""
+    evaluations = np.zeros(5, record_type("evaluation", sizes))
+    return Memory(empty("task", sizes), empty("now", sizes), evaluations, empty("tangent", sizes))
+
+
+def empty(name: str, sizes: Sizes) -> Any:
+    """Record filled with zeros, at an address where a line of the processor's cache begins.
+
+    Vector instructions on its fields then touch one line of the cache and not two.
+    """
+    kind = record_type(name, sizes)
+    room = np.zeros(kind.itemsize + LINE, np.uint8)
+    first = -room.ctypes.data % LINE
+    return room[first : first + kind.itemsize].view(kind)[0]

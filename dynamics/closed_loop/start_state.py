@@ -1,0 +1,233 @@
+"""State from which a closed-loop run starts, and the state of rest."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynamics.checks import Shape, check_type, floats, real
+from dynamics.closed_loop.drives import ABOVE_ZERO, PID, READS, DriveName, Drives
+from dynamics.closed_loop.joints import JointElasticity
+from dynamics.closed_loop.loop_settings import ServoGains
+from dynamics.errors import SimulationError
+from dynamics.robot import Robot
+
+OPTIONAL = (
+    *(
+        "joint_integral_sensitivity",
+        "command_sensitivity",
+        "motor_angle",
+        "motor_rate",
+        "filtered_rate",
+    ),
+    "latencies",
+)
+
+
+@dataclass(frozen=True)
+class StartState:
+    """State of the loop at the first frame, before that frame is measured.
+
+    The robot has n joints, m coordinates and p parameters. The first four entries, with poses as
+    coordinates, are those of which `start_sensitivity` has the derivatives.
+
+    Parameters
+    ----------
+    pose, pose_rate : array_like, shape (6,)
+        Pose of the platform and its time derivative.
+    joint_integral : array_like, shape (n,)
+        Integral of the drives, rad s or m s.
+    servo_integral : array_like, shape (m,)
+        Integral of the servo, m s and rad s.
+    commands : array_like, shape (k, n)
+        Commands that were issued before, rad or m. The oldest is first, and acted before, too.
+    last_measured : array_like, shape (6,)
+        Pose that was measured one frame before.
+    joint_integral_sensitivity, command_sensitivity : array_like, shape (n, p), optional
+        Derivatives of the joint integral and of the commands with respect to the parameters. The
+        default is none. The servo integral follows the commands.
+    motor_angle, motor_rate : array_like, shape (n,), optional
+        State of the motors of elastic joints.
+    filtered_rate : array_like, shape (n,), optional
+        Rates of the errors in drives that filter them. The default is zero.
+    latencies : array_like, shape (k,), optional
+        Latencies of the commands before, s. The default is that of the timing.
+
+    Raises
+    ------
+    SimulationError
+        If an array has another shape, or entries that are not finite. The sizes of the robot are
+        checked when a run begins.
+
+    Examples
+    --------
+    >>> rest = np.zeros(6)
+    >>> home = robot.home_pose
+    >>> start = closed_loop.StartState(home, rest, rest, rest, np.zeros((1, 6)), home)
+    """
+
+    pose: np.ndarray
+    pose_rate: np.ndarray
+    joint_integral: np.ndarray
+    servo_integral: np.ndarray
+    commands: np.ndarray
+    last_measured: np.ndarray
+    joint_integral_sensitivity: np.ndarray | None = None
+    command_sensitivity: np.ndarray | None = None
+    motor_angle: np.ndarray | None = None
+    motor_rate: np.ndarray | None = None
+    filtered_rate: np.ndarray | None = None
+    latencies: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        poses: dict[str, Shape] = dict.fromkeys(("pose", "pose_rate", "last_measured"), (6,))
+        shapes = poses | dict.fromkeys(
+            ("commands", "joint_integral_sensitivity", "command_sensitivity"), ("N", "N")
+        )
+        for name in self.__dataclass_fields__:
+            if getattr(self, name) is None and name in OPTIONAL:
+                continue
+            array = floats(
+                f"start {name}",
+                getattr(self, name),
+                shapes.get(name, ("N",)),
+                error=SimulationError,
+            )
+            object.__setattr__(self, name, np.ascontiguousarray(array))
+        if not len(self.commands):
+            raise SimulationError("start commands must have at least 1 row, got 0")
+
+    def check_sizes(self, robot: Robot) -> None:
+        """Raise SimulationError, with the name of the part, for a size that is not that of the
+        robot.
+        """
+        joints = robot.layout.joints
+        parameters = len(robot.layout.names)
+        wanted: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("joint_integral", "motor_angle", "motor_rate", "filtered_rate"), (joints,)
+        )
+        wanted |= {
+            "servo_integral": (len(robot.coordinate_names),),
+            "commands": (len(self.commands), joints),
+        }
+        wanted |= dict.fromkeys(
+            ("joint_integral_sensitivity", "command_sensitivity"), (joints, parameters)
+        )
+        wanted |= {"latencies": (len(self.commands),)}
+        for name, shape in wanted.items():
+            found = getattr(self, name)
+            if found is not None and found.shape != shape:
+                raise SimulationError(
+                    f"start {name} of {robot.name} must have shape {shape}, got {found.shape}"
+                )
+
+
+def checked_loop_parameters(
+    robot: Robot, parameters: object, drive: DriveName = "pid"
+) -> np.ndarray:
+    """Dynamic parameters of a robot and lp, li, ld, as the law of its drives needs them.
+
+    Raises ParameterError for a dynamic parameter and SimulationError for everything else.
+    """
+    layout = robot.layout
+    values = floats(
+        "loop parameters", parameters, (len(layout.names),), error=SimulationError, finite=False
+    )
+    layout.check(values[layout.dynamic])
+    for name, value in zip(layout.joint_pid_names, values[layout.joint_pid], strict=True):
+        gain = name.split(".")[1]
+        least, above = (None, 0) if gain in ABOVE_ZERO[drive] else (0, None)
+        if gain not in READS[drive]:
+            least = None
+        real(name, value, SimulationError, least=least, above=above)
+    return values
+
+
+def check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
+    """Raise UnreachablePoseError or SingularPoseError for a pose (6,) where no run can start."""
+    # Both calls raise the error. The second one is for Euler angles at their singularity.
+    robot.static_torque(pose, parameters[robot.layout.dynamic])
+    robot.pose_rate(pose, np.zeros(6))
+
+
+def equilibrium(
+    robot: Robot,
+    parameters: np.ndarray,
+    pose: np.ndarray,
+    servo: ServoGains,
+    servo_robot: Robot | None = None,
+    elasticity: JointElasticity | None = None,
+    fed_forward: bool = False,
+    drives: Drives = PID,
+) -> StartState:
+    """State of rest at a pose, with friction unloaded.
+
+    The torque that holds the robot is linear in the dynamic parameters, so that the state has
+    derivatives with respect to them.
+
+    Parameters
+    ----------
+    robot : Robot
+        Robot at rest.
+    parameters : ndarray, shape (p,)
+        Dynamic parameters of the robot, then lp, li, ld of its drives.
+    pose : array_like, shape (6,)
+        Pose of the platform.
+    servo : ServoGains
+        Gains of the servo, whose integral holds the command.
+    servo_robot : Robot, optional
+        Robot whose kinematics the servo uses. The default is `robot`.
+    elasticity : JointElasticity, optional
+        Springs of the joints.
+    fed_forward : bool
+        True where a feedforward commands the joints where they are, so that the servo adds nothing.
+    drives : Drives
+        Law of the drives.
+
+    Returns
+    -------
+    StartState
+        State of rest.
+
+    Raises
+    ------
+    UnreachablePoseError, SingularPoseError, ParameterError, SimulationError
+        As for `simulate_servo`.
+
+    Examples
+    --------
+    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> servo = closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4)
+    >>> start = closed_loop.equilibrium(robot, parameters, robot.home_pose, servo)
+    >>> start.commands.shape
+    (1, 6)
+    """
+    check_type("robot", robot, Robot, SimulationError)
+    check_type("servo", servo, ServoGains, SimulationError)
+    parameters = checked_loop_parameters(robot, parameters, drives.law)
+    pose = floats("pose", pose, (6,))
+    rest = np.zeros(6)
+    chart = robot.geometry.chart
+    law = drives.joint_law(parameters[robot.layout.joint_pid])
+    check_start_pose(robot, parameters, pose)
+    angles = robot.inverse_kinematics(pose)
+    regressor = robot.regressor(pose, rest, rest)
+    torque_map = np.linalg.solve(
+        (robot.joint_jacobian(pose) @ chart.basis).T, chart.projected(regressor)
+    )
+    torque = torque_map @ parameters[robot.layout.dynamic]
+    motors = {}
+    # elastic joints are turned by the torque that their springs hold
+    if elasticity is not None:
+        angles = angles + torque / elasticity.stiffness
+        motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
+    command, integral = law.held(torque, angles)
+    by_command, by_integral = law.held_by_parameters(torque, angles, torque_map)
+    known = servo_robot or robot
+    servo_integral = np.zeros(len(chart.freedoms))
+    # the servo's integral holds the command, unless a feedforward does
+    if servo.ki and not fed_forward:
+        servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), command) / servo.ki
+    moving = by_command if by_command.any() else None
+    return StartState(
+        pose, rest, integral, servo_integral, command[None], pose, by_integral, moving, **motors
+    )

@@ -1,0 +1,330 @@
+"""Lines of LLVM text for one CasADi function, in which each value is assigned once."""
+
+from collections.abc import Callable
+
+import casadi as ca
+
+from dynamics.compiled.lanes import (
+    ColumnFunction,
+    Graph,
+    Group,
+    Node,
+    PartedFunction,
+    graph_of,
+    lane_groups,
+)
+from dynamics.compiled.operations import (
+    CALLED,
+    MEANING,
+    MOST_LANES,
+    OF_TRUTH,
+    OF_VECTORS,
+    TRUTH,
+    constant,
+    lanes_for,
+    type_name,
+)
+from dynamics.compiled.quick_arithmetic import quickened
+from dynamics.errors import DynamicsError
+
+AnyFunction = ca.Function | PartedFunction | ColumnFunction
+
+
+def shapes(function: AnyFunction) -> tuple[list[int], list[tuple[int, int]]]:
+    """Sizes of the inputs of a function, and shapes of its outputs."""
+    last = _last(function)
+    return (
+        [last.nnz_in(k) for k in range(_inputs(function))],
+        [last.size_out(k) for k in range(last.n_out())],
+    )
+
+
+def _last(function: AnyFunction) -> ca.Function:
+    """Function that makes the outputs."""
+    if isinstance(function, ColumnFunction):
+        return function.function
+    return function.end if isinstance(function, PartedFunction) else function
+
+
+def _inputs(function: AnyFunction) -> int:
+    """Number of inputs, without the columns of parts."""
+    return int(function.inputs if isinstance(function, PartedFunction) else _last(function).n_in())
+
+
+class FunctionBody:
+    """Lines of one function, and the functions that they call."""
+
+    def __init__(self, function: AnyFunction, quick: bool = False) -> None:
+        last = _last(function)
+        if not last.is_a("SXFunction"):
+            raise DynamicsError(
+                f"only SX functions become machine code: {last.name()} is {last.class_name()}"
+            )
+        self._name = last.name()
+        self._sizes = shapes(function)
+        self.own_inputs = _inputs(function)
+        self._beside = function.side_by_side if isinstance(function, PartedFunction) else 1
+        self._number = type_name(self._beside)
+        self._inputs = _places(self._name, [last.sparsity_in(k) for k in range(self.own_inputs)])
+        self._outputs = _places(self._name, [last.sparsity_out(k) for k in range(last.n_out())])
+        self._quickened: Callable[[Graph], Graph] = quickened if quick else lambda graph: graph
+        self._count = 0
+        self._vectors = dict[tuple[str, ...], str]()
+        self._lines: list[str] = []
+        # bits of the numbers that are a condition
+        self._truth: dict[str, str] = {}
+        self.called: set[str] = set()
+        parts = self._parts(function) if isinstance(function, PartedFunction) else []
+        self._write(self._quickened(graph_of(last)), parts)
+
+    def text(self) -> str:
+        """Text of the function, and of the one that calls it for many rows."""
+        lines = "\n".join(self._lines)
+        signature = "(ptr noalias readonly %inputs, ptr noalias %outputs)"
+        body = f"define void @{self._name}{signature} nounwind {{\n{lines}\nret void\n}}\n"
+        return body + (_rows(self._name, *self._sizes) if self._beside == 1 else "")
+
+    def _write(self, graph: Graph, parts: list[list[str]]) -> None:
+        """Write the values of a graph and its outputs.
+
+        parts: columns of what is known of the last input.
+        """
+        values = GraphValues(self, graph, parts)
+        for places, nodes in zip(self._outputs, graph.outputs, strict=True):
+            for place, node in zip(places, nodes, strict=True):
+                address = self.new(
+                    f"getelementptr double, ptr %outputs, i64 {place * self._beside}"
+                )
+                self._lines.append(
+                    f"store {self._number} {values.of(node)}, ptr {address}, align 8"
+                )
+
+    def _parts(self, function: PartedFunction) -> list[list[str]]:
+        """Columns of all parts, group by group."""
+        graph = self._quickened(graph_of(function.parts, function.constants))
+        values = GraphValues(self, graph, [])
+        columns = [[""] * len(of) for of in graph.outputs]
+        for group in lane_groups(graph):
+            for some in group.split(max(1, MOST_LANES // self._beside)):
+                width = lanes_for(len(some.lanes))
+                for row, vector in enumerate(self._group(some, values, width)):
+                    for lane, part in enumerate(some.lanes):
+                        columns[part][row] = self._entry(vector, lane, width)
+        return columns
+
+    def _group(self, group: Group, values: "GraphValues", width: int) -> list[str]:
+        """Outputs of parts that are alike, as vectors."""
+        steps: list[str] = []
+
+        def operand(of: int | tuple[int, ...]) -> str:
+            return (
+                steps[of]
+                if isinstance(of, int)
+                else self._vector([values.of(node) for node in of], width)
+            )
+
+        for operation, of in group.steps:
+            steps.append(self.result(operation, [operand(k) for k in of], len(group.lanes), width))
+        return [operand(of) for of in group.outputs]
+
+    def result(self, operation: str, operands: list[str], lanes: int = 1, width: int = 1) -> str:
+        """Result of an operation on numbers, or on vectors with a number of lanes in use."""
+        if operation == "ASSIGN":
+            return operands[0]
+        lanes = lanes * self._beside
+        width = width * self._beside
+        if operation in OF_VECTORS and width > 1:
+            return self._call(f"{OF_VECTORS[operation]}.v{width}f64", operands, type_name(width))
+        if operation in CALLED:
+            entries = [[self._lane(of, lane, width) for of in operands] for lane in range(lanes)]
+            return self._of_lanes(
+                [self._call(CALLED[operation], of, "double") for of in entries], width
+            )
+        if operation not in MEANING:
+            known = ", ".join(sorted({*MEANING, *CALLED}))
+            raise DynamicsError(
+                f"{self._name}: no machine code for the operation {operation}; known: {known}"
+            )
+        words = {"double": type_name(width), "i1": type_name(width, "i1")}
+        words |= {
+            name: constant([value] * width)
+            for name, value in (("zero", 0.0), ("one", 1.0), ("minus", -1.0))
+        }
+        words["true"] = "true" if width == 1 else f"<{', '.join(['i1 true'] * width)}>"
+        last = before = ""
+        lines = MEANING[operation]
+        if operation in OF_TRUTH and operands[0] in self._truth:
+            last = self._truth[operands[0]]
+            lines = OF_TRUTH[operation]
+        for line in lines:
+            text = line.format(*operands, last=last, before=before, **words)
+            before = last
+            last = self.new(text)
+        if lines[-1] == TRUTH:
+            self._truth[last] = before
+        return last
+
+    def _call(self, name: str, operands: list[str], kind: str) -> str:
+        """Result of a call."""
+        self.called.add(f"{kind} @{name}({', '.join([kind] * len(operands))})")
+        return self.new(f"call {kind} @{name}({', '.join(f'{kind} {of}' for of in operands)})")
+
+    def _vector(self, entries: list[str], width: int) -> str:
+        """Vector of numbers, or of several side by side. Unused lanes repeat the first number."""
+        if self._beside == 1:
+            return self._of_lanes(entries, width)
+        joined = entries + entries[:1] * (width - len(entries))
+        size = self._beside
+        while len(joined) > 1:
+            pairs = zip(joined[::2], joined[1::2], strict=True)
+            kind = type_name(size)
+            mask = f"<{2 * size} x i32> <{', '.join(f'i32 {lane}' for lane in range(2 * size))}>"
+            joined = [
+                self._once(f"shufflevector {kind} {one}, {kind} {other}, {mask}")
+                for one, other in pairs
+            ]
+            size *= 2
+        return joined[0]
+
+    def _once(self, text: str) -> str:
+        """Value of a line, or the one that the same line has made before."""
+        if (known := self._vectors.get((text,))) is None:
+            known = self._vectors[(text,)] = self.new(text)
+        return known
+
+    def _of_lanes(self, entries: list[str], width: int) -> str:
+        """Vector of numbers. Unused lanes repeat the first one."""
+        if width == 1:
+            return entries[0]
+        filled = entries + entries[:1] * (width - len(entries))
+        if all(entry.startswith("0x") for entry in filled):
+            return f"<{', '.join(f'double {entry}' for entry in filled)}>"
+        if (known := self._vectors.get(tuple(filled))) is None:
+            known = "poison"
+            once = len(set(filled)) == 1
+            for lane, entry in enumerate(filled[: 1 if once else width]):
+                known = self.new(
+                    f"insertelement {type_name(width)} {known}, double {entry}, i64 {lane}"
+                )
+            if once:
+                mask = f"<{width} x i32> zeroinitializer"
+                known = self.new(
+                    f"shufflevector {type_name(width)} {known}, {type_name(width)} poison, {mask}"
+                )
+            self._vectors[tuple(filled)] = known
+        return known
+
+    def _entry(self, vector: str, part: int, width: int) -> str:
+        """Number of a part in a vector, or its several numbers side by side."""
+        if width == 1 or self._beside == 1:
+            return self._lane(vector, part, width)
+        kind = type_name(width * self._beside)
+        own = range(part * self._beside, (part + 1) * self._beside)
+        mask = f"<{self._beside} x i32> <{', '.join(f'i32 {lane}' for lane in own)}>"
+        return self.new(f"shufflevector {kind} {vector}, {kind} poison, {mask}")
+
+    def _lane(self, vector: str, lane: int, width: int) -> str:
+        """Number in a lane of a vector."""
+        return (
+            vector
+            if width == 1
+            else self.new(f"extractelement {type_name(width)} {vector}, i64 {lane}")
+        )
+
+    def input(self, number: int, entry: int) -> str:
+        """Entry of an input."""
+        place = self.new(
+            f"getelementptr double, ptr %inputs, i64 {self._inputs[number][entry] * self._apart()}"
+        )
+        return self.new(f"load {self._number}, ptr {place}, align 8")
+
+    def _apart(self) -> int:
+        """Distance of the entries of inputs."""
+        return self._beside
+
+    def constant(self, value: float) -> str:
+        """Constant as an operand."""
+        return constant([value] * self._beside)
+
+    def new(self, text: str) -> str:
+        """New value of a line."""
+        self._count += 1
+        self._lines.append(f"%v{self._count} = {text}")
+        return f"%v{self._count}"
+
+
+class GraphValues:
+    """Values of a graph. Each is written once, where it is needed first."""
+
+    def __init__(self, body: FunctionBody, graph: Graph, parts: list[list[str]]) -> None:
+        self._body = body
+        self._nodes = graph.nodes
+        self._known = dict[int, str]()
+        self._parts = parts
+
+    def of(self, node: int) -> str:
+        """Name of a value."""
+        asked = [node]
+        while asked:
+            missing = [k for k in self._nodes[asked[-1]].operands if k not in self._known]
+            if missing:
+                asked.extend(reversed(missing))
+            elif (known := asked.pop()) not in self._known:
+                self._known[known] = self._written(self._nodes[known])
+        return self._known[node]
+
+    def _written(self, node: Node) -> str:
+        if node.operation == "CONST":
+            return self._body.constant(node.value)
+        if node.operation != "INPUT":
+            return self._body.result(node.operation, [self._known[k] for k in node.operands])
+        number, entry = node.entry
+        first = self._body.own_inputs
+        return (
+            self._parts[number - first][entry]
+            if number >= first
+            else self._body.input(number, entry)
+        )
+
+
+def _places(name: str, sparsities: list[ca.Sparsity]) -> list[list[int]]:
+    """Places of the entries of each matrix, row by row.
+
+    The entries are in the order of CasADi, which is by columns.
+    """
+    places = []
+    first = 0
+    for sparsity in sparsities:
+        if not sparsity.is_dense():
+            raise DynamicsError(
+                f"only dense matrices become machine code: {name} has one of {sparsity.dim(True)}"
+            )
+        rows, columns = sparsity.shape
+        places.append(
+            [first + row * columns + column for column in range(columns) for row in range(rows)]
+        )
+        first += rows * columns
+    return places
+
+
+def _rows(name: str, inputs: list[int], outputs: list[tuple[int, int]]) -> str:
+    """Text of the function that calls another for many inputs."""
+    return f"""define void @{name}.rows(i64 %count, ptr %inputs, ptr %outputs) nounwind {{
+entry:
+  br label %ask
+ask:
+  %n = phi i64 [0, %entry], [%next, %do]
+  %goes = icmp slt i64 %n, %count
+  br i1 %goes, label %do, label %done
+do:
+  %from = mul i64 %n, {sum(inputs)}
+  %to = mul i64 %n, {sum(rows * columns for rows, columns in outputs)}
+  %input = getelementptr double, ptr %inputs, i64 %from
+  %output = getelementptr double, ptr %outputs, i64 %to
+  call void @{name}(ptr %input, ptr %output)
+  %next = add i64 %n, 1
+  br label %ask
+done:
+  ret void
+}}
+"""

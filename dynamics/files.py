@@ -1,0 +1,238 @@
+"""Files that people write and pass on, read within limits or refused in one line.
+
+The limits are far beyond what a person writes. They are low enough that any file of at most a
+megabyte is read or refused within seconds.
+"""
+
+import json
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Iterable
+from os import PathLike
+from pathlib import Path
+from typing import Annotated, Any
+from xml.etree import ElementTree as Xml
+
+import yaml
+from pydantic import AfterValidator, WithJsonSchema
+
+LARGEST = 500_000
+"""Largest number of bytes of a file of settings."""
+
+LARGEST_XML = 1_000_000
+"""Largest number of bytes of an XML file."""
+
+DEEPEST = 16
+"""Largest depth of tables and lists, and number of parts of a dotted key."""
+
+DEEPEST_ELEMENT = 150
+"""Largest depth of elements of XML."""
+
+LARGEST_YAML = 100_000
+"""Largest number of bytes of a YAML file."""
+
+NAME = r"^\w[\w .+-]*$"
+"""Pattern of the names of robots, sensors, scenarios and studies, which become names of files."""
+
+LONGEST_NAME = 60
+"""Largest number of characters of such a name. Its file then has at most 255 bytes."""
+
+_YamlLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+_UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
+_TEXTS = re.compile(
+    r"""
+    \"{3} (?: [^"\\] | \\. | "(?!"") )*+ (?: \"{3} | \Z )  # a text over several lines
+    | " (?: [^"\\\n] | \\. )*+ "?
+    | '{3} (?: [^'] | '(?!'') )*+ (?: '{3} | \Z )
+    | ' [^'\n]*+ '?
+    | \# [^\n]*+
+    """,
+    re.DOTALL | re.VERBOSE,
+)
+"""Texts and comments of TOML, each to its end, so that a search takes linear time."""
+
+
+def is_name(name: str) -> bool:
+    """Tell whether a name can become that of a file."""
+    return bool(re.fullmatch(NAME, name)) and len(name) <= LONGEST_NAME
+
+
+def check_name(name: str) -> str:
+    """Return the name. Raises ValueError for one that could not be that of a file."""
+    if is_name(name):
+        return name
+    raise ValueError(
+        f"{name[: LONGEST_NAME + 1]!r} must be at most {LONGEST_NAME} letters, digits, spaces and "
+        ". _ + -, beginning with a letter, a digit or _"
+    )
+
+
+Name = Annotated[
+    str,
+    AfterValidator(check_name),
+    WithJsonSchema({"type": "string", "pattern": NAME, "maxLength": LONGEST_NAME}),
+]
+"""Name that becomes that of a file."""
+
+
+def is_file(path: str | PathLike[str]) -> bool:
+    """Return True where there is such a file. No path, such as one with NUL, is no file."""
+    try:
+        return Path(path).is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def read_bytes(
+    path: str | PathLike[str], source: str, refusal: type[Exception], largest: int = LARGEST
+) -> bytes:
+    """Content of a file. `source` is its name in messages, such as "robot file mine.toml".
+
+    Raises `refusal`, with the reason, for a file that cannot be read or is too large.
+    """
+    try:
+        place = Path(path)
+        if place.exists() and not (place.is_file() or place.is_dir()):
+            raise refusal(f"cannot read {source}: it is no regular file")
+        with place.open("rb") as file:
+            content = file.read(largest + 1)
+    except (OSError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
+        raise refusal(f"cannot read {source}: {reason}") from error
+    if len(content) > largest:
+        raise refusal(f"{source} has more than {largest:,} bytes, which no such file needs")
+    return content
+
+
+def read_text(path: str | PathLike[str], source: str, refusal: type[Exception]) -> str:
+    """Text of a file in UTF-8. Raises what `read_bytes` raises."""
+    try:
+        return read_bytes(path, source, refusal).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise refusal(f"cannot read {source}: {error}") from error
+
+
+def parse_toml(text: str, source: str, refusal: type[Exception]) -> dict[str, Any]:
+    """Content of TOML text. `source` is its name in messages.
+
+    Raises `refusal` for text that is no TOML or has more than `LARGEST` characters, for tables and
+    lists deeper than `DEEPEST`, for integers beyond 64 bits, and for control characters.
+    """
+    if len(text) > LARGEST:
+        raise refusal(f"{source} has more than {LARGEST:,} characters, which no such file needs")
+    deep = f"{source} has keys, tables or lists more than {DEEPEST} deep"
+    bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
+    # the time of tomllib grows as the square of the number of parts
+    if any(key.count(".") >= DEEPEST for key in bare):
+        raise refusal(deep)
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise refusal(f"{source} is not valid TOML: {error}") from error
+    except RecursionError:
+        raise refusal(deep) from None
+    except ValueError:
+        # int() refuses more than some thousand digits
+        raise refusal(f"{source} has an integer beyond 64 bits, or a date that is none") from None
+    fault = _fault(content)
+    if fault:
+        raise refusal(f"{source} has {fault}")
+    return content
+
+
+def _fault(content: dict[str, Any]) -> str:
+    """Text for the first thing in a content that is beyond the limits, or an empty text."""
+    left: list[tuple[Any, int]] = [(content, 0)]
+    while left:
+        value, depth = left.pop()
+        if depth > DEEPEST:
+            return f"keys, tables or lists more than {DEEPEST} deep"
+        if isinstance(value, dict):
+            left += [(key, depth) for key in value]
+            left += [(one, depth + 1) for one in value.values()]
+        elif isinstance(value, list):
+            left += [(one, depth + 1) for one in value]
+        elif isinstance(value, str) and _UNWANTED.search(value):
+            return f"a control character in {value[:60]!r}"
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            return "an integer beyond 64 bits"
+        elif not isinstance(value, (str, int, float)):
+            return f"a date or time, {value}, which none needs"
+    return ""
+
+
+def parse_json(text: str, source: str, refusal: type[Exception]) -> Any:
+    """Content of JSON text.
+
+    Raises `refusal` for text that is no JSON or too deep, and for endless integers.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        reason = "it is too deep" if isinstance(error, RecursionError) else error
+        raise refusal(f"{source} is truncated or not JSON: {reason}") from error
+
+
+def parse_yaml(content: bytes, source: str, refusal: type[Exception]) -> Any:
+    """Content of YAML of mappings, lists and names. Every scalar is a text.
+
+    Raises `refusal` for content that is no YAML, for aliases, for a key that is there twice, and
+    for more than `DEEPEST` levels.
+    """
+    try:
+        _check_events(yaml.parse(content, Loader=_YamlLoader), source, refusal)
+        node = yaml.compose(content, Loader=_YamlLoader)
+        if isinstance(node, yaml.MappingNode):
+            keys = Counter(str(key.value) for key, _ in node.value)
+            twice = [key for key, count in keys.items() if count > 1]
+            if twice:
+                raise refusal(f"{source} has the key {twice[0][:60]!r} twice")
+        return yaml.load(content, Loader=_YamlLoader)
+    except (yaml.YAMLError, ValueError) as error:
+        raise refusal(f"cannot read {source}: {' '.join(str(error).split())}") from None
+
+
+def _check_events(events: Iterable[Any], source: str, refusal: type[Exception]) -> None:
+    """Raise `refusal` for aliases and for content that is too deep."""
+    depth = 0
+    for event in events:
+        if isinstance(event, yaml.AliasEvent):
+            raise refusal(f"{source} has an alias, *{event.anchor}; write out what it stands for")
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise refusal(f"{source} has lists and mappings more than {DEEPEST} deep")
+
+
+def parse_xml(content: bytes, source: str, refusal: type[Exception]) -> Xml.Element:
+    """Root of XML.
+
+    Raises `refusal` for content that is no XML, for elements more than `DEEPEST_ELEMENT` deep, and
+    for a document type, which could define entities.
+    """
+    try:
+        return Xml.fromstring(content, Xml.XMLParser(target=_Builder()))
+    except (Xml.ParseError, ValueError) as error:
+        raise refusal(f"cannot read {source}: {error}") from None
+
+
+class _Builder(Xml.TreeBuilder):
+    """Builder of the tree of XML within limits. Raises ValueError beyond them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = 0
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ValueError("it declares a document type and may define entities, which none needs")
+
+    def start(self, tag: Any, attrs: Any, /) -> Xml.Element:
+        self._depth += 1
+        if self._depth > DEEPEST_ELEMENT:
+            raise ValueError(f"its elements are more than {DEEPEST_ELEMENT} deep")
+        return super().start(tag, attrs)
+
+    def end(self, tag: Any, /) -> Xml.Element:
+        self._depth -= 1
+        return super().end(tag)

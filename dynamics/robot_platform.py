@@ -1,0 +1,350 @@
+"""Platform of a robot: names, poses, twists and reach, for one pose or a batch of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynamics.checks import check_type, row_text, rows
+from dynamics.compiled.machine_code import MachineFunction
+from dynamics.errors import (
+    ChartError,
+    RobotFileError,
+    ShapeError,
+    SingularPoseError,
+    UnreachablePoseError,
+)
+from dynamics.geometry import RobotGeometry
+from dynamics.kinematics.chart import POSE_NAMES
+from dynamics.parameters import parameter_layout
+from dynamics.robot_file import ParameterSet, RobotDescription
+from dynamics.robot_functions import nearby_functions, own_functions
+
+# A system with a larger condition number loses all digits. A healthy robot is near 1e2.
+CONDITION_LIMIT = 1e10
+
+CHART_TOLERANCE = 1e-9
+"""Largest part of a pose or a twist outside the chart, m, rad, m/s or rad/s, that is rounding."""
+
+
+class RobotPlatform:
+    """Names, poses, twists and reach of a robot. See `Robot`."""
+
+    def __init__(self, description: RobotDescription, nominal: RobotGeometry | None = None) -> None:
+        """Make a robot of its description, with the functions of a nominal geometry nearby."""
+        check_type("description", description, RobotDescription, RobotFileError)
+        self.name = description.name
+        self.geometry = description.geometry
+        # robots of other geometries share the functions of a nominal one, see `moved`
+        self.functions_of = nominal or description.geometry
+        self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
+        self.layout = parameter_layout(self.geometry.legs)
+        self.parameter_names = self.layout.dynamic_names
+        self.nominal_parameters = description.parameter_sets["initial"].dynamic
+
+    def __repr__(self) -> str:
+        count = len(self.parameter_names)
+        sets = ", ".join(self.parameter_sets)
+        return f"Robot({self.name!r}, {count} parameters, sets: {sets})"
+
+    @property
+    def home_pose(self) -> np.ndarray:
+        """Pose (6,) of the platform at home."""
+        return self.geometry.home_pose
+
+    @property
+    def travel_limit(self) -> float:
+        """Largest magnitude of a joint coordinate allowed, rad or m."""
+        return self.geometry.travel_limit
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the n actuated joints."""
+        return self.layout.joint_names
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """Names of the m coordinates of the platform."""
+        return self.geometry.chart.coordinate_names
+
+    @property
+    def functions(self) -> dict[str, MachineFunction]:
+        """Compiled functions by name. They are compiled when they are first asked for."""
+        if self.functions_of is self.geometry:
+            return own_functions(self.geometry)
+        return nearby_functions(self.functions_of, self.geometry)
+
+    def pose(self, coordinates: ArrayLike) -> np.ndarray:
+        """Pose of the platform at given coordinates.
+
+        Parameters
+        ----------
+        coordinates : array_like, shape (m,) or (N, m)
+            Coordinates of the platform in the order of `coordinate_names`.
+
+        Returns
+        -------
+        ndarray, shape (6,) or (N, 6)
+            Pose. The entries that the platform cannot change are those at home.
+
+        Raises
+        ------
+        ShapeError
+            If the shape is another one.
+
+        Examples
+        --------
+        >>> robot.pose(np.zeros(6))
+        array([0., 0., 0., 0., 0., 0.])
+        """
+        values = rows("coordinates", coordinates, len(self.coordinate_names))
+        return self.geometry.chart.pose(values)
+
+    def coordinates(self, pose: ArrayLike) -> np.ndarray:
+        """Coordinates of the platform at a pose, which may be a measured one.
+
+        Parameters
+        ----------
+        pose : array_like, shape (6,) or (N, 6)
+            Pose. The entries that the platform cannot change are ignored.
+
+        Returns
+        -------
+        ndarray, shape (m,) or (N, m)
+            Coordinates in the order of `coordinate_names`.
+
+        Raises
+        ------
+        ShapeError
+            If the shape is another one.
+
+        Examples
+        --------
+        >>> robot.coordinates(robot.home_pose)
+        array([0. , 0. , 0.2, 0. , 0. , 0. ])
+        """
+        return self.geometry.chart.coordinates(rows("pose", pose, 6))
+
+    def twist(self, pose: ArrayLike, pose_rate: ArrayLike) -> np.ndarray:
+        """Twist of a pose rate (eq. 2).
+
+        Parameters
+        ----------
+        pose, pose_rate : array_like, shape (6,) or (N, 6)
+            Pose and its time derivative.
+
+        Returns
+        -------
+        ndarray, shape (6,) or (N, 6)
+            Twist [h_dot, omega] in the axes of the base.
+
+        Raises
+        ------
+        ShapeError
+            See the class.
+
+        Examples
+        --------
+        >>> robot.twist(robot.home_pose, np.ones(6))
+        array([1., 1., 1., 1., 1., 1.])
+        """
+        return self._call("twist", rows("pose", pose, 6), rows("pose_rate", pose_rate, 6))[..., 0]
+
+    def twist_dot(
+        self, pose: ArrayLike, pose_rate: ArrayLike, pose_acceleration: ArrayLike
+    ) -> np.ndarray:
+        """Time derivative of the twist (eq. 38).
+
+        Parameters
+        ----------
+        pose, pose_rate, pose_acceleration : array_like, shape (6,) or (N, 6)
+            Pose and its first and second time derivatives.
+
+        Returns
+        -------
+        ndarray, shape (6,) or (N, 6)
+            Time derivative of the twist.
+
+        Raises
+        ------
+        ShapeError
+            See the class.
+
+        Examples
+        --------
+        >>> robot.twist_dot(robot.home_pose, np.zeros(6), np.ones(6))
+        array([1., 1., 1., 1., 1., 1.])
+        """
+        rate = rows("pose_rate", pose_rate, 6)
+        acceleration = rows("pose_acceleration", pose_acceleration, 6)
+        return self._call("twist_dot", rows("pose", pose, 6), rate, acceleration)[..., 0]
+
+    def pose_rate(self, pose: ArrayLike, twist: ArrayLike) -> np.ndarray:
+        """Pose rate of a twist, the inverse of `twist`.
+
+        Parameters
+        ----------
+        pose, twist : array_like, shape (6,) or (N, 6)
+            Pose and twist of the platform.
+
+        Returns
+        -------
+        ndarray, shape (6,) or (N, 6)
+            Time derivative of the pose.
+
+        Raises
+        ------
+        SingularPoseError
+            If beta is pi/2 or -pi/2, where Euler rates have no value.
+        ShapeError
+            See the class.
+
+        Examples
+        --------
+        >>> robot.pose_rate(robot.home_pose, np.ones(6))
+        array([1., 1., 1., 1., 1., 1.])
+        """
+        poses = rows("pose", pose, 6)
+        turned = np.abs(np.cos(poses[..., 4]))
+        if not (turned > 1 / CONDITION_LIMIT).all():
+            raise SingularPoseError(
+                f"Euler rates are singular at beta = +-pi/2: |cos(beta)| is {turned.min():.3g}"
+            )
+        return self._call("pose_rate", poses, rows("twist", twist, 6))[..., 0]
+
+    def reach_margin(self, pose: ArrayLike) -> np.ndarray:
+        """Margin of each leg before the end of its reach.
+
+        The margin has no unit and is at most 1. For a crank it is sin^2 of the angle between the
+        crank and its direction of reach.
+
+        Parameters
+        ----------
+        pose : array_like, shape (6,) or (N, 6)
+            Pose of the platform.
+
+        Returns
+        -------
+        ndarray, shape (n,) or (N, n)
+            Margins. They are negative out of reach, and -inf where squares overflow.
+
+        Raises
+        ------
+        ShapeError, ChartError
+            See the class.
+
+        Examples
+        --------
+        >>> (robot.reach_margin(robot.home_pose) > 0).all()
+        np.True_
+        """
+        return self._margins(self.charted(pose))
+
+    def check_reach(self, pose: ArrayLike, name: str = "pose", row: str = "row") -> None:
+        """Check that all legs reach a pose.
+
+        Parameters
+        ----------
+        pose : array_like, shape (6,) or (N, 6)
+            Pose of the platform.
+        name, row : str
+            Words of the message for the pose and for the number of its row.
+
+        Raises
+        ------
+        UnreachablePoseError
+            With the first leg and the first pose that are out of reach.
+        ShapeError, ChartError
+            See the class.
+
+        Examples
+        --------
+        >>> robot.check_reach(robot.home_pose)
+        """
+        poses = np.atleast_2d(self.charted(pose, name))
+        margin = self._margins(poses)
+        if (margin > 0).all():
+            return
+        index, leg = (int(value) for value in np.argwhere(~(margin > 0))[0])
+        where = f" ({row} {index})" if np.ndim(pose) > 1 else ""
+        raise UnreachablePoseError(
+            f"leg {leg + 1} cannot reach {name} {row_text(poses[index])}{where}: reach margin "
+            f"{margin[index, leg]:.3g}, must be > 0"
+        )
+
+    def charted(self, pose: ArrayLike, name: str = "pose") -> np.ndarray:
+        """Poses as an array, if the platform can have them.
+
+        Parameters
+        ----------
+        pose : array_like, shape (6,) or (N, 6)
+            Pose of the platform.
+        name : str
+            Word of the message for the pose.
+
+        Returns
+        -------
+        ndarray, shape (6,) or (N, 6)
+            The poses.
+
+        Raises
+        ------
+        ShapeError, ChartError
+            See the class.
+
+        Examples
+        --------
+        >>> robot.charted([0, 0, 0.2, 0, 0, 0])
+        array([0. , 0. , 0.2, 0. , 0. , 0. ])
+        """
+        poses = rows(name, pose, 6)
+        self._check_chart(name, poses, self.geometry.chart.forbidden(poses))
+        return poses
+
+    def _margins(self, poses: np.ndarray) -> np.ndarray:
+        """Reach margins of poses that the platform can have."""
+        margin = self._call("inverse_kinematics", poses, output=1)[..., 0]
+        # comparisons with NaN are False, and a leg with a NaN margin does not reach
+        return np.where(np.isnan(margin), -np.inf, margin)
+
+    def _poses(self, pose: ArrayLike) -> np.ndarray:
+        """Poses as an array, if they are in reach."""
+        poses = rows("pose", pose, 6)
+        self.check_reach(poses)
+        return poses
+
+    def _twists(self, name: str, value: ArrayLike) -> np.ndarray:
+        """Twists as an array, if the platform can have them."""
+        twists = rows(name, value, 6)
+        free = self.geometry.chart.basis
+        self._check_chart(name, twists, twists - twists @ free @ free.T)
+        return twists
+
+    def _check_chart(self, name: str, given: np.ndarray, forbidden: np.ndarray) -> None:
+        """Raise ChartError for rows with a part that the platform of this robot cannot do."""
+        if np.abs(forbidden).max(initial=0.0) <= CHART_TOLERANCE:
+            return
+        names = ", ".join(self.coordinate_names)
+        off = np.atleast_2d(forbidden)
+        entry = int(np.argmax(np.abs(off).max(axis=0)))
+        row = int(np.argmax(np.abs(off[:, entry])))
+        raise ChartError(
+            f"the platform of {self.name} moves in {names} only: {name} "
+            f"{row_text(np.atleast_2d(given)[row])} is {off[row, entry]:.3g} off in "
+            f"{POSE_NAMES[entry]}"
+        )
+
+    def _call(self, name: str, *arguments: np.ndarray, output: int = 0) -> np.ndarray:
+        """Output of a function, (rows, columns) or, where an argument is a batch, one axis more."""
+        batched = [argument.shape[0] for argument in arguments if argument.ndim == 2]
+        if len(set(batched) - {1}) > 1:
+            shapes = ", ".join(str(argument.shape) for argument in arguments)
+            raise ShapeError(f"{name}: batch lengths differ, shapes {shapes}")
+        results = self.functions[name](*[np.atleast_2d(argument) for argument in arguments])
+        values = results[output]
+        if output == 0 and not np.isfinite(values).all():
+            said = ", ".join(row_text(argument) for argument in arguments)
+            raise SingularPoseError(
+                f"{name} is not finite for {said}: singular pose or mass matrix"
+            )
+        return values if batched else values[0]
