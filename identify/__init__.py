@@ -1,26 +1,32 @@
-"""Identification of parallel robots from images: excitation, experiment, estimation, validation, reports.
+"""Identification of parallel robots from images: excitation, experiment, estimation, validation,
+reports.
 
 The one place where robots (`dynamics`) and the optical sensor (`cmmsim`) meet.
 
 Experiment
-    load_scenario(name_or_path) -> Scenario     built in (`scenario_names() -> list[str]`), or a TOML file
-    run_experiment(scenario, seed) -> Dataset   the record of a plant moved with images in the loop
+    load_scenario(name_or_path) -> Scenario     built in (`scenario_names() -> list[str]`), or a
+    TOML file run_experiment(scenario, seed) -> Dataset   the record of a plant moved with images in
+    the loop
 
 A record of your own
     build_record(*, time, ...) -> Dataset       from arrays over the frames
-    store_anchor(record, anchor)                what fixes the scale, a ScaleAnchor(name, value, std)
-    store_payload(record, payload, std)         a known load, `payload_vector(mass_kg, inertia_kg_m2)`
+    store_anchor(record, anchor)                what fixes the scale, a ScaleAnchor(name, value,
+    std) store_payload(record, payload, std)         a known load, `payload_vector(mass_kg,
+    inertia_kg_m2)`
 
 Identification
     identify(record, robot, scenario) -> IdentificationResult
-    unseen_errors(parameters, robot, scenario, seed) -> ndarray   model against plant on trajectories it never saw
+    unseen_errors(parameters, robot, scenario, seed) -> ndarray   model against plant on
+    trajectories it never saw
 
 Pictures
-    run_figures(folder) -> dict                 of a finished run, by name: functions that draw them for print
-    the room `identify.scene`                   draws robot, cameras and images, and the page that replays a run
+    run_figures(folder) -> dict                 of a finished run, by name: functions that draw them
+    for print the room `identify.scene`                   draws robot, cameras and images, and the
+    page that replays a run
 
-Every error that a user can cause is an IdentifyError, a `cmmsim.CmmError` or a `dynamics.DynamicsError`. Names are
-imported on first use: CasADi and OpenGL take seconds to load, and `cmmsim --help` must not wait for them.
+Every error that a user can cause is an IdentifyError, a `cmmsim.CmmError` or a
+`dynamics.DynamicsError`. Names are imported on first use: CasADi and OpenGL take seconds to load,
+and `cmmsim --help` must not wait for them.
 """
 
 from importlib import import_module
@@ -63,7 +69,9 @@ if not TYPE_CHECKING:  # a type checker would take every name for one that this 
 
     def __getattr__(name: str) -> Any:
         if name not in _HOME:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+            raise AttributeError(
+                f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}"
+            )
         return getattr(import_module(_HOME[name]), name)
 
     def __dir__() -> list[str]:

@@ -1,4 +1,6 @@
-"""The command ``cmmsim`` from its first line on: Ctrl-C ends it in one line, also while the libraries are loaded."""
+"""The command ``cmmsim`` from its first line on: Ctrl-C ends it in one line, also while the
+libraries are loaded.
+"""
 
 import sys
 

@@ -1,8 +1,18 @@
-"""The errors a user can cause or meet; each message carries the value, the limit and the valid names."""
+"""The errors a user can cause or meet; each message carries the value, the limit and the valid
+names.
+"""
+
+LONGEST = 4000
+"""Characters of a message."""
 
 
 class IdentifyError(Exception):
-    """Base of every error that the command line shows as one line."""
+    """Base of every error that the command line shows as one line. The message is one line."""
+
+    def __str__(self) -> str:
+        """Message on one line of at most `LONGEST` characters, whatever a file had in it."""
+        text = " ".join(super().__str__().splitlines())
+        return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 class ScenarioError(IdentifyError):
@@ -25,6 +35,10 @@ class OutputFolderError(IdentifyError):
     """A run folder that already holds something, or lacks what an earlier stage writes."""
 
 
+class WriteError(IdentifyError):
+    """A file or folder that cannot be written: no room, no permission, or no such place."""
+
+
 class EstimationError(IdentifyError):
     """A record from which no parameters can be estimated."""
 
@@ -34,7 +48,8 @@ class VerificationError(IdentifyError):
 
 
 class StudyError(IdentifyError):
-    """A study that contradicts itself, a folder of another one, or machines on which it cannot run."""
+    """A study that contradicts itself, a folder of another one, or machines on which it cannot
+    run."""
 
 
 class StudyInterrupted(StudyError):

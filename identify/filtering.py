@@ -1,8 +1,8 @@
-"""Zero-phase Butterworth filter (section 4.2), derivatives of sampled signals, and gaps in them.
+"""Zero-phase Butterworth filter (section 4.2), derivatives of sampled signals, and filling of gaps.
 
-Forward and reverse filtering squares the magnitude: ``order`` is that of one pass, as in Matlab's filtfilt, so the
-gain at the cutoff is 1/2. The parts of scipy are loaded on first use: every command reads scenarios, which ask here for
-the padding.
+Forward and reverse filtering squares the magnitude. ``order`` is that of one pass, as in Matlab's
+filtfilt, so the gain at the cutoff is 1/2. Parts of SciPy are loaded on first use, because every
+command reads a scenario, which asks here only for the padding.
 """
 
 import numpy as np
@@ -13,33 +13,66 @@ from identify.arrays import Array
 from identify.errors import FilterError
 
 SPLINE_DEGREE = 5
-"""Quintic: the second derivative is still three times differentiable."""
+"""Degree of the spline; its second derivative is still three times differentiable."""
 
 
-def zero_phase_filter(samples: ArrayLike, rate_hz: float, cutoff_hz: float, order: int = 8) -> Array:
-    """Low-pass filter samples (N, ...) along the first axis without shifting them in time.
+def zero_phase_filter(
+    samples: ArrayLike, rate_hz: float, cutoff_hz: float, order: int = 8
+) -> Array:
+    """Low-pass filter samples along the first axis without shifting them in time.
 
-    Raises FilterError: cutoff not positive, or at or above the Nyquist frequency; a record shorter than the padding; or
-    samples that are not finite.
+    Parameters
+    ----------
+    samples : array_like, shape (N, ...)
+        Finite samples at equal intervals.
+    rate_hz : float
+        Sampling rate.
+    cutoff_hz : float
+        Frequency at which the gain is 1/2.
+    order : int, optional
+        Order of one pass.
+
+    Returns
+    -------
+    ndarray, shape (N, ...)
+        The filtered samples.
+
+    Raises
+    ------
+    FilterError
+        The cutoff is not between zero and the Nyquist frequency, the record is not longer than the
+        padding, or a sample is not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> bool(np.allclose(zero_phase_filter(np.ones(400), 100.0, 10.0), 1.0))
+    True
     """
     values = _finite(samples)
     if not 0 < cutoff_hz < rate_hz / 2:
         raise FilterError(
-            f"filter cutoff {cutoff_hz:g} Hz must be above 0 and below the Nyquist frequency {rate_hz / 2:g} Hz "
-            f"of the sampling rate {rate_hz:g} Hz"
+            f"filter cutoff {cutoff_hz:g} Hz must be above 0 and below the Nyquist frequency "
+            f"{rate_hz / 2:g} Hz of the sampling rate {rate_hz:g} Hz"
         )
     padding = padding_samples(rate_hz, cutoff_hz, order)
     if len(values) <= padding:
         raise FilterError(
-            f"a record of {len(values)} samples is too short for a Butterworth filter of order {order} with cutoff "
-            f"{cutoff_hz:g} Hz at {rate_hz:g} Hz: more than {padding} samples are needed"
+            f"a record of {len(values)} samples is too short for a Butterworth filter of order "
+            f"{order} with cutoff {cutoff_hz:g} Hz at {rate_hz:g} Hz: more than {padding} samples "
+            "are needed"
         )
     sections = scipy.signal.butter(order, cutoff_hz, fs=rate_hz, output="sos")
-    return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=padding), dtype=float)
+    return np.asarray(
+        scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=padding), dtype=float
+    )
 
 
 def padding_samples(rate_hz: float, cutoff_hz: float, order: int) -> int:
-    """Samples by which a record is extended at both ends: three time constants of the filter's slowest pole."""
+    """Number of samples by which a record is extended at both ends.
+
+    They cover three time constants of the filter's slowest pole.
+    """
     slowest_decay = 2 * np.pi * cutoff_hz / rate_hz * np.sin(np.pi / (2 * order))
     return int(max(3 * (order + 1), np.ceil(3 / slowest_decay)))
 
@@ -49,19 +82,25 @@ def filtered_derivatives(
 ) -> tuple[Array, Array, Array]:
     """Filtered samples (N, ...) with their first and second time derivatives.
 
-    The filtered samples are interpolated by a quintic spline, which is then differentiated; towards both ends the
-    derivatives are less exact, so leave the first and last few samples out of a fit.
+    A quintic spline interpolates the filtered samples and is then differentiated. The derivatives
+    are less exact towards both ends, so leave the first and last few samples out of a fit.
 
-    Raises FilterError: as `zero_phase_filter`.
+    Raises
+    ------
+    FilterError
+        See `zero_phase_filter`.
     """
     smooth = zero_phase_filter(samples, rate_hz, cutoff_hz, order)
     return smooth, *spline_derivatives(smooth, rate_hz)
 
 
 def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array]:
-    """First and second time derivative of samples (N, ...) through a quintic spline.
+    """First and second time derivative of samples (N, ...) by a quintic spline.
 
-    Raises FilterError: fewer samples than a quintic spline needs, or samples that are not finite.
+    Raises
+    ------
+    FilterError
+        There are fewer samples than a quintic spline needs, or a sample is not finite.
     """
     values = _finite(samples)
     if len(values) <= SPLINE_DEGREE:
@@ -72,7 +111,10 @@ def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array
 
 
 def without_gaps(samples: Array, ok: NDArray[np.bool_]) -> Array:
-    """Samples (N, k) of which only those that are ok (N,) count, the others interpolated in time; one must be."""
+    """Replace the samples (N, k) that are not ok (N,) by interpolation in time.
+
+    At least one sample must be ok.
+    """
     frames = np.arange(len(ok))
     return np.column_stack([np.interp(frames, frames[ok], column[ok]) for column in samples.T])
 
@@ -81,5 +123,8 @@ def _finite(samples: ArrayLike) -> Array:
     values = np.asarray(samples, dtype=float)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
     if len(bad):
-        raise FilterError(f"sample {bad[0]} of {len(values)} is not a finite number; fill lost frames before filtering")
+        raise FilterError(
+            f"sample {bad[0]} of {len(values)} is not a finite number; fill lost frames before "
+            "filtering"
+        )
     return values

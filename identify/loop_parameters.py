@@ -1,4 +1,5 @@
-"""The closed loop of a scenario: its settings, its parameters, and those that a command line names."""
+"""The closed loop of a scenario: its settings, its parameters, and those that a command line
+names."""
 
 import json
 import sys
@@ -23,19 +24,22 @@ NOMINAL = "initial"
 
 
 def model_settings(robot: Robot, scenario: Scenario) -> LoopSettings:
-    """The loop around the estimator's model: of the latency it knows the mean, where no record says when commands
-    acted. Raises as `loop_settings`."""
+    """The loop around the estimator's model: of the latency it knows the mean, where no record says
+    when commands acted. Raises as `loop_settings`."""
     return loop_settings(robot, scenario, scenario.model)
 
 
 def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> LoopSettings:
-    """The scenario's servo, timing and torque limit, with the laws of friction and of the drives and the steps of the
-    plant or of the model.
+    """The scenario's servo, timing and torque limit, with the laws of friction and of the drives
+    and the steps of the plant or of the model.
 
     Raises ScenarioError for a constant that is one of the other kind of actuators.
     """
-    servo, timing = scenario.servo, scenario.timing
-    velocities = [of_actuators(robot, side, name) for name in ("smoothing_velocity", "stribeck_velocity")]
+    servo = scenario.servo
+    timing = scenario.timing
+    velocities = [
+        of_actuators(robot, side, name) for name in ("smoothing_velocity", "stribeck_velocity")
+    ]
     return LoopSettings(
         servo=ServoGains(servo.kp, servo.kd, servo.ki),
         timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
@@ -50,12 +54,18 @@ def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> Loop
 
 
 def with_drive(scenario: Scenario, law: DriveName) -> Scenario:
-    """The scenario with the law of the drives that an identification settled, where it leaves that to the record."""
-    return scenario.with_overrides(drive_settings(law)) if scenario.model.drive == AUTO else scenario
+    """The scenario with the law of the drives that an identification settled, where it leaves that
+    to the record.
+    """
+    return (
+        scenario.with_overrides(drive_settings(law)) if scenario.model.drive == AUTO else scenario
+    )
 
 
 def drive_settings(law: DriveName) -> dict[str, str | None]:
-    """Settings of a model whose drives have a law, where the scenario leaves it to the record, by dotted path."""
+    """Settings of a model whose drives have a law, where the scenario leaves it to the record, by
+    dotted path.
+    """
     return {"model.drive": law} | ({} if law == FILTERED else {"model.derivative_filter_s": None})
 
 
@@ -77,7 +87,8 @@ def check_parameter_set(robot: Robot, set_name: str) -> None:
         valid = ", ".join(sorted(robot.parameter_sets))
         raise ScenarioError(
             f"robot {robot.name} has no parameter set {set_name!r}; it has {valid} "
-            "(plant.parameters names the truth, model.start_parameters what identification starts from)"
+            "(plant.parameters names the truth, model.start_parameters what identification starts "
+            "from)"
         )
 
 
@@ -94,7 +105,8 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
         and getattr(section, other) is not None
     ):
         raise ScenarioError(
-            f"{type(section).__name__.lower()}.{other} = {getattr(section, other):g} is of actuators that "
+            f"{type(section).__name__.lower()}.{other} = {getattr(section, other):g} is of "
+            "actuators that "
             f"{'turn' if robot.layout.prismatic else 'slide'}; those of {robot.name} "
             f"{'slide' if robot.layout.prismatic else 'turn'}: set {own}"
         )
@@ -110,27 +122,35 @@ class ParameterChoice:
 
 
 def choose_parameters(robot: Robot, choice: str | None = None) -> ParameterChoice:
-    """Parameters by the name of a set, or the estimates of a result file; the nominal set when nothing is named.
+    """Parameters by the name of a set, or the estimates of a result file; the nominal set when
+    nothing is named.
 
-    Raises ScenarioError: neither a set of the robot (with the valid names) nor a file. Raises RecordError: a result
-    file without a complete set of estimates, or one that is no number in its range.
+    Raises ScenarioError: neither a set of the robot (with the valid names) nor a file. Raises
+    RecordError: a result file without a complete set of estimates, or one that is no number in its
+    range.
     """
     name = NOMINAL if choice is None else choice
     if name in robot.parameter_sets:
         return ParameterChoice(robot.parameter_sets[name].dynamic, f"parameter set {name}")
     if not Path(name).is_file():
         valid = ", ".join(sorted(robot.parameter_sets))
-        raise ScenarioError(f"{name!r} is neither a parameter set of robot {robot.name} ({valid}) nor a result.json")
+        raise ScenarioError(
+            f"{name!r} is neither a parameter set of robot {robot.name} ({valid}) nor a result.json"
+        )
     result = load_result(name)
     try:
-        values = robot.layout.check(parameter_column(result.get("identification"), "estimate", robot.parameter_names))
+        values = robot.layout.check(
+            parameter_column(result.get("identification"), "estimate", robot.parameter_names)
+        )
     except (RecordError, ParameterError) as error:
         raise RecordError(f"{name}: {error}") from None
     return ParameterChoice(values, f"estimates of {name}")
 
 
 def parameter_entries(identification: Any) -> dict[str, Any]:
-    """The parameters of an identification entry of a result, by name. Raises RecordError: there are none."""
+    """The parameters of an identification entry of a result, by name. Raises RecordError: there are
+    none.
+    """
     entries = identification.get("parameters") if isinstance(identification, dict) else None
     if not isinstance(entries, dict):
         raise RecordError("there is no identification.parameters; write it with: cmmsim identify")
@@ -143,7 +163,9 @@ def parameter_column(identification: Any, column: str, names: Sequence[str]) -> 
     Raises RecordError: naming those that are missing, or one that is no finite number.
     """
     entries = parameter_entries(identification)
-    found: dict[str, Any] = {n: one.get(column) if isinstance(one := entries.get(n), dict) else None for n in names}
+    found: dict[str, Any] = {
+        n: one.get(column) if isinstance(one := entries.get(n), dict) else None for n in names
+    }
     absent = [name for name, value in found.items() if value is None]
     if absent:
         more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
@@ -151,5 +173,7 @@ def parameter_column(identification: Any, column: str, names: Sequence[str]) -> 
     for name, value in found.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and abs(value) <= sys.float_info.max):
-            raise RecordError(f"{column} of {name} is {json.dumps(value):.60}, must be a finite number")
+            raise RecordError(
+                f"{column} of {name} is {json.dumps(value):.60}, must be a finite number"
+            )
     return list(found.values())

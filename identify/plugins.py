@@ -1,13 +1,18 @@
-"""What can be chosen by name: the built-in ones are named here, a user's own is given as ``module:function``.
+"""Parts that can be chosen by name: built-in ones, and a user's own as ``module:function``.
 
-To build one in, write it in a file of its own and name it here as ``module:function``. Nothing is imported before it is
-chosen, so that every room can look here.
+To build one in, write it in a file of its own and name it here as ``module:function``. Nothing is
+imported before it is chosen, so that every room can look here. A user's own runs only where its
+module is allowed, see `cmmsim.plugins`.
 """
 
 import importlib
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
+from cmmsim.errors import CmmError
+from cmmsim.plugins import Telling as Telling
+from cmmsim.plugins import is_own as is_own
+from cmmsim.plugins import own_part
 from identify.errors import IdentifyError, ScenarioError
 
 CRITERIA = {
@@ -27,48 +32,51 @@ ESTIMATORS = {
     "torque_tls": "identify.estimators.errors_in_variables:total_least_squares",
     "encoders": "identify.estimators.least_squares:encoder_route",
 }
-"""Estimators that `cmmsim estimators` compares, in the order of its table, see `identify.estimators.estimator`."""
+"""Estimators that `cmmsim estimators` compares, in the order of its table, see
+`identify.estimators.estimator`."""
 
 
 LAWS = {
-    "pid": "dynamics.control.pid:pid",
+    "pid": "dynamics.control.law:pid",
     "feedforward": "dynamics.control.feedforward:feedforward",
     "computed_torque": "dynamics.control.computed_torque:computed_torque",
 }
 """Laws that make a robot follow a motion, see `dynamics.control.law`."""
 
 
-def check_choice(given: str, what: str, built_in: Mapping[str, str], error: type[Exception] = ScenarioError) -> None:
-    """Refuse what is neither a built-in name nor ``module:function``. Raises `error` with the valid names."""
+def check_choice(
+    given: str,
+    what: str,
+    built_in: Mapping[str, str],
+    error: type[Exception] = ScenarioError,
+) -> None:
+    """Refuse a name that is neither built in nor ``module:function``.
+
+    Raises `error`, with the valid names.
+    """
     if given not in built_in and not is_own(given):
         raise error(f"unknown {what} {given!r}; valid: {', '.join(built_in)}, or module:function")
 
 
 def chosen(given: str, what: str, built_in: Mapping[str, str]) -> Callable[..., Any]:
-    """What a built-in name stands for, or a user's own. Raises ScenarioError where there is none such."""
+    """Part of a built-in name, or a user's own. Raises ScenarioError where there is none such."""
     check_choice(given, what, built_in)
-    return own_function(built_in.get(given, given), what, ScenarioError)
-
-
-def is_own(name: str) -> bool:
-    """Whether a name is ``module:function`` and no built-in one."""
-    return ":" in name
+    if given not in built_in:
+        return own_function(given, what, ScenarioError)
+    module, _, attribute = built_in[given].partition(":")
+    return cast("Callable[..., Any]", getattr(importlib.import_module(module), attribute))
 
 
 def own_function(name: str, what: str, error: type[IdentifyError]) -> Callable[..., Any]:
-    """The function that ``module:function`` names; ``what`` it is to be, in messages: "kind", "estimator".
+    """Function that ``module:function`` names; what: what it is to be, "kind" or "estimator".
 
-    Its folder must be on PYTHONPATH, so that workers on other machines find it, too.
-
-    Raises error: no such module or function, a module that cannot be imported, or something that cannot be called.
+    Raises `error`: a module that is not allowed to run, with what to type; no such module or
+    function; something that cannot be called.
     """
-    module, _, attribute = name.partition(":")
     try:
-        function = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as reason:
-        raise error(
-            f"{what} {name!r} is no importable module:function: {reason}; its folder must be on PYTHONPATH"
-        ) from reason
+        function = own_part(what, name)
+    except CmmError as refusal:
+        raise error(str(refusal)) from refusal
     if not callable(function):
         raise error(f"{what} {name!r} is not a function")
     return cast("Callable[..., Any]", function)

@@ -1,4 +1,4 @@
-"""What a user sees at the terminal: progress of the stages of a run, tables in one look, and warnings."""
+"""Output at the terminal: progress of the stages of a run, tables, and warnings."""
 
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -22,11 +22,11 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 Advance = Callable[..., None]
-"""``advance(n=1)``: n more steps of the stage are done."""
+"""Function ``advance(n=1)`` that reports n more steps of the stage as done."""
 
 
 class Progress(Protocol):
-    """What a stage needs to tell how far it is."""
+    """Interface by which a stage reports its progress."""
 
     def stage(self, name: str, total: int) -> AbstractContextManager[Advance]:
         """Open a stage of ``total`` steps; the context yields ``advance(n=1)``."""
@@ -34,25 +34,31 @@ class Progress(Protocol):
 
 
 class SilentProgress:
-    """Says nothing."""
+    """Progress that shows nothing."""
 
     @contextmanager
     def stage(self, name: str, total: int) -> Iterator[Advance]:
-        """Open a stage whose progress nobody sees."""
+        """Open a stage whose progress is not shown."""
         yield lambda n=1: None
 
 
 LINE_S = 60.0
-"""How often a stage says where it is when not on a terminal, seconds."""
+"""Interval between the lines of a stage when the output is no terminal, seconds."""
 
 
 class RichProgress:
-    """Bars with elapsed time and time left; when not on a terminal, a plain line for each stage, once a minute while it
-    lasts and at its end."""
+    """Progress as bars with elapsed and remaining time.
+
+    When the output is no terminal, a stage prints a plain line once a minute and at its end.
+    """
 
     def __init__(self, console: Console | None = None, rate: str = "") -> None:
-        """``rate``: unit of the steps' rate, such as rows/s; empty shows none."""
-        self._console, self._rate = console or Console(stderr=True), rate
+        """Choose the console and the unit of the steps' rate, such as "rows/s".
+
+        An empty ``rate`` shows no rate.
+        """
+        self._console = console or Console(stderr=True)
+        self._rate = rate
 
     def stage(self, name: str, total: int) -> AbstractContextManager[Advance]:
         """Open a stage of ``total`` steps."""
@@ -75,13 +81,18 @@ class RichProgress:
 
     @contextmanager
     def _line(self, name: str, total: int) -> Iterator[Advance]:
-        done, start = 0, time.perf_counter()
+        done = 0
+        start = time.perf_counter()
         said = start
 
         def say() -> None:
             seconds = time.perf_counter() - start
             rate = f", {done / seconds:.3g} {self._rate}" if self._rate else ""
-            self._console.print(f"{name}: {done} of {total} in {seconds:.1f} s{rate}", highlight=False, soft_wrap=True)
+            self._console.print(
+                f"{name}: {done} of {total} in {seconds:.1f} s{rate}",
+                highlight=False,
+                soft_wrap=True,
+            )
 
         def advance(n: int = 1) -> None:
             nonlocal done, said
@@ -95,25 +106,25 @@ class RichProgress:
 
 
 def terminal_progress(quiet: bool, rate: str = "") -> Progress:
-    """What a command shows: bars, with `rate` as the unit of the steps' rate, or nothing where it is to be quiet."""
+    """Progress that a command shows: bars with a `rate` in that unit, or nothing if quiet."""
     return SilentProgress() if quiet else RichProgress(rate=rate)
 
 
 class _RateColumn(ProgressColumn):
-    """Steps a second."""
+    """Column with the number of steps a second."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        """The rate of late, or over all where the stage has ended."""
+        """Show the recent rate, or the mean rate of a stage that has ended."""
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:.3g} {self._unit}")
 
 
 def print_warnings(warnings: Iterable[str]) -> None:
-    """One line each on standard error, `warning: ...`; they are no summary, and a quiet command gives them too."""
+    """Print each warning as one line on standard error, also when the command is quiet."""
     for warning in warnings:
         typer.echo(f"warning: {' '.join(warning.split())}", err=True)
 
@@ -125,10 +136,18 @@ def print_table(
     title: str | None = None,
     note: str | None = None,
 ) -> None:
-    """Print rows of text under a header to standard output, the title above and the note below, as all tables look.
+    """Print rows of text under a header to standard output.
 
-    words: headers of the columns that hold words, which stand to the left; numbers stand to the right. The first column
-    is never broken. All text is shown as it is: what stands in brackets, such as a unit, is no markup.
+    Parameters
+    ----------
+    header : sequence of str
+        Names of the columns.
+    rows : iterable of sequences of str
+        Cells, shown as they are: brackets, such as those of a unit, are not markup.
+    words : collection of str
+        Names of the columns that are flush left, because they hold words. Numbers are flush right.
+    title, note : str, optional
+        Lines above and below the table.
     """
     table = RichTable(title=title, caption=note, box=SIMPLE_HEAD, show_edge=False, padding=0)
     for place, name in enumerate(header):

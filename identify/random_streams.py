@@ -1,57 +1,82 @@
-"""Every random stream of this package, by number: who draws what of one seed, so that no two draw the same.
+"""Numbers of all random streams of this package, so that no two of one seed are the same.
 
-The streams of an experiment are children of its seed, of `SeedSequence(seed, spawn_key=(stream, ...))`; what is drawn
-once a run has the run's number behind its own. The search of a trajectory and the teaching share a number, and not a
-draw: the search draws from the child itself, the sensor from a seed that the child generates.
+Streams of an experiment are children of its seed, `SeedSequence(seed, spawn_key=(stream, ...))`.
+What is drawn once a run has the number of the run behind its own. The search of a trajectory and
+the teaching share a number without sharing a draw: the search draws from the child itself, the
+sensor from a seed that the child generates.
 
-Streams beside an experiment mix their number into the seed, or are the same for every seed: `SeedSequence([seed,
-stream])`. Their numbers may be those of children, as 5 is: a mixed seed and a child are not the same sequence.
+Streams beside an experiment mix their number into the seed, `SeedSequence([seed, stream])`, or are
+the same for every seed. Their numbers may equal those of children, as 5 does, because a mixed seed
+and a child are different sequences.
 
-Each kind of a study's row numbers the children of the row's sequence itself, and `cmmsim` those of a sensor's seed.
+Each kind of row of a study numbers the children of the row's sequence itself, and `cmmsim` numbers
+those of a sensor's seed.
 """
 
 import numpy as np
 
-EXCITATION, UNSEEN, SEARCH = 0, 1, 2
-"""Exciting candidates, unseen trajectories, and the search from the candidates."""
-TEACHING, ANCHOR = 2, 3
-"""The sensor's teaching, and the error of what fixes the scale."""
-STATIC_POSES, UNSEEN_POSES, ENCODER_OFFSETS, ENCODERS, STATIC_NOISE = 14, 15, 16, 17, 18
-"""Of a kinematic calibration: candidates and unseen poses, offsets of the encoders and their readings, drawn poses."""
-TRUE_GEOMETRY = 19
-"""The true geometry about one that was calibrated before."""
-NOISE, LATENCY, PREDICTION = 4, 5, 6
-"""Of each run: the sensor's noise, the latency of its frames, the noise in what is predicted of it."""
-DESIGN, LOAD, CALIBRATION, MEAN_LATENCY = 7, 8, 9, 10
-"""The exciting trajectories of several runs, the true load, what is known of the cameras, and the true mean latency."""
-TRACKED, EXPOSURES = 24, 25
-"""Of each motion that is followed: the drawn poses by which the shares of its error are known. And by how much the
-right camera truly exposes later."""
+# Children of the seed of an experiment.
+EXCITATION = 0  # candidates of the exciting trajectory
+UNSEEN = 1  # unseen trajectories
+SEARCH = 2  # search from the candidates
+TEACHING = 2  # teaching of the sensor
+ANCHOR = 3  # error of the quantity that fixes the scale
+DESIGN = 7  # exciting trajectories of several runs
+LOAD = 8  # true load
+CALIBRATION = 9  # calibration of the cameras, as the estimator knows it
+MEAN_LATENCY = 10  # true mean latency
+STATIC_POSES = 14  # candidate poses of a kinematic calibration
+UNSEEN_POSES = 15  # its unseen poses
+ENCODER_OFFSETS = 16  # offsets of the encoders
+ENCODERS = 17  # readings of the encoders
+STATIC_NOISE = 18  # noise of the measured static poses
+TRUE_GEOMETRY = 19  # true geometry, about one that was calibrated before
+EXPOSURES = 25  # true delay of the right camera's exposure
 
-UNCERTAINTY = 5
-"""Mixed with a record's seed: the repeated experiments behind an identification's standard deviations."""
-INSTRUMENTS = 20
-"""Mixed with a seed: the instruments at the joints."""
-ROUTES_UNCERTAINTY, DISTURBED_COPIES = 21, 22
-"""The same for every seed: repeated experiments behind the standard deviations of the output-error estimators, and
-disturbed copies of a record for total least squares."""
-SAMPLED_POINTS = 1
-"""Mixed with a study's seed, of which its rows are the children: the points of a sample."""
-RESAMPLING = 301
-"""Mixed with a sensor's seed: the frames of the moving bar that are drawn again."""
+# Children of the same seed, which experiments follow by the number of the run.
+NOISE = 4  # noise of the sensor
+LATENCY = 5  # latency of the frames
+PREDICTION = 6  # noise of the predicted poses
+TRACKED = 24  # poses drawn for the shares of the error of a tracked motion
+
+# Mixed with a seed, or the same for every seed.
+UNCERTAINTY = 5  # with a record's seed: repeated experiments behind the standard deviations
+INSTRUMENTS = 20  # with a seed: instruments at the joints
+ROUTES_UNCERTAINTY = 21  # alone: repeated experiments of the output-error estimators
+DISTURBED_COPIES = 22  # alone: disturbed copies of a record for total least squares
+SAMPLED_POINTS = 1  # with a study's seed, whose children are the rows: points of a sample
+RESAMPLING = 301  # with a sensor's seed: resampled frames of the moving bar
 
 
 def child(seed: int | np.random.SeedSequence, *stream: int) -> np.random.SeedSequence:
-    """The stream's own sequence, independent of all others of a seed or of a row's sequence, which is left as it is."""
+    """Sequence of a stream, independent of all others of the seed.
+
+    Parameters
+    ----------
+    seed : int or numpy.random.SeedSequence
+        Seed of an experiment, or sequence of a study's row, which is not changed.
+    *stream : int
+        Number of the stream, and further numbers such as that of the run.
+
+    Returns
+    -------
+    numpy.random.SeedSequence
+        The child of the seed with these numbers.
+
+    Examples
+    --------
+    >>> child(0, NOISE, 1).spawn_key
+    (4, 1)
+    """
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, *stream))
 
 
 def stream_seed(seed: int | np.random.SeedSequence, *stream: int) -> int:
-    """A plain integer seed of a stream."""
+    """Integer seed of a stream."""
     return int(child(seed, *stream).generate_state(1)[0])
 
 
 def mixed_generator(stream: int, *seed: int) -> np.random.Generator:
-    """Generator of a stream beside an experiment, for a seed or the same for all."""
+    """Generator of a stream beside an experiment, for one seed or the same for all."""
     return np.random.default_rng([*seed, stream])

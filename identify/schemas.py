@@ -1,4 +1,6 @@
-"""The JSON schemas of all files that a user writes, for editors; `python -m identify.schemas` writes them anew."""
+"""The JSON schemas of all files that a user writes, for editors; `python -m identify.schemas`
+writes them anew.
+"""
 
 import json
 from collections.abc import Callable

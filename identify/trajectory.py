@@ -1,7 +1,7 @@
-"""Reference trajectories: Fourier series of the platform's coordinates (eq. 37), from rest at home; and their file.
+"""Reference trajectories: Fourier series of the platform's coordinates (eq. 37), and their file.
 
-Coordinates are those entries of the pose ``[x y z alpha beta gamma]``, m and rad, that the platform can change. With
-``w = 2 pi f0 l`` each is
+Coordinates are those entries of the pose ``[x y z alpha beta gamma]``, m and rad, that the platform
+can change. With ``w = 2 pi f0 l`` each is
 
     chi(t) = offset + sum_l  s_l sin(w t) / w  -  c_l cos(w t) / w.
 
@@ -25,12 +25,24 @@ from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION, check_motion
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.files.atomic import write_text
+from identify.files.seal import opened_json, sealed_json
 
 
 @dataclass(frozen=True)
 class FourierTrajectory:
-    """One trajectory of m coordinates; ``sine`` and ``cosine`` (m, n) are s and c of eq. 37 [m/s, rad/s], ``offset``
-    (m,) [m, rad]; chart: which coordinates these are."""
+    """Trajectory of m coordinates as a Fourier series.
+
+    Attributes
+    ----------
+    chart : Chart
+        Coordinates of the platform.
+    fundamental_hz : float
+        Frequency of the first harmonic.
+    sine, cosine : ndarray, shape (m, n)
+        Coefficients s and c of eq. 37, m/s and rad/s.
+    offset : ndarray, shape (m,)
+        Constant part, m and rad.
+    """
 
     chart: Chart
     fundamental_hz: float
@@ -43,13 +55,22 @@ class FourierTrajectory:
             value = np.array(getattr(self, name), dtype=float)
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        m, n = len(self.chart.freedoms), self.sine.shape[-1] if self.sine.ndim else 0
-        if self.sine.shape != (m, n) or self.cosine.shape != (m, n) or self.offset.shape != (m,) or n == 0:
+        m = len(self.chart.freedoms)
+        n = self.sine.shape[-1] if self.sine.ndim else 0
+        if (
+            self.sine.shape != (m, n)
+            or self.cosine.shape != (m, n)
+            or self.offset.shape != (m,)
+            or n == 0
+        ):
             raise TrajectoryError(
-                f"a trajectory in {', '.join(self.chart.coordinate_names)} needs sine ({m}, n), cosine ({m}, n) and "
-                f"offset ({m},), got {self.sine.shape}, {self.cosine.shape} and {self.offset.shape}"
+                f"a trajectory in {', '.join(self.chart.coordinate_names)} needs sine ({m}, n), "
+                f"cosine ({m}, n) and offset ({m},), got {self.sine.shape}, {self.cosine.shape} "
+                f"and {self.offset.shape}"
             )
-        if not all(np.isfinite(a).all() for a in (self.sine, self.cosine, self.offset, self.fundamental_hz)):
+        if not all(
+            np.isfinite(a).all() for a in (self.sine, self.cosine, self.offset, self.fundamental_hz)
+        ):
             raise TrajectoryError("a trajectory's coefficients must be finite numbers")
 
     @property
@@ -68,7 +89,10 @@ class FourierTrajectory:
         return self.chart.lifted(cos @ self.sine.T + sin @ self.cosine.T)
 
     def pose_acceleration(self, t: ArrayLike) -> Array:
-        """Second time derivative of the pose, (N, 6) [m/s², rad/s²] (eq. 36 without its stray factor t)."""
+        """Second time derivative of the pose, (N, 6) [m/s², rad/s²].
+
+        This is eq. 36 without its stray factor t.
+        """
         w, sin, cos = self._waves(t)
         return self.chart.lifted(cos @ (self.cosine * w).T - sin @ (self.sine * w).T)
 
@@ -83,7 +107,7 @@ class FourierTrajectory:
 
 
 def box_of(chart: Chart, position_m: float, orientation_rad: float) -> Array:
-    """Largest distances (m,) from home of the coordinates, m and rad."""
+    """Largest distances (m,) of the coordinates from home, m and rad."""
     return np.array([position_m if unit == "m" else orientation_rad for unit in chart.units])
 
 
@@ -95,11 +119,42 @@ def random_trajectory(
     position_amplitude_m: float,
     orientation_amplitude_rad: float,
 ) -> FourierTrajectory:
-    """Random trajectory with a smooth start whose largest distance from home fills the box in every component.
+    """Random trajectory with a smooth start that fills the box about home in every coordinate.
 
-    Normal coefficients are projected onto the conditions of a smooth start, then scaled axis by axis.
+    Normal coefficients are projected onto the conditions of a smooth start, then scaled axis by
+    axis.
 
-    Raises TrajectoryError: fewer than two harmonics, which leave no freedom for a smooth start.
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the coefficients.
+    chart : Chart
+        Coordinates of the platform.
+    fundamental_hz : float
+        Frequency of the first harmonic.
+    harmonics : int
+        Number of harmonics, at least two.
+    position_amplitude_m, orientation_amplitude_rad : float
+        Largest distance of each coordinate from home.
+
+    Returns
+    -------
+    FourierTrajectory
+        The trajectory, which begins at home.
+
+    Raises
+    ------
+    TrajectoryError
+        There are fewer than two harmonics, which leave no freedom for a smooth start.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dynamics import load_robot
+    >>> chart = load_robot("rss6").geometry.chart
+    >>> path = random_trajectory(np.random.default_rng(0), chart, 0.1, 5, 0.02, 0.05)
+    >>> bool(np.allclose(path.pose(0.0), chart.home))
+    True
     """
     if harmonics < 2:
         raise TrajectoryError(f"a smooth start needs at least 2 harmonics, got {harmonics}")
@@ -115,7 +170,7 @@ def random_trajectory(
 
 
 def from_home(chart: Chart, fundamental_hz: float, sine: Array, cosine: Array) -> FourierTrajectory:
-    """Trajectory with coefficients ``sine`` and ``cosine`` (m, n) [m/s, rad/s] that is at the chart's home at t = 0."""
+    """Trajectory with given coefficients (m, n) [m/s, rad/s] that is at home at t = 0."""
     w = 2 * np.pi * fundamental_hz * np.arange(1, sine.shape[1] + 1)
     home = chart.coordinates(np.array(chart.home))
     return FourierTrajectory(chart, fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
@@ -130,15 +185,43 @@ def check_travel(
     least_leverage: float = LEAST_LEVERAGE,
     most_condition: float = MOST_CONDITION,
 ) -> float:
-    """Largest joint coordinate, rad or m, of a trajectory that the robot may follow, sampled at times ``t`` (N,) [s],
-    with a margin, rad or m, to the travel limit, and limits of leverage and condition.
+    """Check that the robot may follow a trajectory.
 
-    Raises TrajectoryError: out of reach, beyond the travel limit less the margin, or near a singularity; the message
-    names time, leg, value and limit (`dynamics.workspace.check_motion`).
+    Parameters
+    ----------
+    robot : dynamics.Robot
+        Robot that is to follow.
+    trajectory : FourierTrajectory
+        Trajectory of the platform.
+    t : array_like, shape (N,)
+        Times at which it is checked [s].
+    margin : float, optional
+        Margin to the travel limit of the joints, rad or m.
+    least_leverage, most_condition : float, optional
+        Limits that keep the robot away from singularities.
+
+    Returns
+    -------
+    float
+        Largest joint coordinate of the trajectory, rad or m.
+
+    Raises
+    ------
+    TrajectoryError
+        A pose is out of reach, beyond the travel limit less the margin, or near a singularity. The
+        message names time, leg, value and limit.
+
+    See Also
+    --------
+    dynamics.workspace.check_motion : the check of any motion
     """
     times = np.asarray(t, dtype=float)
     try:
-        limits = {"travel_margin": margin, "least_leverage": least_leverage, "most_condition": most_condition}
+        limits = {
+            "travel_margin": margin,
+            "least_leverage": least_leverage,
+            "most_condition": most_condition,
+        }
         return check_motion(robot, trajectory.pose(times), times, **limits).travel.value
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow the trajectory: {error}") from error
@@ -150,13 +233,20 @@ def _without(rows: Array, direction: Array) -> Array:
 
 
 FREE, HOME = "free", (0.0,) * 6
-"""Of files that do not say: their platforms move freely, and such a chart does not ask where home is."""
+"""Chart and home of files that state none.
+
+Their platforms move freely, and such a chart does not use its home.
+"""
 
 FORMAT = "cmmsim trajectories, version 1"
-EQUATION = "pose(t) = offset + sum_l sine_l sin(w t)/w - cosine_l cos(w t)/w with w = 2 pi fundamental_hz l"
+EQUATION = (
+    "pose(t) = offset + sum_l sine_l sin(w t)/w - cosine_l cos(w t)/w with w = 2 pi fundamental_hz "
+    "l"
+)
 UNITS = {
     "fundamental_hz": "Hz",
-    "sine": "m/s for x, y, z; rad/s for alpha, beta, gamma; one row per coordinate, one column per harmonic",
+    "sine": "m/s for x, y, z; rad/s for alpha, beta, gamma; one row per coordinate, one column "
+    "per harmonic",
     "cosine": "as sine",
     "offset": "m for x, y, z; rad for alpha, beta, gamma",
     "observability_index": "paper's eq. 39, without unit",
@@ -165,10 +255,11 @@ UNITS = {
 
 @dataclass(frozen=True)
 class TrajectorySet:
-    """The trajectories of a run, all of one chart: the excitation with its observability index (eq. 39), and those for
-    validation.
+    """Trajectories of a run: one for excitation, and unseen ones for validation.
 
-    ``first_index`` is the index of the first random candidate, ``median_index`` that of the middle one.
+    All have the same chart. ``observability_index`` (eq. 39) is that of the excitation,
+    ``first_index`` that of the first random candidate, ``median_index`` the median of all
+    candidates.
     """
 
     seed: int
@@ -181,6 +272,11 @@ class TrajectorySet:
 
 def save_trajectories(path: Path | str, trajectories: TrajectorySet) -> None:
     """Write the set as JSON, whole or not at all."""
+    write_text(path, trajectories_json(trajectories))
+
+
+def trajectories_json(trajectories: TrajectorySet) -> str:
+    """Return the file of the set, with its digest."""
     data = {
         "format": FORMAT,
         "equation": EQUATION,
@@ -196,19 +292,23 @@ def save_trajectories(path: Path | str, trajectories: TrajectorySet) -> None:
         "excitation": _to_dict(trajectories.excitation),
         "validation": [_to_dict(t) for t in trajectories.validation],
     }
-    write_text(path, json.dumps(data, indent=1) + "\n")
+    return json.dumps(sealed_json(data), indent=1) + "\n"
 
 
 def load_trajectories(path: Path | str) -> TrajectorySet:
-    """Read what `save_trajectories` wrote.
+    """Read the file that `save_trajectories` wrote.
 
-    Raises TrajectoryError: the file cannot be read, is of another format or incomplete.
+    Raises
+    ------
+    TrajectoryError
+        The file cannot be read, is of another format, or is incomplete.
     """
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        data = opened_json(path, dict(json.loads(Path(path).read_text(encoding="utf-8"))))
         if data["format"] != FORMAT:
             raise TrajectoryError(f"{path} has format {data['format']!r}, expected {FORMAT!r}")
-        index, chart = data["observability_index"], Chart(data.get("chart", FREE), tuple(data.get("home_pose", HOME)))
+        index = data["observability_index"]
+        chart = Chart(data.get("chart", FREE), tuple(data.get("home_pose", HOME)))
         return TrajectorySet(
             seed=int(data["seed"]),
             excitation=_from_dict(data["excitation"], chart),
@@ -226,8 +326,14 @@ def load_trajectories(path: Path | str) -> TrajectorySet:
 
 
 def _to_dict(trajectory: FourierTrajectory) -> dict[str, Any]:
-    return {name: np.asarray(value).tolist() for name, value in vars(trajectory).items() if name != "chart"}
+    return {
+        name: np.asarray(value).tolist()
+        for name, value in vars(trajectory).items()
+        if name != "chart"
+    }
 
 
 def _from_dict(data: dict[str, Any], chart: Chart) -> FourierTrajectory:
-    return FourierTrajectory(chart, float(data["fundamental_hz"]), data["sine"], data["cosine"], data["offset"])
+    return FourierTrajectory(
+        chart, float(data["fundamental_hz"]), data["sine"], data["cosine"], data["offset"]
+    )

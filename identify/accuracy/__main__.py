@@ -9,9 +9,12 @@ from identify.accuracy.session import markdown_table
 
 
 def main(arguments: list[str]) -> int | str:
-    """Exit status of the command: 0, or the line that says what is wrong."""
+    """Return the exit status of the command: 0, or a line that says what is wrong."""
     if len(arguments) != 1:
-        return "usage: python -m identify.accuracy FILE, a file that pytest --accuracy-save NAME has left"
+        return (
+            "usage: python -m identify.accuracy FILE, where FILE was saved by "
+            "pytest --accuracy-save NAME"
+        )
     try:
         sys.stdout.write(markdown_table(read_saved(Path(arguments[0])).figures))
     except AccuracyError as error:

@@ -1,6 +1,7 @@
-"""A figure of accuracy, a value or a mean with its interval beside its limit, and what records it in a test.
+"""Figures of accuracy, each with its limit, and the object that records them in a test.
 
-Imported at every start of pytest: NumPy and SciPy are imported when a test records something.
+Pytest imports this module at every start. NumPy and SciPy are therefore imported only when a test
+records something.
 """
 
 from __future__ import annotations
@@ -20,23 +21,38 @@ if TYPE_CHECKING:
 Better = Literal["lower", "higher"]
 BETTER: tuple[str, ...] = get_args(Better)
 PROPERTY = "cmmsim_accuracy"
-"""Name of the user properties that carry figures in the reports of tests."""
+"""Name of the user properties that carry the figures in the reports of tests."""
 
 CONFIDENCE = 0.95
-"""Probability with which the interval of a sample holds the true mean."""
+"""Probability with which the interval of a sample contains the true mean."""
 
 
 class AccuracyError(IdentifyError):
-    """A figure that is none, or a file of figures that cannot be read or written."""
+    """A value that cannot be a figure, or a file of figures that cannot be read or written."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """What one test recorded under one name.
+    """One figure, as one test recorded it under one name.
 
-    test: node id of the test; value, in `unit`: the recorded one, or the mean of `count` values with its `interval`
-    (low, high); better: the direction of progress; limit: the largest value that is good enough, or the smallest where
-    higher is better, or None.
+    Attributes
+    ----------
+    test : str
+        Node id of the test.
+    name : str
+        Name of the figure, unique within its test.
+    value : float
+        The recorded number, or the mean of a sample.
+    unit : str
+        Unit of the value, of the limit and of the interval.
+    better : {"lower", "higher"}
+        Direction of progress.
+    limit : float or None
+        Largest value that is good enough, or the smallest one where higher is better.
+    interval : tuple of float or None
+        Ends (low, high) of the confidence interval of a sample's mean.
+    count : int
+        Number of values in the sample; 1 for a single number.
     """
 
     test: str
@@ -50,47 +66,58 @@ class Figure:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Test and name: what tells this figure from all others of a session."""
+        """Test and name, which together are unique in a session."""
         return self.test, self.name
 
     @property
     def sign(self) -> int:
-        """+1 where a larger value is worse, -1 where it is better."""
+        """Sign +1 where a larger value is worse, -1 where it is better."""
         return 1 if self.better == "lower" else -1
 
     @property
     def best(self) -> float:
-        """The end of the interval on the good side; the value where there is no interval."""
+        """End of the interval on the good side; the value where there is no interval."""
         return self._end(-self.sign)
 
     @property
     def worst(self) -> float:
-        """The end of the interval on the bad side; the value where there is no interval."""
+        """End of the interval on the bad side; the value where there is no interval."""
         return self._end(self.sign)
 
     @property
     def beyond_limit(self) -> bool:
-        """Whether the value, or the whole interval, lies on the bad side of the limit."""
+        """True where the value, or the whole interval, lies on the bad side of the limit."""
         return self.limit is not None and self.sign * (self.best - self.limit) > 0
 
     @property
     def undecided(self) -> bool:
-        """Whether the interval holds the limit: good enough or not, the sample does not tell."""
-        return self.limit is not None and not self.beyond_limit and self.sign * (self.worst - self.limit) > 0
+        """True where the interval contains the limit, so that the sample decides nothing."""
+        return (
+            self.limit is not None
+            and not self.beyond_limit
+            and self.sign * (self.worst - self.limit) > 0
+        )
 
     @property
     def limit_text(self) -> str:
-        """The limit behind its relation, without a unit; nothing where there is none."""
-        return "" if self.limit is None else f"{'≤' if self.better == 'lower' else '≥'} {self.limit:.4g}"
+        """Limit with its relation, such as "≤ 2", without a unit; empty where there is no limit."""
+        return (
+            ""
+            if self.limit is None
+            else f"{'≤' if self.better == 'lower' else '≥'} {self.limit:.4g}"
+        )
 
     @property
     def margin(self) -> float | None:
-        """Distance of the value from the limit as a share of the limit, negative beyond it; None without a limit."""
+        """Distance of the value from the limit as a share of the limit, negative beyond it.
+
+        None where there is no limit, or where it is zero.
+        """
         return self.sign * (self.limit - self.value) / abs(self.limit) if self.limit else None
 
     @property
     def verdict(self) -> str:
-        """One line: name, value, unit, interval and limit."""
+        """One line with name, value, unit, interval and limit."""
         side = "above" if self.better == "lower" else "below"
         limit = f"the limit of {with_unit(f'{self.limit:.6g}', self.unit)}"
         if self.interval is None:
@@ -98,8 +125,8 @@ class Figure:
         low, high = self.interval
         interval = with_unit(f"[{low:.6g}, {high:.6g}]", self.unit)
         return (
-            f"{self.name}: mean {with_unit(f'{self.value:.6g}', self.unit)} of {self.count} values, "
-            f"{CONFIDENCE:.0%} interval {interval}, lies wholly {side} {limit}"
+            f"{self.name}: mean {with_unit(f'{self.value:.6g}', self.unit)} of {self.count} "
+            f"values, {CONFIDENCE:.0%} interval {interval}, lies wholly {side} {limit}"
         )
 
     def _end(self, side: int) -> float:
@@ -109,40 +136,101 @@ class Figure:
 
 
 def with_unit(text: str, unit: str) -> str:
-    """A number's text with its unit behind it."""
+    """Append a unit to the text of a number."""
     return f"{text} {unit}".rstrip()
 
 
 def percent(share: float, form: str) -> str:
-    """A share in per cent, its number in a form such as ".0" or "+.1"; a hundredfold or more by its power of ten."""
+    """Format a share in per cent, in a form such as ".0" or "+.1".
+
+    Shares of a hundredfold and more are written with a power of ten.
+    """
     return f"{share:{form}%}" if abs(share) < 100 else f"{100 * share:{form}e}%"
 
 
 class Accuracy:
-    """Records figures of accuracy of one test; get it from the fixture `accuracy`.
+    """Recorder of the figures of accuracy of one test, as the fixture `accuracy` returns it.
 
-    A figure beyond its limit fails the test at the call. Raises AccuracyError for what is no figure: a value that is
-    not a finite number, an empty sample, a name that this test has recorded already.
+    A figure beyond its limit fails the test at the call.
     """
 
     def __init__(self, test: str, properties: list[tuple[str, object]]) -> None:
-        self._test, self._properties = test, properties
+        self._test = test
+        self._properties = properties
         self._names: set[str] = set()
 
     def record(
-        self, name: str, value: ArrayLike, unit: str = "", limit: float | None = None, better: Better = "lower"
+        self,
+        name: str,
+        value: ArrayLike,
+        unit: str = "",
+        limit: float | None = None,
+        better: Better = "lower",
     ) -> None:
-        """Record one number. It fails the test when it is above the limit (below it, where better="higher")."""
+        """Record one number.
+
+        Parameters
+        ----------
+        name : str
+            Name of the figure, which must be new in this test.
+        value : float
+            The number.
+        unit : str, optional
+            Its unit, as tables show it.
+        limit : float, optional
+            Largest value with which the test passes, or the smallest one if higher is better.
+        better : {"lower", "higher"}, optional
+            Direction of progress.
+
+        Raises
+        ------
+        AccuracyError
+            The value is not a finite number, or the name was recorded already.
+
+        Examples
+        --------
+        >>> def test_centre(accuracy):
+        ...     accuracy.record("centre error", 0.013, unit="px", limit=0.02)
+        """
         __tracebackhide__ = True
         number = float(_numbers(name, "value", value, dimensions=0))
         self._keep(name, unit, limit, better, value=number)
 
     def sample(
-        self, name: str, values: ArrayLike, unit: str = "", limit: float | None = None, better: Better = "lower"
+        self,
+        name: str,
+        values: ArrayLike,
+        unit: str = "",
+        limit: float | None = None,
+        better: Better = "lower",
     ) -> None:
-        """Record the mean of independent values (n,), n >= 2, with Student's 95 % interval.
+        """Record the mean of independent values with Student's 95 % interval.
 
-        It fails the test only when the whole interval is beyond the limit.
+        The test fails only if the whole interval lies beyond the limit.
+
+        Parameters
+        ----------
+        name : str
+            Name of the figure, which must be new in this test.
+        values : array_like, shape (n,)
+            At least two independent values.
+        unit : str, optional
+            Their unit, as tables show it.
+        limit : float, optional
+            Largest mean with which the test passes, or the smallest one if higher is better.
+        better : {"lower", "higher"}, optional
+            Direction of progress.
+
+        Raises
+        ------
+        AccuracyError
+            There are fewer than two values, one of them is not a finite number, or the name was
+            recorded already.
+
+        Examples
+        --------
+        >>> def test_distance(accuracy):
+        ...     accuracy.sample("distance error", [1.9, 2.2, 2.0], unit="um", limit=3.0)
         """
         __tracebackhide__ = True
         numbers = _numbers(name, "values", values, dimensions=1)
@@ -150,16 +238,22 @@ class Accuracy:
             raise AccuracyError(f"{name}: a sample needs at least 2 values, got {len(numbers)}")
         mean, (low, high) = mean_interval(numbers)
         if not (isfinite(low) and isfinite(high)):
-            raise AccuracyError(f"{name}: the interval of the mean is {low:.4g} .. {high:.4g}, not finite")
+            raise AccuracyError(
+                f"{name}: the interval of the mean is {low:.4g} .. {high:.4g}, not finite"
+            )
         self._keep(name, unit, limit, better, value=mean, interval=(low, high), count=len(numbers))
 
-    def _keep(self, name: str, unit: str, limit: float | None, better: Better, **found: Any) -> None:
+    def _keep(
+        self, name: str, unit: str, limit: float | None, better: Better, **found: Any
+    ) -> None:
         __tracebackhide__ = True
         for what, text in (("name", name), ("unit", unit)):
             if not isinstance(text, str) or (what == "name" and not text.strip()) or "\n" in text:
                 raise AccuracyError(f"the {what} of a figure is a line of text, got {text!r}")
         if better not in BETTER:
-            raise AccuracyError(f"{name}: better is {better!r}, must be {' or '.join(map(repr, BETTER))}")
+            raise AccuracyError(
+                f"{name}: better is {better!r}, must be {' or '.join(map(repr, BETTER))}"
+            )
         if name in self._names:
             raise AccuracyError(f"{name}: recorded already in this test")
         checked = None if limit is None else float(_numbers(name, "limit", limit, dimensions=0))
@@ -171,15 +265,17 @@ class Accuracy:
 
 
 def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, float]]:
-    """Mean of values (n,), n >= 2, and the interval that holds the true mean with probability CONFIDENCE.
+    """Mean of values (n,), n >= 2, and the interval that contains the true mean.
 
-    An end beyond the largest float is infinite.
+    The probability of the interval is CONFIDENCE. An end beyond the largest float is infinite.
     """
     import numpy as np
     from scipy.special import stdtrit
 
-    count, (_, exponent) = len(values), np.frexp(np.abs(values).max())
-    scaled = np.ldexp(values, -exponent)  # exactly, to within +-1: no square of them overflows
+    count = len(values)
+    # a power of two scales exactly; within +-1 no square overflows
+    exponent = np.frexp(np.abs(values).max())[1]
+    scaled = np.ldexp(values, -exponent)
     mean = np.mean(scaled)
     reach = stdtrit(count - 1, 0.5 + 0.5 * CONFIDENCE) * np.std(scaled, ddof=1) / np.sqrt(count)
     with np.errstate(over="ignore"):
@@ -188,7 +284,7 @@ def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, floa
 
 
 def _numbers(name: object, what: str, given: ArrayLike, dimensions: int) -> NDArray[np.float64]:
-    """The given as finite floats with so many dimensions. Raises AccuracyError."""
+    """Convert the argument to finite floats. Raises AccuracyError if it has other dimensions."""
     __tracebackhide__ = True
     import numpy as np
 
@@ -196,7 +292,9 @@ def _numbers(name: object, what: str, given: ArrayLike, dimensions: int) -> NDAr
     try:
         array = np.asarray(given)
     except ValueError:
-        raise AccuracyError(f"{name}: {what} must be {wanted}, got rows of different lengths") from None
+        raise AccuracyError(
+            f"{name}: {what} must be {wanted}, got rows of different lengths"
+        ) from None
     if array.size and array.dtype.kind not in "iuf":
         raise AccuracyError(f"{name}: {what} must be {wanted}, got {given!r:.80}")
     if array.ndim != dimensions:

@@ -1,8 +1,8 @@
-"""The pytest plugin: its options, its marker, and the fixtures that record figures and bring the testbed.
+"""The pytest plugin: its options, its marker, and the fixtures that record figures.
 
-A test names a scenario, robot or sensor other than the built-in ones by `@pytest.mark.cmmsim(sensor="mine.toml")`, the
-command line for all tests that do not by `--accuracy-sensor mine.toml`. Imported at every start of pytest, so light:
-nothing heavy is imported before a test asks for the testbed.
+A test chooses a scenario, robot or sensor of its own by `@pytest.mark.cmmsim(sensor="mine.toml")`.
+The option `--accuracy-sensor mine.toml` chooses it for all other tests. Pytest imports this module
+at every start, so everything heavy is imported only when a test asks for the testbed.
 """
 
 from __future__ import annotations
@@ -37,34 +37,58 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add(
         "--accuracy-save",
         metavar="NAME",
-        help="save the figures of a session that passes, unless NAME holds others, or one is beyond its limit",
+        help="save the figures of a session that passes, unless one is beyond its limit or NAME "
+        "holds figures that were not measured",
     )
-    add("--accuracy-compare", metavar="NAME", help="show saved figures and the change from them in the table")
+    add(
+        "--accuracy-compare",
+        metavar="NAME",
+        help="show saved figures, and the change from them, in the table",
+    )
     add(
         "--accuracy-fail",
         metavar="RATIO",
         type=ratio,
-        help="fail when a figure is worse than the one compared with by more than RATIO of it, such as 0.1 "
-        "(a sample: when both intervals say so), when it is of fewer values, or one number instead of a sample or the "
-        "other way round, or when its test ran or was skipped and did not record it",
+        help="fail when a figure is worse than the saved one by more than RATIO of it, such as "
+        "0.1 (for a sample: when both intervals show it), when it rests on fewer values, when a "
+        "sample has become one number or the other way round, or when its test ran or was "
+        "skipped without recording it",
     )
-    add("--accuracy-dir", metavar="DIR", help="folder of saved figures (default: .accuracy in the root directory)")
-    add("--accuracy-seed", metavar="N", type=seed, default=0, help="seed of the testbed's fixtures (default: 0)")
+    add(
+        "--accuracy-dir",
+        metavar="DIR",
+        help="folder of the saved figures (default: .accuracy in the root directory)",
+    )
+    add(
+        "--accuracy-seed",
+        metavar="N",
+        type=seed,
+        default=0,
+        help="seed of the testbed's fixtures (default: 0)",
+    )
     add(
         "--accuracy-scenario",
         metavar="NAME",
         help=f"scenario of the testbed, built-in or a file (default: {DEFAULT_SCENARIO})",
     )
-    add("--accuracy-robot", metavar="NAME", help="robot, built-in or a file, instead of the scenario's")
-    add("--accuracy-sensor", metavar="NAME", help="sensor, built-in or a file, instead of the scenario's")
+    add(
+        "--accuracy-robot",
+        metavar="NAME",
+        help="robot, built-in or a file, instead of the scenario's",
+    )
+    add(
+        "--accuracy-sensor",
+        metavar="NAME",
+        help="sensor, built-in or a file, instead of the scenario's",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Declare the marker; check the options and follow the session where its reports arrive."""
+    """Declare the marker, check the options, and register the session in the main process."""
     config.addinivalue_line(
         "markers",
-        f"{MARKER}(scenario=..., robot=..., sensor=...): what the cmmsim_ fixtures of a test load; built-in names, "
-        "or files beside the test's file",
+        f"{MARKER}(scenario=..., robot=..., sensor=...): choose what the cmmsim_ fixtures of a "
+        "test load, by built-in names or by files beside the test's file",
     )
     if not hasattr(config, "workerinput"):
         _check_options(config)
@@ -73,22 +97,34 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def accuracy(request: pytest.FixtureRequest) -> Accuracy:
-    """Record figures of accuracy: `accuracy.record(name, value, ...)`, `accuracy.sample(name, values, ...)`."""
+    """Recorder of figures of accuracy.
+
+    Returns
+    -------
+    Accuracy
+        Its methods `record` and `sample` record a number or the mean of several values.
+
+    Examples
+    --------
+    >>> def test_centre(accuracy):
+    ...     accuracy.record("centre error", 0.013, unit="px", limit=0.02)
+    """
     properties = request.node.user_properties
-    properties[:] = [entry for entry in properties if entry[0] != PROPERTY]  # of an earlier try of the same test
+    # plugins that repeat a failed test keep the figures of the earlier try
+    properties[:] = [entry for entry in properties if entry[0] != PROPERTY]
     return Accuracy(_node_id(request.node), properties)
 
 
 @pytest.fixture
 def cmmsim_seed(request: pytest.FixtureRequest) -> int:
-    """Seed of this test: always the same for the same node id and --accuracy-seed, another for every other test."""
+    """Seed of this test, which depends only on its node id and on --accuracy-seed."""
     text = f"{request.config.getoption('accuracy_seed')} {_node_id(request.node)}"
     return int.from_bytes(sha256(text.encode()).digest()[:4], "big")
 
 
 @pytest.fixture
 def cmmsim_scenario(request: pytest.FixtureRequest) -> Scenario:
-    """The scenario, with the robot and the sensor that were chosen beside it."""
+    """Scenario of the test, with the robot and the sensor that were chosen for it."""
     from identify import load_scenario
 
     chosen = _choices(request)
@@ -98,7 +134,7 @@ def cmmsim_scenario(request: pytest.FixtureRequest) -> Scenario:
 
 @pytest.fixture
 def cmmsim_robot(cmmsim_scenario: Scenario) -> Robot:
-    """The scenario's robot."""
+    """Robot of the test's scenario."""
     from dynamics import load_robot
 
     return load_robot(cmmsim_scenario.robot)
@@ -106,7 +142,10 @@ def cmmsim_robot(cmmsim_scenario: Scenario) -> Robot:
 
 @pytest.fixture(scope="session")
 def cmmsim_taught() -> dict[str, Taught]:
-    """What each sensor was taught, by what teaching depends on: it takes seconds, and is done once a process."""
+    """Results of teaching, by the settings that they depend on.
+
+    Teaching takes seconds, so every process does it once for each sensor.
+    """
     return {}
 
 
@@ -118,10 +157,15 @@ def cmmsim_sensor(
     cmmsim_seed: int,
     cmmsim_taught: dict[str, Taught],
 ) -> Sensor:
-    """The scenario's sensor at the start of a run; its noise is this test's, its teaching that of all tests."""
+    """Sensor of the test's scenario at the start of a run.
+
+    Its noise is drawn from the seed of the test. All tests share what it was taught.
+    """
     from identify.experiment.sensor_in_loop import make_sensor
 
-    key = cmmsim_scenario.model_dump_json(include={"sensor", "sensor_changes", "timing", "renderer"})
+    key = cmmsim_scenario.model_dump_json(
+        include={"sensor", "sensor_changes", "timing", "renderer"}
+    )
     if key not in cmmsim_taught:
         seed = request.config.getoption("accuracy_seed")
         cmmsim_taught[key] = make_sensor(cmmsim_scenario, cmmsim_robot, seed).teach()
@@ -129,7 +173,13 @@ def cmmsim_sensor(
 
 
 def _check_options(config: pytest.Config) -> None:
-    """Raise pytest.UsageError where the command line names a scenario, robot or sensor that cannot be loaded."""
+    """Check that the scenario, robot and sensor of the command line can be loaded.
+
+    Raises
+    ------
+    pytest.UsageError
+        One of them cannot.
+    """
     chosen = _from_options(config)
     if not chosen:
         return
@@ -148,16 +198,27 @@ def _check_options(config: pytest.Config) -> None:
 
 
 def _choices(request: pytest.FixtureRequest) -> dict[str, str]:
-    """Names or files of what this test uses: from the command line, replaced by its markers, the closest last."""
+    """Names or files that this test uses.
+
+    Markers replace the choices of the command line; the closest marker wins.
+    """
     chosen = _from_options(request.config)
     for mark in reversed(list(request.node.iter_markers(MARKER))):
-        unknown = [repr(key) for key in mark.kwargs if key not in CHOICES] + [repr(value) for value in mark.args]
+        unknown = [repr(key) for key in mark.kwargs if key not in CHOICES] + [
+            repr(value) for value in mark.args
+        ]
         if unknown:
-            raise AccuracyError(f"marker {MARKER}: {', '.join(unknown)} unknown; it takes {', '.join(CHOICES)}")
+            raise AccuracyError(
+                f"marker {MARKER}: {', '.join(unknown)} unknown; it takes {', '.join(CHOICES)}"
+            )
         for what, name in mark.kwargs.items():
             if not isinstance(name, str | PathLike):
-                raise AccuracyError(f"marker {MARKER}: {what} is {name!r}, must be a built-in name or a file")
-        chosen |= {what: _file_or_name(request.path.parent, name) for what, name in mark.kwargs.items()}
+                raise AccuracyError(
+                    f"marker {MARKER}: {what} is {name!r}, must be a built-in name or a file"
+                )
+        chosen |= {
+            what: _file_or_name(request.path.parent, name) for what, name in mark.kwargs.items()
+        }
     return chosen
 
 
@@ -168,7 +229,7 @@ def _from_options(config: pytest.Config) -> dict[str, str]:
 
 
 def _file_or_name(folder: Path, name: str | PathLike[str]) -> str:
-    """The file of that name in the folder, or else the name as it is, which may be a built-in one."""
+    """Path of the file with that name in the folder, or the name if there is no such file."""
     path = folder / name
     return str(path) if path.is_file() else str(name)
 
@@ -179,15 +240,17 @@ def _node_id(item: pytest.Item) -> str:
 
 
 def ratio(text: str) -> float:
-    """Value of --accuracy-fail; the parser names this function where it is no number."""
+    """Convert the value of --accuracy-fail. The parser reports what is no number."""
     value = float(text)
     if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"RATIO is {text}, must be 0 or more, such as 0.1 for 10 %")
+        raise argparse.ArgumentTypeError(
+            f"RATIO is {text}, must be 0 or more, such as 0.1 for 10 %"
+        )
     return value
 
 
 def seed(text: str) -> int:
-    """Value of --accuracy-seed."""
+    """Convert the value of --accuracy-seed."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"the seed is {text}, must be 0 or more")

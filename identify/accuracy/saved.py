@@ -1,6 +1,7 @@
-"""Saved sessions, one JSON file a name, and what got worse, is held to another limit or is gone since.
+"""Saved sessions, one JSON file each, and their comparison with the present one.
 
-Imported at every start of pytest: what reads and writes files is imported when there is one.
+Pytest imports this module at every start. Whatever reads and writes files is therefore imported
+only when there is a file.
 """
 
 import os
@@ -27,50 +28,69 @@ class Comparison:
 
     @property
     def mismatch(self) -> str:
-        """Why the two cannot be compared, or nothing."""
+        """Reason why the two cannot be compared; empty if they can."""
         for what in ("unit", "better"):
-            new, old = getattr(self.now, what), getattr(self.saved, what)
+            new = getattr(self.now, what)
+            old = getattr(self.saved, what)
             if new != old:
                 return f"{what} is {new!r}, was {old!r}"
         return ""
 
     @property
     def limit_change(self) -> str:
-        """One line: name, limit and the saved one, where they differ; or nothing."""
-        now, saved = (f"{f.limit_text} {f.unit}".strip() if f.limit_text else "none" for f in (self.now, self.saved))
-        return "" if now == saved else f"{self.now.test}: the limit of {self.now.name} is {now}, was {saved}"
+        """One line with the limit and the saved one where they differ; empty otherwise."""
+        now, saved = (
+            f"{f.limit_text} {f.unit}".strip() if f.limit_text else "none"
+            for f in (self.now, self.saved)
+        )
+        return (
+            ""
+            if now == saved
+            else f"{self.now.test}: the limit of {self.now.name} is {now}, was {saved}"
+        )
 
     @property
     def evidence_change(self) -> str:
-        """One line: name, and what stands behind its value now and before, where that is something else or less; or
-        nothing. An interval of fewer values is wider, and would hold what the saved one did not."""
-        now, saved = self.now, self.saved
+        """One line where the value rests on something else, or on fewer values, than the saved one.
+
+        Empty otherwise. An interval of fewer values is wider, so it could hide a change for the
+        worse.
+        """
+        now = self.now
+        saved = self.saved
         if (now.interval is None) == (saved.interval is None) and now.count >= saved.count:
             return ""
         return f"{now.test}: {now.name} is {_evidence(now)}, was {_evidence(saved)}"
 
     @property
     def change(self) -> float:
-        """Growth of the value as a share of the saved one's size; infinite from zero to anything else."""
+        """Growth of the value as a share of the saved one's size.
+
+        Infinite if the saved value is zero and the present one is not.
+        """
         grown = self.now.value - self.saved.value
         if not grown:
             return 0.0
         return grown / abs(self.saved.value) if self.saved.value else float("inf") * grown
 
     def worse_by_more_than(self, ratio: float) -> bool:
-        """Whether the value got worse by more than this share of the saved one's size.
+        """True where the value got worse by more than this share of the saved one's size.
 
-        Where there are intervals, only if even the good end of the new one is that much worse than the bad end of the
-        saved one.
+        With intervals, even the good end of the new one must be that much worse than the bad end of
+        the saved one.
         """
         sign = self.now.sign
         return sign * (self.now.best - self.saved.worst) > ratio * abs(self.saved.value)
 
     @property
     def regression(self) -> str:
-        """One line: name, both values and the change."""
-        now, saved = (with_unit(f"{figure.value:.6g}", self.now.unit) for figure in (self.now, self.saved))
-        return f"{self.now.test}: {self.now.name} is {now}, was {saved}, {percent(self.change, '+.1')}"
+        """One line with name, both values and the change."""
+        now, saved = (
+            with_unit(f"{figure.value:.6g}", self.now.unit) for figure in (self.now, self.saved)
+        )
+        return (
+            f"{self.now.test}: {self.now.name} is {now}, was {saved}, {percent(self.change, '+.1')}"
+        )
 
 
 def _evidence(figure: Figure) -> str:
@@ -78,13 +98,17 @@ def _evidence(figure: Figure) -> str:
 
 
 def compare(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[Key, Comparison]:
-    """Pairs of figures by their key; figures that have no partner are left out."""
+    """Pair figures with the saved ones by their key; figures without a partner are left out."""
     before = {figure.key: figure for figure in saved}
-    return {figure.key: Comparison(figure, before[figure.key]) for figure in figures if figure.key in before}
+    return {
+        figure.key: Comparison(figure, before[figure.key])
+        for figure in figures
+        if figure.key in before
+    }
 
 
 def missing(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[str, list[str]]:
-    """Names of the saved figures that are not among these, by their test."""
+    """Names of the saved figures that are not among the given ones, by their test."""
     measured = {figure.key for figure in figures}
     gone: dict[str, list[str]] = {}
     for figure in saved:
@@ -93,12 +117,17 @@ def missing(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[str, 
     return gone
 
 
-FORMAT, SCHEMA = "cmmsim accuracy", 1
+FORMAT = "cmmsim accuracy"
+SCHEMA = 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 def _machine() -> dict[str, str]:
-    return {"system": platform.platform(), "processor": platform.machine(), "cores": str(os.cpu_count())}
+    return {
+        "system": platform.platform(),
+        "processor": platform.machine(),
+        "cores": str(os.cpu_count()),
+    }
 
 
 def _versions() -> dict[str, str]:
@@ -109,7 +138,7 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class SavedSession:
-    """A file's content: figures, the testbed's seed, and when, where and with which software they were measured."""
+    """Content of a file: figures, the seed of the testbed, and how they were measured."""
 
     __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012  as pydantic wants it
 
@@ -125,25 +154,51 @@ class SavedSession:
 
 
 def saved_path(folder: Path, name: str) -> Path:
-    """File of a name in a folder. Raises AccuracyError for a name that could not be one everywhere."""
+    """Path of the file of a name in a folder.
+
+    Raises
+    ------
+    AccuracyError
+        The name is not a valid file name on every system.
+    """
     if name.endswith(".json"):
-        raise AccuracyError(f"{name!r} is no name for saved figures: {name.removesuffix('.json')!r} makes that file")
+        raise AccuracyError(
+            f"{name!r} is no name for saved figures: use {name.removesuffix('.json')!r}, "
+            "which is saved in that file"
+        )
     if not NAME.fullmatch(name):
-        raise AccuracyError(f"{name!r} is no name for saved figures: up to 100 letters, digits, '.', '_' and '-' are")
+        raise AccuracyError(
+            f"{name!r} is no name for saved figures: use up to 100 letters, digits, '.', '_' "
+            "and '-'"
+        )
     return folder / f"{name}.json"
 
 
 def find_saved(folder: Path, name: str) -> SavedSession:
-    """The session saved under a name. Raises AccuracyError, with the saved names, where there is none."""
+    """Read the session that was saved under a name.
+
+    Raises
+    ------
+    AccuracyError
+        There is none. The message lists the saved names.
+    """
     path = saved_path(folder, name)
     if not path.is_file():
         names = ", ".join(sorted(path.stem for path in folder.glob("*.json"))) or "none"
-        raise AccuracyError(f"no accuracy figures are saved as {name!r} in {folder}; saved are: {names}")
+        raise AccuracyError(
+            f"no accuracy figures are saved as {name!r} in {folder}; saved are: {names}"
+        )
     return read_saved(path)
 
 
 def read_saved(path: Path) -> SavedSession:
-    """The session in a file. Raises AccuracyError for a file that holds none, or one of another version."""
+    """Read the session in a file.
+
+    Raises
+    ------
+    AccuracyError
+        The file cannot be read, holds no session, or is of another version.
+    """
     from pydantic import TypeAdapter, ValidationError
 
     try:
@@ -155,17 +210,27 @@ def read_saved(path: Path) -> SavedSession:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise AccuracyError(f"{path} holds no accuracy figures (no entry format = {FORMAT!r})")
     if content.get("schema") != SCHEMA:
-        raise AccuracyError(f"{path} has schema {content.get('schema')!r}, this version reads {SCHEMA}")
+        raise AccuracyError(
+            f"{path} has schema {content.get('schema')!r}, this version reads {SCHEMA}"
+        )
     try:
         return TypeAdapter(SavedSession).validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise AccuracyError(f"{path}: {where}: {first['msg']} (got {first['input']!r:.60})") from error
+        raise AccuracyError(
+            f"{path}: {where}: {first['msg']} (got {first['input']!r:.60})"
+        ) from error
 
 
 def check_writable(path: Path) -> None:
-    """Raise AccuracyError where nothing can be saved, or what would be replaced is no file of saved figures."""
+    """Check that a session can be saved to a path.
+
+    Raises
+    ------
+    AccuracyError
+        Nothing can be written there, or the file that would be replaced holds no figures.
+    """
     try:
         with TemporaryFile(dir=next(place for place in path.parents if place.exists())):
             pass
@@ -176,17 +241,25 @@ def check_writable(path: Path) -> None:
 
 
 def save(path: Path, session: SavedSession) -> None:
-    """Write a session, whole or not at all. Raises AccuracyError, also where it would lose figures of another."""
+    """Write a session, whole or not at all.
+
+    Raises
+    ------
+    AccuracyError
+        The file cannot be written, or holds figures that this session did not measure.
+    """
+    from identify.errors import WriteError
     from identify.files.atomic import write_text
 
     lost = missing(session.figures, read_saved(path).figures) if path.exists() else {}
     if lost:
         names = "; ".join(f"{test}: {', '.join(figures)}" for test, figures in lost.items())
         raise AccuracyError(
-            f"not saved as {session.name}: {path} holds figures that were not measured now ({names}); "
-            "take another name, or remove that file"
+            f"not saved as {session.name}: {path} holds figures that were not measured now "
+            f"({names}); take another name, or remove that file"
         )
     try:
-        write_text(path, dumps(asdict(session), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-    except OSError as error:
-        raise AccuracyError(f"{path} cannot be written: {error.strerror or error}") from error
+        text = dumps(asdict(session), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+        write_text(path, text, parents=True)
+    except WriteError as error:
+        raise AccuracyError(str(error)) from error

@@ -1,7 +1,8 @@
-"""What the session does with all figures: gather, compare, save, and show the table.
+"""Gathering, comparing, saving and showing the figures of a test session.
 
-The figures travel as user properties in the reports of the tests, which pytest-xdist brings from its workers: with or
-without it the same figures arrive here, and sorted by node id they make the same table and the same file.
+The figures travel as user properties in the reports of the tests, which pytest-xdist brings from
+its workers. So the same figures arrive here with and without it. Sorted by node id they make the
+same table and the same file.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,39 +21,61 @@ HEADER: Row = ("figure", "value", f"{CONFIDENCE:.0%} interval", "unit", "limit",
 
 
 def terminal_table(
-    figures: Sequence[Figure], comparisons: Mapping[saved.Key, saved.Comparison], compared_with: str | None
+    figures: Sequence[Figure],
+    comparisons: Mapping[saved.Key, saved.Comparison],
+    compared_with: str | None,
 ) -> list[str]:
-    """Lines of the table, the figures of a test under its node id; aligned, with the saved values where compared."""
+    """Aligned lines of the table, the figures of each test under its node id.
+
+    With `compared_with`, the name of a saved session, two columns show its values and the change.
+    """
     header: Row = ("", *HEADER[1:], *((compared_with, "change") if compared_with else ()))
     tests = [(test, list(group)) for test, group in groupby(figures, lambda figure: figure.test)]
     rows = [
         [
-            ("  " + figure.name, *_cells(figure), *(_compared(comparisons.get(figure.key)) if compared_with else ()))
+            (
+                "  " + figure.name,
+                *_cells(figure),
+                *(_compared(comparisons.get(figure.key)) if compared_with else ()),
+            )
             for figure in group
         ]
         for _, group in tests
     ]
-    widths = [max(map(len, column)) for column in zip(header, *(row for group in rows for row in group), strict=True)]
+    widths = [
+        max(map(len, column))
+        for column in zip(header, *(row for group in rows for row in group), strict=True)
+    ]
     lines = [_aligned(header, widths)]
     for (test, _), group_rows in zip(tests, rows, strict=True):
         lines += [test, *(_aligned(row, widths) for row in group_rows)]
     if any(figure.undecided for figure in figures):
-        lines.append(f"{UNDECIDED}: passed, as the interval holds the limit; more values would tell")
+        lines.append(
+            f"{UNDECIDED}: passed, as the interval contains the limit; more values would decide"
+        )
     return lines
 
 
 def markdown_table(figures: Sequence[Figure]) -> str:
-    """The figures as a Markdown table; a parametrised test's parameters stand behind the name."""
+    """Markdown table of figures. The parameters of a parametrised test follow the name."""
     rows = [(_full_name(figure), *_cells(figure)) for figure in figures]
     lines: list[Row] = [HEADER, ("---", "--:", "--:", "---", "--:", "--:"), *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def _cells(figure: Figure) -> Row:
-    interval = "" if figure.interval is None else f"{figure.interval[0]:.4g} .. {figure.interval[1]:.4g}"
+    interval = (
+        "" if figure.interval is None else f"{figure.interval[0]:.4g} .. {figure.interval[1]:.4g}"
+    )
     margin = "" if figure.margin is None else percent(figure.margin, ".0")
     mark = "FAILED" if figure.beyond_limit else UNDECIDED if figure.undecided else ""
-    return f"{figure.value:.4g}", interval, figure.unit, figure.limit_text, f"{margin} {mark}".strip()
+    return (
+        f"{figure.value:.4g}",
+        interval,
+        figure.unit,
+        figure.limit_text,
+        f"{margin} {mark}".strip(),
+    )
 
 
 def _compared(comparison: saved.Comparison | None) -> Row:
@@ -64,9 +87,12 @@ def _compared(comparison: saved.Comparison | None) -> Row:
 
 
 def _aligned(row: Row, widths: Sequence[int]) -> str:
-    """Names and units to the left, all else to the right."""
+    """Row with names and units flush left, all else flush right."""
     left = (0, 3)
-    cells = (c.ljust(w) if i in left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+    cells = (
+        c.ljust(w) if i in left else c.rjust(w)
+        for i, (c, w) in enumerate(zip(row, widths, strict=True))
+    )
     return "  ".join(cells).rstrip()
 
 
@@ -75,29 +101,38 @@ def _full_name(figure: Figure) -> str:
     return f"{figure.name} [{parameters}" if name and bracket else figure.name
 
 
-WHY_MISSING = {None: "did not run", "passed": "passed without", "skipped": "was skipped", "failed": "failed"}
-"""What is said of the test of a figure that was not measured, by the outcome."""
+WHY_MISSING = {
+    None: "did not run",
+    "passed": "passed without",
+    "skipped": "was skipped",
+    "failed": "failed",
+}
+"""Words for a test that did not measure a saved figure, by its outcome."""
 
 
 class AccuracySession:
-    """A plugin object for the process that runs the session, not for the workers of pytest-xdist."""
+    """Plugin object of the main process; the workers of pytest-xdist have none."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._figures: dict[str, list[Figure]] = {}
         self._outcomes: dict[str, str] = {}
         self._remarks: list[tuple[str, bool]] = []
-        folder, base = config.getoption("accuracy_dir"), config.rootpath / ".accuracy"
+        folder = config.getoption("accuracy_dir")
+        base = config.rootpath / ".accuracy"
         self._folder = config.invocation_params.dir / folder if folder else base
         self._seed = config.getoption("accuracy_seed")
-        self._save, self._compare = config.getoption("accuracy_save"), config.getoption("accuracy_compare")
+        self._save = config.getoption("accuracy_save")
+        self._compare = config.getoption("accuracy_compare")
         self._ratio: float | None = config.getoption("accuracy_fail")
         self._saved: list[Figure] = []
         self._prepare()
 
     def _prepare(self) -> None:
-        """Refuse before any test runs what could not work after the last one."""
+        """Refuse what cannot work after the last test before the first one runs."""
         if self._ratio is not None and self._compare is None:
-            raise pytest.UsageError("--accuracy-fail needs --accuracy-compare NAME: worse than what?")
+            raise pytest.UsageError(
+                "--accuracy-fail needs --accuracy-compare NAME, the saved figures to compare with"
+            )
         if self._save is None and self._compare is None:
             return
         try:
@@ -107,27 +142,30 @@ class AccuracySession:
                 before = saved.find_saved(self._folder, self._compare)
                 self._saved = before.figures
                 if before.seed != self._seed:
-                    self._remark(f"{self._compare} was saved with --accuracy-seed {before.seed}, this is {self._seed}")
+                    self._remark(
+                        f"{self._compare} was saved with --accuracy-seed {before.seed}, this is "
+                        f"{self._seed}"
+                    )
         except AccuracyError as error:
             raise pytest.UsageError(str(error)) from error
 
     @property
     def figures(self) -> list[Figure]:
-        """All figures, by node id and in the order of their test."""
+        """All figures, sorted by node id and in the order of their test."""
         return [figure for test in sorted(self._figures) for figure in self._figures[test]]
 
     @property
     def comparisons(self) -> dict[saved.Key, saved.Comparison]:
-        """Figures beside the saved ones."""
+        """Figures paired with the saved ones."""
         return dict(saved.compare(self.figures, self._saved))
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        """Take the outcome of a module that is skipped as a whole."""
+        """Note the outcome of a module that is skipped as a whole."""
         if report.outcome != "passed":
             self._outcomes[report.nodeid] = report.outcome
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Take the outcome from each report of a test, and the figures from the last."""
+        """Note the outcome from each report of a test, and the figures from the last."""
         if report.when == "setup" or report.outcome != "passed":
             self._outcomes[report.nodeid] = report.outcome
         if report.when == "teardown":
@@ -137,7 +175,7 @@ class AccuracySession:
                 self._figures[found[0].test] = found
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Judge the comparison, then save if everything passed and no figure is beyond its limit."""
+        """Judge the comparison; save if all passed and no figure is beyond its limit."""
         if self._compare is not None:
             self._judge(session)
         if self._save is not None:
@@ -164,25 +202,33 @@ class AccuracySession:
             if self._ratio is None:
                 continue
             if pair.mismatch:
-                self._fail(session, f"{pair.now.test}: {pair.now.name} cannot be compared: {pair.mismatch}")
+                self._fail(
+                    session, f"{pair.now.test}: {pair.now.name} cannot be compared: {pair.mismatch}"
+                )
             elif pair.worse_by_more_than(self._ratio):
                 self._fail(session, f"worse by more than {self._ratio:.0%}: {pair.regression}")
 
     def _tell_missing(self, session: pytest.Session) -> None:
-        """Name the saved figures that were not measured; fail, if asked to, where their test was run or skipped."""
+        """Name the saved figures that were not measured.
+
+        With --accuracy-fail the session fails if their test ran or was skipped.
+        """
         gone = saved.missing(self.figures, self._saved)
         if not gone:
             return
         count = sum(map(len, gone.values()))
-        self._remark(f"{count} of {len(self._saved)} figures saved as {self._compare} were not measured now:")
+        self._remark(
+            f"{count} of {len(self._saved)} figures saved as {self._compare} were not measured now:"
+        )
         for test, names in gone.items():
             outcome = self._outcome(test)
             line = f"  {test}: {', '.join(names)} (the test {WHY_MISSING.get(outcome, outcome)})"
             self._tell(session, line, guarded=outcome is not None)
 
     def _outcome(self, test: str) -> str | None:
-        """Outcome of a test or its module, None if it did not run. With --dist loadgroup its reports name a group."""
+        """Outcome of a test or of its module; None if it did not run."""
         for node, outcome in self._outcomes.items():
+            # with --dist loadgroup the reports name the group behind an @
             if node == test or node.startswith(f"{test}@") or test.startswith(f"{node}::"):
                 return outcome
         return None
@@ -194,18 +240,28 @@ class AccuracySession:
             self._remark(f"not saved as {self._save}: {why}")
             return
         beyond = [f"{figure.test}: {figure.name}" for figure in self.figures if figure.beyond_limit]
-        if beyond:  # of a test that may fail, as one marked xfail
-            self._fail(session, f"not saved as {self._save}: beyond their limits are {'; '.join(beyond)}")
+        if beyond:  # a test that may fail, such as one marked xfail, passes in spite of them
+            self._fail(
+                session, f"not saved as {self._save}: beyond their limits are {'; '.join(beyond)}"
+            )
             return
         try:
-            saved.save(path, saved.SavedSession(name=self._save, seed=self._seed, figures=self.figures))
+            saved.save(
+                path, saved.SavedSession(name=self._save, seed=self._seed, figures=self.figures)
+            )
         except AccuracyError as error:
             self._fail(session, str(error))
         else:
-            self._remark(f"saved: {path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}")
+            self._remark(
+                "saved: "
+                f"{path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}"
+            )
 
     def _tell(self, session: pytest.Session, text: str, guarded: bool) -> None:
-        """Say what the comparison found; fail over it if it is guarded and --accuracy-fail asks for that."""
+        """Report a finding of the comparison.
+
+        With --accuracy-fail the session fails over a guarded one.
+        """
         if guarded and self._ratio is not None:
             self._fail(session, text)
         else:

@@ -1,1 +1,3 @@
-"""Subcommands of ``cmmsim``. Heavy imports are late: ``--help`` must not wait for CasADi and OpenGL."""
+"""Subcommands of ``cmmsim``. Heavy imports are late: ``--help`` must not wait for CasADi and
+OpenGL.
+"""

@@ -26,8 +26,9 @@ from identify.runtime import stoppable
 HELP = """
 Identify a parallel robot from rendered stereo images, and prove how good the result is.
 
-A simulated stereo camera measures the pose of a simulated robot, a visual servo moves it along an exciting trajectory,
-and its dynamic parameters are estimated from the record. Unseen trajectories judge them.
+A simulated stereo camera measures the pose of a simulated robot, a visual servo moves it along an
+exciting trajectory, and its dynamic parameters are estimated from the record. Unseen trajectories
+judge them.
 """
 
 EXAMPLES = """
@@ -52,7 +53,9 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command; a known error is one line on standard error and an exit status of `identify.commands.help`."""
+    """Run the command; a known error is one line on standard error and an exit status of
+    `identify.commands.help`.
+    """
     warnings.showwarning = _show_warning
     try:
         app()
@@ -60,17 +63,23 @@ def main() -> None:
         if not is_known(error):
             raise
         typer.echo(f"error: {' '.join(str(error).split())}", err=True)
-        raise SystemExit(BEYOND_LIMIT if isinstance(error, VerificationError) else NOT_DONE) from None
+        raise SystemExit(
+            BEYOND_LIMIT if isinstance(error, VerificationError) else NOT_DONE
+        ) from None
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
+def _show_warning(
+    message: Warning | str, category: type[Warning], *place: object, **more: object
+) -> None:
     """A warning as one line, without the place in the code that gave it."""
     typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 def is_known(error: Exception) -> bool:
     """Whether an error is one that a user can cause or meet, of any of the three packages."""
-    if isinstance(error, IdentifyError) or (isinstance(error, OSError) and error.filename is not None):
+    if isinstance(error, IdentifyError) or (
+        isinstance(error, OSError) and error.filename is not None
+    ):
         return True
     from cmmsim.errors import CmmError, OpenGLMissingError
     from dynamics.errors import DynamicsError
@@ -87,7 +96,10 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _common(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     pass

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.commands.options import JsonFile, Quiet, completion, tell
-from identify.errors import OutputFolderError, ScenarioError
-from identify.files.atomic import atomic_contents, atomic_path
+from identify.commands.options import JsonFile, Plugins, Quiet, completion, tell
+from identify.errors import ScenarioError
+from identify.files.atomic import atomic_contents, write_bytes, write_text
 from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import Progress, print_table, print_warnings, terminal_progress
 
@@ -16,18 +16,29 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    left: Annotated[Path | None, typer.Argument(help="Folder of the left pictures.", show_default=False)] = None,
-    right: Annotated[Path | None, typer.Argument(help="Folder of the right pictures.", show_default=False)] = None,
-    board: Annotated[
-        Path | None, typer.Option("--board", metavar="FILE", help="Board description, TOML.", show_default=False)
+    context: typer.Context,
+    left: Annotated[
+        Path | None, typer.Argument(help="Folder of the left pictures.", show_default=False)
     ] = None,
-    out: Annotated[Path, typer.Option("--out", help="Output folder, new or empty.")] = Path("runs/calibration"),
+    right: Annotated[
+        Path | None, typer.Argument(help="Folder of the right pictures.", show_default=False)
+    ] = None,
+    board: Annotated[
+        Path | None,
+        typer.Option(
+            "--board", metavar="FILE", help="Board description, TOML.", show_default=False
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Output folder, new or empty.")] = Path(
+        "runs/calibration"
+    ),
     sensor: Annotated[
         str | None,
         typer.Option(
             "--sensor",
             metavar="NAME|FILE",
-            help="Optional: sensor whose file takes the cameras; with --render, whose cameras render, ctrack780 "
+            help="Optional: sensor whose file takes the cameras; with --render, whose cameras "
+            "render, ctrack780 "
             "where it is left out.",
             autocompletion=completion("sensor"),
         ),
@@ -36,11 +47,14 @@ def calibrate(
         str | None,
         typer.Option(
             "--distortion",
-            help="Free terms: none, radial2 (k1, k2) or brown5 (k1, k2, p1, p2, k3), which is the default.",
+            help="Free terms: none, radial2 (k1, k2) or brown5 (k1, k2, p1, p2, k3), which is the "
+            "default.",
             show_default=False,
         ),
     ] = None,
-    fix_aspect: Annotated[bool, typer.Option("--fix-aspect", help="Square pixels: fx = fy.")] = False,
+    fix_aspect: Annotated[
+        bool, typer.Option("--fix-aspect", help="Square pixels: fx = fy.")
+    ] = False,
     min_images: Annotated[
         int | None,
         typer.Option(
@@ -55,32 +69,38 @@ def calibrate(
         typer.Option(
             "--halves",
             min=1,
-            help="Also calibrate so often from two random halves of the pictures, and say whether these agree as they "
+            help="Also calibrate so often from two random halves of the pictures, and say whether "
+            "these agree as they "
             "state: ten times tell.",
         ),
     ] = None,
     render: Annotated[
-        int | None, typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop.")
+        int | None,
+        typer.Option(
+            "--render", min=1, help="Render this many pairs of pictures instead, and stop."
+        ),
     ] = None,
     seed: Annotated[
         int | None,
         typer.Option(
             "--seed",
             min=0,
-            help="Seed of the rendered poses and of their noise, or of the halves; 0 where it is left out.",
+            help="Seed of the rendered poses and of their noise, or of the halves; 0 where it is "
+            "left out.",
             show_default=False,
         ),
     ] = None,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Calibrate a stereo camera from pictures of a board: photographs, or rendered ones.
 
-    Both cameras take a picture of the board at the same time, 10 to 30 times. Move the board all over both images and
-    into their corners, and tilt it by 30 degrees and more to all sides. LEFT and RIGHT are folders of the pictures; the
-    first file name of one folder goes with the first of the other and so on, in lexicographic order: img10 stands
-    before img2, so number them img02, img10. A picture may be PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, 8 or
-    16 bit.
+    Both cameras take a picture of the board at the same time, 10 to 30 times. Move the board all
+    over both images and into their corners, and tilt it by 30 degrees and more to all sides. LEFT
+    and RIGHT are folders of the pictures; the first file name of one folder goes with the first of
+    the other and so on, in lexicographic order: img10 stands before img2, so number them img02,
+    img10. A picture may be PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, 8 or 16 bit.
 
     Reads both folders and the description of the board:
 
@@ -94,10 +114,11 @@ def calibrate(
       radius = 0.0095       # m, of dots only
       dark = true           # dots darker than the board, of dots only
 
-    Writes into the folder calibration.json, which is also the JSON: estimates with standard deviations, covariance,
-    residuals, images used and rejected (where the points of a picture err alike, the covariance is enlarged, with a
-    warning); rig.toml, the tables of a sensor file's cameras; with --sensor also sensor.toml, that whole sensor file
-    with the calibrated cameras; and residuals.png, coverage.png, distortion.png.
+    Writes into the folder calibration.json, which is also the JSON: estimates with standard
+    deviations, covariance, residuals, images used and rejected (where the points of a picture err
+    alike, the covariance is enlarged, with a warning); rig.toml, the tables of a sensor file's
+    cameras; with --sensor also sensor.toml, that whole sensor file with the calibrated cameras; and
+    residuals.png, coverage.png, distortion.png.
 
     \b
     Examples:
@@ -114,28 +135,46 @@ def calibrate(
     """
     import numpy as np
 
-    from cmmsim.calibration import CalibrationOptions, as_dict, compare_halves, read_board, sensor_template
+    from cmmsim.calibration import (
+        CalibrationOptions,
+        as_dict,
+        compare_halves,
+        read_board,
+        sensor_template,
+    )
     from cmmsim.calibration import calibrate as calibrate_from
 
-    folder = new_run_folder(out).path
+    folder = context.with_resource(new_run_folder(out)).path
     progress = terminal_progress(quiet)
     if render is not None:
         _require_none("--render makes pictures and reads none", LEFT=left, RIGHT=right)
         _require_none(
             "--render makes pictures and calibrates nothing",
-            **{"--distortion": distortion, "--fix-aspect": fix_aspect or None, "--min-images": min_images},
+            **{
+                "--distortion": distortion,
+                "--fix-aspect": fix_aspect or None,
+                "--min-images": min_images,
+            },
             **{"--halves": halves},
         )
         chosen = None if board is None else read_board(board)
         _render(folder, sensor or "ctrack780", chosen, render, seed or 0, progress, quiet)
         return
     if halves is None:
-        _require_none("a calibration draws no random numbers without --render or --halves", **{"--seed": seed})
+        _require_none(
+            "a calibration draws no random numbers without --render or --halves", **{"--seed": seed}
+        )
     if left is None or right is None or board is None:
-        missing = ["LEFT"] * (left is None) + ["RIGHT"] * (right is None) + ["--board FILE"] * (board is None)
+        missing = (
+            ["LEFT"] * (left is None)
+            + ["RIGHT"] * (right is None)
+            + ["--board FILE"] * (board is None)
+        )
         raise ScenarioError(f"missing {', '.join(missing)}; cmmsim calibrate --help shows examples")
     given: dict[str, Any] = {"distortion": distortion, "min_images": min_images}
-    options = CalibrationOptions(fix_aspect=fix_aspect, **{k: v for k, v in given.items() if v is not None})
+    options = CalibrationOptions(
+        fix_aspect=fix_aspect, **{k: v for k, v in given.items() if v is not None}
+    )
     template = None if sensor is None else sensor_template(sensor, folder)
     described = read_board(board)
     pairs, size = _view(left, right, described, template, progress)
@@ -143,15 +182,22 @@ def calibrate(
         found = calibrate_from(described, pairs, size, options)
         advance()
         rng = np.random.default_rng(seed or 0)
-        apart = compare_halves(described, pairs, size, options, halves, rng, advance) if halves else None
+        apart = (
+            compare_halves(described, pairs, size, options, halves, rng, advance)
+            if halves
+            else None
+        )
     content = as_dict(found) | ({} if apart is None else {"halves": apart.to_dict()})
     refused = _write(folder, found, template, content)
-    print_warnings([*found.warnings, *(template.disagreements(found) if template else []), *refused])
+    print_warnings(
+        [*found.warnings, *(template.disagreements(found) if template else []), *refused]
+    )
     tell(content, json, quiet, lambda: _print_summary(found, apart, folder))
 
 
 def _require_none(reason: str, **given: object) -> None:
-    """Raise ScenarioError naming the arguments that are given although they would change nothing."""
+    """Raise ScenarioError naming the arguments that are given although they would change
+    nothing."""
     if names := [name for name, value in given.items() if value is not None]:
         raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
 
@@ -163,36 +209,55 @@ def _view(
     from cmmsim.calibration import pair_images, read_grey, view_pairs
 
     files = pair_images(left, right)
-    if template is not None:  # what cannot be written is refused before the search, which takes minutes
+    if (
+        template is not None
+    ):  # what cannot be written is refused before the search, which takes minutes
         height, width = read_grey(files[0].left).shape
         template.require_size((width, height))
     with progress.stage("find the board", len(files)) as advance:
         return view_pairs(files, board, advance)
 
 
-def _write(folder: Path, found: "Calibration", template: "SensorTemplate | None", content: dict[str, Any]) -> list[str]:
-    """All files, made before the first is written; a line where no sensor can have these cameras."""
+def _write(
+    folder: Path, found: "Calibration", template: "SensorTemplate | None", content: dict[str, Any]
+) -> list[str]:
+    """All files, made before the first is written; a line where no sensor can have these
+    cameras."""
     from cmmsim.calibration import require_sensor, rig_tables
     from cmmsim.errors import SensorFileError
-    from identify.verification.sensor_figures import coverage_figure, distortion_figure, residual_figure
+    from identify.verification.sensor_figures import (
+        coverage_figure,
+        distortion_figure,
+        residual_figure,
+    )
 
     sensor = None if template is None else template.filled(found)
-    figures = {"residuals": residual_figure, "coverage": coverage_figure, "distortion": distortion_figure}
+    figures = {
+        "residuals": residual_figure,
+        "coverage": coverage_figure,
+        "distortion": distortion_figure,
+    }
     drawn = {f"{name}.png": draw(found) for name, draw in figures.items()}
-    save_files(folder, {"rig.toml": rig_tables(found), "calibration.json": content, **drawn})
-    if sensor is None:
-        return []
-    try:
-        with atomic_path(folder / "sensor.toml") as temporary:
-            temporary.write_text(sensor, encoding="utf-8")
-            require_sensor(temporary)
-    except SensorFileError as error:
-        return [f"sensor.toml is not written, no sensor can have these cameras: {error}"]
+    files = {"rig.toml": rig_tables(found), "calibration.json": content, **drawn}
+    if sensor is not None:
+        try:  # it may be based on a file that it names as seen from the folder
+            save_files(folder, {"sensor.toml": sensor, **files}, require_sensor)
+        except SensorFileError as error:
+            save_files(folder, files)
+            return [f"sensor.toml is not written, no sensor can have these cameras: {error}"]
+    else:
+        save_files(folder, files)
     return []
 
 
 def _render(
-    folder: Path, sensor: str, board: "Board | None", count: int, seed: int, progress: Progress, quiet: bool
+    folder: Path,
+    sensor: str,
+    board: "Board | None",
+    count: int,
+    seed: int,
+    progress: Progress,
+    quiet: bool,
 ) -> None:
     """Pictures in left/ and right/, and board.toml beside them: all of them, or nothing."""
     import cv2
@@ -214,10 +279,9 @@ def _render(
         for k, frame in enumerate(frames):
             for side, image in (("left", frame.left), ("right", frame.right)):
                 path = made / side / f"{k:03d}.png"
-                if not cv2.imwrite(str(path), image):
-                    raise OutputFolderError(f"cannot write {path}")
+                write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
             advance()
-        (made / "board.toml").write_text(board.as_toml(), encoding="utf-8")
+        write_text(made / "board.toml", board.as_toml())
     if not quiet:
         typer.echo(
             f"pictures: {folder}\ncalibrate with: cmmsim calibrate {folder}/left {folder}/right "
@@ -233,14 +297,19 @@ def _print_summary(found: "Calibration", apart: "Halves | None", folder: Path) -
         (name, f"{value:.6g}", f"{std:.2g}" if std > 0.0 else "fixed")
         for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True)
     ]
-    title = f"{count} pairs of pictures; errors of the points in them: {found.adjustment.sigma_px:.3g} px"
+    title = (
+        f"{count} pairs of pictures; errors of the points in them: "
+        f"{found.adjustment.sigma_px:.3g} px"
+    )
     print_table(("parameter", "estimate", "standard deviation"), rows, ("parameter",), title)
     for name, reason in found.rejected.items():
         typer.echo(f"not used: {name}: {reason}")
     if apart is not None:
         typer.echo(
-            f"halves of the pictures differ by {apart.mean_square:.2f} times the variance that they state, on average "
-            f"over {len(apart.squares)} splits; 1 is expected, give or take {apart.chance:.2f} in a single split: "
+            f"halves of the pictures differ by {apart.mean_square:.2f} times the variance that "
+            "they state, on average "
+            f"over {len(apart.squares)} splits; 1 is expected, give or take {apart.chance:.2f} in "
+            "a single split: "
             f"{apart.verdict}"
         )
     typer.echo(f"calibration: {folder}")

@@ -1,11 +1,22 @@
-"""The command ``check``: a robot file judged before anything is built or run. Heavy imports are late."""
+"""The command ``check``: a robot file judged before anything is built or run. Heavy imports are
+late.
+"""
 
 from textwrap import shorten
 from typing import Annotated
 
 import typer
 
-from identify.commands.options import JsonFile, Quiet, RobotArgument, Settings, chosen_scenario, completion, tell
+from identify.commands.options import (
+    JsonFile,
+    Plugins,
+    Quiet,
+    RobotArgument,
+    Settings,
+    chosen_scenario,
+    completion,
+    tell,
+)
 from identify.errors import VerificationError
 from identify.progress import print_table, terminal_progress
 
@@ -16,27 +27,35 @@ LONGEST = 160
 def check(
     robot: RobotArgument,
     scenario: Annotated[
-        str, typer.Option(help="Scenario whose servo, timing and limits count.", autocompletion=completion("scenario"))
+        str,
+        typer.Option(
+            help="Scenario whose servo, timing and limits count.",
+            autocompletion=completion("scenario"),
+        ),
     ] = "paper",
     parameters: Annotated[
         str | None,
         typer.Option(
-            metavar="SET", help="Parameter set of the robot.", show_default="the scenario's truth, else initial"
+            metavar="SET",
+            help="Parameter set of the robot.",
+            show_default="the scenario's truth, else initial",
         ),
     ] = None,
     settings: Settings = None,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Say in a page what a designer wants to know of a robot.
 
-    Reach, travel and singularities at home and over the travel, assembly modes, holding torques, what its motion can
-    show, inertias that no body has, whether its loop is stable, up to which gains and down to which frame rate, what
-    bandwidth and damping its gains give and which gains give those that the scenario's [control] asks for, and whether
-    the platform that the scenario's sensor sees is the robot's: each with its number and limit, and with the leg that
-    it concerns.
+    Reach, travel and singularities at home and over the travel, assembly modes, holding torques,
+    what its motion can show, inertias that no body has, whether its loop is stable, up to which
+    gains and down to which frame rate, what bandwidth and damping its gains give and which gains
+    give those that the scenario's [control] asks for, and whether the platform that the scenario's
+    sensor sees is the robot's: each with its number and limit, and with the leg that it concerns.
 
-    Reads a robot file, and a scenario. Writes nothing but the JSON: whether all is well, and the findings.
+    Reads a robot file, and a scenario. Writes nothing but the JSON: whether all is well, and the
+    findings.
 
     \b
     Examples:
@@ -48,8 +67,11 @@ def check(
     from identify.loop_parameters import NOMINAL, check_parameter_set
     from identify.verification.robot_check import check_robot
 
-    chosen, given = load_robot(robot), chosen_scenario(scenario, settings, None)
-    name = parameters or (given.plant.parameters if given.plant.parameters in chosen.parameter_sets else NOMINAL)
+    chosen = load_robot(robot)
+    given = chosen_scenario(scenario, settings, None)
+    name = parameters or (
+        given.plant.parameters if given.plant.parameters in chosen.parameter_sets else NOMINAL
+    )
     check_parameter_set(chosen, name)
     values = chosen.parameter_sets[name].vector
     findings = check_robot(chosen, values, given, terminal_progress(quiet))
@@ -63,10 +85,16 @@ def check(
         )
         for finding in findings
     ]
-    header, title = ("ok", "check", "limit", "finding"), f"{chosen.name}, parameters `{name}`"
+    header = ("ok", "check", "limit", "finding")
+    title = f"{chosen.name}, parameters `{name}`"
     entry = {"ok": not failed, "findings": [finding.entry() for finding in findings]}
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
-        told = (shorten(f"{finding.check}: {finding.text}", LONGEST, placeholder=" …") for finding in failed)
+        told = (
+            shorten(f"{finding.check}: {finding.text}", LONGEST, placeholder=" …")
+            for finding in failed
+        )
         said = "; ".join(told)
-        raise VerificationError(f"{len(failed)} of {len(findings)} findings about {chosen.name} fail: {said}")
+        raise VerificationError(
+            f"{len(failed)} of {len(findings)} findings about {chosen.name} fail: {said}"
+        )

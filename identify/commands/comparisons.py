@@ -1,4 +1,5 @@
-"""Commands that compare: estimators on one record, estimates from run to run, and methods of excitation.
+"""Commands that compare: estimators on one record, estimates from run to run, and methods of
+excitation.
 
 Heavy imports are late.
 """
@@ -10,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.commands.options import JsonFile, Quiet, WholeRunOption, repeatable, tell
+from identify.commands.options import (
+    JsonFile,
+    Plugins,
+    Quiet,
+    WholeRunOption,
+    allow_named,
+    repeatable,
+    tell,
+)
+from identify.files.lock import working_in
 from identify.files.run_folder import RunFolder, save_files
 from identify.progress import Progress, print_table, terminal_progress
 from identify.scenario import Scenario, load_scenario
@@ -31,49 +41,77 @@ ESTIMATORS_HEADER = (
     "runs",
 )
 
-METHODS_HEADER = ("method", "maximised", "index", "narrows", "seconds", "values", "gradients", "stopped")
+METHODS_HEADER = (
+    "method",
+    "maximised",
+    "index",
+    "narrows",
+    "seconds",
+    "values",
+    "gradients",
+    "stopped",
+)
 
 PAPERS_ROBOT = "rss6"
-PAPER = "the paper, with its own robot and geometry: index 0.38 at the start, 1.345 after 324 generations"
+PAPER = (
+    "the paper, with its own robot and geometry: index 0.38 at the start, 1.345 after 324 "
+    "generations"
+)
 
 
 def estimators(
+    context: typer.Context,
     out: WholeRunOption,
     only: Annotated[
         list[str] | None, repeatable("Name of an estimator, or module:function of one's own", "all")
     ] = None,
     add: Annotated[
-        list[str] | None, repeatable("Estimator of one's own beside these, as module:function", "none")
+        list[str] | None,
+        repeatable("Estimator of one's own beside these, as module:function", "none"),
     ] = None,
     torque_noise: Annotated[
         float | None,
-        typer.Option(min=0, help="Standard deviation of a torque, N m, or of a force, N.", show_default="0.02, 0.5"),
+        typer.Option(
+            min=0,
+            help="Standard deviation of a torque, N m, or of a force, N.",
+            show_default="0.02, 0.5",
+        ),
     ] = None,
     encoder_noise: Annotated[
         float | None,
-        typer.Option(min=0, help="Standard deviation of a joint angle, rad, or length, m.", show_default="1e-5, 1e-6"),
+        typer.Option(
+            min=0,
+            help="Standard deviation of a joint angle, rad, or length, m.",
+            show_default="1e-5, 1e-6",
+        ),
     ] = None,
     encoder_bits: Annotated[
         int | None,
         typer.Option(
-            min=4, max=40, help="Bits a turn, or over the travel, of the encoders.", show_default="17, 1 um steps"
+            min=4,
+            max=40,
+            help="Bits a turn, or over the travel, of the encoders.",
+            show_default="17, 1 um steps",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the joint instruments' noise.")] = 0,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Compare nine estimators, and your own, on the record of a run.
 
-    The paper's output error beside its variants and beside what the literature does with measured joint torques and
-    encoders (inverse dynamics; poses from the camera, or by forward kinematics). The run has no such instruments: they
-    are simulated from its truth, with the noise given here. Where the joint controller is known it has the true gains.
-    All are judged by the truth of the record and of the unseen trajectories. An estimator of one's own is a function of
-    the evidence, see identify.estimators.estimator.
+    The paper's output error beside its variants and beside what the literature does with measured
+    joint torques and encoders (inverse dynamics; poses from the camera, or by forward kinematics).
+    The run has no such instruments: they are simulated from its truth, with the noise given here.
+    Where the joint controller is known it has the true gains. All are judged by the truth of the
+    record and of the unseen trajectories. An estimator of one's own is a function of the evidence,
+    see identify.estimators.estimator.
 
     Reads scenario.toml, experiment.nc and validation.nc of the folder.
 
-    Writes instruments.nc, estimators.json, which is also the JSON, and figures/estimators.png there.
+    Writes instruments.nc, estimators.json, which is also the JSON, and figures/estimators.png
+    there.
 
     \b
     Examples:
@@ -89,24 +127,35 @@ def estimators(
 
     folder = RunFolder(out)
     folder.require("scenario.toml", "experiment.nc", "validation.nc")
+    context.with_resource(working_in(folder.path))
     files = RunFiles(folder)
     files.check_made_of("experiment.nc", "validation.nc")
-    robot = load_robot(load_scenario(folder.scenario).robot)
+    allow_named([*(only or ()), *(add or ())])
+    robot = load_robot(load_scenario(folder.whole_scenario).robot)
     instruments = instruments_of(robot, torque_noise, encoder_noise, encoder_bits)
     chosen = find_estimators(only) | (find_estimators(add) if add else {})
     scores = compare_on_run(files, instruments, chosen, seed, terminal_progress(quiet))
-    entry = {"seed": seed, "instruments": instruments.figures, "estimators": {s.name: _entry(s) for s in scores}}
-    save_files(folder.path, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)})
+    entry = {
+        "seed": seed,
+        "instruments": instruments.figures,
+        "estimators": {s.name: _entry(s) for s in scores},
+    }
+    save_files(
+        folder.path, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)}
+    )
     tell(entry, json, quiet, lambda: _print_scores(scores, out))
 
 
 def _entry(score: "Score") -> dict[str, Any]:
     """A score with its parameters by name."""
     entry = asdict(score)
-    estimate, std, names = entry.pop("parameters"), entry.pop("std"), entry.pop("names")
+    estimate = entry.pop("parameters")
+    std = entry.pop("std")
+    names = entry.pop("names")
     if estimate is not None:
         entry["parameters"] = {
-            name: {"estimate": estimate[k], "std": None if std is None else std[k]} for k, name in enumerate(names)
+            name: {"estimate": estimate[k], "std": None if std is None else std[k]}
+            for k, name in enumerate(names)
         }
     return entry
 
@@ -117,8 +166,10 @@ def _print_scores(scores: list["Score"], out: Path) -> None:
         [(score.title, *_score_row(score)) for score in scores],
         ("estimator",),
         "estimators on one record, against one truth",
-        "groups: RMS and median relative error of the base parameters that the record shows; gains: RMS relative error "
-        "of those of the joint controller; position, angle: model against true plant on unseen trajectories, RMS of "
+        "groups: RMS and median relative error of the base parameters that the record shows; "
+        "gains: RMS relative error "
+        "of those of the joint controller; position, angle: model against true plant on unseen "
+        "trajectories, RMS of "
         "the worst axis and run; runs: how often the model was simulated",
     )
     for score in scores:
@@ -142,6 +193,7 @@ def _short(value: float) -> str:
 
 
 def variation(
+    context: typer.Context,
     out: WholeRunOption,
     designed: Annotated[
         int | None,
@@ -149,24 +201,30 @@ def variation(
             "--designed",
             min=3,
             metavar="COUNT",
-            help="Record this many new runs, each on an exciting trajectory designed for it by the scenario's method, "
+            help="Record this many new runs, each on an exciting trajectory designed for it by "
+            "the scenario's method, "
             "instead of taking the unseen runs.",
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option("--workers", min=1, help="Processes that design and render.", show_default="one a core"),
+        typer.Option(
+            "--workers", min=1, help="Processes that design and render.", show_default="one a core"
+        ),
     ] = None,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
-    """Identify from each of several runs alone, and see how the estimates vary (the paper's table 5).
+    """Identify from each of several runs alone, and see how the estimates vary (the paper's table
+    5).
 
-    As in the paper, from the unseen runs of validation.nc; or from newly recorded ones, which are kept as variation.nc.
-    The masses of the links vary most: only what accelerates shows them, so that fast trajectories tell more of them
-    than long ones.
+    As in the paper, from the unseen runs of validation.nc; or from newly recorded ones, which are
+    kept as variation.nc. The masses of the links vary most: only what accelerates shows them, so
+    that fast trajectories tell more of them than long ones.
 
-    Reads scenario.toml and validation.nc of the folder; with --designed trajectories.json in place of the latter.
+    Reads scenario.toml and validation.nc of the folder; with --designed trajectories.json in place
+    of the latter.
 
     Writes variation.json, which is also the JSON, variation.md and figures/variation.png there.
 
@@ -184,21 +242,26 @@ def variation(
     from identify.validation.variation import designed_runs, identify_each
     from identify.validation.variation import variation as variation_of
 
-    folder, progress = RunFolder(out), terminal_progress(quiet)
+    folder = RunFolder(out)
+    progress = terminal_progress(quiet)
     folder.require("scenario.toml", "trajectories.json" if designed else "validation.nc")
-    scenario = load_scenario(folder.scenario)
+    context.with_resource(working_in(folder.path))
+    scenario = load_scenario(folder.whole_scenario)
     robot = load_robot(scenario.robot)
     if designed:
         seed = load_trajectories(folder.trajectories).seed
         runs = designed_runs(scenario, robot, seed, designed, workers, progress)
         recording.write_runs(out / "variation.nc", [(run.record, run.truth) for run in runs])
-        records, origin = [run.record for run in runs], f"designed: {scenario.excitation.method}"
+        records = [run.record for run in runs]
+        origin = f"designed: {scenario.excitation.method}"
     else:
         seen = RunFiles(folder)
         seen.check_made_of("validation.nc")
-        records, origin = seen.validation, "unseen"
+        records = seen.validation
+        origin = "unseen"
     found = variation_of(identify_each(records, robot, scenario, progress))
-    table, entry = tables.variation_table(found), tables.variation_entry(found, origin)
+    table = tables.variation_table(found)
+    entry = tables.variation_entry(found, origin)
     files = {
         "variation.json": entry,
         "variation.md": f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n",
@@ -239,9 +302,12 @@ def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:
         used = ", ".join(f"{worst.name} {100 * worst.share:.2f} %" for worst in nearest)
         typer.echo(f"{entry.method}: share of each limit used: {used}")
     typer.echo(
-        f"maximised: the criterion (information: of the linearised loop). index: the paper's observability index, eq. "
-        f"39. narrows: factor by which a run narrows what is known before of the parameters, with the simulated loop; "
-        f"- where that is unstable. Candidates and functions took {found.preparation_seconds:.1f} s. Files: {folder}"
+        "maximised: the criterion (information: of the linearised loop). index: the paper's "
+        "observability index, eq. "
+        "39. narrows: factor by which a run narrows what is known before of the parameters, with "
+        "the simulated loop; "
+        f"- where that is unstable. Candidates and functions took {found.preparation_seconds:.1f} "
+        f"s. Files: {folder}"
     )
 
 

@@ -10,6 +10,7 @@ from identify.commands.options import (
     EstimatorSettings,
     JsonFile,
     NewFolder,
+    Plugins,
     Quiet,
     RobotOption,
     RunFolderOption,
@@ -21,7 +22,14 @@ from identify.commands.options import (
     parse_settings,
     tell,
 )
-from identify.files.run_folder import RunFolder, load_result, new_run_folder
+from identify.files.lock import working_in
+from identify.files.run_folder import (
+    BEGUN,
+    UNFINISHED,
+    RunFolder,
+    load_result,
+    new_run_folder,
+)
 from identify.progress import print_warnings, terminal_progress
 
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
@@ -29,6 +37,7 @@ PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
 
 
 def run(
+    context: typer.Context,
     scenario: ScenarioArgument = "paper",
     out: NewFolder = None,
     seed: Seed = 0,
@@ -37,17 +46,19 @@ def run(
     workers: Workers = None,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Do a whole experiment, from designing the motion to the report.
 
-    Chooses an exciting trajectory, moves the simulated robot along it with images in the loop, identifies the robot
-    from the record, judges the model on unseen trajectories, and writes the report. A goal that is missed is said, and
-    does not change the exit status.
+    Chooses an exciting trajectory, moves the simulated robot along it with images in the loop,
+    identifies the robot from the record, judges the model on unseen trajectories, and writes the
+    report. A goal that is missed is said, and does not change the exit status.
 
     Reads a scenario, and the robot and sensor that it names.
 
-    Writes into the folder: scenario.toml, trajectories.json, experiment.nc, result.json, covariance.nc, validation.nc,
-    model.nc, report.html and figures; with geometry.known=calibrated also geometry. The JSON is result.json.
+    Writes into the folder: scenario.toml, trajectories.json, experiment.nc, result.json,
+    covariance.nc, validation.nc, model.nc, report.html and figures; with geometry.known=calibrated
+    also geometry. The JSON is result.json.
 
     \b
     Examples:
@@ -61,7 +72,9 @@ def run(
                                               is wrong, and the residuals tell
     """
     chosen = chosen_scenario(scenario, settings, robot)
-    folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
+    path = out or Path("runs") / f"{chosen.name}-{seed}"
+    begun = _pipeline().is_begun(chosen, seed, path)
+    folder = context.with_resource(new_run_folder(path, BEGUN if begun else UNFINISHED))
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
     result = _warned(folder)
     tell(result, json, quiet, lambda: _summary().print_goals(result, folder.report))
@@ -71,45 +84,56 @@ def warm_up(
     scenario: ScenarioArgument = "paper",
     robot: RobotOption = None,
     settings: Settings = None,
-    all_robots: Annotated[bool, typer.Option("--all-robots", help="Compile every built-in robot, too.")] = False,
+    all_robots: Annotated[
+        bool, typer.Option("--all-robots", help="Compile every built-in robot, too.")
+    ] = False,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
-    """Compile once, for this user, all that runs of a scenario need, so that no run waits for it later.
+    """Compile once, for this user, all that runs of a scenario need, so that no run waits for it
+    later.
 
-    A robot is compiled for itself, and one with another number of joints or freedoms compiles the loop anew.
+    A robot is compiled for itself, and one with another number of joints or freedoms compiles the
+    loop anew.
 
-    Reads a scenario and its robot. Writes machine code into the cache of this user (CMMSIM_CACHE names another folder).
+    Reads a scenario and its robot. Writes machine code into the cache of this user (CMMSIM_CACHE
+    names another folder).
 
     \b
     Examples:
       cmmsim warm-up
       cmmsim warm-up quick --robot mine.toml
     """
-    from dynamics import built_in_robots, load_robot
-    from identify.experiment.run import warm_up
+    from dynamics import built_in_robots
+    from identify.experiment.warm_up import warm_up
 
-    others = tuple(load_robot(name) for name in built_in_robots()) if all_robots else ()
+    others = tuple(built_in_robots()) if all_robots else ()
     warm_up(chosen_scenario(scenario, settings, robot), terminal_progress(quiet), others)
 
 
 def excite(
+    context: typer.Context,
     scenario: ScenarioArgument = "paper",
     out: NewFolder = None,
     seed: Seed = 0,
     robot: RobotOption = None,
     settings: Settings = None,
     compare: Annotated[
-        bool, typer.Option("--compare", help="Only compare the methods: writes comparison.json and comparison.png.")
+        bool,
+        typer.Option(
+            "--compare", help="Only compare the methods: writes comparison.json and comparison.png."
+        ),
     ] = False,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Choose the exciting trajectory and the unseen ones: the first stage of an experiment.
 
     Reads a scenario and its robot.
 
-    Writes scenario.toml and trajectories.json into the folder; with --compare, what each method of search finds
-    instead. The JSON is trajectories.json or comparison.json.
+    Writes scenario.toml and trajectories.json into the folder; with --compare, what each method of
+    search finds instead. The JSON is trajectories.json or comparison.json.
 
     \b
     Examples:
@@ -119,7 +143,8 @@ def excite(
     """
     chosen = chosen_scenario(scenario, settings, robot)
     name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
-    folder = new_run_folder(out or Path("runs") / name)
+    may_hold = () if compare else UNFINISHED
+    folder = context.with_resource(new_run_folder(out or Path("runs") / name, may_hold))
     if compare:
         compare_excitation(chosen, seed, folder.path, terminal_progress(quiet), json, quiet)
         return
@@ -127,23 +152,32 @@ def excite(
     tell(load_result(folder.trajectories), json, quiet, lambda: None)
 
 
-def record(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) -> None:
-    """Move the simulated robot along the exciting trajectory with images in the loop: the second stage.
+def record(
+    context: typer.Context,
+    out: RunFolderOption,
+    workers: Workers = None,
+    quiet: Quiet = False,
+    plugin: Plugins = None,
+) -> None:
+    """Move the simulated robot along the exciting trajectory with images in the loop: the second
+    stage.
 
     Reads scenario.toml and trajectories.json of the folder.
 
-    Writes experiment.nc there: the record, and the truth in a group of its own; payload.nc too, where a known load is
-    what fixes the scale.
+    Writes experiment.nc there: the record, and the truth in a group of its own; payload.nc too,
+    where a known load is what fixes the scale.
 
     \b
     Example:
       cmmsim record --out mine
     """
     RunFolder(out).require("scenario.toml", "trajectories.json")
+    context.with_resource(working_in(out))
     _pipeline().record(out, terminal_progress(quiet), workers)
 
 
 def identify(
+    context: typer.Context,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -157,7 +191,8 @@ def identify(
         typer.Option(
             "--record",
             metavar="FILE",
-            help="Identify from a record of your own, netCDF or CSV; a second one of the same robot under a known "
+            help="Identify from a record of your own, netCDF or CSV; a second one of the same "
+            "robot under a known "
             "load, where that fixes the scale.",
             show_default=False,
         ),
@@ -165,21 +200,24 @@ def identify(
     settings: EstimatorSettings = None,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Estimate the robot's parameters from the record: the third stage.
 
-    Reads scenario.toml, trajectories.json and experiment.nc of the folder; or a record of your own, netCDF as
-    experiment.nc is, or a CSV table with a TOML file of the same name beside it, which says what it is a record of.
-    cmmsim new record mine.csv writes both, with comments that say which columns there are, and these rules:
+    Reads scenario.toml, trajectories.json and experiment.nc of the folder; or a record of your own,
+    netCDF as experiment.nc is, or a CSV table with a TOML file of the same name beside it, which
+    says what it is a record of. cmmsim new record mine.csv writes both, with comments that say
+    which columns there are, and these rules:
 
-    A record begins at rest: before its first row the robot has stood still at the first reference pose. It has one row
-    a frame, without gaps; a lost frame keeps its row, with empty measured columns. Units are m, rad and s. What breaks
-    a rule is refused with its line or frame.
+    A record begins at rest: before its first row the robot has stood still at the first reference
+    pose. It has one row a frame, without gaps; a lost frame keeps its row, with empty measured
+    columns. Units are m, rad and s. What breaks a rule is refused with its line or frame.
 
-    Writes result.json and covariance.nc there, and from a record of your own also scenario.toml, experiment.nc and
-    model.nc: go on with cmmsim report, since nothing is known of the truth that could be validated. What is set here
-    stays in scenario.toml, so that validate, report and the next identify go on with it; result.json, which is also the
-    JSON, lists all settings of its estimator.
+    Writes result.json and covariance.nc there, and from a record of your own also scenario.toml,
+    experiment.nc and model.nc: go on with cmmsim report, since nothing is known of the truth that
+    could be validated. What is set here stays in scenario.toml, so that validate, report and the
+    next identify go on with it; result.json, which is also the JSON, lists all settings of its
+    estimator.
 
     \b
     Examples:
@@ -190,24 +228,37 @@ def identify(
       cmmsim identify --out mine \\
         --set 'identification.prior={"platform.mass"={value=23.5,std=0.1}}'
     """
-    chosen, progress = parse_settings(settings), terminal_progress(quiet)
+    chosen = parse_settings(settings)
+    progress = terminal_progress(quiet)
     if record:
-        folder = new_run_folder(out or Path("runs") / record[0].stem)
+        path = out or Path("runs") / record[0].stem
+        folder = context.with_resource(new_run_folder(path))
         _pipeline().identify_own(record, folder.path, progress, chosen)
     elif out is None:
-        raise typer.BadParameter("name the folder of a run, or a record of your own with --record", param_hint="--out")
+        raise typer.BadParameter(
+            "name the folder of a run, or a record of your own with --record", param_hint="--out"
+        )
     else:
         folder = RunFolder(out)
         folder.require(*(PLANNED[:1] if folder.holds_own_record else PLANNED))
+        context.with_resource(working_in(out))
         _pipeline().identify(out, progress, chosen)
     result = _warned(folder)
     tell(result, json, quiet, lambda: _summary().print_identification(result, folder.result))
 
 
-def validate(out: RunFolderOption, workers: Workers = None, json: JsonFile = None, quiet: Quiet = False) -> None:
+def validate(
+    context: typer.Context,
+    out: RunFolderOption,
+    workers: Workers = None,
+    json: JsonFile = None,
+    quiet: Quiet = False,
+    plugin: Plugins = None,
+) -> None:
     """Judge the identified model on trajectories that it has never seen: the fourth stage.
 
-    Reads scenario.toml, trajectories.json, experiment.nc, result.json and covariance.nc of the folder.
+    Reads scenario.toml, trajectories.json, experiment.nc, result.json and covariance.nc of the
+    folder.
 
     Writes validation.nc and model.nc there, and completes result.json, which is also the JSON.
 
@@ -218,11 +269,17 @@ def validate(out: RunFolderOption, workers: Workers = None, json: JsonFile = Non
     folder = RunFolder(out)
     if not folder.holds_own_record:
         folder.require(*PLANNED, "result.json")
+    context.with_resource(working_in(out))
     _pipeline().validate(out, terminal_progress(quiet), workers)
     tell(load_result(folder.result), json, quiet, lambda: None)
 
 
-def report(out: RunFolderOption, quiet: Quiet = False) -> None:
+def report(
+    context: typer.Context,
+    out: RunFolderOption,
+    quiet: Quiet = False,
+    plugin: Plugins = None,
+) -> None:
     """Draw the figures of a run and write its report, one file that opens without a network.
 
     Reads result.json, the records and model.nc of the folder. Writes report.html and figures there.
@@ -233,6 +290,7 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
     """
     folder = RunFolder(out)
     folder.require("result.json", "experiment.nc")
+    context.with_resource(working_in(out))
     _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
         _summary().print_goals(load_result(folder.result), folder.report)

@@ -1,4 +1,6 @@
-"""The command ``geometry``: where a robot's joints, axes and zero angles are. Heavy imports are late."""
+"""The command ``geometry``: where a robot's joints, axes and zero angles are. Heavy imports are
+late.
+"""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,6 +9,7 @@ import typer
 
 from identify.commands.options import (
     JsonFile,
+    Plugins,
     Quiet,
     RobotOption,
     ScenarioArgument,
@@ -20,29 +23,36 @@ from identify.progress import print_table, print_warnings, terminal_progress
 
 
 def geometry(
+    context: typer.Context,
     scenario: ScenarioArgument = "geometry",
     out: Annotated[Path | None, new_folder("runs/geometry-SEED")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of poses, offsets and noise.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Seed of poses, offsets and noise.")
+    ] = 0,
     robot: RobotOption = None,
     settings: Settings = None,
     poses: Annotated[
-        Path | None, typer.Option("--poses", metavar="FILE", help="Your own poses in place of simulated ones.")
+        Path | None,
+        typer.Option("--poses", metavar="FILE", help="Your own poses in place of simulated ones."),
     ] = None,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Calibrate the geometry of a robot with the optical CMM.
 
-    The robot stands at poses that show most of its geometry. Joint encoders read its joints, the mean of some frames
-    its pose; joint places, axes, zero angles and lengths follow, each with its standard deviation. Numbers and
-    combinations that the poses cannot tell stay where the robot file has them, and are named. The scenario's [geometry]
-    says how; its [plant] how far the simulated robot is off.
+    The robot stands at poses that show most of its geometry. Joint encoders read its joints, the
+    mean of some frames its pose; joint places, axes, zero angles and lengths follow, each with its
+    standard deviation. Numbers and combinations that the poses cannot tell stay where the robot
+    file has them, and are named. The scenario's [geometry] says how; its [plant] how far the
+    simulated robot is off.
 
-    Reads a scenario, or poses of your own: a JSON file with joints (N, n) in rad or m, joint_std (n,), poses (N, 6) in
-    m and rad and covariances (N, 6, 6), as poses.json is; base_covariance and platform_covariance (6, 6) say how well
-    the frames of the measurement are known, and are left out where they are not. It writes geometry.json, geometry.md,
-    geometry.png and geometry.svg, covariance.nc, poses.json, and robot.toml, the calibrated robot, which every other
-    command takes; cmmsim run --set geometry.known=FILE takes it with its covariance.
+    Reads a scenario, or poses of your own: a JSON file with joints (N, n) in rad or m, joint_std
+    (n,), poses (N, 6) in m and rad and covariances (N, 6, 6), as poses.json is; base_covariance and
+    platform_covariance (6, 6) say how well the frames of the measurement are known, and are left
+    out where they are not. It writes geometry.json, geometry.md, geometry.png and geometry.svg,
+    covariance.nc, poses.json, and robot.toml, the calibrated robot, which every other command
+    takes; cmmsim run --set geometry.known=FILE takes it with its covariance.
 
     \b
     Examples:
@@ -55,11 +65,11 @@ def geometry(
     from dynamics import load_robot
     from identify.geometry.run import run_geometry
     from identify.geometry.static_poses import read_static_poses
-    from identify.reporting.figures.geometry import geometry_figure
+    from identify.reporting.figures.geometry_calibration import geometry_figure
     from identify.reporting.figures.style import drawn, svg_text
 
     chosen = chosen_scenario(scenario, settings, robot)
-    folder = new_run_folder(out or Path("runs") / f"geometry-{seed}").path
+    folder = context.with_resource(new_run_folder(out or Path("runs") / f"geometry-{seed}")).path
     own = None if poses is None else read_static_poses(poses, load_robot(chosen.robot))
     outcome = run_geometry(chosen, seed, terminal_progress(quiet), own)
     picture = drawn(lambda: geometry_figure(outcome.entry))
@@ -73,15 +83,22 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
 
     known = [
         (said, [*entry[key]["position_rms_um"], *entry[key]["orientation_rms_urad"]])
-        for key, said in (("uncalibrated", "before"), ("unseen", "after"), ("expected", "expected after"))
+        for key, said in (
+            ("uncalibrated", "before"),
+            ("unseen", "after"),
+            ("expected", "expected after"),
+        )
         if key in entry
     ]
-    rows = [(said, *(f"{value:.2f}" for value in row)) for said, row in known if np.isfinite(row).all()]
+    rows = [
+        (said, *(f"{value:.2f}" for value in row)) for said, row in known if np.isfinite(row).all()
+    ]
     header = ("", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad")
     print_table(header, rows, (), "rms error of poses that were not measured")
     told = [name for name, one in entry["parameters"].items() if one["observable"]]
     typer.echo(
-        f"{len(told)} of {len(entry['parameters'])} geometric numbers are told by {entry['poses']} poses; "
+        f"{len(told)} of {len(entry['parameters'])} geometric numbers are told by "
+        f"{entry['poses']} poses; "
         f"{len(entry['cannot_be_told'])} combinations cannot be told"
     )
     typer.echo(f"files: {folder}")

@@ -1,4 +1,6 @@
-"""How the command line explains itself: commands first, by group and in whole sentences, and the exit statuses."""
+"""How the command line explains itself: commands first, by group and in whole sentences, and the
+exit statuses.
+"""
 
 from typing import Any, ClassVar
 
@@ -7,11 +9,16 @@ from typer.core import TyperCommand, TyperGroup
 
 from identify.runtime import STOPPED
 
-DONE, NOT_DONE, MISUSED, ROWS_FAILED, BEYOND_LIMIT = 0, 1, 2, 3, 4
+DONE = 0
+NOT_DONE = 1
+MISUSED = 2
+ROWS_FAILED = 3
+BEYOND_LIMIT = 4
 STATUSES = {
     DONE: "It is done.",
     NOT_DONE: "It cannot be done; one line on standard error says why.",
-    MISUSED: "The command line is wrong: no such command or option, or a value that it cannot have.",
+    MISUSED: "The command line is wrong: no such command or option, or a value that it cannot "
+    "have.",
     ROWS_FAILED: "The study is done, but some of its rows failed, and say why.",
     BEYOND_LIMIT: "It is done, and what it judges is beyond its limit, which one line names.",
     STOPPED: "Ctrl-C has ended it.",
@@ -46,7 +53,9 @@ class StudyCommand(Command):
 
 
 class Commands(TyperGroup):
-    """A group of commands: help lists these first. Says when Ctrl-C has ended one; typer alone would say nothing."""
+    """A group of commands: help lists these first. Says when Ctrl-C has ended one; typer alone
+    would say nothing.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
@@ -71,7 +80,9 @@ class Commands(TyperGroup):
             command = self.get_command(ctx, name)
             if command is not None and not command.hidden:
                 sentence = " ".join((command.help or "").strip().split("\n\n")[0].split())
-                groups.setdefault(getattr(command, "rich_help_panel", None) or OTHERS, []).append((name, sentence))
+                groups.setdefault(getattr(command, "rich_help_panel", None) or OTHERS, []).append(
+                    (name, sentence)
+                )
         widest = max((len(name) for rows in groups.values() for name, _ in rows), default=0)
         for group, rows in sorted(groups.items(), key=lambda one: one[0] == OTHERS):
             with formatter.section(group if len(groups) > 1 else "Commands"):
@@ -79,7 +90,11 @@ class Commands(TyperGroup):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the options alone; commands stand before them."""
-        options = [record for one in self.get_params(ctx) if (record := one.get_help_record(ctx)) is not None]
+        options = [
+            record
+            for one in self.get_params(ctx)
+            if (record := one.get_help_record(ctx)) is not None
+        ]
         with formatter.section("Options"):
             formatter.write_dl(options)
 

@@ -8,7 +8,7 @@ import typer
 from identify.commands.help import Command, Commands
 from identify.commands.options import Quiet
 from identify.errors import OutputFolderError
-from identify.files.atomic import atomic_path
+from identify.files.atomic import write_files
 
 if TYPE_CHECKING:
     from dynamics.robot_file import RobotDescription
@@ -16,18 +16,25 @@ if TYPE_CHECKING:
 IMPORT_HELP = """
 Read a robot from a file of another program, where its legs are of kinds that are known.
 
-Writes a robot file: geometry, inertias and friction as they are there, in one parameter set `initial`. Joints are
-checked one by one; a mechanism that is no such robot is refused in one line that says why.
+Writes a robot file: geometry, inertias and friction as they are there, in one parameter set
+`initial`. Joints are checked one by one; a mechanism that is no such robot is refused in one line
+that says why.
 """
 
-imports = typer.Typer(name="import", cls=Commands, help=IMPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
+imports = typer.Typer(
+    name="import", cls=Commands, help=IMPORT_HELP, no_args_is_help=True, rich_markup_mode=None
+)
 
-Out = Annotated[Path, typer.Option(metavar="ROBOT.toml", help="Robot file to write; replaced if there.")]
+Out = Annotated[
+    Path, typer.Option(metavar="ROBOT.toml", help="Robot file to write; replaced if there.")
+]
 
 
 @imports.command(cls=Command)
 def mjcf(
-    file: Annotated[Path, typer.Argument(help="MJCF file whose loops are connect or weld equalities.")],
+    file: Annotated[
+        Path, typer.Argument(help="MJCF file whose loops are connect or weld equalities.")
+    ],
     out: Out,
     quiet: Quiet = False,
 ) -> None:
@@ -49,7 +56,10 @@ def mjcf(
 def urdf(
     file: Annotated[Path, typer.Argument(help="URDF file, a tree of bodies.")],
     closures: Annotated[
-        Path, typer.Option(metavar="YAML", help="closed_loop, type, name_mot, as example-parallel-robots has them.")
+        Path,
+        typer.Option(
+            metavar="YAML", help="closed_loop, type, name_mot, as example-parallel-robots has them."
+        ),
     ],
     out: Out,
     quiet: Quiet = False,
@@ -64,25 +74,30 @@ def urdf(
     """
     from dynamics.engines.urdf_import import robot_of_urdf
 
-    _write(*robot_of_urdf(file, closures), f"From {file.name} with {closures.name}, imported by cmmsim.", out, quiet)
+    _write(
+        *robot_of_urdf(file, closures),
+        f"From {file.name} with {closures.name}, imported by cmmsim.",
+        out,
+        quiet,
+    )
 
 
-def _write(description: "RobotDescription", notes: list[str], source: str, out: Path, quiet: bool) -> None:
+def _write(
+    description: "RobotDescription", notes: list[str], source: str, out: Path, quiet: bool
+) -> None:
     from dynamics.robot_file import read_robot_file
     from dynamics.robot_text import robot_text
 
     if out.suffix != ".toml":
         raise OutputFolderError(f"cannot write {out}: the name of a robot file ends in .toml")
-    try:
-        with atomic_path(out) as temporary:
-            temporary.write_text(robot_text(description, [source, *notes]), encoding="utf-8")
-            read_robot_file(temporary)
-    except (OSError, ValueError) as error:
-        reason = (error.strerror if isinstance(error, OSError) else None) or error
-        raise OutputFolderError(f"cannot write {out}: {reason}; name another file with --out") from None
+    text = robot_text(description, [source, *notes])
+    write_files({out: text.encode()}, parents=True, check=read_robot_file)
     if quiet:
         return
     kinds = ", ".join(str(getattr(leg, "type", "")) for leg in description.geometry.legs)
-    typer.echo(f"{description.name}: platform moves in {', '.join(description.geometry.chart.coordinate_names)}")
+    typer.echo(
+        f"{description.name}: platform moves in "
+        f"{', '.join(description.geometry.chart.coordinate_names)}"
+    )
     for line in [f"legs: {kinds}", *notes, f"robot: {out}; judge it with: cmmsim check {out}"]:
         typer.echo(line)

@@ -1,11 +1,11 @@
-"""The command ``new``: starting files that work as they are, with comments, and with a schema for editors.
+"""The command ``new``: starting files that work as they are, with comments, and with a schema for
+editors.
 
 Heavy imports are late.
 """
 
 import json
 import re
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,30 +13,43 @@ from typing import Annotated, Any
 import typer
 
 from identify.commands.help import Command, Commands
-from identify.commands.options import Quiet, RobotArgument, built_in_folder, built_in_names, completion
+from identify.commands.options import (
+    Quiet,
+    RobotArgument,
+    built_in_folder,
+    built_in_names,
+    completion,
+)
 from identify.errors import OutputFolderError
-from identify.files.atomic import write_text
+from identify.files.atomic import write_files
 
 NEW_HELP = """
 Write a commented file to start from: a robot, sensor, scenario, study, or record.
 
-Each works as it is. The first line of a TOML file names its JSON schema, by which editors complete and check what is
-written. A file that is there already is never replaced.
+Each works as it is. The first line of a TOML file names its JSON schema, by which editors complete
+and check what is written. A file that is there already is never replaced.
 """
 
-new = typer.Typer(name="new", cls=Commands, help=NEW_HELP, no_args_is_help=True, rich_markup_mode=None)
+new = typer.Typer(
+    name="new", cls=Commands, help=NEW_HELP, no_args_is_help=True, rich_markup_mode=None
+)
 
-File = Annotated[Path, typer.Argument(metavar="FILE.toml", help="File to write, which must not be there.")]
+File = Annotated[
+    Path, typer.Argument(metavar="FILE.toml", help="File to write, which must not be there.")
+]
 
 
 def _like(kind: str) -> Any:
     names = ", ".join(built_in_names(kind))
-    return typer.Option("--like", help=f"Built-in {kind} to start from: {names}.", autocompletion=completion(kind))
+    return typer.Option(
+        "--like", help=f"Built-in {kind} to start from: {names}.", autocompletion=completion(kind)
+    )
 
 
 @new.command(cls=Command)
 def robot(file: File, like: Annotated[str, _like("robot")] = "rss6", quiet: Quiet = False) -> None:
-    """Write a robot file: geometry, parameter sets and gains of a built-in robot, under a name of your own.
+    """Write a robot file: geometry, parameter sets and gains of a built-in robot, under a name of
+    your own.
 
     Reads nothing of yours. Writes one TOML file.
 
@@ -53,8 +66,11 @@ def robot(file: File, like: Annotated[str, _like("robot")] = "rss6", quiet: Quie
 
 
 @new.command(cls=Command)
-def sensor(file: File, like: Annotated[str, _like("sensor")] = "ctrack780", quiet: Quiet = False) -> None:
-    """Write a sensor file: timing, cameras, light and stickers of a built-in sensor, under a name of your own.
+def sensor(
+    file: File, like: Annotated[str, _like("sensor")] = "ctrack780", quiet: Quiet = False
+) -> None:
+    """Write a sensor file: timing, cameras, light and stickers of a built-in sensor, under a name
+    of your own.
 
     Reads nothing of yours. Writes one TOML file.
 
@@ -71,8 +87,11 @@ def sensor(file: File, like: Annotated[str, _like("sensor")] = "ctrack780", quie
 
 
 @new.command(cls=Command)
-def scenario(file: File, like: Annotated[str, _like("scenario")] = "quick", quiet: Quiet = False) -> None:
-    """Write a scenario file with every key, its unit and its meaning; what holds without being said is commented out.
+def scenario(
+    file: File, like: Annotated[str, _like("scenario")] = "quick", quiet: Quiet = False
+) -> None:
+    """Write a scenario file with every key, its unit and its meaning; what holds without being said
+    is commented out.
 
     Reads nothing of yours. Writes one TOML file.
 
@@ -103,7 +122,8 @@ def study(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write a study file: what is varied, over which values, what is drawn, and the laws that it should follow.
+    """Write a study file: what is varied, over which values, what is drawn, and the laws that it
+    should follow.
 
     Reads nothing of yours. Writes one TOML file.
 
@@ -122,15 +142,18 @@ def study(
 
 @new.command(cls=Command)
 def record(
-    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Table to write, which must not be there.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE.csv", help="Table to write, which must not be there.")
+    ],
     robot: RobotArgument = "rss6",
     quiet: Quiet = False,
 ) -> None:
-    """Write an empty record of a robot of your own as CSV, and beside it the TOML file that goes with it.
+    """Write an empty record of a robot of your own as CSV, and beside it the TOML file that goes
+    with it.
 
-    The table has the columns of this robot, comments that say what they hold and which rules a record keeps, and two
-    rows at rest to show how one looks. The TOML file holds robot, timing, servo gains, what fixes the scale, and how
-    exact the poses are.
+    The table has the columns of this robot, comments that say what they hold and which rules a
+    record keeps, and two rows at rest to show how one looks. The TOML file holds robot, timing,
+    servo gains, what fixes the scale, and how exact the poses are.
 
     Reads a robot file. Writes FILE.csv and FILE.toml.
 
@@ -145,7 +168,8 @@ def record(
 
     if file.suffix != ".csv":
         raise OutputFolderError(f"cannot write {file}: the name of a record's table ends in .csv")
-    chosen, beside = load_robot(robot), description_file(file)
+    chosen = load_robot(robot)
+    beside = description_file(file)
     named = robot if robot in built_in_names("robot") else str(Path(robot).resolve())
     description = _with_schema(SCHEMA, description_text(chosen, named, file.name))
     _write({file: table_text(chosen), beside: description}, lambda path: read_own_records([path]))
@@ -154,7 +178,9 @@ def record(
 
 def _known(kind: str, like: str) -> str:
     if like not in built_in_names(kind):
-        raise OutputFolderError(f"unknown {kind} {like!r} after --like; valid: {', '.join(built_in_names(kind))}")
+        raise OutputFolderError(
+            f"unknown {kind} {like!r} after --like; valid: {', '.join(built_in_names(kind))}"
+        )
     return like
 
 
@@ -166,7 +192,13 @@ def _copy(kind: str, like: str, file: Path) -> str:
 
 def _named(text: str, file: Path) -> str:
     """A TOML text whose name is that of its file."""
-    return re.sub(r"^name = .*$", lambda _: f"name = {json.dumps(file.stem)}", text, count=1, flags=re.MULTILINE)
+    return re.sub(
+        r"^name = .*$",
+        lambda _: f"name = {json.dumps(file.stem)}",
+        text,
+        count=1,
+        flags=re.MULTILINE,
+    )
 
 
 def _schema(kind: str) -> Path:
@@ -181,27 +213,25 @@ def _with_schema(schema: Path, text: str) -> str:
 def _toml(file: Path) -> Path:
     if file.suffix != ".toml" or not re.fullmatch(r"[\w.-]+", file.stem):
         raise OutputFolderError(
-            f"cannot write {file}: its name must end in .toml, and have letters, digits, dots, _ and - before that"
+            f"cannot write {file}: its name must end in .toml, and have letters, digits, dots, _ "
+            "and - before that"
         )
     return file
 
 
 def _write(texts: Mapping[Path, str], read: Callable[[Path], Any]) -> None:
-    """Write files of one folder that are not there yet and of which the first can be read: all of them, or none.
+    """Write files of one folder that are not there yet and of which the first can be read: all of
+    them, or none.
 
-    Raises OutputFolderError: one is there. Raises what `read` does, such as for a name that cannot be.
+    Raises OutputFolderError: one is there. Raises what `read` does, such as for a name that cannot
+    be.
     """
     for path in texts:
         if path.exists():
-            raise OutputFolderError(f"{path} is there already, and is not replaced; name another file, or remove it")
-    folder = next(iter(texts)).parent
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as name:
-        for path, text in texts.items():
-            write_text(Path(name) / path.name, text)
-        read(Path(name) / next(iter(texts)).name)
-        for path in texts:
-            (Path(name) / path.name).rename(path)
+            raise OutputFolderError(
+                f"{path} is there already, and is not replaced; name another file, or remove it"
+            )
+    write_files({path: text.encode() for path, text in texts.items()}, parents=True, check=read)
 
 
 def _say(quiet: bool, file: Path, further: str) -> None:

@@ -1,4 +1,6 @@
-"""Arguments and options that several commands share, what a shell completes of them, and how figures are handed out."""
+"""Arguments and options that several commands share, what a shell completes of them, and how
+figures are handed out.
+"""
 
 import tomllib
 from collections.abc import Callable
@@ -8,8 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
-from identify.errors import OutputFolderError, ScenarioError
-from identify.files.run_folder import as_json, save_result
+from cmmsim.plugins import ALLOWED, allow_plugin, is_own
+from identify.errors import ScenarioError
+from identify.files.atomic import write_text
+from identify.files.run_folder import as_json
 from identify.scenario import Scenario, load_scenario
 
 BUILT_IN = {
@@ -25,7 +29,9 @@ STANDARD_OUTPUT = "-"
 
 
 def built_in_folder(kind: str) -> Path:
-    """Folder of the built-in files of a kind; its package is not imported, since a shell waits for completions."""
+    """Folder of the built-in files of a kind; its package is not imported, since a shell waits for
+    completions.
+    """
     package, folder = BUILT_IN[kind]
     spec = find_spec(package)
     return Path(str(spec and spec.origin)).parent / folder
@@ -37,14 +43,18 @@ def built_in_names(kind: str) -> list[str]:
 
 
 def completion(kind: str) -> Callable[[str], list[str]]:
-    """What a shell offers for a name or path of this kind: built-in names, TOML files, and folders to look into."""
+    """What a shell offers for a name or path of this kind: built-in names, TOML files, and folders
+    to look into.
+    """
 
     def offered(incomplete: str) -> list[str]:
         typed = Path(incomplete)
         folder = typed if incomplete.endswith("/") else typed.parent
         beside = sorted(folder.glob("*")) if folder.is_dir() else []
         paths = [
-            f"{path}/" if path.is_dir() else str(path) for path in beside if path.is_dir() or path.suffix == ".toml"
+            f"{path}/" if path.is_dir() else str(path)
+            for path in beside
+            if path.is_dir() or path.suffix == ".toml"
         ]
         return [name for name in [*built_in_names(kind), *paths] if name.startswith(incomplete)]
 
@@ -53,17 +63,22 @@ def completion(kind: str) -> Callable[[str], list[str]]:
 
 def named(kind: str, help_: str | None = None, **more: Any) -> Any:
     """The argument that is a built-in name of a kind or the path of a TOML file."""
-    said = help_ or f"Built-in {kind} ({', '.join(built_in_names(kind))}), or the path of a TOML file."
+    said = (
+        help_ or f"Built-in {kind} ({', '.join(built_in_names(kind))}), or the path of a TOML file."
+    )
     return typer.Argument(help=said, autocompletion=completion(kind), **more)
 
 
 def new_folder(default: str) -> Any:
-    """The option of a folder to write into; default: how the help calls the one that is taken where it is left out."""
+    """The option of a folder to write into; default: how the help calls the one that is taken where
+    it is left out.
+    """
     return typer.Option("--out", help="Output folder, new or empty.", show_default=default)
 
 
 def repeatable(what: str, default: str) -> Any:
-    """An option that may be given several times; default: how the help calls what holds without it."""
+    """An option that may be given several times; default: how the help calls what holds
+    without it."""
     return typer.Option(help=f"{what}; repeatable.", show_default=default)
 
 
@@ -81,15 +96,23 @@ RobotOption = Annotated[
     ),
 ]
 NewFolder = Annotated[Path | None, new_folder("runs/SCENARIO-SEED")]
-RunFolderOption = Annotated[Path, typer.Option("--out", help="Folder of the run, as the stage before left it.")]
-WholeRunOption = Annotated[Path, typer.Option("--out", help="Folder of a whole run, as cmmsim run leaves it.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness: trajectories and sensor noise.")]
+RunFolderOption = Annotated[
+    Path, typer.Option("--out", help="Folder of the run, as the stage before left it.")
+]
+WholeRunOption = Annotated[
+    Path, typer.Option("--out", help="Folder of a whole run, as cmmsim run leaves it.")
+]
+Seed = Annotated[
+    int,
+    typer.Option("--seed", min=0, help="Seed of all randomness: trajectories and sensor noise."),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable. What cmmsim new scenario FILE "
+        help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable. What cmmsim "
+        "new scenario FILE "
         "writes has all keys.",
     ),
 ]
@@ -98,39 +121,67 @@ EstimatorSettings = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Replace a setting of the estimator, in the sections identification, model or filter of the scenario: "
+        help="Replace a setting of the estimator, in the sections identification, model or filter "
+        "of the scenario: "
         "identification.method=command_driven; repeatable. The record was made with the rest.",
     ),
 ]
 Workers = Annotated[
-    int | None, typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core")
+    int | None,
+    typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core"),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no tables; warnings stay.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", help="No progress bars and no tables; warnings stay.")
+]
+
+
+def _allow(modules: list[str] | None) -> None:
+    allow_plugin(*modules or ())
+
+
+Plugins = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--plugin",
+        metavar="MODULE",
+        is_eager=True,
+        callback=_allow,
+        help="Module of your own whose parts files and options may name as module:function; "
+        f"repeatable. {ALLOWED} names such modules for all commands.",
+    ),
+]
+"""Modules that parts of a user's own may come from; allowed as soon as they are read."""
+
+
+def allow_named(names: list[str] | None) -> None:
+    """Allow the modules of parts that the user has typed as ``module:function`` in an option."""
+    allow_plugin(*(name.partition(":")[0] for name in names or () if is_own(name)))
+
+
 JsonFile = Annotated[
     Path | None,
     typer.Option(
         "--json",
         metavar="FILE",
-        help="Also write the figures as JSON into this file, replaced if there; - prints them in place of the tables.",
+        help="Also write the figures as JSON into this file, replaced if there; - prints them in "
+        "place of the tables.",
     ),
 ]
 
 
-def tell(entry: dict[str, Any], json_file: Path | None, quiet: bool, say: Callable[[], None]) -> None:
-    """Hand out a command's figures: as JSON where that is asked for, and in words unless it is to be quiet.
+def tell(
+    entry: dict[str, Any], json_file: Path | None, quiet: bool, say: Callable[[], None]
+) -> None:
+    """Hand out a command's figures: as JSON where that is asked for, and in words unless it is to
+    be quiet.
 
-    Raises OutputFolderError: the file cannot be written.
+    Raises WriteError: the file cannot be written.
     """
     if str(json_file) == STANDARD_OUTPUT:
         typer.echo(as_json(entry), nl=False)
         return
     if json_file is not None:
-        try:
-            save_result(json_file, entry)
-        except OSError as error:
-            raise OutputFolderError(
-                f"cannot write {json_file}: {error.strerror or error}; name another file with --json"
-            ) from None
+        write_text(json_file, as_json(entry), parents=True)
     if not quiet:
         say()
 
@@ -144,13 +195,16 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
     for text in settings or []:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
-            raise ScenarioError(f"--set {text!r} is not of the form KEY=VALUE, such as timing.frame_rate_hz=30")
+            raise ScenarioError(
+                f"--set {text!r} is not of the form KEY=VALUE, such as timing.frame_rate_hz=30"
+            )
         overrides[key.strip()] = _toml_or_text(value.strip())
     return overrides
 
 
 def chosen_scenario(name: str, settings: list[str] | None, robot: str | None) -> Scenario:
-    """The scenario of a name or path with values replaced, and with another robot where one is named.
+    """The scenario of a name or path with values replaced, and with another robot where one is
+    named.
 
     Raises ScenarioError: no such scenario, or a setting that it cannot have.
     """
@@ -161,5 +215,5 @@ def chosen_scenario(name: str, settings: list[str] | None, robot: str | None) ->
 def _toml_or_text(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text

@@ -1,4 +1,5 @@
-"""Commands about a robot alone: what its motion can show, where it can go, its model in other engines.
+"""Commands about a robot alone: what its motion can show, where it can go, its model in other
+engines.
 
 Heavy imports are late.
 """
@@ -10,7 +11,7 @@ import typer
 
 from identify.commands.help import Command, Commands
 from identify.commands.options import JsonFile, Quiet, RobotArgument, new_folder, tell
-from identify.errors import OutputFolderError, VerificationError
+from identify.errors import VerificationError
 from identify.files.atomic import write_text
 from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import print_table, terminal_progress
@@ -30,11 +31,13 @@ DECADES = (0, 3, 6)
 """Units in which the paper's threshold is tried: the regressor in N, kN, MN."""
 
 
-def base_parameters(robot: RobotArgument = "rss6", json: JsonFile = None, quiet: Quiet = False) -> None:
+def base_parameters(
+    robot: RobotArgument = "rss6", json: JsonFile = None, quiet: Quiet = False
+) -> None:
     """Print which combinations of its dynamic parameters a robot's motion can show at all.
 
-    A parameter that stands alone can be identified by itself, one in a sum only as part of it, and the unseen ones by
-    no motion. All of it up to one common factor where only poses are measured.
+    A parameter that stands alone can be identified by itself, one in a sum only as part of it, and
+    the unseen ones by no motion. All of it up to one common factor where only poses are measured.
 
     Reads a robot file. Writes nothing but the JSON, which has the coefficients of each combination.
 
@@ -49,34 +52,53 @@ def base_parameters(robot: RobotArgument = "rss6", json: JsonFile = None, quiet:
     chosen = load_robot(robot)
     matrix = base.structural_regressor(chosen)
     found = base.base_parameters(matrix, chosen.layout)
-    singular, angle = base.rank_by_singular_values(matrix), base.angle_to_singular_vectors(matrix, found)
+    singular = base.rank_by_singular_values(matrix)
+    angle = base.angle_to_singular_vectors(matrix, found)
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
     entry = _groups(found, singular, angle)
-    tell(entry, json, quiet, lambda: _print_groups(found, singular, angle, counts, chosen.name == PAPERS))
+    tell(
+        entry,
+        json,
+        quiet,
+        lambda: _print_groups(found, singular, angle, counts, chosen.name == PAPERS),
+    )
 
 
-def _print_groups(found: "BaseParameters", singular: int, angle: float, counts: dict[int, int], papers: bool) -> None:
+def _print_groups(
+    found: "BaseParameters", singular: int, angle: float, counts: dict[int, int], papers: bool
+) -> None:
     for expression in found.expressions():
         typer.echo(expression)
     typer.echo(f"No motion shows: {', '.join(found.unseen) or 'none of them, all are shown'}.")
     typer.echo(
-        f"The {len(found.names)} parameters make {found.rank} base parameters, which are all that a motion can show; "
-        f"singular values find {singular}. What is independent stands out of the others by {found.gap[1]:.1e} of its "
-        f"length or more, what is not by {found.gap[0]:.1e} at most; both ways find the same groups to {angle:.1e} rad."
+        f"The {len(found.names)} parameters make {found.rank} base parameters, which are all that "
+        "a motion can show; "
+        f"singular values find {singular}. What is independent stands out of the others by "
+        f"{found.gap[1]:.1e} of its "
+        f"length or more, what is not by {found.gap[0]:.1e} at most; both ways find the same "
+        f"groups to {angle:.1e} rad."
     )
     tried = ", ".join(f"{count} in units of {unit:g} N" for unit, count in counts.items())
     left = len(found.names) - len(found.unseen)
     typer.echo(
-        f"The paper's rule, a diagonal of R above {THRESHOLD:g} without scaling, depends on the units, and finds "
-        f"{tried}. Deleting only what no motion shows leaves {left} parameters, {left + 3} with the gains of the joint "
+        f"The paper's rule, a diagonal of R above {THRESHOLD:g} without scaling, depends on the "
+        "units, and finds "
+        f"{tried}. Deleting only what no motion shows leaves {left} parameters, {left + 3} with "
+        "the gains of the joint "
         f"controller{'; its table lists 49' if papers else ''}."
     )
 
 
 def _groups(found: "BaseParameters", singular: int, angle: float) -> dict[str, Any]:
     groups = [
-        {"name": name, "expression": text, "coefficients": {found.names[k]: row[k] for k in row.nonzero()[0]}}
-        for name, text, row in zip(found.group_names(), found.expressions(), found.combinations, strict=True)
+        {
+            "name": name,
+            "expression": text,
+            "coefficients": {found.names[k]: row[k] for k in row.nonzero()[0]},
+        }
+        for name, text, row in zip(
+            found.group_names(), found.expressions(), found.combinations, strict=True
+        )
     ]
     return {
         "rank": found.rank,
@@ -88,6 +110,7 @@ def _groups(found: "BaseParameters", singular: int, angle: float) -> dict[str, A
 
 
 def workspace(
+    context: typer.Context,
     robot: RobotArgument = "rss6",
     out: Annotated[Path | None, new_folder("runs/workspace-ROBOT")] = None,
     json: JsonFile = None,
@@ -104,10 +127,16 @@ def workspace(
       cmmsim workspace mine.toml --out maps
     """
     from dynamics import load_robot
-    from identify.verification.workspace_map import conditioning_figure, map_workspace, travel_figure
+    from identify.verification.workspace_map import (
+        conditioning_figure,
+        map_workspace,
+        travel_figure,
+    )
 
     chosen = load_robot(robot)
-    folder = new_run_folder(out or Path("runs") / f"workspace-{chosen.name}").path
+    folder = context.with_resource(
+        new_run_folder(out or Path("runs") / f"workspace-{chosen.name}")
+    ).path
     found = map_workspace(chosen, terminal_progress(quiet))
     summary = found.summary()
     figures = {"travel.png": travel_figure(found), "conditioning.png": conditioning_figure(found)}
@@ -118,11 +147,16 @@ def workspace(
 def _print_workspace(summary: dict[str, Any], folder: Path) -> None:
     for axis, (low, high) in summary["range_from_home"].items():
         name, unit = axis.rsplit("_", 1)
-        typer.echo(f"{name}: {1e3 * low:+.1f} to {1e3 * high:+.1f} m{unit} from home, within the joints' travel")
+        typer.echo(
+            f"{name}: {1e3 * low:+.1f} to {1e3 * high:+.1f} m{unit} from home, within the joints' "
+            "travel"
+        )
     worst = summary["whole_travel"]
     typer.echo(
-        f"over the whole travel the actuators' leverage on their legs is at least {worst['least_leverage_J_a1']:.3f}; "
-        f"the condition number of the legs' directions (J_a2) is at most {worst['largest_condition_J_a2']:.2f}, and "
+        "over the whole travel the actuators' leverage on their legs is at least "
+        f"{worst['least_leverage_J_a1']:.3f}; "
+        "the condition number of the legs' directions (J_a2) is at most "
+        f"{worst['largest_condition_J_a2']:.2f}, and "
         f"that of the whole Jacobian (J_ad) {worst['largest_condition_J_ad']:.2f}"
     )
     typer.echo(f"maps: {folder}")
@@ -130,7 +164,9 @@ def _print_workspace(summary: dict[str, Any], folder: Path) -> None:
 
 EXPORT_HELP = "Write a robot for another engine."
 
-export = typer.Typer(name="export", cls=Commands, help=EXPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
+export = typer.Typer(
+    name="export", cls=Commands, help=EXPORT_HELP, no_args_is_help=True, rich_markup_mode=None
+)
 
 
 @export.callback()
@@ -150,20 +186,25 @@ def mjcf(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="File to write; replaced if there.", show_default="ROBOT.xml")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="File to write; replaced if there.", show_default="ROBOT.xml"
+        ),
     ] = None,
     allow_unphysical_inertia: Annotated[
         bool,
         typer.Option(
             "--allow-unphysical-inertia",
-            help="Where a body breaks Ix + Iy >= Iz, write the nearest inertia that MuJoCo accepts.",
+            help="Where a body breaks Ix + Iy >= Iz, write the nearest inertia that MuJoCo "
+            "accepts.",
         ),
     ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the robot as MJCF, a closed chain that MuJoCo loads.
 
-    Reads a robot file, and where --parameters names one the result.json of a run. Writes one XML file.
+    Reads a robot file, and where --parameters names one the result.json of a run. Writes one XML
+    file.
 
     \b
     Examples:
@@ -179,13 +220,11 @@ def mjcf(
         chosen_robot = load_robot(robot)
         chosen = choose_parameters(chosen_robot, parameters)
         allowed = allow_unphysical_inertia
-        text = mjcf_text(chosen_robot, chosen.values, allow_unphysical_inertia=allowed, source=chosen.source)
+        text = mjcf_text(
+            chosen_robot, chosen.values, allow_unphysical_inertia=allowed, source=chosen.source
+        )
         path = out or Path(f"{chosen_robot.name}.xml")
-        try:
-            write_text(path, text)
-        except (OSError, ValueError) as error:  # ValueError: a robot's name that no file can have
-            reason = (error.strerror if isinstance(error, OSError) else None) or error
-            raise OutputFolderError(f"cannot write {path}: {reason}; name another file with --out") from None
+        write_text(path, text, parents=True)
         advance()
     if not quiet:
         for line in [*_changes(chosen_robot, chosen.values), f"model: {path}"]:
@@ -193,7 +232,9 @@ def mjcf(
 
 
 def _changes(robot: "Robot", parameters: "Array") -> list[str]:
-    """Lines: the inertias that the export changed, and by how much that changes the robot's accelerations."""
+    """Lines: the inertias that the export changed, and by how much that changes the robot's
+    accelerations.
+    """
     from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 
     inertias = physical_inertias(robot.layout, parameters, allow_changes=True)
@@ -208,6 +249,7 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
 
 
 def verify_model(
+    context: typer.Context,
     robot: RobotArgument = "rss6",
     out: Annotated[Path | None, new_folder("runs/verify-ROBOT")] = None,
     json: JsonFile = None,
@@ -227,21 +269,28 @@ def verify_model(
     from identify.verification.against_mujoco import figure_8, verification_entry, verify
 
     chosen = load_robot(robot)
-    folder = new_run_folder(out or Path("runs") / f"verify-{chosen.name}").path
+    folder = context.with_resource(
+        new_run_folder(out or Path("runs") / f"verify-{chosen.name}")
+    ).path
     runs = verify(chosen, terminal_progress(quiet))
     entry = verification_entry(chosen, runs)
     save_files(folder, {"verification.json": entry, "figure8.png": figure_8(runs)})
     tell(entry, json, quiet, lambda: _print_verdict(entry, folder))
     if not entry["met"]:
-        found, goal = entry["difference"], entry["goal"]
+        found = entry["difference"]
+        goal = entry["goal"]
         raise VerificationError(
-            f"model and MuJoCo differ by {found['position_steady_um']:.3g} um and {found['angle_steady_urad']:.3g} urad"
-            f", more than {goal['position_steady_um']:g} um and {goal['angle_steady_urad']:g} urad; see {folder}"
+            f"model and MuJoCo differ by {found['position_steady_um']:.3g} um and "
+            f"{found['angle_steady_urad']:.3g} urad"
+            f", more than {goal['position_steady_um']:g} um and {goal['angle_steady_urad']:g} "
+            f"urad; see {folder}"
         )
 
 
 def _print_verdict(entry: dict[str, Any], folder: Path) -> None:
-    found, goal, paper = entry["difference"], entry["goal"], entry["paper"]
+    found = entry["difference"]
+    goal = entry["goal"]
+    paper = entry["paper"]
     title = f"{entry['robot']}: MuJoCo {entry['mujoco']['version']} against this model"
     rows = []
     for label, key in (
@@ -254,5 +303,10 @@ def _print_verdict(entry: dict[str, Any], folder: Path) -> None:
         rows.append((label, key.rpartition("_")[2], f"{found[key]:.2g}", limit, f"{paper[key]:g}"))
     rows.append(("torque, whole run", entry["torque_unit"], f"{found['torque_max']:.2g}", "", ""))
     rows.append(("MuJoCo's loop closure", "um", f"{found['closure_max_um']:.2g}", "", ""))
-    print_table(("largest difference", "unit", "value", "goal", "paper"), rows, ("largest difference", "unit"), title)
+    print_table(
+        ("largest difference", "unit", "value", "goal", "paper"),
+        rows,
+        ("largest difference", "unit"),
+        title,
+    )
     typer.echo(f"figure: {folder / 'figure8.png'}")

@@ -1,12 +1,13 @@
-"""Commands that show: a run as a page that replays it, and a robot or a sensor as it stands. Heavy imports are late."""
+"""Commands that show: a run as a page that replays it, and a robot or a sensor as it stands. Heavy
+imports are late.
+"""
 
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from identify.commands.options import Quiet
+from identify.commands.options import Plugins, Quiet
 from identify.errors import OutputFolderError, ScenarioError
 from identify.progress import print_warnings, terminal_progress
 
@@ -15,23 +16,31 @@ if TYPE_CHECKING:
 
 PICTURES = (".png", ".pdf", ".svg")
 SENSOR = "ctrack780"
-ROBOT_KEYS, SENSOR_KEYS = {"parameters", "legs", "family"}, {"rig", "stickers", "based_on"}
+ROBOT_KEYS = {"parameters", "legs", "family"}
+SENSOR_KEYS = {"rig", "stickers", "based_on"}
 
 
 def replay(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run that has been recorded.")],
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of a run that has been recorded.")
+    ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="File to write.", show_default="RUN/replay.html")
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="File to write.", show_default="RUN/replay.html"
+        ),
     ] = None,
     motion: Annotated[
-        str, typer.Option(metavar="NAME", help="Which motion: excitation, or an unseen one, as run01.")
+        str,
+        typer.Option(metavar="NAME", help="Which motion: excitation, or an unseen one, as run01."),
     ] = "excitation",
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Show a run as one HTML page that opens without a network.
 
-    It has robot, stickers and cameras in space, what both cameras see, and the measured, true and modelled poses over
-    time, their differences enlarged. Open it in a browser.
+    It has robot, stickers and cameras in space, what both cameras see, and the measured, true and
+    modelled poses over time, their differences enlarged. Open it in a browser.
 
     Reads the files of a run that has been recorded. It writes RUN/replay.html.
 
@@ -51,24 +60,33 @@ def replay(
 
 
 def show(
-    names: Annotated[list[str], typer.Argument(metavar="NAME|FILE", help="A robot, a sensor, or one of each.")],
+    names: Annotated[
+        list[str], typer.Argument(metavar="NAME|FILE", help="A robot, a sensor, or one of each.")
+    ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Page to write.", show_default="NAME.html")
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="Page to write.", show_default="NAME.html"),
     ] = None,
     png: Annotated[
-        Path | None, typer.Option("--png", metavar="FILE", help="Draw a picture for print: .png, .pdf or .svg.")
+        Path | None,
+        typer.Option("--png", metavar="FILE", help="Draw a picture for print: .png, .pdf or .svg."),
     ] = None,
     renderer: Annotated[
-        str, typer.Option(help="What draws the camera images: analytic, or pyrender, which needs OpenGL.")
+        str,
+        typer.Option(
+            help="What draws the camera images: analytic, or pyrender, which needs OpenGL."
+        ),
     ] = "analytic",
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Show a robot and a sensor as they stand, as one HTML page or as a picture.
 
-    A robot is shown before the sensor ctrack780 where its platform fits that, or before the sensor that is named with
-    it. The page opens without a network.
+    A robot is shown before the sensor ctrack780 where its platform fits that, or before the sensor
+    that is named with it. The page opens without a network.
 
-    Reads the file of a robot, of a sensor, or of one of each. It writes NAME.html, or a picture for print.
+    Reads the file of a robot, of a sensor, or of one of each. It writes NAME.html, or a picture for
+    print.
 
     \b
     Examples:
@@ -79,7 +97,9 @@ def show(
     from identify.scene import motion_at_home, write_page
 
     if png is not None and png.suffix not in PICTURES:
-        raise OutputFolderError(f"--png {png} ends in {png.suffix or 'nothing'}; valid: {', '.join(PICTURES)}")
+        raise OutputFolderError(
+            f"--png {png} ends in {png.suffix or 'nothing'}; valid: {', '.join(PICTURES)}"
+        )
     cell, notes = chosen_cell(names)
     print_warnings(notes)
     if png is not None:
@@ -96,26 +116,23 @@ def show(
 
 
 def write_picture(path: Path, cell: "Workcell", renderer: str) -> None:
-    """Draw the scene, beside it what the cameras see, into a file. Raises OutputFolderError: it cannot be written."""
-    from identify.files.atomic import atomic_path
+    """Draw the scene, beside it what the cameras see, into a file. Raises WriteError."""
+    from identify.files.atomic import check_writable, figure_bytes, write_bytes
     from identify.scene import overview_figure, scene_figure, stereo_view
 
-    try:
-        with atomic_path(path) as temporary:
-            if cell.sensor is None:
-                figure = scene_figure(cell)
-            else:
-                figure = overview_figure(cell, stereo_view(cell, renderer=renderer))
-            figure.savefig(temporary, dpi=200)
-    except OSError as error:
-        raise OutputFolderError(f"cannot write {path}: {error.strerror}; name another file with --png") from None
+    check_writable(path)
+    if cell.sensor is None:
+        figure = scene_figure(cell)
+    else:
+        figure = overview_figure(cell, stereo_view(cell, renderer=renderer))
+    write_bytes(path, figure_bytes(figure, path.suffix, dpi=200), parents=True)
 
 
 def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
     """Robot and sensor of one or two names or files, and what is to be said of them.
 
-    Raises ScenarioError: two robots, two sensors, or what is neither; and for two that do not fit each other. Raises
-    dynamics.RobotFileError, cmmsim.CmmError for files that cannot be used.
+    Raises ScenarioError: two robots, two sensors, or what is neither; and for two that do not fit
+    each other. Raises dynamics.RobotFileError, cmmsim.CmmError for files that cannot be used.
     """
     from cmmsim.files import read_sensor_file
     from dynamics import load_robot
@@ -123,8 +140,12 @@ def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
 
     kinds = [kind_of(name) for name in names]
     if len(set(kinds)) < len(kinds):
-        raise ScenarioError(f"show takes a robot, a sensor, or one of each; {' and '.join(names)} are {kinds[0]}s")
-    robot = next((load_robot(name) for name, kind in zip(names, kinds, strict=True) if kind == "robot"), None)
+        raise ScenarioError(
+            f"show takes a robot, a sensor, or one of each; {' and '.join(names)} are {kinds[0]}s"
+        )
+    robot = next(
+        (load_robot(name) for name, kind in zip(names, kinds, strict=True) if kind == "robot"), None
+    )
     named = next((name for name, kind in zip(names, kinds, strict=True) if kind == "sensor"), None)
     if robot is None or named is not None:
         return workcell(robot, None if named is None else read_sensor_file(named)), []
@@ -132,30 +153,33 @@ def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
         return workcell(robot, read_sensor_file(SENSOR)), []
     except ScenarioError as error:
         remedy = f"A sensor that fits can be named with it: cmmsim show {' '.join(names)} SENSOR"
-        return workcell(robot), [f"{robot.name} is shown without cameras, because {error}. {remedy}"]
+        return workcell(robot), [
+            f"{robot.name} is shown without cameras, because {error}. {remedy}"
+        ]
 
 
 def kind_of(name: str) -> str:
-    """Whether a built-in name or a file is a "robot" or a "sensor". Raises ScenarioError with the valid names."""
+    """Whether a built-in name or a file is a "robot" or a "sensor". Raises ScenarioError with the
+    valid names.
+    """
     from cmmsim.files import built_in_names
     from dynamics import built_in_robots
+    from dynamics.files import is_file, parse_toml, read_text
 
     if name in built_in_robots():
         return "robot"
     if name in built_in_names():
         return "sensor"
-    try:
-        content = tomllib.loads(Path(name).read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not is_file(name):
         valid = f"robots {', '.join(built_in_robots())}, sensors {', '.join(built_in_names())}"
-        raise ScenarioError(f"there is no robot, sensor or file {name!r}; built in: {valid}") from None
-    except (OSError, ValueError) as error:
-        raise ScenarioError(f"cannot read {name} as TOML: {' '.join(str(error).split())}") from None
+        raise ScenarioError(f"there is no robot, sensor or file {name!r}; built in: {valid}")
+    content = parse_toml(read_text(name, name, ScenarioError), name, ScenarioError)
     if ROBOT_KEYS & content.keys():
         return "robot"
     if SENSOR_KEYS & content.keys():
         return "sensor"
     raise ScenarioError(
-        f"{name} is neither a robot nor a sensor: a robot has {', '.join(sorted(ROBOT_KEYS))}, a sensor "
+        f"{name} is neither a robot nor a sensor: a robot has {', '.join(sorted(ROBOT_KEYS))}, a "
+        "sensor "
         f"{', '.join(sorted(SENSOR_KEYS))}; it has {', '.join(content) or 'nothing'}"
     )

@@ -1,4 +1,5 @@
-"""Commands about a sensor alone: tested like a real instrument, and its detectors beside their bound.
+"""Commands about a sensor alone: tested like a real instrument, and its detectors beside their
+bound.
 
 Heavy imports are late.
 """
@@ -11,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.commands.options import JsonFile, Quiet, SensorArgument, new_folder, repeatable, tell
+from identify.commands.options import (
+    JsonFile,
+    Plugins,
+    Quiet,
+    SensorArgument,
+    new_folder,
+    repeatable,
+    tell,
+)
 from identify.errors import VerificationError
 from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import print_table, terminal_progress
@@ -23,6 +32,7 @@ DEFAULT_LIMIT_UM = 50.0  # published static limit of the C-Track 780
 
 
 def acceptance(
+    context: typer.Context,
     sensor: SensorArgument = "ctrack780",
     out: Annotated[Path | None, new_folder("runs/acceptance-SENSOR-SEED")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all sensor noise.")] = 0,
@@ -33,7 +43,9 @@ def acceptance(
             show_default="what the sensor file says",
         ),
     ] = None,
-    standard: Annotated[str, typer.Option(help="vdi (lengths), e3064 (moving bar), e3124 (latency) or all.")] = "all",
+    standard: Annotated[
+        str, typer.Option(help="vdi (lengths), e3064 (moving bar), e3124 (latency) or all.")
+    ] = "all",
     volume: Annotated[
         str | None,
         typer.Option(
@@ -47,11 +59,12 @@ def acceptance(
     ] = DEFAULT_LIMIT_UM,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Test a sensor like a real instrument: lengths, a moving bar, latency.
 
-    The sensor's own cameras take noisy pictures of artefacts in its measuring volume, its own detection and
-    triangulation measure them, and what is true of the artefacts judges the result.
+    The sensor's own cameras take noisy pictures of artefacts in its measuring volume, its own
+    detection and triangulation measure them, and what is true of the artefacts judges the result.
 
     \b
     vdi    seven lines through the volume, five lengths each: length error
@@ -62,8 +75,8 @@ def acceptance(
 
     Reads a sensor file.
 
-    Writes acceptance.md, acceptance.json, which is also the JSON, and figures/*.png into the folder. The limit is that
-    of the length error.
+    Writes acceptance.md, acceptance.json, which is also the JSON, and figures/*.png into the
+    folder. The limit is that of the length error.
 
     \b
     Examples:
@@ -76,11 +89,15 @@ def acceptance(
     from identify.verification.sensor_figures import acceptance_figures
 
     run = prepare(sensor, seed, renderer, volume, standard, limit_um)
-    folder = new_run_folder(out or Path("runs") / f"acceptance-{run.under_test.file.name}-{seed}").path
+    folder = context.with_resource(
+        new_run_folder(out or Path("runs") / f"acceptance-{run.under_test.file.name}-{seed}")
+    ).path
     do(run, terminal_progress(quiet))
     entry = acceptance_entry(run)
     figures = {f"figures/{name}.png": figure for name, figure in acceptance_figures(run).items()}
-    save_files(folder, {"acceptance.json": entry, "acceptance.md": acceptance_markdown(entry), **figures})
+    save_files(
+        folder, {"acceptance.json": entry, "acceptance.md": acceptance_markdown(entry), **figures}
+    )
     tell(entry, json, quiet, lambda: _print_acceptance(entry, folder))
     lengths = entry.get("vdi_2634_1")
     if lengths and not lengths["met"]:
@@ -94,42 +111,61 @@ def _print_acceptance(entry: dict[str, Any], folder: Path) -> None:
     """One line a test, and where the report is."""
     if (test := entry.get("vdi_2634_1")) is not None:
         typer.echo(
-            f"length error: largest {test['largest_error_um']:+.1f} um, limit ± {test['limit_um']:g} um: "
+            f"length error: largest {test['largest_error_um']:+.1f} um, limit ± "
+            f"{test['limit_um']:g} um: "
             f"{'met' if test['met'] else 'MISSED'}"
         )
     if (test := entry.get("astm_e3064")) is not None:
         for state in ("standing", "moving"):
-            position, orientation = test[state]["position_um"], test[state]["orientation_urad"]
+            position = test[state]["position_um"]
+            orientation = test[state]["orientation_urad"]
             typer.echo(
-                f"{state} bar: position {position['rms']:.1f} um RMS, {position['maximum']:.0f} largest; "
-                f"orientation {orientation['rms']:.0f} urad RMS, {orientation['maximum']:.0f} largest"
+                f"{state} bar: position {position['rms']:.1f} um RMS, {position['maximum']:.0f} "
+                "largest; "
+                f"orientation {orientation['rms']:.0f} urad RMS, {orientation['maximum']:.0f} "
+                "largest"
             )
     if (test := entry.get("astm_e3124")) is not None:
         low, high = test["mean_interval_ms"]
-        typer.echo(f"latency: {test['mean_ms']:.4f} ms ({low:.4f} to {high:.4f}), largest {test['max_ms']:.4f} ms")
+        typer.echo(
+            f"latency: {test['mean_ms']:.4f} ms ({low:.4f} to {high:.4f}), largest "
+            f"{test['max_ms']:.4f} ms"
+        )
     typer.echo(f"report: {folder / 'acceptance.md'}")
 
 
-RADII_PX, NOISES_PERCENT, TILTS_DEG = (2.5, 5.0, 10.0), (0.2, 1.0, 5.0), (0.0, 30.0, 60.0)
+RADII_PX = (2.5, 5.0, 10.0)
+NOISES_PERCENT = (0.2, 1.0, 5.0)
+TILTS_DEG = (0.0, 30.0, 60.0)
 
 
 def detectors(
+    context: typer.Context,
     sensor: SensorArgument = "ctrack780",
-    radius: Annotated[list[float] | None, repeatable("Long half axis of the disc, 1 to 50 px", "2.5, 5, 10")] = None,
+    radius: Annotated[
+        list[float] | None, repeatable("Long half axis of the disc, 1 to 50 px", "2.5, 5, 10")
+    ] = None,
     noise: Annotated[
         list[float] | None, repeatable("Noise half-way up the edge, % of the contrast", "0.2, 1, 5")
     ] = None,
-    tilt: Annotated[list[float] | None, repeatable("Tilt of the disc, degrees", "0, 30, 60")] = None,
-    psf: Annotated[list[float] | None, repeatable("Sigma of the point spread, px", "the sensor's")] = None,
+    tilt: Annotated[
+        list[float] | None, repeatable("Tilt of the disc, degrees", "0, 30, 60")
+    ] = None,
+    psf: Annotated[
+        list[float] | None, repeatable("Sigma of the point spread, px", "the sensor's")
+    ] = None,
     draws: Annotated[int, typer.Option(min=2, help="Discs drawn for each row of the table.")] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Seed of places, directions and noise.")] = 0,
     out: Annotated[Path | None, new_folder("runs/detectors-SENSOR")] = None,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
-    """Compare the detectors of sticker centres with the Cramer-Rao bound, which no detector can beat.
+    """Compare the detectors of sticker centres with the Cramer-Rao bound, which no detector can
+    beat.
 
-    The first row is what the sensor sees of the platform at home; the others are all combinations of the options.
+    The first row is what the sensor sees of the platform at home; the others are all combinations
+    of the options.
 
     Reads a sensor file.
 
@@ -149,12 +185,18 @@ def detectors(
 
     file = read_sensor_file(sensor)
     at_work = working_point(file)
-    grid = product(radius or RADII_PX, tilt or TILTS_DEG, noise or NOISES_PERCENT, psf or [at_work.psf_px])
+    grid = product(
+        radius or RADII_PX, tilt or TILTS_DEG, noise or NOISES_PERCENT, psf or [at_work.psf_px]
+    )
     swept = [Condition(r, np.radians(t), n / 100.0, p) for r, t, n, p in grid]
-    folder = new_run_folder(out or Path("runs") / f"detectors-{file.name}").path
+    folder = context.with_resource(
+        new_run_folder(out or Path("runs") / f"detectors-{file.name}")
+    ).path
     with terminal_progress(quiet).stage("detectors", 1 + len(swept)) as advance:
         rng = np.random.default_rng(seed)
-        scores = compete(scene_of(file), [at_work, *swept], draws, rng, report=lambda done, total: advance())
+        scores = compete(
+            scene_of(file), [at_work, *swept], draws, rng, report=lambda done, total: advance()
+        )
     rows = [_row(score) for score in scores]
     said = {"sensor": file.name, "seed": seed, "draws": draws, "confidence": CONFIDENCE}
     entry = {**said, "working_point": _columns(at_work), "scores": rows}
@@ -181,11 +223,20 @@ def _row(score: "Score") -> dict[str, Any]:
 
 
 def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:
-    """One row a condition: the bound, then the rms error of each detector; the working point's row in words below."""
+    """One row a condition: the bound, then the rms error of each detector; the working point's row
+    in words below.
+    """
     names = list(dict.fromkeys(score.detector for score in scores))
     together = [scores[k : k + len(names)] for k in range(0, len(scores), len(names))]
     print_table(
-        ("radius\npx", "tilt\n°", "noise\n%", "psf\npx", "bound", *(name.replace("_", " ") for name in names)),
+        (
+            "radius\npx",
+            "tilt\n°",
+            "noise\n%",
+            "psf\npx",
+            "bound",
+            *(name.replace("_", " ") for name in names),
+        ),
         map(_cells, together),
         (),
         f"rms error of a sticker's centre, px; first row: working point of {sensor}",
@@ -193,7 +244,8 @@ def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:
     )
     for s in together[0]:
         typer.echo(
-            f"{s.detector}: {s.ratio:.3f} times the bound at the working point, 95 % interval {s.ratio_low:.3f} to "
+            f"{s.detector}: {s.ratio:.3f} times the bound at the working point, 95 % interval "
+            f"{s.ratio_low:.3f} to "
             f"{s.ratio_high:.3f}; {s.bias_px:.5f} px without noise"
         )
     typer.echo(f"files: {folder}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.commands.help import BEYOND_LIMIT, ROWS_FAILED
-from identify.commands.options import JsonFile, completion, parse_settings, tell
+from identify.commands.options import JsonFile, Plugins, completion, parse_settings, tell
 from identify.errors import StudyError, StudyInterrupted
 from identify.progress import print_table, terminal_progress
 from identify.runtime import STOPPED
@@ -33,57 +33,83 @@ def study(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder of the study.", show_default="runs/study-NAME")
+        Path | None,
+        typer.Option("--out", help="Folder of the study.", show_default="runs/study-NAME"),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Use a running Dask cluster: tcp://HOST:8786.")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Use a running Dask cluster: tls://HOST:8786."),
     ] = None,
+    insecure: Annotated[
+        bool,
+        typer.Option(
+            "--insecure",
+            help="Take a scheduler that asks for no certificate: whoever reaches it can run code "
+            "as you.",
+        ),
+    ] = False,
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Replace an entry of the study: repeats=5, or scenario.timing.latency_s=0.01 in every row, or, with a "
+            help="Replace an entry of the study: repeats=5, or scenario.timing.latency_s=0.01 in "
+            "every row, or, with a "
             "list, a factor: 'sensor.rig.baseline=[0.5,1.0]'; repeatable.",
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of all randomness.", show_default="what the study says")
+        int | None,
+        typer.Option(min=0, help="Seed of all randomness.", show_default="what the study says"),
     ] = None,
     repeats: Annotated[
-        int | None, typer.Option(min=1, help="Rows at each point.", show_default="what the study says")
+        int | None,
+        typer.Option(min=1, help="Rows at each point.", show_default="what the study says"),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=0, help="Processes on this machine; 0: none but this one.", show_default="one a core"),
+        typer.Option(
+            min=0,
+            help="Processes on this machine; 0: none but this one.",
+            show_default="one a core",
+        ),
     ] = None,
     beside: Annotated[
         list[Path] | None,
-        typer.Option(help="Folder of a finished study with the same factors, drawn beside this one; repeatable."),
+        typer.Option(
+            help="Folder of a finished study with the same factors, drawn beside this one; "
+            "repeatable."
+        ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help=f"Do run more than {MANY_ROWS} rows.")] = False,
-    show: Annotated[bool, typer.Option("--show", help="Only print the file of the study, to start from.")] = False,
+    show: Annotated[
+        bool, typer.Option("--show", help="Only print the file of the study, to start from.")
+    ] = False,
     list_: Annotated[bool, typer.Option("--list", help="Only list the built-in studies.")] = False,
     kinds: Annotated[
-        bool, typer.Option("--kinds", help="Only list the kinds of row, with their options and figures.")
+        bool,
+        typer.Option("--kinds", help="Only list the kinds of row, with their options and figures."),
     ] = False,
     json: JsonFile = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar and no summary.")] = False,
+    plugin: Plugins = None,
 ) -> None:
     """Run a study: a scenario varied over factors, row by row, on all cores or on many machines.
 
-    What is finished stays in the folder: after Ctrl-C, or whatever ends the program, the same command goes on where it
-    stopped. The same study gives the same figures however it is run. More repeats, by --repeats or in the file, are
-    added to what is there; with fewer, the others are left out of the table and the summary, but none is lost. Title,
-    figures and laws may change too; any other change makes another study, which needs another folder.
+    What is finished stays in the folder: after Ctrl-C, or whatever ends the program, the same
+    command goes on where it stopped. The same study gives the same figures however it is run. More
+    repeats, by --repeats or in the file, are added to what is there; with fewer, the others are
+    left out of the table and the summary, but none is lost. Title, figures and laws may change too;
+    any other change makes another study, which needs another folder.
 
-    Reads a study file, and the scenario, robot and sensor that it names. cmmsim new study mine.toml writes a commented
-    one to start from; --show prints a built-in one.
+    Reads a study file, and the scenario, robot and sensor that it names. cmmsim new study mine.toml
+    writes a commented one to start from; --show prints a built-in one.
 
-    Writes into the folder study.json, the resolved study; rows.jsonl, finished rows as they come; study.parquet, one
-    table of factors, figures with units, seeds, seconds and errors; study.nc, the figures by factors and repeat;
-    summary.md and summary.json, which is also the JSON, renewed now and then while it runs; and figures as PNG, PDF and
-    SVG, with --beside also those of both studies side by side.
+    Writes into the folder study.json, the resolved study; rows.jsonl, finished rows as they come;
+    study.parquet, one table of factors, figures with units, seeds, seconds and errors; study.nc,
+    the figures by factors and repeat; summary.md and summary.json, which is also the JSON, renewed
+    now and then while it runs; and figures as PNG, PDF and SVG, with --beside also those of both
+    studies side by side.
 
     \b
     Examples:
@@ -96,16 +122,18 @@ def study(
         --set 'sensor.camera.dark_noise=[800.0,1600.0]' --set repeats=5
 
     \b
-    A kind of row of your own, kind = "my_module:run", in a module on PYTHONPATH:
+    A kind of row of your own, kind = "my_module:run", in a module on PYTHONPATH,
+    allowed by --plugin my_module:
       def run(scenario, seed, options):            # or run(scenario, seed)
           rng = numpy.random.default_rng(seed)     # a SeedSequence
           return {"error_um": ...}                 # numbers, units in names
 
     \b
-    On many machines, all with this cmmsim and the files that are named:
-      dask scheduler                               on one
-      dask worker tcp://HOST:8786 --nthreads 1     on each, once a core
-      cmmsim study STUDY --scheduler tcp://HOST:8786
+    On many machines, all with this cmmsim, dask[distributed], and the files that
+    are named; how to make certificates is in docs/howto/studies.md:
+      dask scheduler --protocol tls                on one
+      dask worker tls://HOST:8786 --nthreads 1     on each, once a core
+      cmmsim study STUDY --scheduler tls://HOST:8786
     """
     if list_:
         _list()
@@ -114,19 +142,30 @@ def study(
         _list_kinds()
         return
     if name is None:
-        raise typer.BadParameter("name a built-in study or a TOML file, or ask for --list", param_hint="STUDY")
+        raise typer.BadParameter(
+            "name a built-in study or a TOML file, or ask for --list", param_hint="STUDY"
+        )
     if scheduler is not None and workers is not None:
-        raise typer.BadParameter("--workers is for this machine, not for a running cluster", param_hint="--workers")
+        raise typer.BadParameter(
+            "--workers is for this machine, not for a running cluster", param_hint="--workers"
+        )
+    if scheduler is None and insecure:
+        raise typer.BadParameter("--insecure is for --scheduler", param_hint="--insecure")
     from identify.studies.study_file import STUDIES, load_study
 
     if show:
         typer.echo(STUDIES.text(name)[0], nl=False)
         return
     given = {"seed": seed, "repeats": repeats}
-    changes = parse_settings(settings) | {key: value for key, value in given.items() if value is not None}
+    changes = parse_settings(settings) | {
+        key: value for key, value in given.items() if value is not None
+    }
     chosen = load_study(name).with_settings(changes)
     if chosen.rows > MANY_ROWS and not yes:
-        raise StudyError(f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say --yes")
+        raise StudyError(
+            f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say "
+            "--yes"
+        )
     from identify.runtime import cores
     from identify.studies.memory import check_memory
     from identify.studies.runner import run_study
@@ -138,8 +177,9 @@ def study(
     others = rows_beside(chosen, beside or ())
     folder = out or Path("runs") / f"study-{chosen.name}"
     try:
-        progress, so_far = terminal_progress(quiet, rate="rows/s"), partial(_summary, chosen, folder, figures=False)
-        outcome = run_study(chosen, folder, progress, _workers(scheduler, count), so_far)
+        progress = terminal_progress(quiet, rate="rows/s")
+        so_far = partial(_summary, chosen, folder, figures=False)
+        outcome = run_study(chosen, folder, progress, _workers(scheduler, count, insecure), so_far)
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(STOPPED) from None
@@ -148,14 +188,22 @@ def study(
     _judge(outcome, summary["theory"])
 
 
-def _workers(scheduler: str | None, workers: int) -> "Workers":
+def _workers(scheduler: str | None, workers: int, insecure: bool) -> "Workers":
+    if scheduler is not None:
+        try:
+            from identify.studies.dask_cluster import running_cluster
+        except ImportError as error:
+            raise StudyError(
+                f"--scheduler needs Dask ({error}): pip install '.[cluster]' in a checkout"
+            ) from None
+        return partial(running_cluster, scheduler, insecure)
     if workers == 0:
         from identify.studies.runner import in_this_process
 
         return in_this_process
-    from identify.studies.dask_cluster import local_cluster, running_cluster
+    from identify.studies.processes import local_processes
 
-    return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers)
+    return partial(local_processes, workers)
 
 
 def _summary(study: "Study", folder: Path, frame: "pd.DataFrame", **how: Any) -> dict[str, Any]:
@@ -163,7 +211,9 @@ def _summary(study: "Study", folder: Path, frame: "pd.DataFrame", **how: Any) ->
     from identify.studies import summary
     from identify.studies.table import written
 
-    with written(folder / summary.MARKDOWN, "; all rows are kept, and the same command writes it again"):
+    with written(
+        folder / summary.MARKDOWN, "; all rows are kept, and the same command writes it again"
+    ):
         return summary.write(folder, study, frame, **how)
 
 
@@ -183,7 +233,10 @@ def _judge(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
     if broken:
         typer.echo(f"{len(broken)} of {len(laws)} laws failed; {_law_line(broken[0])}", err=True)
     if outcome.failures:
-        typer.echo(f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}", err=True)
+        typer.echo(
+            f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}",
+            err=True,
+        )
         raise typer.Exit(ROWS_FAILED)
     if broken:
         raise typer.Exit(BEYOND_LIMIT)
@@ -192,7 +245,10 @@ def _judge(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
 def _law_line(law: dict[str, Any]) -> str:
     measured = law["reason"]
     if law["measured"] is not None:
-        measured = f"measured {law['measured']:.4g} ({law['low']:.4g} to {law['high']:.4g}), expected {law['expected']}"
+        measured = (
+            f"measured {law['measured']:.4g} ({law['low']:.4g} to {law['high']:.4g}), "
+            f"expected {law['expected']}"
+        )
     return f"{law['verdict']}: {law['statement']}: {measured}"
 
 
@@ -210,15 +266,23 @@ def _list_kinds() -> None:
     from identify.studies.rows import KINDS
 
     for kind in KINDS.values():
-        typer.echo(f"{kind.name}: {kind.what}\n\nIt reads {kind.reads}, and its options; no other factor is taken.\n")
+        typer.echo(
+            f"{kind.name}: {kind.what}\n\nIt reads {kind.reads}, and its options; no other factor "
+            "is taken.\n"
+        )
         options = [
             (path, str(field.default), factor_unit(path), str(field.description))
             for path, field in valid_keys(kind.options).items()
             if path.startswith("options.")
         ]
-        print_table(("option", "default", "unit", "what it is"), options, ("option", "default", "unit", "what it is"))
+        print_table(
+            ("option", "default", "unit", "what it is"),
+            options,
+            ("option", "default", "unit", "what it is"),
+        )
         figures = [
-            (name, "" if column.unit == "1" else column.unit, column.meaning) for name, column in kind.columns.items()
+            (name, "" if column.unit == "1" else column.unit, column.meaning)
+            for name, column in kind.columns.items()
         ]
         print_table(("figure", "unit", "what it is"), figures, ("figure", "unit", "what it is"))
         typer.echo()

@@ -8,11 +8,13 @@ import typer
 
 from identify.commands.options import (
     JsonFile,
+    Plugins,
     Quiet,
     RobotOption,
     ScenarioArgument,
     Seed,
     Settings,
+    allow_named,
     chosen_scenario,
     new_folder,
     repeatable,
@@ -27,22 +29,31 @@ ALL = "all"
 
 
 def track(
+    context: typer.Context,
     scenario: ScenarioArgument = "quick",
     law: Annotated[
-        list[str] | None, repeatable(f"Law: {', '.join(LAWS)}, module:function, or {ALL}", "the scenario's")
+        list[str] | None,
+        repeatable(f"Law: {', '.join(LAWS)}, module:function, or {ALL}", "the scenario's"),
     ] = None,
     model: Annotated[
-        list[str] | None, repeatable(f"Model that the law knows: initial, identified, true, or {ALL}", ALL)
+        list[str] | None,
+        repeatable(f"Model that the law knows: initial, identified, true, or {ALL}", ALL),
     ] = None,
     run: Annotated[
         Path | None,
         typer.Option(
-            "--run", metavar="DIR", help="Folder of a run whose estimates are the identified model; else it is made."
+            "--run",
+            metavar="DIR",
+            help="Folder of a run whose estimates are the identified model; else it is made.",
         ),
     ] = None,
     motion: Annotated[
         Path | None,
-        typer.Option("--motion", metavar="FILE", help="CSV file of poses to follow instead of the usual motions."),
+        typer.Option(
+            "--motion",
+            metavar="FILE",
+            help="CSV file of poses to follow instead of the usual motions.",
+        ),
     ] = None,
     out: Annotated[Path | None, new_folder("runs/track-SCENARIO-SEED")] = None,
     seed: Seed = 0,
@@ -50,17 +61,20 @@ def track(
     settings: Settings = None,
     json: JsonFile = None,
     quiet: Quiet = False,
+    plugin: Plugins = None,
 ) -> None:
     """Follow motions under control laws that know a model of the robot.
 
-    The simulated robot follows the scenario's unseen trajectories, a circle and a square, with images in the loop:
-    under the paper's servo (pid), with joint commands shaped by the inverse dynamics (feedforward), or with torques
-    (computed_torque). The law knows the starting model, the identified one, or the truth. Told are the errors of the
-    true poses, the effort, and how much of the squared error would go if the sensor, the model or the latency were
-    exact. The scenario's [control] says whether an observer predicts the pose, and what the actuators take and give.
+    The simulated robot follows the scenario's unseen trajectories, a circle and a square, with
+    images in the loop: under the paper's servo (pid), with joint commands shaped by the inverse
+    dynamics (feedforward), or with torques (computed_torque). The law knows the starting model, the
+    identified one, or the truth. Told are the errors of the true poses, the effort, and how much of
+    the squared error would go if the sensor, the model or the latency were exact. The scenario's
+    [control] says whether an observer predicts the pose, and what the actuators take and give.
 
-    Reads a scenario; the folder of a whole run, if one is named; and, if named, a CSV file of poses with the columns t,
-    x, y, z, alpha, beta, gamma in s, m and rad. It writes track.json and scenario.toml.
+    Reads a scenario; the folder of a whole run, if one is named; and, if named, a CSV file of poses
+    with the columns t, x, y, z, alpha, beta, gamma in s, m and rad. It writes track.json and
+    scenario.toml.
 
     \b
     Examples:
@@ -74,18 +88,23 @@ def track(
     from identify.tracking.track import track as follow_all
 
     chosen = chosen_scenario(scenario, settings, robot)
+    allow_named(law)
     laws = _each(law or [chosen.control.law], tuple(LAWS))
     models = _each(model or [ALL], MODELS)
     unknown = [name for name in models if name not in MODELS]
     if unknown:
         raise ScenarioError(f"unknown model {unknown[0]!r}; valid: {', '.join(MODELS)}, or {ALL}")
-    folder = new_run_folder(out or Path("runs") / f"track-{chosen.name}-{seed}").path
+    folder = context.with_resource(
+        new_run_folder(out or Path("runs") / f"track-{chosen.name}-{seed}")
+    ).path
     entry = follow_all(chosen, laws, models, seed, terminal_progress(quiet), run, motion)
     save_files(folder, {"track.json": entry, "scenario.toml": chosen.to_toml()})
     tell(entry, json, quiet, lambda: _print(entry, folder))
     first = entry["runs"][0]
     if all("failed" in run for run in entry["runs"]):
-        raise SimulationError(f"no law kept the robot on its motion; {_called(first)}: {first['failed']}")
+        raise SimulationError(
+            f"no law kept the robot on its motion; {_called(first)}: {first['failed']}"
+        )
 
 
 def _each(given: list[str], every: tuple[str, ...]) -> list[str]:
@@ -100,7 +119,8 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
     done = [run for run in entry["runs"] if "failed" not in run]
     if done:
         _print_tables(done, entry["effort_unit"])
-    for run in entry["runs"] if done else entry["runs"][1:]:  # the error of a command that lost all says the first
+    # the error of a command that lost all says the first
+    for run in entry["runs"] if done else entry["runs"][1:]:
         if "failed" in run:
             typer.echo(f"lost: {_called(run)}: {run['failed']}")
         elif run["saturated_frames"]:
@@ -111,7 +131,11 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
 
 def _print_tables(done: list[dict[str, Any]], effort_unit: str) -> None:
     errors = [
-        (run["law"], run["model"] or "–", *map(_rounded, (*run["position_rms_um"], *run["orientation_rms_urad"])))
+        (
+            run["law"],
+            run["model"] or "–",
+            *map(_rounded, (*run["position_rms_um"], *run["orientation_rms_urad"])),
+        )
         for run in done
     ]
     header = ("law", "model", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad")
@@ -126,7 +150,10 @@ def _print_tables(done: list[dict[str, Any]], effort_unit: str) -> None:
         for run in done
     ]
     of_effort = ("law", "model", f"effort\n{effort_unit}", "sensor", "model", "latency", "rest")
-    said = "rms effort, and what of the squared error of positions an exact sensor, model or latency would take away"
+    said = (
+        "rms effort, and what of the squared error of positions an exact sensor, model or "
+        "latency would take away"
+    )
     print_table(of_effort, shares, header[:2], said)
 
 

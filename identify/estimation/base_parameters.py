@@ -1,10 +1,12 @@
-"""Base parameters: the combinations of dynamic parameters that a motion can tell apart (section 4.2).
+"""Base parameters: the combinations of dynamic parameters that a motion can tell apart (section
+4.2).
 
-The wrench is H Xi (eq. 26). Where columns of H depend on each other, only combinations of their parameters act:
-H = H_1 (1 | beta) P, so that H Xi = H_1 (xi_1 + beta xi_2), and the base parameters are xi_1 + beta xi_2, one for each
-pivot column. Columns are scaled to length one, so that the choice does not depend on units. Pivots are deterministic:
-of all columns that are long enough, the first in a stated order is taken (threshold pivoting), so that the groups are
-the same whatever motion shows them.
+The wrench is H Xi (eq. 26). Where columns of H depend on each other, only combinations of their
+parameters act: H = H_1 (1 | beta) P, so that H Xi = H_1 (xi_1 + beta xi_2), and the base parameters
+are xi_1 + beta xi_2, one for each pivot column. Columns are scaled to length one, so that the
+choice does not depend on units. Pivots are deterministic: of all columns that are long enough, the
+first in a stated order is taken (threshold pivoting), so that the groups are the same whatever
+motion shows them.
 """
 
 from dataclasses import dataclass
@@ -36,16 +38,20 @@ MOTIONS = 200
 """Random motions that excite whatever can be excited."""
 
 REACH_SHARES, TURN = (0.03, 0.01, 0.003, 0.001), 0.05
-"""Random poses lie within a share of the largest distance between joints (m) and a turn (rad) about home."""
+"""Random poses lie within a share of the largest distance between joints (m) and a turn (rad) about
+home.
+"""
 
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """Base parameters of a regression matrix with columns `names`, the dynamic parameters of a robot.
+    """Base parameters of a regression matrix with columns `names`, the dynamic parameters of a
+    robot.
 
-    combinations (rank, p): base = combinations @ parameters; pivots (rank,): the parameter that each group is named
-    after, with coefficient 1; unseen: names of the parameters with no effect at all; gap: largest column remainder that
-    was taken as dependent and smallest that was taken as independent.
+    combinations (rank, p): base = combinations @ parameters; pivots (rank,): the parameter that
+    each group is named after, with coefficient 1; unseen: names of the parameters with no effect at
+    all; gap: largest column remainder that was taken as dependent and smallest that was taken as
+    independent.
     """
 
     names: tuple[str, ...]
@@ -61,7 +67,9 @@ class BaseParameters:
 
     @cached_property
     def rigid_groups(self) -> RigidGroups:
-        """Those of the inertial parameters, which stand first, without friction: that is in no group with others."""
+        """Those of the inertial parameters, which stand first, without friction: that is in no
+        group with others.
+        """
         inertial = np.flatnonzero([name.split(".")[1] in INERTIAL for name in self.names])
         rows = np.flatnonzero(np.isin(self.pivots, inertial))
         return RigidGroups(np.array(self.pivots)[rows], self.combinations[np.ix_(rows, inertial)])
@@ -69,30 +77,41 @@ class BaseParameters:
     def group_names(self) -> tuple[str, ...]:
         """Name of each group: its pivot's, with a plus where other parameters belong to it."""
         lone = (np.abs(self.combinations) > 0).sum(axis=1) == 1
-        return tuple(self.names[p] + ("" if alone else " +") for p, alone in zip(self.pivots, lone, strict=True))
+        return tuple(
+            self.names[p] + ("" if alone else " +")
+            for p, alone in zip(self.pivots, lone, strict=True)
+        )
 
     def expressions(self) -> tuple[str, ...]:
         """Each group as a sum, such as ``crank1.Izz + 0.0009 crank1.mass``."""
-        return tuple(self._expression(row, pivot) for row, pivot in zip(self.combinations, self.pivots, strict=True))
+        return tuple(
+            self._expression(row, pivot)
+            for row, pivot in zip(self.combinations, self.pivots, strict=True)
+        )
 
     def _expression(self, row: Array, pivot: int) -> str:
         others = [k for k in np.flatnonzero(row) if k != pivot]
-        terms = [f"{'-' if row[k] < 0 else '+'} {_coefficient(abs(row[k]))}{self.names[k]}" for k in others]
+        terms = [
+            f"{'-' if row[k] < 0 else '+'} {_coefficient(abs(row[k]))}{self.names[k]}"
+            for k in others
+        ]
         return " ".join([self.names[pivot], *terms])
 
 
 def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
     """Base parameters of a regression matrix (rows, p) of a robot with this layout by pivoted QR.
 
-    Among the columns of which enough is left, pivots go to friction first, then to the platform, the moments of the
-    legs' bodies, and their masses, those nearest to the platform first. Raises EstimationError for a matrix without any
-    effect.
+    Among the columns of which enough is left, pivots go to friction first, then to the platform,
+    the moments of the legs' bodies, and their masses, those nearest to the platform first. Raises
+    EstimationError for a matrix without any effect.
     """
     names = layout.dynamic_names
     lengths = np.linalg.norm(matrix, axis=0)
     seen = np.flatnonzero(lengths > DEPENDENT * lengths.max(initial=0.0))
     if len(seen) == 0:
-        raise EstimationError(f"the regression matrix {matrix.shape} is zero: the motion excites no parameter")
+        raise EstimationError(
+            f"the regression matrix {matrix.shape} is zero: the motion excites no parameter"
+        )
     columns = matrix[:, seen] / lengths[seen]
     pivots, gap = _pivots(columns, _preferences(layout)[seen])
     others = np.setdiff1d(np.arange(len(seen)), pivots)
@@ -103,27 +122,35 @@ def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
     combinations[:, seen[others]] = beta * lengths[seen[others]] / lengths[seen[pivots]][:, None]
     order = np.argsort(seen[pivots])
     unseen = tuple(name for k, name in enumerate(names) if k not in seen)
-    return BaseParameters(names, combinations[order], tuple(int(k) for k in seen[pivots][order]), unseen, gap)
+    return BaseParameters(
+        names, combinations[order], tuple(int(k) for k in seen[pivots][order]), unseen, gap
+    )
 
 
 @lru_cache(maxsize=8)
 def structure(robot: Robot) -> BaseParameters:
-    """Base parameters of a robot, whatever moves it, found once. Raises EstimationError as `structural_regressor`."""
+    """Base parameters of a robot, whatever moves it, found once. Raises EstimationError as
+    `structural_regressor`.
+    """
     return base_parameters(structural_regressor(robot), robot.layout)
 
 
 def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) -> Array:
-    """Regression matrix (m motions, p) of random poses about home, twists and accelerations: what can be excited is.
-    Rows are wrenches along the platform's m coordinates: what the chart forbids moves nothing.
+    """Regression matrix (m motions, p) of random poses about home, twists and accelerations: what
+    can be excited is. Rows are wrenches along the platform's m coordinates: what the chart forbids
+    moves nothing.
 
     Raises EstimationError, with the last reason, where no neighbourhood of home is in reach.
     """
-    rng, chart = np.random.default_rng(seed), robot.geometry.chart
+    rng = np.random.default_rng(seed)
+    chart = robot.geometry.chart
     size = float(np.abs(robot.geometry.platform_joints).max())
     draws = chart.lifted(rng.uniform(-1.0, 1.0, (3, motions, len(chart.freedoms))))
     reason: Exception | None = None
     for share in REACH_SHARES:
-        poses = robot.home_pose + draws[0] * np.repeat([share * size, TURN * share / REACH_SHARES[0]], 3)
+        poses = robot.home_pose + draws[0] * np.repeat(
+            [share * size, TURN * share / REACH_SHARES[0]], 3
+        )
         try:
             robot.inverse_kinematics(poses)
         except DynamicsError as error:
@@ -136,28 +163,39 @@ def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) ->
 
 
 def rank_by_singular_values(matrix: Array) -> int:
-    """Rank of a regression matrix whose columns are scaled to length one, from its singular values."""
+    """Rank of a regression matrix whose columns are scaled to length one, from its singular
+    values."""
     lengths = np.linalg.norm(matrix, axis=0)
     singular = np.linalg.svd(matrix / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
     return int(np.sum(singular > DEPENDENT * singular[0]))
 
 
 def angle_to_singular_vectors(matrix: Array, found: BaseParameters) -> float:
-    """Largest angle [rad] between what the groups span and the row space of a regression matrix (rows, p) by its
-    singular vectors, with columns of length one; pi / 2 where one has a direction more than the other."""
+    """Largest angle [rad] between what the groups span and the row space of a regression matrix
+    (rows, p) by its singular vectors, with columns of length one; pi / 2 where one has a direction
+    more than the other."""
     lengths = np.linalg.norm(matrix, axis=0)
     scale = np.where(lengths > DEPENDENT * lengths.max(), lengths, 1.0)
-    groups, rows = found.combinations / scale, orth((matrix / scale).T, rcond=DEPENDENT)
-    return float(subspace_angles(groups.T, rows).max()) if len(groups) == rows.shape[1] else np.pi / 2
+    groups = found.combinations / scale
+    rows = orth((matrix / scale).T, rcond=DEPENDENT)
+    return (
+        float(subspace_angles(groups.T, rows).max()) if len(groups) == rows.shape[1] else np.pi / 2
+    )
 
 
 def rank_by_threshold(matrix: Array, threshold: float) -> int:
-    """The paper's count: diagonal entries of R above `threshold` in the pivoted QR of the unscaled H (section 4.2).
+    """The paper's count: diagonal entries of R above `threshold` in the pivoted QR of the unscaled
+    H (section 4.2).
 
-    The entries have the regressor's units (N, N m per unit of a parameter) and grow with the root of the number of
-    samples, so the count depends on both; where it exceeds the rank, the threshold lies below rounding.
+    The entries have the regressor's units (N, N m per unit of a parameter) and grow with the root
+    of the number of samples, so the count depends on both; where it exceeds the rank, the threshold
+    lies below rounding.
     """
-    return int(np.sum(np.abs(np.diag(qr(triangular_factor(matrix), mode="r", pivoting=True)[0])) > threshold))
+    return int(
+        np.sum(
+            np.abs(np.diag(qr(triangular_factor(matrix), mode="r", pivoting=True)[0])) > threshold
+        )
+    )
 
 
 def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> Array:
@@ -171,7 +209,8 @@ def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> A
 
 def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[float, float]]:
     """Indices of independent columns, and the remainders on both sides of the limit."""
-    left, smallest = columns.copy(), 1.0
+    left = columns.copy()
+    smallest = 1.0
     chosen: list[int] = []
     while True:
         lengths = np.linalg.norm(left, axis=0)

@@ -1,8 +1,9 @@
 """Bounded Gauss-Newton with a trust region for nonlinear least squares (eq. 32-35).
 
-Minimises |r(p)|^2 with r' = J. The paper's update (eq. 33, with the residual in place of its square) solves the linear
-problem without limits; here the step stays inside the parameters' bounds and inside a box that shrinks when the model
-of the cost was wrong, which keeps it from stalling near unstable loops.
+Minimises |r(p)|^2 with r' = J. The paper's update (eq. 33, with the residual in place of its
+square) solves the linear problem without limits; here the step stays inside the parameters' bounds
+and inside a box that shrinks when the model of the cost was wrong, which keeps it from stalling
+near unstable loops.
 """
 
 from collections.abc import Callable
@@ -16,8 +17,10 @@ from scipy.optimize import lsq_linear
 from dynamics import DynamicsError
 from identify.arrays import Array
 
-SHRINK, GROW = 0.25, 2.0
-POOR, GOOD = 0.25, 0.75
+SHRINK = 0.25
+GROW = 2.0
+POOR = 0.25
+GOOD = 0.75
 SMALLEST_RADIUS = 1e-10
 AT_BOUND = 1e-12  # of the parameter's scale: what rounding may leave
 
@@ -33,14 +36,16 @@ class Problem(Protocol):
         ...
 
     def linearise(self, parameters: Array) -> Linearisation:
-        """|r|^2, and a factor R (p, p) with a vector d (p,): |r + J step|^2 = |d + R step|^2 + constant. Raises
-        DynamicsError where the model cannot run."""
+        """|r|^2, and a factor R (p, p) with a vector d (p,): |r + J step|^2 = |d + R step|^2 +
+        constant. Raises DynamicsError where the model cannot run."""
         ...
 
 
 @dataclass(frozen=True)
 class StopCriteria:
-    """Eq. 35: tol1 on the relative change of the cost, tol2 on the relative change of every parameter."""
+    """Eq. 35: tol1 on the relative change of the cost, tol2 on the relative change of every
+    parameter.
+    """
 
     cost_tolerance: float
     parameter_tolerance: float
@@ -49,8 +54,8 @@ class StopCriteria:
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters (p,), which are at their bounds (p,), cost after each iteration, evaluations of the model and why it
-    stopped."""
+    """Parameters (p,), which are at their bounds (p,), cost after each iteration, evaluations of
+    the model and why it stopped."""
 
     parameters: Array
     at_bound: NDArray[np.bool_]
@@ -73,13 +78,19 @@ def minimise(
     on_iteration: Callable[[int, float], None] = lambda iteration, cost: None,
     ahead: bool = True,
 ) -> Solution:
-    """Minimise from `start` (p,) with p >= lower; `scale` (p,) is the size of a large change of each parameter.
+    """Minimise from `start` (p,) with p >= lower; `scale` (p,) is the size of a large change of
+    each parameter.
 
-    ahead: whether the problem may be linearised at a trial that is then not taken: not where it follows its own steps.
+    ahead: whether the problem may be linearised at a trial that is then not taken: not where it
+    follows its own steps.
     """
-    parameters, radius, trusted = start.copy(), 1.0, True
+    parameters = start.copy()
+    radius = 1.0
+    trusted = True
     cost, factor, residual = problem.linearise(parameters)
-    costs, evaluations, reason = [cost], 1, ""
+    costs = [cost]
+    evaluations = 1
+    reason = ""
     while not reason:
         step, predicted = _box_step(factor, residual, parameters, lower, scale, radius)
         trial = np.maximum(parameters + step, lower)
@@ -89,7 +100,8 @@ def minimise(
         ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
         trusted = ratio > POOR
         largest = float(np.abs(step / scale).max())
-        tried, radius = radius, _new_radius(radius, ratio, largest)
+        tried = radius
+        radius = _new_radius(radius, ratio, largest)
         if ratio > 0:
             # A step cut short by the trust region says nothing about convergence.
             if largest < 0.9 * tried:
@@ -97,7 +109,8 @@ def minimise(
                 reason = _converged(cost, new_cost, change, criteria)
             if not reason and len(costs) >= criteria.max_iterations:
                 reason = f"stopped after max_iterations = {criteria.max_iterations}"
-            parameters, cost = trial, new_cost
+            parameters = trial
+            cost = new_cost
             costs.append(cost)
             on_iteration(len(costs) - 1, cost)
             if not reason:
@@ -110,8 +123,8 @@ def minimise(
 
 
 def _tried(problem: Problem, trial: Array, goes_on: bool) -> tuple[float, Linearisation | None]:
-    """The cost of a trial (p,), and where the search is expected to go on from there at once its linearisation, which
-    the cost alone would be spent on twice."""
+    """The cost of a trial (p,), and where the search is expected to go on from there at once its
+    linearisation, which the cost alone would be spent on twice."""
     if not goes_on:
         return problem.cost(trial), None
     try:
@@ -127,7 +140,12 @@ def _box_step(
     """Minimiser of the linearised cost in the box, and the gain it predicts."""
     low = np.maximum((lower - parameters) / scale, -radius)
     scaled = factor * scale
-    solved = lsq_linear(scaled, -residual, bounds=(np.minimum(low, -1e-15), np.full(len(scale), radius)), method="bvls")
+    solved = lsq_linear(
+        scaled,
+        -residual,
+        bounds=(np.minimum(low, -1e-15), np.full(len(scale), radius)),
+        method="bvls",
+    )
     gain = residual @ residual - np.sum((residual + scaled @ solved.x) ** 2)
     return solved.x * scale, float(gain)
 
@@ -150,5 +168,8 @@ def _converged(cost: float, new_cost: float, change: float, criteria: StopCriter
     if gain <= criteria.cost_tolerance:
         return f"cost changed by {gain:.2e} <= tol1 = {criteria.cost_tolerance:g} (eq. 35)"
     if change <= criteria.parameter_tolerance:
-        return f"parameters changed by {change:.2e} <= tol2 = {criteria.parameter_tolerance:g} (eq. 35)"
+        return (
+            f"parameters changed by {change:.2e} <= tol2 = {criteria.parameter_tolerance:g} "
+            "(eq. 35)"
+        )
     return ""

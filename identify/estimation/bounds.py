@@ -1,24 +1,27 @@
 """Bounds: where a search may go, and the 95 % intervals of what is estimated within them.
 
-No parameter is negative, and on demand bodies are such as can exist: a rigid body has a positive mass, and none of its
-principal moments of inertia exceeds the sum of the other two. With the second moments of its mass along its axes,
-J_x = integral of x^2 dm and so on,
+No parameter is negative, and on demand bodies are such as can exist: a rigid body has a positive
+mass, and none of its principal moments of inertia exceeds the sum of the other two. With the second
+moments of its mass along its axes, J_x = integral of x^2 dm and so on,
 
     Ixx = J_y + J_z,    Iyy = J_x + J_z,    Izz = J_x + J_y,
 
-and the triangle inequality of the moments is nothing but J >= 0: a search in J instead of I needs bounds only, see
-Traversaro et al., "Identification of fully physical consistent inertial parameters" (IROS 2016).
+and the triangle inequality of the moments is nothing but J >= 0: a search in J instead of I needs
+bounds only, see Traversaro et al., "Identification of fully physical consistent inertial
+parameters" (IROS 2016).
 
-The covariance of an estimate is that of the problem without bounds. Where bounds hold the estimate back, they pull all
-of it from where the record and the starting guess alone would have it. Linearised about the estimate, that is
+The covariance of an estimate is that of the problem without bounds. Where bounds hold the estimate
+back, they pull all of it from where the record and the starting guess alone would have it.
+Linearised about the estimate, that is
 
     unheld = estimate - W^-1 g,
 
-with the information W and that part g of the cost's gradient which the active bounds balance. The interval of the
-unheld estimate, cut to what is allowed, holds the truth as often as it says; but it may be empty, or leave the estimate
-outside. The interval given spans that of the unheld and that of the held estimate, cut at the least allowed value: it
-is never empty, holds the estimate, and covers at least as often. (The interval of the held estimate alone, cut there,
-would not: a sum of many quantities near their bounds is estimated too high by more than its standard deviation.)
+with the information W and that part g of the cost's gradient which the active bounds balance. The
+interval of the unheld estimate, cut to what is allowed, holds the truth as often as it says; but it
+may be empty, or leave the estimate outside. The interval given spans that of the unheld and that of
+the held estimate, cut at the least allowed value: it is never empty, holds the estimate, and covers
+at least as often. (The interval of the held estimate alone, cut there, would not: a sum of many
+quantities near their bounds is estimated too high by more than its standard deviation.)
 """
 
 from dataclasses import dataclass
@@ -35,12 +38,16 @@ from identify.estimation.prior import StartingGuess
 
 
 def combined_std(rows: Array, covariance: Array) -> Array:
-    """Standard deviations (n,) of the combinations rows (n, p) @ parameters, from the parameters' covariance (p, p)."""
+    """Standard deviations (n,) of the combinations rows (n, p) @ parameters, from the parameters'
+    covariance (p, p).
+    """
     return np.asarray(np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows)))
 
 
 SMALLEST_SHARE = 1e-3
-"""Lower bound of platform mass and integral gain, as a share of the starting guess: the model needs both."""
+"""Lower bound of platform mass and integral gain, as a share of the starting guess: the model needs
+both.
+"""
 
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
 """(Ixx, Iyy, Izz) from (J_x, J_y, J_z)."""
@@ -48,9 +55,11 @@ MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
 
 @dataclass(frozen=True)
 class ParameterBounds:
-    """Coordinates (p,) of a search and their lower bounds (p,), with parameters = matrix (p, p) @ coordinates.
+    """Coordinates (p,) of a search and their lower bounds (p,), with parameters = matrix (p, p) @
+    coordinates.
 
-    layout: of the parameters; statements: what each bound says of them; physical: only bodies that can exist.
+    layout: of the parameters; statements: what each bound says of them; physical: only bodies that
+    can exist.
     """
 
     layout: ParameterLayout
@@ -60,8 +69,8 @@ class ParameterBounds:
     physical: bool
 
     def nearest(self, parameters: Array) -> Array:
-        """Parameters (p,) within the bounds: negative ones raised, and bodies changed where they cannot exist, if it
-        can be in what the motion does not feel."""
+        """Parameters (p,) within the bounds: negative ones raised, and bodies changed where they
+        cannot exist, if it can be in what the motion does not feel."""
         allowed = np.maximum(parameters, 0.0)
         if self.physical:
             bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
@@ -77,19 +86,25 @@ class ParameterBounds:
         return np.asarray(self.matrix @ coordinates, dtype=float)
 
     def least(self, rows: Array) -> Array:
-        """Least values (n,) that rows (n, p) @ parameters take within the bounds; -inf where there is none."""
+        """Least values (n,) that rows (n, p) @ parameters take within the bounds; -inf where there
+        is none.
+        """
         weights = rows @ self.matrix
         return np.where((weights >= 0).all(axis=1), weights @ self.lower, -np.inf)
 
     def balanced(self, gradient: Array, at_bound: NDArray[np.bool_]) -> Array:
-        """The part (p,) of a cost's gradient (p,) that the coordinates (p,) at their bounds balance."""
+        """The part (p,) of a cost's gradient (p,) that the coordinates (p,) at their bounds
+        balance.
+        """
         multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
         return np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
 
 
 @dataclass(frozen=True)
 class InCoordinates:
-    """A least-squares problem as a function of the coordinates; see `bounded_least_squares.Problem`."""
+    """A least-squares problem as a function of the coordinates; see
+    `bounded_least_squares.Problem`.
+    """
 
     problem: Problem
     bounds: ParameterBounds
@@ -106,8 +121,10 @@ class InCoordinates:
 
 def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     """Bounds of all parameters; physical: only masses and inertias that a rigid body can have."""
-    layout, names = guess.layout, guess.layout.names
-    matrix, lower = np.eye(len(names)), np.zeros(len(names))
+    layout = guess.layout
+    names = guess.layout.names
+    matrix = np.eye(len(names))
+    lower = np.zeros(len(names))
     for place in (names.index(name) for name in guess.above_zero):
         lower[place] = SMALLEST_SHARE * guess.values[place]
     lower[guess.fixed] = -1.0  # they stay at zero by what is known of them, not by a bound
@@ -129,7 +146,8 @@ HALF_WIDTH = float(norm.ppf(0.975))
 
 @dataclass(frozen=True)
 class BoundedEstimate:
-    """An estimate (p,) within bounds, and where it is at them (p,) bool, in the order of the bounds' coordinates.
+    """An estimate (p,) within bounds, and where it is at them (p,) bool, in the order of the
+    bounds' coordinates.
 
     unheld (p,): where record and starting guess alone would have it; covariance (p, p): of that.
     """
@@ -141,7 +159,9 @@ class BoundedEstimate:
     bounds: ParameterBounds
 
     def intervals(self, rows: Array) -> Array:
-        """95 % intervals (n, 2) of the quantities rows (n, p) @ parameters, cut at the least value allowed."""
+        """95 % intervals (n, 2) of the quantities rows (n, p) @ parameters, cut at the least value
+        allowed.
+        """
         half = HALF_WIDTH * combined_std(rows, self.covariance)
         centres = np.stack([rows @ self.estimate, rows @ self.unheld])
         low = np.maximum(centres.min(axis=0) - half, self.bounds.least(rows))
@@ -149,7 +169,9 @@ class BoundedEstimate:
 
     @property
     def active_bounds(self) -> tuple[str, ...]:
-        """What the bounds that hold the estimate say of the parameters, as "platform.Izz <= Ixx + Iyy"."""
+        """What the bounds that hold the estimate say of the parameters, as "platform.Izz <= Ixx +
+        Iyy".
+        """
         return tuple(self.bounds.statements[k] for k in np.flatnonzero(self.at_bound))
 
     def warnings(self) -> tuple[str, ...]:
@@ -157,13 +179,18 @@ class BoundedEstimate:
         if not self.at_bound.any():
             return ()
         beyond = self.bounds.lower - self.bounds.coordinates(self.unheld)
-        std = combined_std(np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float), self.covariance)
+        std = combined_std(
+            np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float), self.covariance
+        )
         said = ", ".join(
-            f"{self.bounds.statements[k]} ({max(beyond[k] / std[k], 0):.2g})" for k in np.flatnonzero(self.at_bound)
+            f"{self.bounds.statements[k]} ({max(beyond[k] / std[k], 0):.2g})"
+            for k in np.flatnonzero(self.at_bound)
         )
         return (
-            f"the estimate is held at {self.at_bound.sum()} bounds, beyond which no robot is: {said}; in brackets how "
-            "far record and starting values would go beyond, in standard deviations; the intervals allow for it",
+            f"the estimate is held at {self.at_bound.sum()} bounds, beyond which no robot is: "
+            f"{said}; in brackets how "
+            "far record and starting values would go beyond, in standard deviations; the "
+            "intervals allow for it",
         )
 
 
@@ -175,6 +202,8 @@ def bounded_estimate(
     covariance: Array,
     bounds: ParameterBounds,
 ) -> BoundedEstimate:
-    """The estimate (p,) of a search within bounds, where J^T r is `gradient` (p,) and J^T J is `information` (p, p)."""
+    """The estimate (p,) of a search within bounds, where J^T r is `gradient` (p,) and J^T J is
+    `information` (p, p).
+    """
     unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
     return BoundedEstimate(estimate, at_bound, unheld, covariance, bounds)

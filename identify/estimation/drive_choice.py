@@ -1,14 +1,17 @@
-"""Which law the drives have: the evidence of a record for each of those that are known, and how sure it makes one.
+"""Which law the drives have: the evidence of a record for each of those that are known, and how
+sure it makes one.
 
-Each law is a model of its own: warm start, then the search for the optimum of the output error under the logged
-commands, whose residuals are white. About the optimum the cost is a parabola, so that the evidence, the probability of
-the record with all parameters integrated out over what was known of them before, is (Laplace's method)
+Each law is a model of its own: warm start, then the search for the optimum of the output error
+under the logged commands, whose residuals are white. About the optimum the cost is a parabola, so
+that the evidence, the probability of the record with all parameters integrated out over what was
+known of them before, is (Laplace's method)
 
     ln p(record | law) = -(cost + ln det W - ln det P) / 2 + the same for all,
 
-W the information of poses and prior at the optimum, P that of the prior: a gain that a law has and the record does not
-need costs what it could have been. Before the record all laws are as probable. Where the best of them misses the
-record by more than noise explains, all costs are divided by its share: what no law explains rules none out.
+W the information of poses and prior at the optimum, P that of the prior: a gain that a law has and
+the record does not need costs what it could have been. Before the record all laws are as probable.
+Where the best of them misses the record by more than noise explains, all costs are divided by its
+share: what no law explains rules none out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,14 +35,14 @@ SURE = 0.95
 """Probability from which on a record tells the law."""
 
 FIRST, HOPELESS = 4, 10.0
-"""Iterations for every law at first, and how many times the best cost they may leave for it to go on: laws that the
-record shows are there by then, while others may search for long."""
+"""Iterations for every law at first, and how many times the best cost they may leave for it to go
+on: laws that the record shows are there by then, while others may search for long."""
 
 
 @dataclass(frozen=True)
 class DriveChoice:
-    """The law of the drives, and how probable each is: 1 for one that the scenario names; in_loop: whether it acted as
-    the record was made, which it does not where the drives took torques."""
+    """The law of the drives, and how probable each is: 1 for one that the scenario names; in_loop:
+    whether it acted as the record was made, which it does not where the drives took torques."""
 
     law: DriveName
     probabilities: Mapping[str, float]
@@ -59,23 +62,31 @@ class DriveChoice:
         """One line where the record cannot tell the law, or says nothing of it."""
         if not self.in_loop:
             return (
-                "the drives took torques: the law by which they follow joint commands is not in this record, and its "
+                "the drives took torques: the law by which they follow joint commands is not in "
+                "this record, and its "
                 "gains are those of the starting values",
             )
         if self.sure:
             return ()
-        said = ", ".join(f"{name} {value:.0%}" for name, value in self.probabilities.items() if value >= 0.01)
+        said = ", ".join(
+            f"{name} {value:.0%}" for name, value in self.probabilities.items() if value >= 0.01
+        )
         return (
-            f"the record cannot tell the law of the drives ({said}): the gains are those of {self.law}; move the robot "
+            f"the record cannot tell the law of the drives ({said}): the gains are those of "
+            f"{self.law}; move the robot "
             "faster or longer, or state the law in model.drive",
         )
 
 
 def choose_drive(
-    problem_of: Callable[[Scenario], OutputErrorProblem], scenario: Scenario, progress: Progress, in_loop: bool = True
+    problem_of: Callable[[Scenario], OutputErrorProblem],
+    scenario: Scenario,
+    progress: Progress,
+    in_loop: bool = True,
 ) -> DriveChoice:
-    """The law that a scenario names or, where it leaves that to the record, the most probable; problem_of: the output
-    error of a scenario that names one; in_loop: whether the law acted in the record.
+    """The law that a scenario names or, where it leaves that to the record, the most probable;
+    problem_of: the output error of a scenario that names one; in_loop: whether the law acted in the
+    record.
 
     Raises EstimationError: no law gives a model that runs; and as `problem_of` does.
     """
@@ -86,7 +97,8 @@ def choose_drive(
         return DriveChoice(law, {law: 1.0})
     laws = scenario.model.drives_considered
     with progress.stage("laws of the drives", 2 * len(laws)) as advance:
-        first, failed = {}, []
+        first = {}
+        failed = []
         for law in laws:
             own = _asking(scenario, law, FIRST)
             try:
@@ -96,7 +108,9 @@ def choose_drive(
                 failed.append(f"{law}: {error}")
             advance()
         if not first:
-            raise EstimationError(f"no law of the drives gives a model that runs: {'; '.join(failed)}")
+            raise EstimationError(
+                f"no law of the drives gives a model that runs: {'; '.join(failed)}"
+            )
         limit = HOPELESS * min(one.solution.costs[-1] for one in first.values())
         found = {}
         for law, one in first.items():
@@ -108,19 +122,24 @@ def choose_drive(
 
 
 def _asking(scenario: Scenario, law: DriveName, iterations: int) -> Scenario:
-    searched = {"identification.method": "command_driven", "identification.max_iterations": iterations}
+    searched = {
+        "identification.method": "command_driven",
+        "identification.max_iterations": iterations,
+    }
     return scenario.with_overrides({**drive_settings(law), **searched})
 
 
 def _searched(problem: OutputErrorProblem, scenario: Scenario, start: Array) -> Search:
-    """The search for the optimum under the logged commands. Raises EstimationError: no model that runs."""
+    """The search for the optimum under the logged commands. Raises EstimationError: no model that
+    runs.
+    """
     return output_error_searches(problem, scenario, start, SilentProgress())["command_driven"]
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a record says of a law: cost at the optimum, that of the poses alone over their number, and ln det W - ln
-    det P."""
+    """What a record says of a law: cost at the optimum, that of the poses alone over their number,
+    and ln det W - ln det P."""
 
     cost: float
     misfit: float
@@ -129,18 +148,26 @@ class Evidence:
 
 def evidence(found: Search) -> Evidence:
     """What a finished search says of its law. Raises LoopFailure."""
-    parameters, judged = found.solution.parameters, found.linearised()
+    parameters = found.solution.parameters
+    judged = found.linearised()
     cost, factor, _ = judged.linearise(parameters)
     known, _ = judged.known(parameters)
     poses = 6 * sum(int(np.count_nonzero(run.ok)) for run in judged.runs)
-    narrowed = 2 * np.log(np.abs(np.diag(factor))).sum() - np.linalg.slogdet(judged.known_information())[1]
+    narrowed = (
+        2 * np.log(np.abs(np.diag(factor))).sum() - np.linalg.slogdet(judged.known_information())[1]
+    )
     return Evidence(cost, (cost - float(known @ known)) / poses, float(narrowed))
 
 
-def _weighed(found: Mapping[DriveName, Evidence], laws: Sequence[DriveName]) -> tuple[DriveName, dict[str, float]]:
+def _weighed(
+    found: Mapping[DriveName, Evidence], laws: Sequence[DriveName]
+) -> tuple[DriveName, dict[str, float]]:
     """The most probable law, and the probability of each; a law that gives no model has none."""
     misfit = max(1.0, min(one.misfit for one in found.values()))
     logarithms = {law: -(one.cost / misfit + one.narrowed) / 2 for law, one in found.items()}
     best = max(logarithms, key=lambda law: logarithms[law])
-    weights = {law: float(np.exp(logarithms[law] - logarithms[best])) if law in found else 0.0 for law in laws}
+    weights = {
+        law: float(np.exp(logarithms[law] - logarithms[best])) if law in found else 0.0
+        for law in laws
+    }
     return best, {law: weight / sum(weights.values()) for law, weight in weights.items()}

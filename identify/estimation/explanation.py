@@ -1,22 +1,26 @@
-"""Whether the model explains its records: by the size of what it leaves, and by whether that is white.
+"""Whether the model explains its records: by the size of what it leaves, and by whether that is
+white.
 
-With the right model the mean squared whitened residual is what noise makes of it, but for chance. Where it is larger
-than chance allows, the rest, the misfit, is an error of the model. Unlike noise it lasts from frame to frame, and moves
-an estimate further than white residuals of the same size would: scaling the covariance by the residual (Birge's ratio)
-is not enough. The scores J^T r of stationary residuals with the autocorrelation R_k have the covariance
+With the right model the mean squared whitened residual is what noise makes of it, but for chance.
+Where it is larger than chance allows, the rest, the misfit, is an error of the model. Unlike noise
+it lasts from frame to frame, and moves an estimate further than white residuals of the same size
+would: scaling the covariance by the residual (Birge's ratio) is not enough. The scores J^T r of
+stationary residuals with the autocorrelation R_k have the covariance
 
     sum over frames i, j of J_i^T R_(i-j) J_j
 
-(Morelli and Klein, "Accuracy of aerodynamic model parameters estimated from flight test data", J. Guidance, Control,
-and Dynamics 20(1), 1997), with R_k from the residuals themselves. The model's share is added to what the noise makes.
-No residual shows the part of an error that the parameters take up. Where the model's error makes most of the residual,
-no interval can be trusted, and nothing counts as identified.
+(Morelli and Klein, "Accuracy of aerodynamic model parameters estimated from flight test data", J.
+Guidance, Control, and Dynamics 20(1), 1997), with R_k from the residuals themselves. The model's
+share is added to what the noise makes. No residual shows the part of an error that the parameters
+take up. Where the model's error makes most of the residual, no interval can be trusted, and nothing
+counts as identified.
 
-A model driven by the logged commands feels everything the plant felt, so that with the right model its residuals are
-the sensor's noise, independent from frame to frame. The portmanteau test of Ljung and Box asks whether their
-autocorrelations could be chance: n (n + 2) sum_k r_k² / (n - k) over the lags k = 1 ... L is chi-square with L degrees
-of freedom. (A model that closes its own loop cannot follow what the noise did to the plant: its residuals are coloured
-even when it is right, and are not tested.)
+A model driven by the logged commands feels everything the plant felt, so that with the right model
+its residuals are the sensor's noise, independent from frame to frame. The portmanteau test of Ljung
+and Box asks whether their autocorrelations could be chance: n (n + 2) sum_k r_k² / (n - k) over the
+lags k = 1 ... L is chi-square with L degrees of freedom. (A model that closes its own loop cannot
+follow what the noise did to the plant: its residuals are coloured even when it is right, and are
+not tested.)
 """
 
 from dataclasses import dataclass
@@ -32,16 +36,22 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.files.dataset import POSE
 
 SIGNIFICANT = float(norm.ppf(0.999))
-"""Standard deviations above the expected residual beyond which the rest is called an error of the model."""
+"""Standard deviations above the expected residual beyond which the rest is called an error of the
+model.
+"""
 
 MISFIT_STDS = 5.0
-"""Standard deviations that a record may be away from the expected residual: below, the stated covariance is wrong."""
+"""Standard deviations that a record may be away from the expected residual: below, the stated
+covariance is wrong.
+"""
 
 NOISE_DECIDES = 3.0
 """Residual, in units of the expected one, beyond which the model's error decides, not the noise."""
 
 REACH = 0.2
-"""Of a record's length: the lags after which residuals are taken as independent; up to there correlations fade out."""
+"""Of a record's length: the lags after which residuals are taken as independent; up to there
+correlations fade out.
+"""
 
 MISFIT = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
 """Entries of a result that tell a `Misfit`, in its order."""
@@ -49,8 +59,8 @@ MISFIT = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
 
 @dataclass(frozen=True)
 class Misfit:
-    """Mean squared whitened residual that was found, what noise alone would make of it, and how far that spreads from
-    one experiment to the next."""
+    """Mean squared whitened residual that was found, what noise alone would make of it, and how far
+    that spreads from one experiment to the next."""
 
     found: float
     expected: float
@@ -58,7 +68,8 @@ class Misfit:
 
     def __str__(self) -> str:
         return (
-            f"the mean squared residual is {self.found:.3f} times the variance that the sensor states, where noise "
+            f"the mean squared residual is {self.found:.3f} times the variance that the sensor "
+            "states, where noise "
             f"alone would make it {self.expected:.3f} ± {self.std:.3f}"
         )
 
@@ -69,7 +80,9 @@ class Misfit:
 
     @property
     def share_of_model(self) -> float:
-        """The part of the residual's variance that is the model's error; zero where it may be chance."""
+        """The part of the residual's variance that is the model's error; zero where it may be
+        chance.
+        """
         return 1 - self.expected / self.found if self.significant else 0.0
 
     @property
@@ -78,42 +91,53 @@ class Misfit:
         return self.found > NOISE_DECIDES * self.expected
 
     def warnings(self, model: str = "the model") -> tuple[str, ...]:
-        """One line where noise does not explain the residual: a local minimum, or a model or covariance is wrong."""
+        """One line where noise does not explain the residual: a local minimum, or a model or
+        covariance is wrong.
+        """
         wrong = "either this model of the robot or the covariance that the sensor states is wrong"
         if self.decides:
             return (
-                f"{model} does not explain the record: {self}; {wrong}, by so much that nothing counts as identified",
+                f"{model} does not explain the record: {self}; {wrong}, by so much that nothing "
+                "counts as identified",
             )
         if self.significant:
             return (
-                f"{model} does not explain all of the record: {self}; {wrong}; the intervals are widened by what the "
+                f"{model} does not explain all of the record: {self}; {wrong}; the intervals are "
+                "widened by what the "
                 "residuals show, but cannot know of errors that the parameters have taken up",
             )
         if self.found < self.expected - MISFIT_STDS * self.std:
             return (
-                f"{model} is nearer to the record than its noise allows: {self}; the covariance that the sensor states "
+                f"{model} is nearer to the record than its noise allows: {self}; the covariance "
+                "that the sensor states "
                 "is too large, and so are the intervals",
             )
         return ()
 
 
 def misfit_of_white(residuals: Array) -> Misfit:
-    """Misfit of whitened residuals (n, 6) that noise alone would leave white, as those of a model that is driven by the
-    logged commands."""
+    """Misfit of whitened residuals (n, 6) that noise alone would leave white, as those of a model
+    that is driven by the logged commands."""
     return Misfit(float(np.mean(residuals**2)), 1.0, float(np.sqrt(2 / residuals.size)))
 
 
 def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.bool_]) -> Array:
-    """Covariance (p, p) of J^T r for residuals r as correlated as those found, (n, 6), with their Jacobian (n, 6, p).
+    """Covariance (p, p) of J^T r for residuals r as correlated as those found, (n, 6), with their
+    Jacobian (n, 6, p).
 
     Both are of the good frames, `ok` (N,); those between them have no residual, and add nothing.
     """
-    count, size = len(ok), jacobian.shape[2]
-    rows, slopes = np.zeros((count, 6)), np.zeros((count, 6, size))
-    rows[ok], slopes[ok] = residuals, jacobian
+    count = len(ok)
+    size = jacobian.shape[2]
+    rows = np.zeros((count, 6))
+    slopes = np.zeros((count, 6, size))
+    rows[ok] = residuals
+    slopes[ok] = jacobian
     length = next_fast_len(2 * count, real=True)
     spectrum = rfft(rows, length, axis=0)
-    correlations = irfft(spectrum[:, :, None] * spectrum[:, None, :].conj(), length, axis=0) / ok.sum()
+    correlations = (
+        irfft(spectrum[:, :, None] * spectrum[:, None, :].conj(), length, axis=0) / ok.sum()
+    )
     lags = np.minimum(np.arange(length), length - np.arange(length))
     fading = np.maximum(1 - lags / (REACH * count), 0.0)  # keeps the sum positive semidefinite
     density = rfft(correlations * fading[:, None, None], axis=0)
@@ -133,8 +157,9 @@ SUSPICIOUS = 1e-4
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Result of the test: autocorrelations (6, lags) of the six pose components; p_values (6,) of each, and p_value of
-    all together: the probability of correlations at least as large where nothing but noise remains."""
+    """Result of the test: autocorrelations (6, lags) of the six pose components; p_values (6,) of
+    each, and p_value of all together: the probability of correlations at least as large where
+    nothing but noise remains."""
 
     autocorrelations: Array
     p_values: Array
@@ -151,23 +176,29 @@ class Whiteness:
             return ()
         parts = ", ".join(f"{name} {p:.1g}" for name, p in zip(POSE, self.p_values, strict=True))
         return (
-            "the model, driven by the logged commands, leaves residuals that follow each other from frame to frame: "
-            f"noise would do so with a probability of {self.p_value:.1g} (by component {parts}); either this model of "
+            "the model, driven by the logged commands, leaves residuals that follow each other "
+            "from frame to frame: "
+            f"noise would do so with a probability of {self.p_value:.1g} (by component {parts}); "
+            "either this model of "
             "the robot is wrong, or the errors of the camera last for several frames",
         )
 
 
 def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whiteness:
-    """Test residuals (N, 6) in standard deviations; frames with `ok` (N,) False are missing and may be NaN.
+    """Test residuals (N, 6) in standard deviations; frames with `ok` (N,) False are missing and may
+    be NaN.
 
     Raises EstimationError with fewer than ten good frames a lag.
     """
     if ok.sum() < 10 * lags:
-        raise EstimationError(f"{ok.sum()} good frames are too few to test {lags} lags, {10 * lags} are needed")
+        raise EstimationError(
+            f"{ok.sum()} good frames are too few to test {lags} lags, {10 * lags} are needed"
+        )
     centred = np.where(ok[:, None], residuals - residuals[ok].mean(axis=0), 0.0)
     power = np.sum(centred**2, axis=0)
     present = ok.astype(float)
-    correlations, statistics = np.zeros((residuals.shape[1], lags)), np.zeros(residuals.shape[1])
+    correlations = np.zeros((residuals.shape[1], lags))
+    statistics = np.zeros(residuals.shape[1])
     count = float(ok.sum())
     for lag in range(1, lags + 1):
         pairs = float(present[lag:] @ present[:-lag])
@@ -180,8 +211,8 @@ def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whit
 
 @dataclass(frozen=True)
 class Explanation:
-    """misfit: of the estimate's own residuals; driven_misfit, whiteness: of those of the model that the logged commands
-    drive, which feels what the sensor's noise did to the plant."""
+    """misfit: of the estimate's own residuals; driven_misfit, whiteness: of those of the model that
+    the logged commands drive, which feels what the sensor's noise did to the plant."""
 
     misfit: Misfit
     driven_misfit: Misfit
@@ -189,7 +220,9 @@ class Explanation:
 
     @property
     def hidden(self) -> bool:
-        """Whether the closed loop hides an error of the model that shows where the logged commands drive it."""
+        """Whether the closed loop hides an error of the model that shows where the logged commands
+        drive it.
+        """
         return self.driven_misfit.decides and not self.misfit.decides
 
     @property
@@ -199,13 +232,19 @@ class Explanation:
 
     def warnings(self) -> tuple[str, ...]:
         """What the command-driven residuals say beyond the misfit of the estimate's own."""
-        driven = self.driven_misfit.warnings("driven by the logged commands, the model") if self.hidden else ()
+        driven = (
+            self.driven_misfit.warnings("driven by the logged commands, the model")
+            if self.hidden
+            else ()
+        )
         return (*driven, *self.whiteness.warnings())
 
 
-def explanation(driven: OutputErrorProblem, parameters: Array, misfit: Misfit, rng: np.random.Generator) -> Explanation:
-    """Judge the model from the command-driven problem at its own optimum (p,), and the misfit of the estimate; rng: for
-    what a fit has taken out of the residuals.
+def explanation(
+    driven: OutputErrorProblem, parameters: Array, misfit: Misfit, rng: np.random.Generator
+) -> Explanation:
+    """Judge the model from the command-driven problem at its own optimum (p,), and the misfit of
+    the estimate; rng: for what a fit has taken out of the residuals.
 
     Raises EstimationError with too few good frames.
     """
@@ -216,9 +255,11 @@ def explanation(driven: OutputErrorProblem, parameters: Array, misfit: Misfit, r
 def _residuals(
     driven: OutputErrorProblem, parameters: Array, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """All whitened residuals (N, 6), NaN where lost, and the good frames (N,): one record after the other, with a gap
-    of all lags of the whiteness test between them."""
-    gap, residuals, ok = np.full((LAGS, 6), np.nan), [], []
+    """All whitened residuals (N, 6), NaN where lost, and the good frames (N,): one record after the
+    other, with a gap of all lags of the whiteness test between them."""
+    gap = np.full((LAGS, 6), np.nan)
+    residuals = []
+    ok = []
     for run in driven.runs:
         rows = np.full(run.measured.shape, np.nan)
         rows[run.ok] = run.white_misses(parameters, rng)

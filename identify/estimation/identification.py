@@ -1,7 +1,7 @@
 """Identification of one record: linear warm start, output error, uncertainty, identifiability.
 
-Sees the record, the robot's geometry and starting guess, and the scenario's model side; never the sensor, the plant's
-settings or the truth.
+Sees the record, the robot's geometry and starting guess, and the scenario's model side; never the
+sensor, the plant's settings or the truth.
 """
 
 import time
@@ -11,7 +11,9 @@ from dataclasses import replace
 import xarray as xr
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop.problem import checked_loop_parameters
+from dynamics.closed_loop.start_state import (
+    checked_loop_parameters,
+)
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.base_parameters import structure
 from identify.estimation.common_errors import common_error_estimates
@@ -26,13 +28,13 @@ from identify.estimation.result import IdentificationResult
 from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
 from identify.loop_parameters import with_drive
+from identify.model.from_record import identified_model
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.command_times import command_time_warnings
 from identify.record.drift import drift_warnings
 from identify.record.law import SERVO, recorded_law
 from identify.record.provenance import recorded_seed
-from identify.record.recorded_run import recorded_run
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 
@@ -44,20 +46,25 @@ def identify(
     scenario: Scenario,
     progress: Progress | None = None,
 ) -> IdentificationResult:
-    """Estimate the parameters of robot and joint PID from one or several records by closed-loop output error.
+    """Estimate the parameters of robot and joint PID from one or several records by closed-loop
+    output error.
 
-    Raises RecordError: the record misses something, such as its scenario or its scale anchor, or states what is none,
-    such as a seed that is no whole number. Raises EstimationError: no robot or scenario; a record of another robot,
-    timing or servo, or one that cannot carry an identification; no model that runs from the starting guess or the warm
-    start, or that bears the noise. Raises ScenarioError: a parameter set that the robot does not have, or a starting
-    guess that no model has. Raises dynamics.DynamicsError: poses that the robot cannot reach.
+    Raises RecordError: the record misses something, such as its scenario or its scale anchor, or
+    states what is none, such as a seed that is no whole number. Raises EstimationError: no robot or
+    scenario; a record of another robot, timing or servo, or one that cannot carry an
+    identification; no model that runs from the starting guess or the warm start, or that bears the
+    noise. Raises ScenarioError: a parameter set that the robot does not have, or a starting guess
+    that no model has. Raises dynamics.DynamicsError: poses that the robot cannot reach.
     """
-    progress, began = progress or SilentProgress(), time.perf_counter()
+    progress = progress or SilentProgress()
+    began = time.perf_counter()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
     scenario = under_its_law(scenario, records)
     problem = output_error_problem(records, robot, scenario)
     in_loop = not any(run.settings.drives.torques for run in problem.runs)
-    drive = choose_drive(lambda named: output_error_problem(records, robot, named), scenario, progress, in_loop)
+    drive = choose_drive(
+        lambda named: output_error_problem(records, robot, named), scenario, progress, in_loop
+    )
     if drive.asked:
         scenario = with_drive(scenario, drive.law)
         problem = output_error_problem(records, robot, scenario)
@@ -68,7 +75,8 @@ def identify(
     searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()
     method = scenario.identification.method
-    solution, judged = searches[method].solution, searches[method].linearised()
+    solution = searches[method].solution
+    judged = searches[method].linearised()
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
     by_commands = searches["command_driven"]
@@ -107,38 +115,50 @@ def identify(
 
 
 def under_its_law(scenario: Scenario, records: Sequence[xr.Dataset]) -> Scenario:
-    """The scenario with the method that fits the law under which a record was made: the model can close the loop of the
-    servo, and under any other law gets the logged commands."""
+    """The scenario with the method that fits the law under which a record was made: the model can
+    close the loop of the servo, and under any other law gets the logged commands."""
     if all(recorded_law(record) == SERVO for record in records):
         return scenario
     return scenario.with_overrides({"identification.method": "command_driven"})
 
 
-def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
+def output_error_problem(
+    records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario
+) -> OutputErrorProblem:
     """The output-error problem of one or several records; the first brings the scale anchor.
 
-    Raises RecordError: no scale anchor, or no such poses. Raises EstimationError: no robot or scenario; a record that
-    does not fit, or cannot carry an identification. Raises ScenarioError: no such starting guess, or one that no model
-    has.
+    Raises RecordError: no scale anchor, or no such poses. Raises EstimationError: no robot or
+    scenario; a record that does not fit, or cannot carry an identification. Raises ScenarioError:
+    no such starting guess, or one that no model has.
     """
-    for given, kind, loader in ((robot, Robot, "dynamics.load_robot"), (scenario, Scenario, "identify.load_scenario")):
+    for given, kind, loader in (
+        (robot, Robot, "dynamics.load_robot"),
+        (scenario, Scenario, "identify.load_scenario"),
+    ):
         if not isinstance(given, kind):
-            raise EstimationError(f"{given!r} is no {kind.__name__}: {loader}(name or path) gives one")
+            raise EstimationError(
+                f"{given!r} is no {kind.__name__}: {loader}(name or path) gives one"
+            )
     if not records:
         raise EstimationError("no record to identify from")
-    found = [recorded_run(record, robot, scenario) for record in records]
+    found = [identified_model(record, robot, scenario) for record in records]
     runs = tuple(replace(run, groups=structure(robot).rigid_groups) for run in found)
     anchor = read_anchor(records[0], robot.layout)
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(
-            f"the scale anchor is a payload, and the {len(runs)} records have all the same load: one with and one "
+            f"the scale anchor is a payload, and the {len(runs)} records have all the same load: "
+            "one with and one "
             "without it are needed"
         )
-    return OutputErrorProblem(runs, _guess(robot, scenario), anchor, scenario.identification.physical_consistency)
+    return OutputErrorProblem(
+        runs, _guess(robot, scenario), anchor, scenario.identification.physical_consistency
+    )
 
 
 def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
-    """The scenario's starting guess. Raises ScenarioError where the robot has none of the name, or no model has it."""
+    """The scenario's starting guess. Raises ScenarioError where the robot has none of the name, or
+    no model has it.
+    """
     settings = scenario.identification
     law = scenario.model.drive_law
     guess = model_guess(robot, scenario)
@@ -147,7 +167,8 @@ def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
     except DynamicsError as error:
         known = ", ".join(settings.prior) or "nothing"
         raise ScenarioError(
-            f"no model has the starting guess (set {scenario.model.start_parameters!r}, known beforehand: {known}): "
+            f"no model has the starting guess (set {scenario.model.start_parameters!r}, known "
+            f"beforehand: {known}): "
             f"{error}"
         ) from None
     return guess

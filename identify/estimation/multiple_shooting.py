@@ -1,14 +1,17 @@
-"""Multiple shooting: the record in short segments, for models that do not run through the whole of it.
+"""Multiple shooting: the record in short segments, for models that do not run through the whole of
+it.
 
-A model that is unstable, or that leaves the reachable set, has no output error over a record. Driven by the logged
-commands it has one over half a second, where each segment starts from a state of its own: coordinates of the platform,
-their rates and joint PID integral, s = 2 m + n numbers of m coordinates and n joints. These states are unknowns beside
-the parameters, and each segment must end where the next starts, up to what the sensor can see, so that in the optimum
-the segments make up one run.
+A model that is unstable, or that leaves the reachable set, has no output error over a record.
+Driven by the logged commands it has one over half a second, where each segment starts from a state
+of its own: coordinates of the platform, their rates and joint PID integral, s = 2 m + n numbers of
+m coordinates and n joints. These states are unknowns beside the parameters, and each segment must
+end where the next starts, up to what the sensor can see, so that in the optimum the segments make
+up one run.
 
-In the linearised problem the states form a chain. They are eliminated one after the other by QR, which leaves a problem
-in the parameters alone (condensing; Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal
-control problems", IFAC 1984); the step of the states follows from that of the parameters.
+In the linearised problem the states form a chain. They are eliminated one after the other by QR,
+which leaves a problem in the parameters alone (condensing; Bock and Plitt, "A multiple shooting
+algorithm for direct solution of optimal control problems", IFAC 1984); the step of the states
+follows from that of the parameters.
 """
 
 from dataclasses import dataclass, field
@@ -17,17 +20,26 @@ from itertools import pairwise
 import numpy as np
 
 from dynamics import DynamicsError
-from dynamics.closed_loop import ClosedLoopRun, Reference, StartState, equilibrium, simulate
+from dynamics.closed_loop import (
+    ClosedLoopRun,
+    Reference,
+    StartState,
+    differentiate_commands,
+    equilibrium,
+    simulate_commands,
+)
 from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import effective_command, running_integral
 from identify.filtering import filtered_derivatives
-from identify.record.recorded_run import RecordedRun
+from identify.model.loop_model import LoopModel
 from identify.scenario import Scenario
 
 SEGMENT_S = 0.5
-"""Length of a segment: a few periods of the joint loop, in which an unstable one does not leave the reachable set."""
+"""Length of a segment: a few periods of the joint loop, in which an unstable one does not leave the
+reachable set.
+"""
 
 BANDWIDTH = 20.0
 """rad/s, of the joint loop: turns the sensor's noise into a deviation of rates and integrals."""
@@ -35,10 +47,10 @@ BANDWIDTH = 20.0
 
 @dataclass(frozen=True)
 class Segment:
-    """Frames first to last of a run; the last one is the next segment's first. state_std (s,): what the sensor's noise
-    is in a state."""
+    """Frames first to last of a run; the last one is the next segment's first. state_std (s,): what
+    the sensor's noise is in a state."""
 
-    run: RecordedRun
+    run: LoopModel
     reference: Reference
     first: int
     last: int
@@ -59,34 +71,43 @@ class Segment:
         """Measured poses (frames, 6)."""
         return self.run.measured[self.first : self.last + 1]
 
-    def simulate(self, parameters: Array, state: Array, sensitivities: bool = False) -> ClosedLoopRun:
-        """The model's run from a state (s,); the first segment starts in equilibrium. Raises LoopFailure."""
-        run, chart = self.run, self.chart
-        coordinates, rates, integral = np.split(state, [len(chart.freedoms), 2 * len(chart.freedoms)])
-        pose, at_rest, start = chart.pose(coordinates), np.zeros(len(chart.freedoms)), None
+    def simulate(
+        self, parameters: Array, state: Array, sensitivities: bool = False
+    ) -> ClosedLoopRun:
+        """The model's run from a state (s,); the first segment starts in equilibrium. Raises
+        LoopFailure.
+        """
+        run = self.run
+        chart = self.chart
+        coordinates, rates, integral = np.split(
+            state, [len(chart.freedoms), 2 * len(chart.freedoms)]
+        )
+        pose = chart.pose(coordinates)
+        at_rest = np.zeros(len(chart.freedoms))
+        start = None
         if self.first:
             before, latencies = run.commands_before(self.first)
-            start = StartState(pose, chart.lifted(rates), integral, at_rest, before, pose, latencies=latencies)
-        return simulate(
-            run.robot,
-            parameters + run.payload,
-            self.reference,
-            run.settings,
-            start=start,
-            sensitivities=sensitivities,
-            start_sensitivities=sensitivities,
-            commands=run.logged[self.first : self.last + 1],
-            latencies=None if run.latencies is None else run.latencies[self.first : self.last + 1],
-        )
+            start = StartState(
+                pose, chart.lifted(rates), integral, at_rest, before, pose, latencies=latencies
+            )
+        frames = slice(self.first, self.last + 1)
+        commands = run.logged[frames]
+        late = None if run.latencies is None else run.latencies[frames]
+        given = run.robot, parameters + run.payload, self.reference, run.settings, commands
+        if sensitivities:
+            return differentiate_commands(*given, start=start, latencies=late, by_start=True)
+        return simulate_commands(*given, start=start, latencies=late)
 
     def whitened(self, values: Array) -> Array:
-        """Pose values (frames, 6, ...) whitened and stacked (n, ...), without lost frames and the next segment's."""
+        """Pose values (frames, 6, ...) whitened and stacked (n, ...), without lost frames and the
+        next segment's.
+        """
         count = self.last - self.first + self.ends_the_run
         rows = values[:count][self.run.ok[self.first : self.first + count]]
         return np.einsum("ij,nj...->ni...", self.run.whitener, rows).reshape(-1, *values.shape[2:])
 
 
-def segments(run: RecordedRun) -> list[Segment]:
+def segments(run: LoopModel) -> list[Segment]:
     """The segments of a run, all of about the same length."""
     frames = len(run.ok)
     count = max(1, round((frames - 1) / (SEGMENT_S * run.settings.timing.frame_rate_hz)))
@@ -97,38 +118,53 @@ def segments(run: RecordedRun) -> list[Segment]:
     place = np.sqrt(np.diag(covariance))
     joint = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
     std = np.concatenate([place, BANDWIDTH * place, joint / BANDWIDTH])
-    poses, rates = run.reference.poses, run.reference.rates
+    poses = run.reference.poses
+    rates = run.reference.rates
     return [
-        Segment(run, Reference(poses[first : last + 1], rates[first : last + 1]), int(first), int(last), std)
+        Segment(
+            run,
+            Reference(poses[first : last + 1], rates[first : last + 1]),
+            int(first),
+            int(last),
+            std,
+        )
         for first, last in pairwise(edges)
     ]
 
 
 def measured_states(chain: list[Segment], parameters: Array, scenario: Scenario) -> Array:
-    """States (segments, s) at the starts of a run's segments: filtered poses and rates, and what the joint PID has
-    integrated since the start, where it held the model of parameters (p,) at rest."""
-    run, rate_hz, filtering = chain[0].run, scenario.timing.frame_rate_hz, scenario.filter
+    """States (segments, s) at the starts of a run's segments: filtered poses and rates, and what
+    the joint PID has integrated since the start, where it held the model of parameters (p,) at
+    rest."""
+    run = chain[0].run
+    rate_hz = scenario.timing.frame_rate_hz
+    filtering = scenario.filter
     measured = run.robot.geometry.chart.coordinates(run.without_gaps())
     place, rate, _ = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
     _, _, command_integral = effective_command(run.logged, scenario, run.latencies)
     angle_integral = running_integral(run.robot.inverse_kinematics(run.robot.pose(place)), rate_hz)
-    servo, drives = run.settings.servo, run.settings.drives
-    rest = equilibrium(run.robot, parameters + run.payload, run.reference.poses[0], servo, drives=drives)
+    servo = run.settings.servo
+    drives = run.settings.drives
+    rest = equilibrium(
+        run.robot, parameters + run.payload, run.reference.poses[0], servo, drives=drives
+    )
     states = np.hstack([place, rate, rest.joint_integral + command_integral - angle_integral])
     return np.asarray(states[[part.first for part in chain]], dtype=float)
 
 
 def end_state(run: ClosedLoopRun, chart: Chart) -> Array:
     """State (s,) at the last frame of a run of a robot with this chart."""
-    return np.concatenate([*(chart.coordinates(of[-1]) for of in (run.pose, run.pose_rate)), run.joint_integral[-1]])
+    return np.concatenate(
+        [*(chart.coordinates(of[-1]) for of in (run.pose, run.pose_rate)), run.joint_integral[-1]]
+    )
 
 
 @dataclass
 class MultipleShooting:
     """Least-squares problem in a robot's p parameters, for `bounded_least_squares.minimise`.
 
-    chains: the segments of each record; states: a (segments, s) for each record. The states follow the parameters by
-    the latest linearisation, and are moved with each new one.
+    chains: the segments of each record; states: a (segments, s) for each record. The states follow
+    the parameters by the latest linearisation, and are moved with each new one.
     """
 
     problem: OutputErrorProblem
@@ -138,7 +174,9 @@ class MultipleShooting:
     _eliminated: list[list[Array]] = field(default_factory=list)
 
     def cost(self, parameters: Array) -> float:
-        """Sum of squared residuals of poses, continuity and what is known; infinite where a segment does not run."""
+        """Sum of squared residuals of poses, continuity and what is known; infinite where a segment
+        does not run.
+        """
         known, _ = self.problem.known(parameters)
         total = float(known @ known)
         try:
@@ -154,22 +192,29 @@ class MultipleShooting:
         return total
 
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
-        """Cost and the condensed linearisation in the parameters, see `bounded_least_squares.Problem`.
+        """Cost and the condensed linearisation in the parameters, see
+        `bounded_least_squares.Problem`.
 
         Raises LoopFailure where a segment does not run.
         """
         self.states = self._moved(parameters)
-        self._at, self._eliminated = parameters.copy(), []
+        self._at = parameters.copy()
+        self._eliminated = []
         known, known_rows = self.problem.known(parameters)
-        size, cost = len(parameters), float(known @ known)
+        size = len(parameters)
+        cost = float(known @ known)
         condensed = np.column_stack([known_rows, known])
         for chain, states in zip(self.chains, self.states, strict=True):
             state = states.shape[1]
-            carried, eliminated = np.eye(state, state + size + 1), []  # nothing depends on the first state: it stays
+            carried = np.eye(state, state + size + 1)
+            eliminated = []  # nothing depends on the first state: it stays
             for k, part in enumerate(chain):
-                rows = _linearised(part, parameters, states[k], None if part.ends_the_run else states[k + 1])
+                rows = _linearised(
+                    part, parameters, states[k], None if part.ends_the_run else states[k + 1]
+                )
                 cost += float(np.sum(rows[:, -1] ** 2))
-                carried = np.insert(carried, [state] * state, 0.0, axis=1)  # columns of the next state
+                # columns of the next state
+                carried = np.insert(carried, [state] * state, 0.0, axis=1)
                 triangle = np.asarray(np.linalg.qr(np.vstack([carried, rows]), mode="r"))
                 eliminated.append(triangle[:state])
                 carried = triangle[state:, state:]
@@ -188,26 +233,38 @@ class MultipleShooting:
 
 
 def _linearised(part: Segment, parameters: Array, state: Array, following: Array | None) -> Array:
-    """Rows of a segment's residuals and of its continuity with the `following` state, in the columns of its state, the
-    following one, the parameters, and the value. The first segment starts in equilibrium: its state does not count."""
+    """Rows of a segment's residuals and of its continuity with the `following` state, in the
+    columns of its state, the following one, the parameters, and the value. The first segment starts
+    in equilibrium: its state does not count."""
     run = part.simulate(parameters, state, sensitivities=True)
     by_state, by_parameters, end_by_state, end_by_parameters = (
         np.asarray(one)
-        for one in (run.start_sensitivity, run.pose_sensitivity, run.end_start_sensitivity, run.end_sensitivity)
+        for one in (
+            run.start_sensitivity,
+            run.pose_sensitivity,
+            run.end_start_sensitivity,
+            run.end_sensitivity,
+        )
     )
-    counts, size = float(part.first > 0), len(part.state_std)
-    values, own = part.whitened(run.pose - part.measured), counts * part.whitened(by_state[:, :, :size])
+    counts = float(part.first > 0)
+    size = len(part.state_std)
+    values = part.whitened(run.pose - part.measured)
+    own = counts * part.whitened(by_state[:, :, :size])
     rows = np.column_stack([own, np.zeros_like(own), part.whitened(by_parameters), values])
     if following is None:
         return rows
-    own, gap = counts * end_by_state[:size, :size], end_state(run, part.chart) - following
+    own = counts * end_by_state[:size, :size]
+    gap = end_state(run, part.chart) - following
     joint = np.column_stack([own, -np.eye(size), end_by_parameters[:size], gap])
     return np.vstack([rows, joint / part.state_std[:, None]])
 
 
 def _moved_chain(states: Array, eliminated: list[Array], step: Array) -> Array:
-    """States (segments, s) after a step (p + 1,) of the parameters (its last entry 1), by the triangles of their QR."""
-    moved, size = states.copy(), states.shape[1]
+    """States (segments, s) after a step (p + 1,) of the parameters (its last entry 1), by the
+    triangles of their QR.
+    """
+    moved = states.copy()
+    size = states.shape[1]
     following: Array = np.zeros(size)
     for k in reversed(range(len(states))):
         triangle = eliminated[k]

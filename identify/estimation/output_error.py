@@ -1,11 +1,13 @@
-"""Output error: measured poses against those of the model under the same excitation (eq. 32, figure 3).
+"""Output error: measured poses against those of the model under the same excitation (eq. 32, figure
+3).
 
-Two ways to drive the model. Closed loop, as in the paper: the model has the servo around it and follows the reference
-with an ideal sensor of the same sampling, delay and hold, which loses the frames that the real one lost. Command
-driven: the joints get the logged commands, so the model feels what the sensor's noise did to the plant.
+Two ways to drive the model. Closed loop, as in the paper: the model has the servo around it and
+follows the reference with an ideal sensor of the same sampling, delay and hold, which loses the
+frames that the real one lost. Command driven: the joints get the logged commands, so the model
+feels what the sensor's noise did to the plant.
 
-The residuals are the pose differences of all records, whitened by the sensor's covariance, and one row for each thing
-known beside the poses (`prior`).
+The residuals are the pose differences of all records, whitened by the sensor's covariance, and one
+row for each thing known beside the poses (`prior`).
 """
 
 from collections.abc import Sequence
@@ -18,15 +20,15 @@ from identify.arrays import Array, triangular_factor
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
 from identify.estimation.prior import StartingGuess, prior_residuals
 from identify.estimation.scale_anchor import ScaleAnchor
-from identify.record.recorded_run import RecordedRun
+from identify.model.loop_model import LoopModel
 
 
 @dataclass(frozen=True)
 class OutputErrorProblem:
-    """Least-squares problem in a robot's parameters over one or several records, for `bounded_least_squares.minimise`;
-    physical: whether only bodies that can exist are allowed."""
+    """Least-squares problem in a robot's parameters over one or several records, for
+    `bounded_least_squares.minimise`; physical: whether only bodies that can exist are allowed."""
 
-    runs: tuple[RecordedRun, ...]
+    runs: tuple[LoopModel, ...]
     guess: StartingGuess
     anchor: ScaleAnchor
     physical: bool = False
@@ -42,28 +44,37 @@ class OutputErrorProblem:
 
     @property
     def bends(self) -> bool:
-        """Whether the model is not linear in what the poses have in common: within a servo, or where latency is part of
-        it."""
-        return any(run.common.latency_std or (run.common.names and not run.driven) for run in self.runs if run.marginal)
+        """Whether the model is not linear in what the poses have in common: within a servo, or
+        where latency is part of it."""
+        return any(
+            run.common.latency_std or (run.common.names and not run.driven)
+            for run in self.runs
+            if run.marginal
+        )
 
     def has(self, errors: Sequence[Array], within: float) -> bool:
-        """Whether the model of each run has these common errors (k,), as far as it can, but for so many standard
-        deviations."""
+        """Whether the model of each run has these common errors (k,), as far as it can, but for so
+        many standard deviations."""
         pairs = zip(self.runs, errors, strict=True)
-        return all(np.abs(run.errors_had - run.having(own).errors_had).max(initial=0.0) <= within for run, own in pairs)
+        return all(
+            np.abs(run.errors_had - run.having(own).errors_had).max(initial=0.0) <= within
+            for run, own in pairs
+        )
 
     def having(self, errors: Sequence[Array]) -> "OutputErrorProblem":
         """The same problem, the model of each run with these common errors (k,)."""
-        return replace(self, runs=tuple(run.having(own) for run, own in zip(self.runs, errors, strict=True)))
+        return replace(
+            self, runs=tuple(run.having(own) for run, own in zip(self.runs, errors, strict=True))
+        )
 
     def with_common_errors(self, parameters: Array) -> "OutputErrorProblem":
-        """The same problem, which knows what the poses of each record have in common, as a model with these parameters
-        (p,) shows it. Raises LoopFailure where that is unstable."""
+        """The same problem, which knows what the poses of each record have in common, as a model
+        with these parameters (p,) shows it. Raises LoopFailure where that is unstable."""
         return replace(self, runs=tuple(run.with_common_errors(parameters) for run in self.runs))
 
     def cost(self, parameters: Array, ahead: bool = False) -> float:
-        """Sum of squared whitened residuals; infinite where the model cannot run. ahead: from the runs that `linearise`
-        will need, if it is asked next."""
+        """Sum of squared whitened residuals; infinite where the model cannot run. ahead: from the
+        runs that `linearise` will need, if it is asked next."""
         known, _ = self.known(parameters)
         total = float(known @ known)
         try:
@@ -74,9 +85,11 @@ class OutputErrorProblem:
         return total
 
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
-        """Cost and the triangular form of its linearisation, see `bounded_least_squares.Problem`."""
+        """Cost and the triangular form of its linearisation, see
+        `bounded_least_squares.Problem`."""
         known, known_jacobian = self.known(parameters)
-        size, cost = len(parameters), float(known @ known)
+        size = len(parameters)
+        cost = float(known @ known)
         triangle = np.column_stack([known_jacobian, known])
         for run in self.runs:
             residual, shown = run.shown_residuals(parameters)

@@ -1,9 +1,10 @@
 """The searches for the optimum of the output error, one after the other.
 
-From the linear warm start through the command-driven output error, which has few local minima, to the closed-loop
-output error, whose stick-slip events make narrow ones. Errors that all poses have in common are left to the noise at
-first: what they hide, far from the optimum, is the way there. Where neither the warm start nor the starting guess gives
-a model that runs, multiple shooting finds one that does.
+From the linear warm start through the command-driven output error, which has few local minima, to
+the closed-loop output error, whose stick-slip events make narrow ones. Errors that all poses have
+in common are left to the noise at first: what they hide, far from the optimum, is the way there.
+Where neither the warm start nor the starting guess gives a model that runs, multiple shooting finds
+one that does.
 """
 
 from dataclasses import dataclass, replace
@@ -22,29 +23,36 @@ from identify.progress import Advance, Progress
 from identify.scenario import Scenario
 
 LINEARISATIONS, SETTLED = 6, 0.02
-"""Of the common errors, at most, and how near the last ones the most likely must be, in standard deviations."""
+"""Of the common errors, at most, and how near the last ones the most likely must be, in standard
+deviations.
+"""
 
 CLOSE_ENOUGH = 1e-2
-"""Relative change of the cost at which multiple shooting ends: the searches after it go on from there."""
+"""Relative change of the cost at which multiple shooting ends: the searches after it go on from
+there.
+"""
 
 
 @dataclass(frozen=True)
 class Search:
-    """A problem, with what its poses have in common where that is most likely, and what the search for its optimum
-    found."""
+    """A problem, with what its poses have in common where that is most likely, and what the search
+    for its optimum found."""
 
     problem: OutputErrorProblem
     solution: Solution
 
     def linearised(self) -> OutputErrorProblem:
-        """The problem with the common errors as the model shows them at the optimum. Raises LoopFailure."""
+        """The problem with the common errors as the model shows them at the optimum. Raises
+        LoopFailure.
+        """
         return self.problem.with_common_errors(self.solution.parameters)
 
 
 def output_error_searches(
     problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
 ) -> dict[str, Search]:
-    """The searches by name, in their order, from the warm start (p,); the last is that of the scenario's method.
+    """The searches by name, in their order, from the warm start (p,); the last is that of the
+    scenario's method.
 
     Raises EstimationError: no model that runs.
     """
@@ -55,15 +63,20 @@ def output_error_searches(
         found["multiple_shooting"] = Search(driven, shoot(driven, scenario, warm, progress))
         start = found["multiple_shooting"].solution.parameters
     settings = scenario.identification
-    closed_loop, told = settings.method == "closed_loop", any(run.common.all_names for run in problem.runs)
+    closed_loop = settings.method == "closed_loop"
+    told = any(run.common.all_names for run in problem.runs)
     with progress.stage("identify", (1 + closed_loop + told) * settings.max_iterations) as advance:
         starts = [start]
         if told:
             found["noise_alone"] = Search(driven, search(driven, start, scenario, advance))
             starts = [found["noise_alone"].solution.parameters, start, problem.guess.values]
-        found["command_driven"] = searched = search_with_common_errors(driven, starts, scenario, advance)
+        found["command_driven"] = searched = search_with_common_errors(
+            driven, starts, scenario, advance
+        )
         if closed_loop:
-            problem = problem.having(most_likely_errors(searched.problem, searched.solution.parameters))
+            problem = problem.having(
+                most_likely_errors(searched.problem, searched.solution.parameters)
+            )
             start = _closed_loop_start(problem, searched.solution.parameters)
             found["closed_loop"] = search_with_common_errors(problem, [start], scenario, advance)
     return found
@@ -72,8 +85,9 @@ def output_error_searches(
 def search_with_common_errors(
     problem: OutputErrorProblem, starts: list[Array], scenario: Scenario, advance: Advance
 ) -> Search:
-    """Minimise a problem from the best of some parameters (p,) with what its poses have in common, time and again until
-    the most likely errors, about which the model is taken as linear in them, settle."""
+    """Minimise a problem from the best of some parameters (p,) with what its poses have in common,
+    time and again until the most likely errors, about which the model is taken as linear in them,
+    settle."""
     problem, start = _with_common_errors(problem, starts)
     solution = search(problem, start, scenario, advance)
     for _ in range(LINEARISATIONS if problem.bends else 0):
@@ -87,17 +101,25 @@ def search_with_common_errors(
     return Search(problem, solution)
 
 
-def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
+def search(
+    problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance
+) -> Solution:
     """Minimise one output-error problem from parameters (p,), within its bounds."""
     settings = scenario.identification
-    criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
+    criteria = StopCriteria(
+        settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations
+    )
     return _within_bounds(problem, problem, start, criteria, advance)
 
 
-def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress) -> Solution:
-    """Parameters with which the command-driven model runs, by multiple shooting from warm start or starting guess.
+def shoot(
+    problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
+) -> Solution:
+    """Parameters with which the command-driven model runs, by multiple shooting from warm start or
+    starting guess.
 
-    Raises EstimationError: no segment-wise model that runs, or none that does over the whole records.
+    Raises EstimationError: no segment-wise model that runs, or none that does over the whole
+    records.
     """
     settings = scenario.identification
     criteria = StopCriteria(CLOSE_ENOUGH, settings.parameter_tolerance, settings.max_iterations)
@@ -112,42 +134,55 @@ def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress
         if np.isfinite(problem.cost(solution.parameters)):
             return solution
     raise EstimationError(
-        "neither the warm start nor the starting guess gives a model that runs, nor does multiple shooting from them: "
+        "neither the warm start nor the starting guess gives a model that runs, nor does multiple "
+        "shooting from them: "
         f"{_why(problem, warm)}"
     )
 
 
 def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
-    """The better of warm start and starting guess (p,), within the bounds; None where the model runs with neither."""
+    """The better of warm start and starting guess (p,), within the bounds; None where the model
+    runs with neither.
+    """
     first, second = _candidates(problem, warm)
-    costs = [(problem.cost(first, ahead=_begins_there(problem)), first), (problem.cost(second), second)]
+    costs = [
+        (problem.cost(first, ahead=_begins_there(problem)), first),
+        (problem.cost(second), second),
+    ]
     cost, start = min(costs, key=lambda entry: entry[0])
     return start if np.isfinite(cost) else None
 
 
 def _begins_there(problem: OutputErrorProblem) -> bool:
-    """Whether a search linearises this very problem at just the parameters that it is given: not where it is whitened
-    otherwise first, or goes through other coordinates."""
+    """Whether a search linearises this very problem at just the parameters that it is given: not
+    where it is whitened otherwise first, or goes through other coordinates."""
     return not problem.physical and not any(run.common.all_names for run in problem.runs)
 
 
 def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
-    """The better of what the command-driven search found (p,) and the starting guess, for the closed loop."""
+    """The better of what the command-driven search found (p,) and the starting guess, for the
+    closed loop.
+    """
     start = runnable_start(problem, driven)
     if start is None:
         raise EstimationError(
-            "the closed loop runs neither with what the command-driven search found nor with the starting guess: "
+            "the closed loop runs neither with what the command-driven search found nor with the "
+            "starting guess: "
             f"{_why(problem, driven)}"
         )
     return start
 
 
-def _with_common_errors(problem: OutputErrorProblem, starts: list[Array]) -> tuple[OutputErrorProblem, Array]:
-    """The problem that knows what poses have in common, as a model shows it that runs with the best of some parameters
-    (p,); and these. A single start is known to run."""
+def _with_common_errors(
+    problem: OutputErrorProblem, starts: list[Array]
+) -> tuple[OutputErrorProblem, Array]:
+    """The problem that knows what poses have in common, as a model shows it that runs with the best
+    of some parameters (p,); and these. A single start is known to run."""
     if len(starts) == 1 and not any(run.common.all_names for run in problem.runs):
         return problem, problem.bounds.nearest(starts[0])
-    inside = [start for start in map(problem.bounds.nearest, starts) if np.isfinite(problem.cost(start))]
+    inside = [
+        start for start in map(problem.bounds.nearest, starts) if np.isfinite(problem.cost(start))
+    ]
     told = problem.with_common_errors(inside[0])
     best = min(inside, key=told.cost)
     return (told if best is inside[0] else problem.with_common_errors(best)), best
@@ -158,9 +193,15 @@ def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:
 
 
 def _within_bounds(
-    least_squares: Problem, problem: OutputErrorProblem, start: Array, criteria: StopCriteria, advance: Advance
+    least_squares: Problem,
+    problem: OutputErrorProblem,
+    start: Array,
+    criteria: StopCriteria,
+    advance: Advance,
 ) -> Solution:
-    """Solution in the parameters of a search in the coordinates of their bounds; `advance` reaches all iterations."""
+    """Solution in the parameters of a search in the coordinates of their bounds; `advance` reaches
+    all iterations.
+    """
     bounds = problem.bounds
     found = minimise(
         InCoordinates(least_squares, bounds),

@@ -1,7 +1,7 @@
 """The prior: what is known beside the poses, as residuals that join theirs.
 
-That is the starting guess, each parameter with its standard deviation (wide, but for single ones of which a scenario's
-`[identification.prior]` knows more), and the scale anchor.
+That is the starting guess, each parameter with its standard deviation (wide, but for single ones of
+which a scenario's `[identification.prior]` knows more), and the scale anchor.
 """
 
 from collections.abc import Mapping
@@ -22,8 +22,9 @@ from identify.scenario import PriorValue, Scenario
 
 @dataclass(frozen=True)
 class StartingGuess:
-    """What is known before the experiment of a robot's parameters: values (p,) and standard deviations (p,), SI; the
-    law of its drives, which fixes the gains that it does not read at zero."""
+    """What is known before the experiment of a robot's parameters: values (p,) and standard
+    deviations (p,), SI; the law of its drives, which fixes the gains that it does not read at zero.
+    """
 
     layout: ParameterLayout
     values: Array
@@ -34,7 +35,9 @@ class StartingGuess:
     def fixed(self) -> NDArray[np.bool_]:
         """Gains (p,) that the law of the drives does not read."""
         read = [f"joint_pid.{gain}" for gain in READS[self.drive]]
-        return np.isin(self.layout.names, self.layout.joint_pid_names) & ~np.isin(self.layout.names, read)
+        return np.isin(self.layout.names, self.layout.joint_pid_names) & ~np.isin(
+            self.layout.names, read
+        )
 
     @property
     def above_zero(self) -> tuple[str, ...]:
@@ -58,54 +61,67 @@ def starting_guess(
     known: Mapping[str, PriorValue] = MappingProxyType({}),
     drive: DriveName = "pid",
 ) -> StartingGuess:
-    """The named parameter set of the robot file, uncertain by a fraction of each parameter's size, but for those of
-    which a value and its standard deviation are known.
+    """The named parameter set of the robot file, uncertain by a fraction of each parameter's size,
+    but for those of which a value and its standard deviation are known.
 
     Raises ScenarioError: no such set (with the valid names).
     """
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
     torque = holding_torque(robot, chosen.dynamic)
-    values, std = chosen.vector.copy(), relative_std * typical_sizes(robot.layout, chosen.vector, torque)
+    values = chosen.vector.copy()
+    std = relative_std * typical_sizes(robot.layout, chosen.vector, torque)
     for name, prior in known.items():
         place = robot.layout.names.index(name)
-        values[place], std[place] = prior.value, prior.std
+        values[place] = prior.value
+        std[place] = prior.std
     guess = StartingGuess(robot.layout, values, std, drive)
-    values[guess.fixed], std[guess.fixed] = 0.0, FIXED * std[guess.fixed]
+    values[guess.fixed] = 0.0
+    std[guess.fixed] = FIXED * std[guess.fixed]
     return guess
 
 
 def model_guess(robot: Robot, scenario: Scenario) -> StartingGuess:
     """The starting guess of a scenario's model. Raises as `starting_guess`."""
-    settings, model = scenario.identification, scenario.model
-    return starting_guess(robot, model.start_parameters, settings.start_std, settings.prior, model.drive_law)
+    settings = scenario.identification
+    model = scenario.model
+    return starting_guess(
+        robot, model.start_parameters, settings.start_std, settings.prior, model.drive_law
+    )
 
 
 WEIGHTLESS = 0.01
-"""Share of the torque for an acceleration of GRAVITY that joints must hold for their load to count as held by them."""
+"""Share of the torque for an acceleration of GRAVITY that joints must hold for their load to count
+as held by them.
+"""
 
 GRAVITY = 9.81  # m/s^2
 
 
 def holding_torque(robot: Robot, dynamic: Array) -> float:
-    """Mean torque [N m] or force [N] that the joints hold at the home pose, with dynamic parameters (p,).
+    """Mean torque [N m] or force [N] that the joints hold at the home pose, with dynamic parameters
+    (p,).
 
-    Where they hold next to nothing, as those of a robot that lies flat, it is the mean of what they need to accelerate
-    the platform by that of gravity along each axis.
+    Where they hold next to nothing, as those of a robot that lies flat, it is the mean of what they
+    need to accelerate the platform by that of gravity along each axis.
     """
-    home, axes = robot.home_pose, robot.geometry.chart.basis.T
+    home = robot.home_pose
+    axes = robot.geometry.chart.basis.T
     held = robot.static_torque(home, dynamic)
     lifting = GRAVITY * axes[axes[:, :3].any(axis=1)]
     rest = np.zeros_like(lifting)
     needed = robot.inverse_dynamics(np.tile(home, (len(lifting), 1)), rest, lifting, dynamic) - held
-    mean, accelerating = float(np.abs(held).mean()), float(np.abs(needed).mean())
+    mean = float(np.abs(held).mean())
+    accelerating = float(np.abs(needed).mean())
     return mean if mean > WEIGHTLESS * accelerating else accelerating
 
 
 def typical_sizes(layout: ParameterLayout, values: Array, torque: float) -> Array:
-    """Size (p,) of each parameter: its own value, and for friction the torque [N m] or force [N] that the joints hold.
+    """Size (p,) of each parameter: its own value, and for friction the torque [N m] or force [N]
+    that the joints hold.
 
-    A specification says little about friction; a joint that rubs more than it carries would be called broken.
+    A specification says little about friction; a joint that rubs more than it carries would be
+    called broken.
     """
     return np.where(friction(layout), torque, np.where(values > 0, values, 1.0))
 
@@ -115,8 +131,12 @@ def friction(layout: ParameterLayout) -> NDArray[np.bool_]:
     return np.isin(layout.names, layout.coulomb_names + layout.viscous_names)
 
 
-def prior_residuals(parameters: Array, guess: StartingGuess, anchor: ScaleAnchor) -> tuple[Array, Array]:
-    """Residuals (k,) of what is known beside the poses, in standard deviations, and their rows (k, p)."""
+def prior_residuals(
+    parameters: Array, guess: StartingGuess, anchor: ScaleAnchor
+) -> tuple[Array, Array]:
+    """Residuals (k,) of what is known beside the poses, in standard deviations, and their rows (k,
+    p).
+    """
     place, measured = anchor.row(guess.layout)
     rows = np.vstack([guess.rows, place])
     values = np.concatenate([guess.values / guess.std, measured])

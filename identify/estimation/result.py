@@ -1,4 +1,6 @@
-"""What an identification says: estimates with their uncertainty and judgement, as a table, as JSON, and in one line."""
+"""What an identification says: estimates with their uncertainty and judgement, as a table, as JSON,
+and in one line.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +34,17 @@ STRONGEST = 10
 class IdentificationResult:
     """What one record says about the parameters of a robot, in the order of its `layout`; SI.
 
-    drive: the law of the drives; initial, warm_start, estimate, std (p,), covariance (p, p), the last two as they were
-    without bounds; intervals (p, 2): 95 %, cut at the bounds; identifiable (p,) bool; prior_share (p,): of the
-    variance, what errors of the starting guess make, and common_share (p,) by kind: what those that all poses of a
-    record have in common; groups, group_intervals: what the record says of the base parameters; base_rank: independent
-    groups that the trajectory excites by the paper's rule; iterations and evaluations: of all searches; stop_reason: of
-    the last; searches: their names in order, and costs: after each iteration, one tuple a search; active_bounds: what
-    holds the estimate back, as "platform.Izz <= Ixx + Iyy"; noise_ratio: mean squared whitened residual, to compare
-    with expected_noise_ratio, what the sensor's noise alone would leave, give or take noise_ratio_std; whiteness: test
-    of the residuals of the model driven by the logged commands.
+    drive: the law of the drives; initial, warm_start, estimate, std (p,), covariance (p, p), the
+    last two as they were without bounds; intervals (p, 2): 95 %, cut at the bounds; identifiable
+    (p,) bool; prior_share (p,): of the variance, what errors of the starting guess make, and
+    common_share (p,) by kind: what those that all poses of a record have in common; groups,
+    group_intervals: what the record says of the base parameters; base_rank: independent groups that
+    the trajectory excites by the paper's rule; iterations and evaluations: of all searches;
+    stop_reason: of the last; searches: their names in order, and costs: after each iteration, one
+    tuple a search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
+    noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the
+    sensor's noise alone would leave, give or take noise_ratio_std; whiteness: test of the residuals
+    of the model driven by the logged commands.
     """
 
     layout: ParameterLayout
@@ -75,7 +79,9 @@ class IdentificationResult:
 
     @property
     def rests_on_prior(self) -> NDArray[np.bool_]:
-        """Whether each parameter (p,) is identified only with what the starting guess says of others."""
+        """Whether each parameter (p,) is identified only with what the starting guess says of
+        others.
+        """
         return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
     @property
@@ -90,13 +96,17 @@ class IdentificationResult:
 
     def __repr__(self) -> str:
         return (
-            f"<IdentificationResult: {np.sum(self.identifiable)} of {len(self.names)} parameters and "
-            f"{np.sum(self.groups.identifiable)} of {len(self.groups.names)} groups identified in {self.iterations} "
+            f"<IdentificationResult: {np.sum(self.identifiable)} of {len(self.names)} parameters "
+            "and "
+            f"{np.sum(self.groups.identifiable)} of {len(self.groups.names)} groups identified in "
+            f"{self.iterations} "
             f"iterations, {self.misfit}, {len(self.warnings)} warnings>"
         )
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row a parameter: unit, initial, estimate, std, the interval from low to high, identifiable."""
+        """One row a parameter: unit, initial, estimate, std, the interval from low to high,
+        identifiable.
+        """
         import pandas as pd
 
         columns = {
@@ -112,18 +122,31 @@ class IdentificationResult:
 
     @property
     def whole_covariance(self) -> Array:
-        """Covariance (p + k, p + k) of the estimates, and behind them of what all poses have in common."""
+        """Covariance (p + k, p + k) of the estimates, and behind them of what all poses have in
+        common.
+        """
         common = self.common_errors
-        return np.block([[self.covariance, common.with_parameters], [common.with_parameters.T, common.covariance]])
+        return np.block(
+            [
+                [self.covariance, common.with_parameters],
+                [common.with_parameters.T, common.covariance],
+            ]
+        )
 
     def save(self, path: Path | str) -> None:
-        """Write a JSON file whose "identification" is that of a run's result.json; commands take its estimates."""
+        """Write a JSON file whose "identification" is that of a run's result.json; commands take
+        its estimates.
+        """
         save_result(path, {"identification": self.to_dict()})
 
     def to_dict(self) -> dict[str, Any]:
-        """Estimates with their uncertainty, for a JSON file; the true values, where known, are for others to add."""
+        """Estimates with their uncertainty, for a JSON file; the true values, where known, are for
+        others to add.
+        """
         common = self.common_errors
-        anchor, whiteness, identified = self.scale_anchor, self.whiteness, np.flatnonzero(self.identifiable)
+        anchor = self.scale_anchor
+        whiteness = self.whiteness
+        identified = np.flatnonzero(self.identifiable)
         correlations = correlation_matrix(self.covariance[np.ix_(identified, identified)])
         pairs = strongest_pairs(correlations, [self.names[k] for k in identified], STRONGEST)
         return {
@@ -135,7 +158,10 @@ class IdentificationResult:
             "searches": list(self.searches),
             "active_bounds": list(self.active_bounds),
             **{name: getattr(self, name) for name in MISFIT},
-            "whiteness": {"p_value": whiteness.p_value, "p_values": dict(zip(POSE, whiteness.p_values, strict=True))},
+            "whiteness": {
+                "p_value": whiteness.p_value,
+                "p_values": dict(zip(POSE, whiteness.p_values, strict=True)),
+            },
             "conditioning": asdict(self.conditioning),
             "strongest_correlations": pairs,
             "warnings": list(self.warnings),
@@ -149,8 +175,11 @@ class IdentificationResult:
         }
 
     def _drive(self) -> dict[str, Any]:
-        """The law of the drives, how probable each is, and which gains it has not; of a cascade its own gains."""
-        law, gains = self.drive.law, self.layout.joint_pid
+        """The law of the drives, how probable each is, and which gains it has not; of a cascade its
+        own gains.
+        """
+        law = self.drive.law
+        gains = self.layout.joint_pid
         entry: dict[str, Any] = {
             "law": law,
             "decided_by": "record" if self.drive.asked else "scenario",
@@ -164,7 +193,10 @@ class IdentificationResult:
             std = np.sqrt(np.diag(by_gains @ self.covariance[gains, gains] @ by_gains.T))
             units = "1/s", self.layout.unit("joint_pid.ld"), self.layout.unit("joint_pid.lp")
             rows = zip(own._fields, units, map(float, own), std.tolist(), strict=True)
-            entry["gains"] = {name: {"unit": unit, "estimate": value, "std": err} for name, unit, value, err in rows}
+            entry["gains"] = {
+                name: {"unit": unit, "estimate": value, "std": err}
+                for name, unit, value, err in rows
+            }
         return entry
 
     def _parameter(self, k: int) -> dict[str, Any]:
@@ -183,7 +215,8 @@ class IdentificationResult:
         }
 
     def _group(self, k: int) -> dict[str, Any]:
-        groups, row = self.groups, self.groups.combinations[k]
+        groups = self.groups
+        row = self.groups.combinations[k]
         return {
             "expression": groups.expressions[k],
             "coefficients": {self.names[i]: float(row[i]) for i in np.flatnonzero(row)},

@@ -1,12 +1,14 @@
-"""The scale anchor: poses alone leave one common factor of all parameters free, and something known fixes it.
+"""The scale anchor: poses alone leave one common factor of all parameters free, and something known
+fixes it.
 
-Multiplying every dynamic parameter and the three PID gains by the same number changes no pose of the closed loop
-(eq. 17 and 31). What fixes the factor is one of
+Multiplying every dynamic parameter and the three PID gains by the same number changes no pose of
+the closed loop (eq. 17 and 31). What fixes the factor is one of
 
     platform_mass   the platform was weighed
     joint_gain      the proportional gain of the joint PID is known
-    payload         a second run with a known load on the platform (`identify.record.payload`); the standard deviations
-                    of the load stand with that run, and widen the intervals (`load_error`)
+    payload         a second run with a known load on the platform (`identify.record.payload`); the
+                    standard deviations of the load stand with that run, and widen the intervals
+                    (`load_error`)
     prior           nothing but the starting guess, with its standard deviations
 """
 
@@ -26,7 +28,9 @@ MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid
 ANCHORS = (*MEASURED_PARAMETER, "payload", "prior")
 
 DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 5.0}
-"""Standard deviation of an ordinary platform balance [kg], and of a gain read from the controller's data, by units."""
+"""Standard deviation of an ordinary platform balance [kg], and of a gain read from the controller's
+data, by units.
+"""
 
 
 def default_std(name: str, layout: ParameterLayout) -> float:
@@ -36,14 +40,18 @@ def default_std(name: str, layout: ParameterLayout) -> float:
 
 @dataclass(frozen=True)
 class ScaleAnchor:
-    """What fixes the scale; value and std (SI) where it is a parameter measured on its own, else None."""
+    """What fixes the scale; value and std (SI) where it is a parameter measured on its own, else
+    None.
+    """
 
     name: str
     value: float | None = None
     std: float | None = None
 
     def row(self, layout: ParameterLayout) -> tuple[Array, Array]:
-        """What was measured as equations: rows (k, p) and right side (k,), in standard deviations; k is 0 or 1."""
+        """What was measured as equations: rows (k, p) and right side (k,), in standard deviations;
+        k is 0 or 1.
+        """
         if self.value is None or self.std is None:
             return np.zeros((0, len(layout.names))), np.zeros(0)
         row = np.zeros((1, len(layout.names)))
@@ -54,8 +62,8 @@ class ScaleAnchor:
 def measured_anchor(
     name: str, std: float | None, layout: ParameterLayout, true: Array, rng: np.random.Generator
 ) -> ScaleAnchor:
-    """The anchor as an experimenter with an instrument of standard deviation `std` (or the usual one) brings it, of a
-    robot whose true parameters (p,) are `true`."""
+    """The anchor as an experimenter with an instrument of standard deviation `std` (or the usual
+    one) brings it, of a robot whose true parameters (p,) are `true`."""
     if name not in MEASURED_PARAMETER:
         return ScaleAnchor(name)
     spread = default_std(name, layout) if std is None else std
@@ -73,13 +81,14 @@ def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
 def read_anchor(record: xr.Dataset, layout: ParameterLayout) -> ScaleAnchor:
     """The anchor's measurement of a record of a robot.
 
-    Raises RecordError: the record has none, so that the scale of its parameters is free; or a measured value or
-    standard deviation that is no finite number > 0.
+    Raises RecordError: the record has none, so that the scale of its parameters is free; or a
+    measured value or standard deviation that is no finite number > 0.
     """
     name = record.attrs.get("scale_anchor")
     if name not in ANCHORS:
         raise RecordError(
-            f"the record holds no scale anchor (attributes scale_anchor, scale_anchor_value, scale_anchor_std), found "
+            "the record holds no scale anchor (attributes scale_anchor, scale_anchor_value, "
+            "scale_anchor_std), found "
             f"{shown(name)}; valid anchors: {', '.join(ANCHORS)}"
         )
     if name not in MEASURED_PARAMETER:

@@ -1,1 +1,3 @@
-"""Estimators on the same record, the project's own and those of the literature; none sees sensor or truth."""
+"""Estimators on the same record, the project's own and those of the literature; none sees sensor or
+truth.
+"""

@@ -1,18 +1,21 @@
-"""Inverse dynamics where the regression matrix has errors, too: instrumental variables and total least squares.
+"""Inverse dynamics where the regression matrix has errors, too: instrumental variables and total
+least squares.
 
-Instrumental variables Z are the same matrix built from a simulated run of the present model, which is free of the
-measurement's noise and correlated with the true motion: Z^T (W x - tau) = 0 is not biased where least squares is
-(Janot, Vandanjon, Gautier, "A generic instrumental variable approach for industrial robot identification", IEEE TCST
-22(1), 2014). The model closes its own loop: logged commands would carry the sensor's noise into the instruments.
+Instrumental variables Z are the same matrix built from a simulated run of the present model, which
+is free of the measurement's noise and correlated with the true motion: Z^T (W x - tau) = 0 is not
+biased where least squares is (Janot, Vandanjon, Gautier, "A generic instrumental variable approach
+for industrial robot identification", IEEE TCST 22(1), 2014). The model closes its own loop: logged
+commands would carry the sensor's noise into the instruments.
 
-Plain total least squares takes the errors of all columns as alike and independent; here they come from the same poses
-through derivatives. So their second moments are drawn: the poses are disturbed by the sensor's noise, and the columns
-follow. Of all x~ = (x, -1) the estimate minimises |A x~|^2 / |E x~|^2, with A = (W | tau) and E the drawn errors of
-A: with A = Q R, the last right singular vector of E R^-1 turned round (generalised total least squares, Van Huffel and
-Vandewalle, "The total least squares problem", SIAM 1991, chapter 10). Directions that the motion does not show
-better than the starting guess are left there first (truncation), for the noise would otherwise rule them. All this
-removes the bias, not the spread: where the errors are large the normal matrix less theirs is nearly singular, and the
-deviations say so.
+Plain total least squares takes the errors of all columns as alike and independent; here they come
+from the same poses through derivatives. So their second moments are drawn: the poses are disturbed
+by the sensor's noise, and the columns follow. Of all x~ = (x, -1) the estimate minimises |A x~|^2 /
+|E x~|^2, with A = (W | tau) and E the drawn errors of A: with A = Q R, the last right singular
+vector of E R^-1 turned round (generalised total least squares, Van Huffel and Vandewalle, "The
+total least squares problem", SIAM 1991, chapter 10). Directions that the motion does not show
+better than the starting guess are left there first (truncation), for the noise would otherwise rule
+them. All this removes the bias, not the spread: where the errors are large the normal matrix less
+theirs is nearly singular, and the deviations say so.
 """
 
 import time
@@ -47,33 +50,42 @@ SETTLED = 0.05
 
 @estimator("torque, IV", uses="poses, torque")
 def instrumental_variables(evidence: Evidence) -> Estimate:
-    """Instruments from the simulated run of the present estimate, starting at weighted least squares.
+    """Instruments from the simulated run of the present estimate, starting at weighted least
+    squares.
 
     Raises EstimationError where the model of an estimate does not run.
     """
     began = time.perf_counter()
-    equations, guess = measured_equations(evidence), evidence.problem.guess
+    equations = measured_equations(evidence)
+    guess = evidence.problem.guess
     unknowns, noise = fit_equations(equations, guess, weighted=True)
     count = len(guess.values)
-    runs, moved = 0, np.array([np.inf])
+    runs = 0
+    moved = np.array([np.inf])
     while moved.max() > SETTLED and runs < MAX_ITERATIONS:
         instruments = _simulated_matrix(evidence, equations, unknowns[:count])
         new, covariance = iv_fit(equations, instruments, noise, guess)
         moved = np.abs(new - unknowns)[:count] / standard_deviations(covariance, count)
-        unknowns, noise, runs = new, row_noise(equations, new, equations.kind), runs + 1
+        unknowns = new
+        noise = row_noise(equations, new, equations.kind)
+        runs = runs + 1
     seconds = time.perf_counter() - began
     note = f"last step {moved.max():.2g} standard deviations"
     std = standard_deviations(covariance, count)
     return Estimate(unknowns[:count], std, seconds, REWEIGHTINGS + runs, runs, note)
 
 
-def iv_fit(equations: TorqueEquations, instruments: Array, noise: Array, guess: StartingGuess) -> tuple[Array, Array]:
-    """Unknowns (u,) with Z^T (W x - tau) = 0 in whitened rows, beside the starting guess, and their covariance.
+def iv_fit(
+    equations: TorqueEquations, instruments: Array, noise: Array, guess: StartingGuess
+) -> tuple[Array, Array]:
+    """Unknowns (u,) with Z^T (W x - tau) = 0 in whitened rows, beside the starting guess, and their
+    covariance.
 
     instruments: Z (2 n, u); noise (2 n,): standard deviations of the rows, N m or N.
     """
     values, std = prior_of(guess)
-    rows, z = equations.whitened(noise), instruments / noise[:, None]
+    rows = equations.whitened(noise)
+    z = instruments / noise[:, None]
     prior = np.eye(len(std))
     # In units of the starting guess's deviations, so that the prior is the identity.
     normal = (z.T @ rows.matrix) * np.outer(std, std) + prior
@@ -90,9 +102,13 @@ def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters
     try:
         simulated = evidence.run.simulate(parameters)
     except DynamicsError as error:
-        raise EstimationError(f"no instruments: the model of the present estimate does not run: {error}") from None
+        raise EstimationError(
+            f"no instruments: the model of the present estimate does not run: {error}"
+        ) from None
     noise_free = replace(evidence.run, logged=simulated.command)
-    return torque_equations(noise_free, simulated.pose, simulated.torque, evidence.scenario, equations.slipping).matrix
+    return torque_equations(
+        noise_free, simulated.pose, simulated.torque, evidence.scenario, equations.slipping
+    ).matrix
 
 
 DRAWS = 4
@@ -102,7 +118,9 @@ SHOWN = 3.0
 """A direction counts as shown by the motion when it is known this many times better than before."""
 
 NOT_GENERIC = 1e-12
-"""Part of the right side in the singular vector, relative to its largest entry, below which there is no solution."""
+"""Part of the right side in the singular vector, relative to its largest entry, below which there
+is no solution.
+"""
 
 
 @estimator("torque, total LS", uses="poses, torque")
@@ -112,15 +130,23 @@ def total_least_squares(evidence: Evidence) -> Estimate:
     Raises EstimationError where a solution is not generic: the torque column has no part in it.
     """
     began = time.perf_counter()
-    equations, guess = measured_equations(evidence), evidence.problem.guess
+    equations = measured_equations(evidence)
+    guess = evidence.problem.guess
     _, noise = fit_equations(equations, guess, weighted=True)
     errors = _drawn_errors(evidence, equations, noise)
     values, std = prior_of(guess)
-    rows, half = equations.whitened(noise), len(noise) // 2
-    unknowns, deviations = values.copy(), std.copy()
-    dynamic, count = guess.layout.dynamic, len(guess.values)
-    for block, columns in ((slice(0, half), dynamic), (slice(half, None), slice(dynamic.stop, len(std)))):
-        matrix, right = rows.matrix[block, columns], rows.right[block]
+    rows = equations.whitened(noise)
+    half = len(noise) // 2
+    unknowns = values.copy()
+    deviations = std.copy()
+    dynamic = guess.layout.dynamic
+    count = len(guess.values)
+    for block, columns in (
+        (slice(0, half), dynamic),
+        (slice(half, None), slice(dynamic.stop, len(std))),
+    ):
+        matrix = rows.matrix[block, columns]
+        right = rows.right[block]
         solution, covariance = _fit_block(matrix, right, errors[:, block], columns, values, std)
         unknowns[columns] += std[columns] * solution
         deviations[columns] *= np.sqrt(np.diag(covariance))
@@ -130,12 +156,12 @@ def total_least_squares(evidence: Evidence) -> Estimate:
 
 
 def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Array]:
-    """x (p,) of matrix (n, p) x = right (n,) by generalised total least squares in the directions shown, and its
-    covariance (p, p) to first order.
+    """x (p,) of matrix (n, p) x = right (n,) by generalised total least squares in the directions
+    shown, and its covariance (p, p) to first order.
 
-    Rows have the standard deviation 1, and nothing beyond 0 with deviation 1 is known of x beforehand.
-    errors (draws, n, p + 1): drawn errors of (matrix | right).
-    Raises EstimationError where the right side has no part in the smallest singular vector.
+    Rows have the standard deviation 1, and nothing beyond 0 with deviation 1 is known of x
+    beforehand. errors (draws, n, p + 1): drawn errors of (matrix | right). Raises EstimationError
+    where the right side has no part in the smallest singular vector.
     """
     size = matrix.shape[1]
     _, singular, directions = np.linalg.svd(matrix, full_matrices=False)
@@ -149,7 +175,8 @@ def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Ar
     vector = np.linalg.solve(triangle, vectors[0])
     if abs(vector[-1]) < NOT_GENERIC * np.abs(vector).max():
         raise EstimationError(
-            f"total least squares is not generic: the right side has a part of {vector[-1]:.1e} in a solution of size "
+            f"total least squares is not generic: the right side has a part of {vector[-1]:.1e} "
+            "in a solution of size "
             f"{np.abs(vector).max():.1e}"
         )
     solution = -shown.T @ (vector[:-1] / vector[-1])
@@ -166,17 +193,27 @@ def _fit_block(
     block = errors[..., [*range(len(std))[columns], -1]]
     block[..., -1] -= block[..., :-1] @ values[columns]
     scale = std[columns]
-    return truncated_tls(matrix * scale, right - matrix @ values[columns], block * np.append(scale, 1.0))
+    return truncated_tls(
+        matrix * scale, right - matrix @ values[columns], block * np.append(scale, 1.0)
+    )
 
 
 def _drawn_errors(evidence: Evidence, equations: TorqueEquations, noise: Array) -> Array:
-    """Errors (draws, 2 n, u + 1) of the whitened columns and right side, from drawn noise of poses and torques."""
-    rng, run, channels = mixed_generator(DISTURBED_COPIES), evidence.run, evidence.joint_channels()
-    factor, poses, drawn = np.linalg.cholesky(run.covariance), run.without_gaps(), []
+    """Errors (draws, 2 n, u + 1) of the whitened columns and right side, from drawn noise of poses
+    and torques.
+    """
+    rng = mixed_generator(DISTURBED_COPIES)
+    run = evidence.run
+    channels = evidence.joint_channels()
+    factor = np.linalg.cholesky(run.covariance)
+    poses = run.without_gaps()
+    drawn = []
     for _ in range(DRAWS):
         moved = poses + rng.standard_normal(poses.shape) @ factor.T
         read = channels.torque + channels.torque_std * rng.standard_normal(channels.torque.shape)
         other = torque_equations(run, moved, read, evidence.scenario, equations.slipping)
-        differences = np.column_stack([other.matrix - equations.matrix, other.right - equations.right])
+        differences = np.column_stack(
+            [other.matrix - equations.matrix, other.right - equations.right]
+        )
         drawn.append(differences / noise[:, None])
     return np.stack(drawn)

@@ -1,27 +1,31 @@
 """What an estimator is: what it is given, what it gives back, and all of them by name.
 
-An estimator is a function (evidence) -> Estimate, named in `identify.plugins` or given as ``module:function``; the
-decorator `estimator` says in words what it is.
+An estimator is a function (evidence) -> Estimate, named in `identify.plugins` or given as
+``module:function``; the decorator `estimator` says in words what it is.
 """
 
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation.output_error import OutputErrorProblem
-from identify.plugins import ESTIMATORS, check_choice, chosen, is_own
-from identify.record.recorded_run import RecordedRun
+from identify.model.loop_model import LoopModel
+from identify.plugins import ESTIMATORS, Telling, check_choice, chosen, is_own
 from identify.scenario import Scenario
 
 
 @dataclass(frozen=True)
 class JointChannels:
-    """Channels of n joints: torque (N, n) in N m or N, mean over a frame, and encoder angle (N, n) in rad or m."""
+    """Channels of n joints: torque (N, n) in N m or N, mean over a frame, and encoder angle (N, n)
+    in rad or m.
+    """
 
     torque: Array
     angle: Array
@@ -30,8 +34,9 @@ class JointChannels:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that an estimator may use: the record as an output-error problem, with starting guess and scale anchor;
-    channels of the joints where there are any; gains of the joint PID (lp, li, ld) where they are known."""
+    """All that an estimator may use: the record as an output-error problem, with starting guess and
+    scale anchor; channels of the joints where there are any; gains of the joint PID (lp, li, ld)
+    where they are known."""
 
     problem: OutputErrorProblem
     scenario: Scenario
@@ -39,22 +44,24 @@ class Evidence:
     known_gains: Array | None = None
 
     @property
-    def run(self) -> RecordedRun:
+    def run(self) -> LoopModel:
         """The record. The estimators of this package that use the joints take one only."""
         return self.problem.runs[0]
 
     def joint_channels(self) -> JointChannels:
         """The channels. Raises EstimationError where the record has none."""
         if self.channels is None:
-            raise EstimationError("the record has no joint channels: this estimator needs a measured torque")
+            raise EstimationError(
+                "the record has no joint channels: this estimator needs a measured torque"
+            )
         return self.channels
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters (p,) with standard deviations (p,) (None: the method states none), seconds without those of the
-    standard deviations, iterations (searches: steps; linear fits: solutions), evaluations: simulated runs of the model,
-    those with sensitivities counted once."""
+    """Parameters (p,) with standard deviations (p,) (None: the method states none), seconds without
+    those of the standard deviations, iterations (searches: steps; linear fits: solutions),
+    evaluations: simulated runs of the model, those with sensitivities counted once."""
 
     parameters: Array
     std: Array | None
@@ -66,7 +73,9 @@ class Estimate:
 
 @dataclass(eq=False)
 class Estimator:
-    """An estimator: what it is in words, what it uses beside the commands, and the function, as which it is called."""
+    """An estimator: what it is in words, what it uses beside the commands, and the function, as
+    which it is called.
+    """
 
     title: str
     uses: str
@@ -76,7 +85,9 @@ class Estimator:
         functools.update_wrapper(self, self.estimate)
 
     def __call__(self, evidence: Evidence) -> Estimate:
-        """The function's estimate. Raises EstimationError, or dynamics.DynamicsError, where there is none."""
+        """The function's estimate. Raises EstimationError, or dynamics.DynamicsError, where there
+        is none.
+        """
         return self.estimate(evidence)
 
 
@@ -86,7 +97,8 @@ def estimator(title: str, uses: str) -> Callable[[Callable[[Evidence], Estimate]
 
 
 def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
-    """The built-in estimators of these names, or all, in the order of their table; then those of a user's own.
+    """The built-in estimators of these names, or all, in the order of their table; then those of a
+    user's own.
 
     Raises ScenarioError for one that does not exist, with the valid names, or cannot be imported.
     """
@@ -95,8 +107,33 @@ def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
     wanted = [name for name in ESTIMATORS if not names or name in names] + [
         name for name in names or () if is_own(name)
     ]
-    found = {name: chosen(name, "estimator", ESTIMATORS) for name in wanted}
-    return {name: one if isinstance(one, Estimator) else Estimator(name, "", one) for name, one in found.items()}
+    return {name: _found(name) for name in wanted}
+
+
+def _found(name: str) -> Estimator:
+    found = chosen(name, "estimator", ESTIMATORS)
+    return found if isinstance(found, Estimator) and not is_own(name) else _own(name, found)
+
+
+def _own(name: str, function: Callable[..., Any]) -> Estimator:
+    """Estimator of a user's own, of which all that goes wrong is an EstimationError in a line."""
+    known = (EstimationError, DynamicsError)
+    told = Telling(f"estimator {name!r}", function, EstimationError, known, _check_estimate)
+    title = getattr(function, "title", name)
+    return Estimator(title, getattr(function, "uses", ""), told)
+
+
+def _check_estimate(part: str, found: object, evidence: Evidence) -> None:
+    """Raise EstimationError unless an estimator of a user's own has returned what it should."""
+    if not isinstance(found, Estimate):
+        raise EstimationError(f"{part} must return an Estimate, returned {type(found).__name__}")
+    shape = np.shape(evidence.problem.guess.values)
+    for name in ("parameters", "std"):
+        values = getattr(found, name)
+        if name == "std" and values is None:
+            continue
+        if np.shape(values) != shape or not np.isfinite(np.asarray(values, dtype=float)).all():
+            raise EstimationError(f"{part} must return finite {name} {shape}")
 
 
 TORQUE_NOISE = ("torque_noise_N_m", "force_noise_N")
@@ -108,13 +145,19 @@ def joint_channels(channels: xr.Dataset, record: xr.Dataset) -> JointChannels:
 
     Raises RecordError where the two were not recorded at the same instants.
     """
-    ours, theirs = record["time"].values, channels["time"].values
+    ours = record["time"].values
+    theirs = channels["time"].values
     if len(ours) != len(theirs) or np.abs(ours - theirs).max() > 1e-9:
         raise RecordError(
-            f"the joint channels have {len(theirs)} frames up to t = {theirs[-1]:.3f} s, the record {len(ours)} up to "
+            f"the joint channels have {len(theirs)} frames up to t = {theirs[-1]:.3f} s, the "
+            f"record {len(ours)} up to "
             f"{ours[-1]:.3f} s: they are of another run"
         )
-    torque, angle = (np.asarray(channels[name].values, dtype=float) for name in ("joint_torque", "joint_angle"))
+    torque, angle = (
+        np.asarray(channels[name].values, dtype=float) for name in ("joint_torque", "joint_angle")
+    )
     return JointChannels(
-        torque, angle, next(float(channels.attrs[name]) for name in TORQUE_NOISE if name in channels.attrs)
+        torque,
+        angle,
+        next(float(channels.attrs[name]) for name in TORQUE_NOISE if name in channels.attrs),
     )

@@ -1,16 +1,18 @@
-"""Inverse dynamics by least squares: measured torque, ordinary and weighted; or joint coordinates from encoders.
+"""Inverse dynamics by least squares: measured torque, ordinary and weighted; or joint coordinates
+from encoders.
 
 With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 25; eq. 31)
 
     (J_ad^-T Gamma(chi, v, v_dot) Xi)_j = tau_j
     lp (U - theta)_j + li integral(U - theta)_j + ld (U_dot - theta_dot)_j + z_j = tau_j
 
-Both stand in one system with the unknowns Xi, lp, li, ld and the starting torques z (n,). The measured torque gives
-the scale: no anchor is needed. What the motion does not show is left to the starting guess with its deviations.
+Both stand in one system with the unknowns Xi, lp, li, ld and the starting torques z (n,). The
+measured torque gives the scale: no anchor is needed. What the motion does not show is left to the
+starting guess with its deviations.
 
-Noise in the poses gets into the regression matrix through both derivatives, which draws the estimates towards zero: no
-number of samples removes that bias. Weights, from what each joint leaves unexplained: Gautier, "Dynamic identification
-of robots with power model", ICRA 1997.
+Noise in the poses gets into the regression matrix through both derivatives, which draws the
+estimates towards zero: no number of samples removes that bias. Weights, from what each joint leaves
+unexplained: Gautier, "Dynamic identification of robots with power model", ICRA 1997.
 """
 
 import time
@@ -29,23 +31,23 @@ from identify.estimation.scale_anchor import ScaleAnchor
 from identify.estimation.warm_start import REWEIGHTINGS, bounded_fit, joint_balance
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter
-from identify.record.recorded_run import RecordedRun
+from identify.model.loop_model import LoopModel
 from identify.scenario import Scenario
 
 FREE_TORQUE = {False: 1e3, True: 1e6}
-"""Standard deviation of a starting torque [N m], or of a force [N] of prismatic joints, before the experiment: nothing
-is known of it."""
+"""Standard deviation of a starting torque [N m], or of a force [N] of prismatic joints, before the
+experiment: nothing is known of it."""
 
 
 @dataclass(frozen=True)
 class TorqueEquations:
-    """matrix (2 n, u) times the u unknowns = right (2 n,), N m or N: n rows of the dynamics, then the same of the
-    controller.
+    """matrix (2 n, u) times the u unknowns = right (2 n,), N m or N: n rows of the dynamics, then
+    the same of the controller.
 
-    layout: of the parameters, the first unknowns; after them come the starting torques of the joints. kind (2 n,):
-    number of the joint for its dynamics, and that after all joints for its controller; correlation: samples to one
-    independent sample, because a low-pass filter of cutoff f leaves 2 f independent ones a second; slipping (N,
-    joints): which rows stand here.
+    layout: of the parameters, the first unknowns; after them come the starting torques of the
+    joints. kind (2 n,): number of the joint for its dynamics, and that after all joints for its
+    controller; correlation: samples to one independent sample, because a low-pass filter of cutoff
+    f leaves 2 f independent ones a second; slipping (N, joints): which rows stand here.
     """
 
     layout: ParameterLayout
@@ -66,18 +68,27 @@ class TorqueEquations:
 
 
 def torque_equations(
-    run: RecordedRun, poses: Array, torque: Array, scenario: Scenario, slipping: NDArray[np.bool_] | None = None
+    run: LoopModel,
+    poses: Array,
+    torque: Array,
+    scenario: Scenario,
+    slipping: NDArray[np.bool_] | None = None,
 ) -> TorqueEquations:
-    """Equations of poses (N, 6) and torques (N, n) of a run with its logged commands; those of the joints that slip, or
-    of the ones given (N, n)."""
-    timing, filtering = scenario.timing, scenario.filter
-    layout, guess = run.robot.layout, run.robot.parameter_sets[scenario.model.start_parameters]
+    """Equations of poses (N, 6) and torques (N, n) of a run with its logged commands; those of the
+    joints that slip, or of the ones given (N, n)."""
+    timing = scenario.timing
+    filtering = scenario.filter
+    layout = run.robot.layout
+    guess = run.robot.parameter_sets[scenario.model.start_parameters]
     law = run.settings.drives.joint_law(guess.joint_pid)
     balance, found = joint_balance(run.robot, poses, run.logged, scenario, law, run.latencies)
     rows = found if slipping is None else slipping
     columns = balance[rows]
-    smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)[rows]
-    dynamic, others = layout.dynamic, slice(layout.dynamic.stop, None)
+    smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)[
+        rows
+    ]
+    dynamic = layout.dynamic
+    others = slice(layout.dynamic.stop, None)
     matrix = np.zeros((2 * len(columns), columns.shape[1]))
     matrix[: len(columns), dynamic] = columns[:, dynamic]
     matrix[len(columns) :, others] = -columns[:, others]
@@ -95,17 +106,24 @@ def lower_bounds(layout: ParameterLayout) -> Array:
 
 def prior_of(guess: StartingGuess) -> tuple[Array, Array]:
     """Values (u,) and standard deviations (u,) of the unknowns before the experiment."""
-    joints, free = guess.layout.joints, FREE_TORQUE[guess.layout.prismatic]
+    joints = guess.layout.joints
+    free = FREE_TORQUE[guess.layout.prismatic]
     return np.append(guess.values, np.zeros(joints)), np.append(guess.std, np.full(joints, free))
 
 
-def nearest_admissible(layout: ParameterLayout, unknowns: Array, information: Array, scale: Array) -> Array:
-    """Unknowns (u,) within their bounds that are nearest in the metric of the information matrix (u, u)."""
+def nearest_admissible(
+    layout: ParameterLayout, unknowns: Array, information: Array, scale: Array
+) -> Array:
+    """Unknowns (u,) within their bounds that are nearest in the metric of the information matrix
+    (u, u).
+    """
     lower = lower_bounds(layout)
     if (unknowns >= lower).all():
         return unknowns
     factor = np.linalg.cholesky(information * np.outer(scale, scale)).T
-    solved = lsq_linear(factor, factor @ (unknowns / scale), bounds=(lower / scale, np.inf), method="bvls")
+    solved = lsq_linear(
+        factor, factor @ (unknowns / scale), bounds=(lower / scale, np.inf), method="bvls"
+    )
     return np.maximum(solved.x * scale, lower)
 
 
@@ -126,13 +144,16 @@ def weighted_least_squares(evidence: Evidence) -> Estimate:
 
 @estimator("encoders, weighted LS", uses="encoders, torque")
 def encoder_route(evidence: Evidence) -> Estimate:
-    """Weighted least squares on the poses that the encoders give, by forward kinematics: the conventional route.
+    """Weighted least squares on the poses that the encoders give, by forward kinematics: the
+    conventional route.
 
-    Forward kinematics of a parallel robot has no closed form: Newton's method solves all instants at once, each from
-    the desired pose there, which the robot is never far from. Knows nothing of the camera. The note says what it took.
-    Raises EstimationError where the angles belong to no pose near the desired one.
+    Forward kinematics of a parallel robot has no closed form: Newton's method solves all instants
+    at once, each from the desired pose there, which the robot is never far from. Knows nothing of
+    the camera. The note says what it took. Raises EstimationError where the angles belong to no
+    pose near the desired one.
     """
-    began, run = time.perf_counter(), evidence.run
+    began = time.perf_counter()
+    run = evidence.run
     try:
         poses = run.robot.forward_kinematics(evidence.joint_channels().angle, run.reference.poses)
     except DynamicsError as error:
@@ -141,12 +162,19 @@ def encoder_route(evidence: Evidence) -> Estimate:
     return replace(_solved(evidence, began, weighted=True, poses=poses), note=note)
 
 
-def _solved(evidence: Evidence, began: float, weighted: bool, poses: Array | None = None) -> Estimate:
-    """The estimate of a fit that began at `began` (`time.perf_counter`), from the measured poses or others (N, 6)."""
-    equations, guess = measured_equations(evidence, poses), evidence.problem.guess
+def _solved(
+    evidence: Evidence, began: float, weighted: bool, poses: Array | None = None
+) -> Estimate:
+    """The estimate of a fit that began at `began` (`time.perf_counter`), from the measured poses or
+    others (N, 6).
+    """
+    equations = measured_equations(evidence, poses)
+    guess = evidence.problem.guess
     unknowns, noise = fit_equations(equations, guess, weighted)
     seconds = time.perf_counter() - began
-    covariance = np.asarray(np.linalg.inv(information(equations.whitened(noise), guess)), dtype=float)
+    covariance = np.asarray(
+        np.linalg.inv(information(equations.whitened(noise), guess)), dtype=float
+    )
     count = len(guess.values)
     return Estimate(unknowns[:count], standard_deviations(covariance, count), seconds, REWEIGHTINGS)
 
@@ -156,26 +184,36 @@ def measured_equations(evidence: Evidence, poses: Array | None = None) -> Torque
 
     Raises EstimationError where the record has no torque.
     """
-    run, torque = evidence.run, evidence.joint_channels().torque
-    return torque_equations(run, run.without_gaps() if poses is None else poses, torque, evidence.scenario)
+    run = evidence.run
+    torque = evidence.joint_channels().torque
+    return torque_equations(
+        run, run.without_gaps() if poses is None else poses, torque, evidence.scenario
+    )
 
 
-def fit_equations(equations: TorqueEquations, guess: StartingGuess, weighted: bool) -> tuple[Array, Array]:
+def fit_equations(
+    equations: TorqueEquations, guess: StartingGuess, weighted: bool
+) -> tuple[Array, Array]:
     """Unknowns (u,) of the equations, and the standard deviation (2 n,) of the rows, N m or N.
 
-    The deviations come from the residuals, of a joint or of all, and count the filter's correlation.
+    The deviations come from the residuals, of a joint or of all, and count the filter's
+    correlation.
     """
     groups = equations.kind if weighted else equations.kind // equations.layout.joints
     noise = np.full(len(equations.right), 0.1)
     for _ in range(REWEIGHTINGS):
         rows = equations.whitened(noise)
-        unknowns = bounded_fit(rows.matrix, rows.right, guess, ScaleAnchor("prior"), lower_bounds(guess.layout))
+        unknowns = bounded_fit(
+            rows.matrix, rows.right, guess, ScaleAnchor("prior"), lower_bounds(guess.layout)
+        )
         noise = row_noise(equations, unknowns, groups)
     return unknowns, noise
 
 
 def row_noise(equations: TorqueEquations, unknowns: Array, groups: NDArray[np.intp]) -> Array:
-    """Standard deviation (2 n,) of each row: the RMS residual of its group, as if all samples were independent."""
+    """Standard deviation (2 n,) of each row: the RMS residual of its group, as if all samples were
+    independent.
+    """
     squares = equations.residual(unknowns) ** 2
     rms = np.sqrt(np.bincount(groups, squares) / np.maximum(np.bincount(groups), 1))
     return np.maximum(rms, SMALLEST_NOISE_N_M)[groups] * np.sqrt(equations.correlation)
@@ -188,5 +226,7 @@ def information(rows: TorqueEquations, guess: StartingGuess) -> Array:
 
 
 def standard_deviations(covariance: Array, count: int) -> Array:
-    """Standard deviations (p,) of the first `count` unknowns, the parameters, from a covariance (u, u) of all."""
+    """Standard deviations (p,) of the first `count` unknowns, the parameters, from a covariance (u,
+    u) of all.
+    """
     return np.asarray(np.sqrt(np.diag(covariance))[:count], dtype=float)

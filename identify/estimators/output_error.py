@@ -1,4 +1,6 @@
-"""Output error in its variants: the paper's, driven by the logged commands, with known gains; and its warm start."""
+"""Output error in its variants: the paper's, driven by the logged commands, with known gains; and
+its warm start.
+"""
 
 import time
 from dataclasses import replace
@@ -20,7 +22,9 @@ KNOWN = 1e-6
 
 @estimator("output error, unknown PID", uses="poses")
 def closed_loop(evidence: Evidence) -> Estimate:
-    """Closed-loop output error with unknown PID, as in the paper; warm start and command-driven search before it."""
+    """Closed-loop output error with unknown PID, as in the paper; warm start and command-driven
+    search before it.
+    """
     return _searched(evidence, evidence.problem, "closed_loop")
 
 
@@ -32,11 +36,17 @@ def command_driven(evidence: Evidence) -> Estimate:
 
 @estimator("output error, known PID", uses="poses, gains")
 def known_pid(evidence: Evidence) -> Estimate:
-    """Closed-loop output error with the joint PID's gains known. Raises EstimationError where they are not."""
+    """Closed-loop output error with the joint PID's gains known. Raises EstimationError where they
+    are not.
+    """
     if evidence.known_gains is None:
-        raise EstimationError("the gains of the joint PID are not known: this estimator needs lp, li and ld")
+        raise EstimationError(
+            "the gains of the joint PID are not known: this estimator needs lp, li and ld"
+        )
     guess = evidence.problem.guess
-    values, std, gains = guess.values.copy(), guess.std.copy(), guess.layout.joint_pid
+    values = guess.values.copy()
+    std = guess.std.copy()
+    gains = guess.layout.joint_pid
     read = ~guess.fixed[gains]
     values[gains] = np.where(read, evidence.known_gains, 0.0)
     std[gains] = np.where(read, KNOWN * np.abs(evidence.known_gains), std[gains])
@@ -46,7 +56,9 @@ def known_pid(evidence: Evidence) -> Estimate:
 
 @estimator("linear warm start alone", uses="poses")
 def warm_start_alone(evidence: Evidence) -> Estimate:
-    """The linear closed-loop equation with the logged commands, solved once; no standard deviations."""
+    """The linear closed-loop equation with the logged commands, solved once; no standard
+    deviations.
+    """
     began = time.perf_counter()
     parameters = linear_warm_start(evidence.problem, evidence.scenario)
     return Estimate(parameters, None, time.perf_counter() - began, REWEIGHTINGS, 0)
@@ -57,7 +69,13 @@ def _searched(evidence: Evidence, problem: OutputErrorProblem, method: str) -> E
     scenario = evidence.scenario.with_overrides({"identification.method": method})
     warm = linear_warm_start(problem, evidence.scenario)
     found = list(output_error_searches(problem, scenario, warm, SilentProgress()).values())
-    seconds, last = time.perf_counter() - began, found[-1].solution
-    std = estimate_uncertainty(found[-1].linearised(), last.parameters, mixed_generator(ROUTES_UNCERTAINTY)).std
-    counts = sum(one.solution.iterations for one in found), sum(one.solution.evaluations for one in found)
+    seconds = time.perf_counter() - began
+    last = found[-1].solution
+    std = estimate_uncertainty(
+        found[-1].linearised(), last.parameters, mixed_generator(ROUTES_UNCERTAINTY)
+    ).std
+    counts = (
+        sum(one.solution.iterations for one in found),
+        sum(one.solution.evaluations for one in found),
+    )
     return Estimate(last.parameters, std, seconds, *counts, last.stop_reason)

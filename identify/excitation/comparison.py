@@ -1,4 +1,6 @@
-"""The methods of excitation side by side: same criterion, same seed, same random candidates; with a figure."""
+"""The methods of excitation side by side: same criterion, same seed, same random candidates; with a
+figure.
+"""
 
 import time
 from dataclasses import dataclass
@@ -27,9 +29,10 @@ COMPARISON_REFINEMENT = 10
 
 @dataclass(frozen=True)
 class Entry:
-    """What one method found: trajectory, value of the criterion that it maximised, the index of eq. 39, D of the
-    simulated loop (None where it is unstable at the starting guess), seconds of the search, counts of the criterion and
-    of its gradient, iterations, why it stopped, and where it comes nearest to each limit."""
+    """What one method found: trajectory, value of the criterion that it maximised, the index of eq.
+    39, D of the simulated loop (None where it is unstable at the starting guess), seconds of the
+    search, counts of the criterion and of its gradient, iterations, why it stopped, and where it
+    comes nearest to each limit."""
 
     method: str
     trajectory: FourierTrajectory
@@ -46,7 +49,9 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The entries of all methods; the seconds that making candidates and functions took once for all of them."""
+    """The entries of all methods; the seconds that making candidates and functions took once for
+    all of them.
+    """
 
     criterion: str
     seed: int
@@ -63,28 +68,45 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
         prepare(robot)
         advance()
     began = time.perf_counter()
-    scenario = scenario.with_overrides({"excitation.method": "gradient", "excitation.candidates": count})
+    scenario = scenario.with_overrides(
+        {"excitation.method": "gradient", "excitation.candidates": count}
+    )
     check = motion_check(robot, scenario)
     with progress.stage("random candidates", 1) as advance:
         candidates = random_candidates(robot, scenario, count, seed, check)
         problem = search_problem(robot, scenario, candidates)
-        index = log_observability(robot, problem.unknowns, settings.duration_s, problem.candidates[0])
+        index = log_observability(
+            robot, problem.unknowns, settings.duration_s, problem.candidates[0]
+        )
         advance()
-    known, prepared = knowledge(robot, scenario), time.perf_counter() - began
+    known = knowledge(robot, scenario)
+    prepared = time.perf_counter() - began
     times = sample_times(settings.fundamental_hz, settings.harmonics, COMPARISON_REFINEMENT)
     entries = []
     for method, search in SEARCHES.items():
         began = time.perf_counter()
         found = search(problem, child(seed, SEARCH), progress)
-        seconds, trajectory = time.perf_counter() - began, found.trajectory(problem)
+        seconds = time.perf_counter() - began
+        trajectory = found.trajectory(problem)
         try:
             information = float(np.exp(log_information(robot, scenario, known, trajectory)))
         except TrajectoryError:
             information = None
-        value, observability = float(np.exp(found.log_value)), observability_index(index, found.z)
+        value = float(np.exp(found.log_value))
+        observability = observability_index(index, found.z)
         counts = found.evaluations, found.gradients, found.iterations
         worst = tuple(problem.constraints.worst(trajectory, times))
-        entry = Entry(method, trajectory, value, observability, information, seconds, *counts, found.reason, worst)
+        entry = Entry(
+            method,
+            trajectory,
+            value,
+            observability,
+            information,
+            seconds,
+            *counts,
+            found.reason,
+            worst,
+        )
         entries.append(entry)
     return Comparison(settings.criterion, seed, count, prepared, tuple(entries))
 
@@ -116,14 +138,23 @@ def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) 
             for sign in (-1, 1):
                 axes.axhline(sign * limit, color="black", linestyle="--", linewidth=0.8)
             axes.grid(alpha=0.3)
-        panels[0, column].set_title(f"{entry.method}: index {entry.observability:.3f}, {entry.seconds:.1f} s")
+        panels[0, column].set_title(
+            f"{entry.method}: index {entry.observability:.3f}, {entry.seconds:.1f} s"
+        )
         panels[2, column].set_xlabel("time [s]")
     for axes, label in zip(
         panels[:, 0],
-        ("position from home [mm]", "orientation from home [mrad]", f"joint [{robot.layout.joint_unit}]"),
+        (
+            "position from home [mm]",
+            "orientation from home [mrad]",
+            f"joint [{robot.layout.joint_unit}]",
+        ),
         strict=True,
     ):
         axes.set_ylabel(label)
         axes.legend(loc="upper right", fontsize="small", ncols=2)
-    figure.suptitle(f"Exciting trajectories, criterion {comparison.criterion}, seed {comparison.seed}; dashed: limits")
+    figure.suptitle(
+        f"Exciting trajectories, criterion {comparison.criterion}, seed {comparison.seed}; "
+        "dashed: limits"
+    )
     return figure

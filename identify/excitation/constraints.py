@@ -1,18 +1,20 @@
 """What an exciting trajectory has to keep, as CasADi expressions of pose and pose rate.
 
-Every constraint is written as the share of its limit that is used; the trajectory is admissible while all shares are
-within -1 and +1:
+Every constraint is written as the share of its limit that is used; the trajectory is admissible
+while all shares are within -1 and +1:
 
     box           distance from home over the amplitude that the scenario allows, a coordinate
     travel        joint coordinate over the travel limit less the margin, a leg
     velocity      joint velocity over the largest allowed, a leg
     leverage      least leverage of J_a1 over the leverage, a leg (see `dynamics.workspace`)
-    conditioning  condition number of the scaled J_a2 over its limit, of the 2-norm as everywhere; expressions have that
-                  of a Schatten norm near it, which is smooth, never below, and at most 3 % above
-    visibility    angle to grazing and place in the image of four stickers a plane and both cameras; left out where the
-                  whole box is proved to be in sight
+    conditioning  condition number of the scaled J_a2 over its limit, of the 2-norm as everywhere;
+                  expressions have that of a Schatten norm near it, which is smooth, never below,
+                  and at most 3 % above
+    visibility    angle to grazing and place in the image of four stickers a plane and both cameras;
+                  left out where the whole box is proved to be in sight
 
-The start at home and at rest holds by the form of the trajectory, the end because the run lasts whole periods.
+The start at home and at rest holds by the form of the trajectory, the end because the run lasts
+whole periods.
 """
 
 from collections.abc import Collection
@@ -23,7 +25,7 @@ import casadi as ca
 import numpy as np
 
 from cmmsim.geometry.pose import apply, pose_to_transform
-from cmmsim.pose_estimation.observation import GRAZING
+from cmmsim.measuring.observation import GRAZING
 from cmmsim.visibility import EDGE_PX, SightLines, sight_lines
 from dynamics import DynamicsError, Robot
 from dynamics.kinematics.platform import rotation_matrix
@@ -37,7 +39,9 @@ from identify.scenario import Excitation, Scenario
 from identify.trajectory import FourierTrajectory, box_of
 
 STICKERS_A_PLANE = 4
-"""Stickers of each plane that both cameras must be able to look for at every pose; all where it has fewer."""
+"""Stickers of each plane that both cameras must be able to look for at every pose; all where it has
+fewer.
+"""
 
 PLANES = "ABC"
 
@@ -45,19 +49,25 @@ CONDITIONING = "conditioning"
 
 
 def required_stickers(sight: SightLines, home: Array) -> list[int]:
-    """The stickers, STICKERS_A_PLANE a plane, that are to stay visible: those that face both cameras best at home.
+    """The stickers, STICKERS_A_PLANE a plane, that are to stay visible: those that face both
+    cameras best at home.
 
     Raises TrajectoryError, naming the plane, where not so many can be looked for even at home.
     """
-    uses = np.array(_functions(sight, range(len(sight.platform.sticker_ids)))(home)).reshape(-1, 2, 3)
-    worst, visible = np.abs(uses).max(axis=(1, 2)), sight.visible(home)
+    uses = np.array(_functions(sight, range(len(sight.platform.sticker_ids)))(home)).reshape(
+        -1, 2, 3
+    )
+    worst = np.abs(uses).max(axis=(1, 2))
+    visible = sight.visible(home)
     chosen: list[int] = []
     for index, plane in enumerate(PLANES):
         on_plane = sight.platform.plane_index == index
-        able, needed = np.flatnonzero(visible & on_plane), min(STICKERS_A_PLANE, int(on_plane.sum()))
+        able = np.flatnonzero(visible & on_plane)
+        needed = min(STICKERS_A_PLANE, int(on_plane.sum()))
         if len(able) < needed:
             raise TrajectoryError(
-                f"visibility: both cameras can look for {len(able)} stickers of plane {plane} at the home pose, "
+                f"visibility: both cameras can look for {len(able)} stickers of plane {plane} at "
+                "the home pose, "
                 f"{needed} are needed"
             )
         chosen += able[np.argsort(worst[able], kind="stable")][:needed].tolist()
@@ -65,11 +75,13 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
 
 
 def sight_uses(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
-    """Six rows a sticker, for each camera: share used of grazing incidence, and of the image across and up.
+    """Six rows a sticker, for each camera: share used of grazing incidence, and of the image across
+    and up.
 
     Beyond +-1 the camera cannot look for the sticker. Lens distortion is left out.
     """
-    platform, rows = sight.platform, []
+    platform = sight.platform
+    rows = []
     rotation = rotation_matrix(pose[3:6])
     for k in stickers:
         place = rotation @ platform.nominal[k] + pose[0:3]
@@ -84,21 +96,32 @@ def sight_uses(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
 
 
 def within_sight(sight: SightLines, stickers: list[int], home: Array, box: Array) -> bool:
-    """Whether the stickers stay in sight wherever the platform goes within the box (6,) [m, rad] about home.
+    """Whether the stickers stay in sight wherever the platform goes within the box (6,) [m, rad]
+    about home.
 
-    By bounds on how far a sticker moves and turns, so that no pose has to be tried; False where they do not tell.
+    By bounds on how far a sticker moves and turns, so that no pose has to be tried; False where
+    they do not tell.
     """
-    turn, uses = float(box[3:].sum()), np.array(_functions(sight, stickers)(home)).reshape(-1, 2, 3)
+    turn = float(box[3:].sum())
+    uses = np.array(_functions(sight, stickers)(home)).reshape(-1, 2, 3)
     places = apply(pose_to_transform(home), sight.platform.nominal[stickers])
-    shifts = np.linalg.norm(box[:3]) + turn * np.linalg.norm(sight.platform.nominal[stickers], axis=1)
-    for camera, move, use in zip(sight.rig.cameras, sight.cameras_from_base, uses.swapaxes(0, 1), strict=True):
+    shifts = np.linalg.norm(box[:3]) + turn * np.linalg.norm(
+        sight.platform.nominal[stickers], axis=1
+    )
+    for camera, move, use in zip(
+        sight.rig.cameras, sight.cameras_from_base, uses.swapaxes(0, 1), strict=True
+    ):
         seen = apply(move, places)
         nearest = seen[:, 2] - shifts
         if (nearest <= 0).any():
             return False
         turned = turn + np.arcsin(np.minimum(1.0, shifts / np.linalg.norm(seen, axis=1)))
         angle = np.arccos(1 - use[:, 0] * (1 - GRAZING)) + turned
-        moved = (shifts / nearest)[:, None] * (1 + np.abs(seen[:, :2] / seen[:, 2:])) * camera.focal_lengths
+        moved = (
+            (shifts / nearest)[:, None]
+            * (1 + np.abs(seen[:, :2] / seen[:, 2:]))
+            * camera.focal_lengths
+        )
         half = np.array([camera.width - 1, camera.height - 1]) / 2 - EDGE_PX
         if (angle >= np.arccos(GRAZING)).any() or (np.abs(use[:, 1:]) + moved / half >= 1).any():
             return False
@@ -115,14 +138,16 @@ SQUARINGS = 6
 
 
 def condition_number(matrix: ca.SX) -> ca.SX:
-    """Condition number of a square matrix in a norm near the 2-norm: never below that one, and for six rows at most 3 %
-    above."""
+    """Condition number of a square matrix in a norm near the 2-norm: never below that one, and for
+    six rows at most 3 % above."""
     inverse = ca.solve(matrix, ca.SX.eye(matrix.rows()))
     return _schatten_norm(matrix) * _schatten_norm(inverse)
 
 
 def _schatten_norm(matrix: ca.SX) -> ca.SX:
-    """(sum of sigma^p)^(1/p) over the singular values; powers of a matrix whose trace is one cannot overflow."""
+    """(sum of sigma^p)^(1/p) over the singular values; powers of a matrix whose trace is one cannot
+    overflow.
+    """
     power = ca.densify(matrix.T @ matrix)
     logarithm = 0
     for step in range(SQUARINGS):
@@ -135,8 +160,9 @@ def _schatten_norm(matrix: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class Limit:
-    """One constraint: name, share of it that is used, the limit itself in its unit and whom it concerns (an entry a row
-    each), and whether it bounds from below (a share is then limit / value)."""
+    """One constraint: name, share of it that is used, the limit itself in its unit and whom it
+    concerns (an entry a row each), and whether it bounds from below (a share is then limit /
+    value)."""
 
     name: str
     share: ca.SX
@@ -148,7 +174,9 @@ class Limit:
 
 @dataclass(frozen=True)
 class Worst:
-    """Where a trajectory comes nearest to a limit: value and limit in `unit`, share used, whom, and time [s]."""
+    """Where a trajectory comes nearest to a limit: value and limit in `unit`, share used, whom, and
+    time [s].
+    """
 
     name: str
     value: float
@@ -164,40 +192,60 @@ class Worst:
 
     def __str__(self) -> str:
         who = f" of {self.who}" if self.who else ""
-        return f"{self.name}{who} is {self.value:.4g}{self.unit} at t = {self.time_s:.3f} s, limit {self.limit:.4g}" + (
-            self.unit
+        return (
+            f"{self.name}{who} is {self.value:.4g}{self.unit} at t = {self.time_s:.3f} s, limit "
+            f"{self.limit:.4g}" + (self.unit)
         )
 
 
 class MotionConstraints:
     """The constraints of a scenario on the motion of a robot.
 
-    Raises TrajectoryError, with value, limit and leg, where not even the home pose keeps them, and ScenarioError for
-    settings of another kind of actuators.
+    Raises TrajectoryError, with value, limit and leg, where not even the home pose keeps them, and
+    ScenarioError for settings of another kind of actuators.
     """
 
     def __init__(self, robot: Robot, scenario: Scenario, sight: SightLines | None = None) -> None:
-        settings, geometry, chart = scenario.excitation, robot.geometry, robot.geometry.chart
-        margin, velocity = (of_actuators(robot, settings, key) for key in ("travel_margin", "max_joint_velocity"))
-        travel, unit = robot.travel_limit - margin, robot.layout.joint_unit
+        settings = scenario.excitation
+        geometry = robot.geometry
+        chart = robot.geometry.chart
+        margin, velocity = (
+            of_actuators(robot, settings, key) for key in ("travel_margin", "max_joint_velocity")
+        )
+        travel = robot.travel_limit - margin
+        unit = robot.layout.joint_unit
         if travel <= 0:
             raise TrajectoryError(
-                f"excitation.travel_margin_{unit} = {margin:g} {unit} leaves nothing of the travel limit "
+                f"excitation.travel_margin_{unit} = {margin:g} {unit} leaves nothing of the "
+                "travel limit "
                 f"{robot.travel_limit:g} {unit} of {robot.name}"
             )
         _check_home(robot, settings, margin)
         sight = sight or sight_lines(scenario.sensor, scenario.sensor_changes)
         self.box = box_of(chart, settings.position_amplitude_m, settings.orientation_amplitude_rad)
         stickers = required_stickers(sight, robot.home_pose)
-        self.always_in_sight = within_sight(sight, stickers, robot.home_pose, chart.lifted(self.box))
-        self._robot, self._pose, self._rate = robot, ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
+        self.always_in_sight = within_sight(
+            sight, stickers, robot.home_pose, chart.lifted(self.box)
+        )
+        self._robot = robot
+        self._pose = ca.SX.sym("pose", 6)
+        self._rate = ca.SX.sym("rate", 6)
         leverage, link_rows = singularity_measures(geometry, self._pose)
         joints = joint_coordinates(geometry, self._pose)
         velocities = pose_jacobian(geometry, self._pose) @ self._rate
-        legs, away = tuple(f"leg {k}" for k in range(1, len(geometry.legs) + 1)), self._pose - geometry.home_pose
-        least, most, count = settings.least_leverage, settings.most_condition, len(legs)
+        legs = tuple(f"leg {k}" for k in range(1, len(geometry.legs) + 1))
+        away = self._pose - geometry.home_pose
+        least = settings.least_leverage
+        most = settings.most_condition
+        count = len(legs)
         self.limits = [
-            Limit("box", away[list(chart.freedoms)] / self.box, tuple(self.box), "", chart.coordinate_names),
+            Limit(
+                "box",
+                away[list(chart.freedoms)] / self.box,
+                tuple(self.box),
+                "",
+                chart.coordinate_names,
+            ),
             Limit("travel", joints / travel, (travel,) * count, f" {unit}", legs),
             Limit("velocity", velocities / velocity, (velocity,) * count, f" {unit}/s", legs),
             Limit("leverage", least / leverage, (least,) * count, "", legs, lower=True),
@@ -211,7 +259,8 @@ class MotionConstraints:
                 for side in ("left", "right")
                 for what in ("incidence", "across", "up")
             ]
-            uses, limit = sight_uses(sight, stickers, self._pose), (1.0,) * len(names)
+            uses = sight_uses(sight, stickers, self._pose)
+            limit = (1.0,) * len(names)
             self.limits.append(Limit("visibility", uses, limit, " of the limit", tuple(names)))
 
     @cached_property
@@ -225,32 +274,45 @@ class MotionConstraints:
         return ca.Function("shares", [self._pose, self._rate], ca.cse([rows]))
 
     def worst(self, trajectory: FourierTrajectory, times: Array) -> list[Worst]:
-        """Where a trajectory, sampled at `times` (N,) [s], comes nearest to each limit; share NaN: out of reach."""
-        poses, rates = trajectory.pose(times), trajectory.pose_rate(times)
+        """Where a trajectory, sampled at `times` (N,) [s], comes nearest to each limit; share NaN:
+        out of reach.
+        """
+        poses = trajectory.pose(times)
+        rates = trajectory.pose_rate(times)
         used = np.array(self.shares(poses.T, rates.T)).T
         condition = measure(self._robot, poses).platform_condition
-        found, first = [], 0
+        found = []
+        first = 0
         for limit in self.limits:
             block = np.abs(used[:, first : first + len(limit.who)])
             if limit.name == CONDITIONING:
                 block = condition[:, None] / limit.limit[0]
-            row, who = np.unravel_index(np.argmax(block), block.shape)  # the first NaN counts as the largest
-            share, bound = float(block[row, who]), limit.limit[who]
+            # the first NaN counts as the largest
+            row, who = np.unravel_index(np.argmax(block), block.shape)
+            share = float(block[row, who])
+            bound = limit.limit[who]
             value = bound / share if limit.lower else bound * share
             unit = f" {self._box_units[who]}" if limit.name == "box" else limit.unit
-            found.append(Worst(limit.name, value, bound, unit, share, limit.who[who], float(times[row])))
+            found.append(
+                Worst(limit.name, value, bound, unit, share, limit.who[who], float(times[row]))
+            )
             first += len(limit.who)
         return found
 
-    def check(self, trajectory: FourierTrajectory, times: Array, tolerance: float = 1e-9) -> list[Worst]:
+    def check(
+        self, trajectory: FourierTrajectory, times: Array, tolerance: float = 1e-9
+    ) -> list[Worst]:
         """`worst` of an admissible trajectory.
 
-        Raises TrajectoryError naming constraint, leg, value, limit and time of the one that is broken most.
+        Raises TrajectoryError naming constraint, leg, value, limit and time of the one that is
+        broken most.
         """
         found = self.worst(trajectory, times)
         broken = [w for w in found if not w.share <= 1 + tolerance]
         if broken:
-            raise TrajectoryError(f"the trajectory is not admissible: {max(broken, key=Worst.excess)}")
+            raise TrajectoryError(
+                f"the trajectory is not admissible: {max(broken, key=Worst.excess)}"
+            )
         return found
 
 
@@ -263,12 +325,16 @@ def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:
 
 
 def check_periods(scenario: Scenario) -> None:
-    """Raise TrajectoryError where a run is no whole number of periods, so that it cannot end at home and at rest."""
+    """Raise TrajectoryError where a run is no whole number of periods, so that it cannot end at
+    home and at rest.
+    """
     settings = scenario.excitation
     if not is_whole_periods(settings.duration_s, settings.fundamental_hz):
         periods = settings.duration_s * settings.fundamental_hz
         raise TrajectoryError(
-            f"end at rest: excitation.duration_s = {settings.duration_s:g} s is {periods:.4g} periods of "
-            f"excitation.fundamental_hz = {settings.fundamental_hz:g} Hz; excitation.method = {settings.method!r} "
+            f"end at rest: excitation.duration_s = {settings.duration_s:g} s is {periods:.4g} "
+            "periods of "
+            f"excitation.fundamental_hz = {settings.fundamental_hz:g} Hz; excitation.method = "
+            f"{settings.method!r} "
             "needs a whole number of periods, at least 1"
         )

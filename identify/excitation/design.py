@@ -1,4 +1,6 @@
-"""The trajectories of a run: the exciting one by the scenario's method and criterion, and unseen random ones."""
+"""The trajectories of a run: the exciting one by the scenario's method and criterion, and unseen
+random ones.
+"""
 
 from collections.abc import Callable
 
@@ -6,7 +8,7 @@ import numpy as np
 
 from dynamics import Robot
 from dynamics.kinematics.chart import Chart
-from identify.arrays import Array
+from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods
 from identify.excitation.criteria import criterion_of, log_observability, observability_index
@@ -25,8 +27,12 @@ Check = Callable[[FourierTrajectory, Array], object]
 """Raises TrajectoryError for a trajectory that is not admissible at some instants (N,) [s]."""
 
 
-def drawn_trajectory(rng: np.random.Generator, chart: Chart, settings: Excitation) -> FourierTrajectory:
-    """A random trajectory that fills the box of a scenario's excitation about home, whatever else limits it."""
+def drawn_trajectory(
+    rng: np.random.Generator, chart: Chart, settings: Excitation
+) -> FourierTrajectory:
+    """A random trajectory that fills the box of a scenario's excitation about home, whatever else
+    limits it.
+    """
     box = (settings.position_amplitude_m, settings.orientation_amplitude_rad)
     return random_trajectory(rng, chart, settings.fundamental_hz, settings.harmonics, *box)
 
@@ -39,7 +45,8 @@ def admissible_trajectories(
     seed: np.random.SeedSequence,
     check: Check = lambda trajectory, times: None,
 ) -> list[FourierTrajectory]:
-    """Random trajectories that stay inside the travel less the margin, off singularities, and pass `check`.
+    """Random trajectories that stay inside the travel less the margin, off singularities, and pass
+    `check`.
 
     Raises TrajectoryError, with the last reason, when too few of them do.
     """
@@ -47,7 +54,8 @@ def admissible_trajectories(
     rate_hz = 4 * SAMPLES_PER_HARMONIC * settings.harmonics * settings.fundamental_hz
     t = np.arange(round(duration_s * rate_hz) + 1) / rate_hz
     accepted: list[FourierTrajectory] = []
-    margin, reason = of_actuators(robot, settings, "travel_margin"), TrajectoryError("none tried")
+    margin = of_actuators(robot, settings, "travel_margin")
+    reason = TrajectoryError("none tried")
     for _ in range(ATTEMPTS * count):
         candidate = drawn_trajectory(rng, robot.geometry.chart, settings)
         try:
@@ -60,30 +68,43 @@ def admissible_trajectories(
         if len(accepted) == count:
             return accepted
     raise TrajectoryError(
-        f"only {len(accepted)} of {ATTEMPTS * count} random trajectories of ±{settings.position_amplitude_m:g} m and "
-        f"±{settings.orientation_amplitude_rad:g} rad stay inside the travel and the other limits, {count} are needed; "
+        f"only {len(accepted)} of {ATTEMPTS * count} random trajectories of "
+        f"±{settings.position_amplitude_m:g} m and "
+        f"±{settings.orientation_amplitude_rad:g} rad stay inside the travel and the other "
+        f"limits, {count} are needed; "
         f"the last: {reason}"
     )
 
 
 RANDOM_TOLERANCE = 1e-3
-"""Share by which random trajectories may go over a limit: they fill the box as closely as they were sampled for it."""
+"""Share by which random trajectories may go over a limit: they fill the box as closely as they were
+sampled for it.
+"""
 
 
-def design_trajectories(robot: Robot, scenario: Scenario, seed: int, progress: Progress | None = None) -> TrajectorySet:
-    """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream of the seed.
+def design_trajectories(
+    robot: Robot, scenario: Scenario, seed: int, progress: Progress | None = None
+) -> TrajectorySet:
+    """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream
+    of the seed.
 
-    Raises ScenarioError: no such criterion. Raises TrajectoryError: no random trajectory of this amplitude keeps the
-    limits; no whole number of periods where a search needs it; a search that finds nothing.
+    Raises ScenarioError: no such criterion. Raises TrajectoryError: no random trajectory of this
+    amplitude keeps the limits; no whole number of periods where a search needs it; a search that
+    finds nothing.
     """
-    progress, settings = progress or SilentProgress(), scenario.excitation
+    progress = progress or SilentProgress()
+    settings = scenario.excitation
     check = motion_check(robot, scenario)
     with progress.stage("excitation", settings.candidates) as advance:
         candidates = random_candidates(robot, scenario, settings.candidates, seed, check)
         problem = search_problem(robot, scenario, candidates, advance)
     found = SEARCHES[settings.method](problem, child(seed, SEARCH), progress)
-    index = log_observability(robot, problem.unknowns, settings.duration_s, problem.candidates[0])
-    indices = [observability_index(index, problem.unknowns.of(trajectory)) for trajectory in candidates]
+    index = log_observability(
+        robot, problem.unknowns, settings.duration_s, problem.unknowns.of(candidates[0])
+    )
+    indices = [
+        observability_index(index, problem.unknowns.of(trajectory)) for trajectory in candidates
+    ]
     return TrajectorySet(
         seed=seed,
         excitation=found.trajectory(problem),
@@ -94,8 +115,12 @@ def design_trajectories(robot: Robot, scenario: Scenario, seed: int, progress: P
     )
 
 
-def unseen_trajectories(robot: Robot, scenario: Scenario, seed: int) -> tuple[FourierTrajectory, ...]:
-    """The validation trajectories of a scenario alone, the same as `design_trajectories` gives, without its search."""
+def unseen_trajectories(
+    robot: Robot, scenario: Scenario, seed: int
+) -> tuple[FourierTrajectory, ...]:
+    """The validation trajectories of a scenario alone, the same as `design_trajectories` gives,
+    without its search.
+    """
     return _unseen(robot, scenario, seed, motion_check(robot, scenario))
 
 
@@ -105,26 +130,34 @@ def motion_check(robot: Robot, scenario: Scenario) -> Check:
     return lambda trajectory, times: constraints.check(trajectory, times, RANDOM_TOLERANCE)
 
 
-def random_candidates(robot: Robot, scenario: Scenario, count: int, seed: int, check: Check) -> list[FourierTrajectory]:
+def random_candidates(
+    robot: Robot, scenario: Scenario, count: int, seed: int, check: Check
+) -> list[FourierTrajectory]:
     """The random trajectories among which, or from which, a search goes."""
     settings = scenario.excitation
-    return admissible_trajectories(robot, settings, settings.duration_s, count, child(seed, EXCITATION), check)
+    return admissible_trajectories(
+        robot, settings, settings.duration_s, count, child(seed, EXCITATION), check
+    )
 
 
 def search_problem(
-    robot: Robot, scenario: Scenario, candidates: list[FourierTrajectory], advance: Advance = lambda n=1: None
+    robot: Robot,
+    scenario: Scenario,
+    candidates: list[FourierTrajectory],
+    advance: Advance = lambda n=1: None,
 ) -> SearchProblem:
     """The search of a scenario among, or from, admissible random trajectories.
 
-    Raises ScenarioError: no such criterion. Raises TrajectoryError: no whole number of periods for a method that needs
-    it.
+    Raises ScenarioError: no such criterion. Raises TrajectoryError: no whole number of periods for
+    a method that needs it.
     """
     settings = scenario.excitation
     if settings.method != "random":
         check_periods(scenario)
     free = unknowns(robot.geometry.chart, settings)
     pool = [free.of(trajectory) for trajectory in candidates]
-    criterion, values = criterion_of(robot, scenario, free, pool[0]), []
+    criterion = criterion_of(robot, scenario, free, agreed(pool[0]))
+    values = []
     for z in pool:
         values.append(-float(criterion.value(z)))
         advance()
@@ -132,6 +165,13 @@ def search_problem(
     return SearchProblem(settings, free, MotionConstraints(robot, scenario), criterion, best_first)
 
 
-def _unseen(robot: Robot, scenario: Scenario, seed: int, check: Check) -> tuple[FourierTrajectory, ...]:
-    count, duration_s = scenario.validation.count, scenario.validation.duration_s
-    return tuple(admissible_trajectories(robot, scenario.excitation, duration_s, count, child(seed, UNSEEN), check))
+def _unseen(
+    robot: Robot, scenario: Scenario, seed: int, check: Check
+) -> tuple[FourierTrajectory, ...]:
+    count = scenario.validation.count
+    duration_s = scenario.validation.duration_s
+    return tuple(
+        admissible_trajectories(
+            robot, scenario.excitation, duration_s, count, child(seed, UNSEEN), check
+        )
+    )

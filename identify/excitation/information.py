@@ -1,29 +1,36 @@
-"""D-optimality of the output error's information: in the simulated closed loop, and in the loop linearised at home.
+"""D-optimality of the output error's information: in the simulated closed loop, and in the loop
+linearised at home.
 
-With J = d(poses)/d(p parameters) of the closed loop at the starting guess, Sigma the covariance that the sensor
-states, and what is known before (starting guess, the scenario's prior of single parameters, scale anchor),
+With J = d(poses)/d(p parameters) of the closed loop at the starting guess, Sigma the covariance
+that the sensor states, and what is known before (starting guess, the scenario's prior of single
+parameters, scale anchor),
 
-    W = sum over frames J^T Sigma^-1 J + prior,      D = (det(S W S))^(1 / (2 p)),      S = diag(prior deviations).
+    W = sum over frames J^T Sigma^-1 J + prior,      D = (det(S W S))^(1 / (2 p)),      S =
+    diag(prior deviations).
 
-D is the factor by which the experiment narrows the prior, the geometric mean over all directions of the parameter
-space; it has no unit. That the sensor's noise also moves the plant (through the servo) is left out.
+D is the factor by which the experiment narrows the prior, the geometric mean over all directions of
+the parameter space; it has no unit. That the sensor's noise also moves the plant (through the
+servo) is left out.
 
-The simulation gives D of a trajectory, but no exact derivative by it. Searches go by D in the loop linearised about
-rest at home. With s = i omega, C = kp + kd s + ki / s the servo, L = lp + ld s + li / s the joint PID and t_d the
-latency plus half a frame of hold, the pose x follows a torque error d (Nm, joints) as
+The simulation gives D of a trajectory, but no exact derivative by it. Searches go by D in the loop
+linearised about rest at home. With s = i omega, C = kp + kd s + ki / s the servo, L = lp + ld s +
+li / s the joint PID and t_d the latency plus half a frame of hold, the pose x follows a torque
+error d (Nm, joints) as
 
-    x = -S d,   S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C exp(-s t_d)))^-1,
+    x = -S d,   S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C
+    exp(-s t_d)))^-1,
 
-E from pose rates to twists, and follows a reference x_d as x = T x_d with T = S L J_theta C exp(-s t_d). Friction
-counts with its viscous part only. Poses, wrenches and Jacobians are those along the platform's coordinates. So the
-robot follows each harmonic of the trajectory with a known lag, and the sensitivities are filtered columns of the torque
-regressor along that motion: with Y its Fourier coefficients at a harmonic, tau = Y Xi the torques and e = tau / L the
-joint error that the PID needs for them,
+E from pose rates to twists, and follows a reference x_d as x = T x_d with T = S L J_theta C exp(-s
+t_d). Friction counts with its viscous part only. Poses, wrenches and Jacobians are those along the
+platform's coordinates. So the robot follows each harmonic of the trajectory with a known lag, and
+the sensitivities are filtered columns of the torque regressor along that motion: with Y its Fourier
+coefficients at a harmonic, tau = Y Xi the torques and e = tau / L the joint error that the PID
+needs for them,
 
     d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
 
-One period in the steady state counts for all, so the start of the run is left out, as are what the drives of a cascade
-have beside a PID's terms.
+One period in the steady state counts for all, so the start of the run is left out, as are what the
+drives of a cascade have beside a PID's terms.
 """
 
 from dataclasses import dataclass
@@ -35,29 +42,41 @@ from numpy.typing import NDArray
 
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot
-from dynamics.closed_loop import LoopFailure, simulate
-from identify.arrays import Array
+from dynamics.closed_loop import LoopFailure, differentiate_servo
+from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
 from identify.estimation.prior import StartingGuess, model_guess
 from identify.estimation.scale_anchor import MEASURED_PARAMETER, default_std
 from identify.excitation.criteria import Criterion, smoothing_of
-from identify.excitation.motion import Unknowns, log_determinant, regressor, sample_times, tracked_motion
+from identify.excitation.motion import (
+    RESPONSE_BITS,
+    Unknowns,
+    log_determinant,
+    regressor,
+    sample_times,
+    tracked_motion,
+)
 from identify.loop_parameters import model_settings
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
 
 def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
-    """D in the linearised loop, by which searches go; what they end in is judged by that of the simulated loop."""
+    """D in the linearised loop, by which searches go; what they end in is judged by that of the
+    simulated loop.
+    """
     known = knowledge(robot, scenario)
-    value, smooth = (log_linear_information(robot, unknowns, scenario, known, v) for v in (None, smoothing_of(robot)))
+    value, smooth = (
+        log_linear_information(robot, unknowns, scenario, known, v)
+        for v in (None, smoothing_of(robot))
+    )
     return Criterion(value, smooth, judge=partial(log_information, robot, scenario, known))
 
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known before the run: starting guess, covariance (6, 6) of a measured pose [m, rad], and the prior's
-    information (p, p) in units of its own standard deviations."""
+    """What is known before the run: starting guess, covariance (6, 6) of a measured pose [m, rad],
+    and the prior's information (p, p) in units of its own standard deviations."""
 
     guess: StartingGuess
     covariance: Array
@@ -80,19 +99,20 @@ def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
     return Knowledge(guess, covariance, prior)
 
 
-def log_information(robot: Robot, scenario: Scenario, known: Knowledge, trajectory: FourierTrajectory) -> float:
+def log_information(
+    robot: Robot, scenario: Scenario, known: Knowledge, trajectory: FourierTrajectory
+) -> float:
     """ln D of a trajectory run for `excitation.duration_s`.
 
     Raises TrajectoryError where the model with the starting guess is unstable on it.
     """
     times = scenario.timing.frame_times(scenario.excitation.duration_s)
     try:
-        run = simulate(
+        run = differentiate_servo(
             robot,
             known.guess.values,
             trajectory.reference(times),
             model_settings(robot, scenario),
-            sensitivities=True,
         )
     except LoopFailure as error:
         raise TrajectoryError(
@@ -108,7 +128,7 @@ def log_information(robot: Robot, scenario: Scenario, known: Knowledge, trajecto
 
 ComplexArray = NDArray[np.complex128]
 
-STEP = 1e-6
+STEP = 1e-5
 """Step [m, rad] of the difference quotient of the holding torque."""
 
 
@@ -118,22 +138,33 @@ def pid_response(robot: Robot, parameters: Array, s: ComplexArray) -> ComplexArr
     return np.asarray(lp + ld * s + li / s)
 
 
-def torque_response(robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray) -> ComplexArray:
-    """S (K, m, n), coordinates per torque or force, for `parameters` (p,) at s = i omega (K,) [1/s], none of them
-    zero."""
-    home, xi, free = robot.home_pose, parameters[robot.layout.dynamic], robot.geometry.chart.basis
+def torque_response(
+    robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray
+) -> ComplexArray:
+    """S (K, m, n), coordinates per torque or force, for `parameters` (p,) at s = i omega (K,)
+    [1/s], none of them zero."""
+    home = robot.home_pose
+    xi = parameters[robot.layout.dynamic]
+    free = robot.geometry.chart.basis
     to_twist = robot.twist(np.tile(home, (len(free.T), 1)), free.T).T
     joint_rates = robot.coordinate_jacobian(home)
-    inertia = np.linalg.solve((robot.joint_jacobian(home) @ free).T, free.T @ robot.mass_matrix(home, xi) @ to_twist)
+    inertia = np.linalg.solve(
+        (robot.joint_jacobian(home) @ free).T, free.T @ robot.mass_matrix(home, xi) @ to_twist
+    )
     steps = STEP * free.T
-    stiffness = (robot.static_torque(home + steps, xi) - robot.static_torque(home - steps, xi)).T / (2 * STEP)
+    stiffness = (
+        robot.static_torque(home + steps, xi) - robot.static_torque(home - steps, xi)
+    ).T / (2 * STEP)
+    stiffness = agreed(stiffness, RESPONSE_BITS)
     damping = parameters[robot.layout.viscous][:, None] * joint_rates
     loop = pid_response(robot, parameters, s) * (1 + servo_response(scenario, s))
     total = np.multiply.outer(s**2, inertia) + np.multiply.outer(s, damping) + stiffness
     return np.asarray(np.linalg.inv(total + np.multiply.outer(loop, joint_rates)))
 
 
-def tracking_response(robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray) -> ComplexArray:
+def tracking_response(
+    robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray
+) -> ComplexArray:
     """T (K, m, m) from desired to actual coordinates, as `torque_response`."""
     gain = pid_response(robot, parameters, s) * servo_response(scenario, s)
     drive = np.multiply.outer(gain, robot.coordinate_jacobian(robot.home_pose))
@@ -142,7 +173,8 @@ def tracking_response(robot: Robot, parameters: Array, scenario: Scenario, s: Co
 
 def servo_response(scenario: Scenario, s: ComplexArray) -> ComplexArray:
     """C exp(-s t_d) (K,) of the visual servo at s (K,) [1/s]."""
-    servo, timing = scenario.servo, scenario.timing
+    servo = scenario.servo
+    timing = scenario.timing
     delay = np.exp(-s * (timing.latency_s + timing.frame_period_s / 2))
     return np.asarray((servo.kp + servo.kd * s + servo.ki / s) * delay)
 
@@ -152,14 +184,21 @@ HARMONICS_SEEN = 8
 
 
 def log_linear_information(
-    robot: Robot, unknowns: Unknowns, scenario: Scenario, known: Knowledge, smoothing: float | None = None
+    robot: Robot,
+    unknowns: Unknowns,
+    scenario: Scenario,
+    known: Knowledge,
+    smoothing: float | None = None,
 ) -> ca.Function:
     """z -> ln D in the linearised loop; `smoothing` as in `log_observability`."""
     z = ca.MX.sym("z", unknowns.size)
     rows = sensitivity_spectrum(robot, unknowns, scenario, known.guess.values, z, smoothing)
-    count, free = len(known.guess.std), unknowns.chart.basis
+    count = len(known.guess.std)
+    free = unknowns.chart.basis
     whitener = np.linalg.inv(np.linalg.cholesky(known.covariance)) @ free
-    rows = rows @ ca.DM(np.kron(np.eye(2 * len(harmonics(unknowns))), whitener.T))
+    rows = rows @ ca.DM(
+        np.kron(np.eye(2 * len(harmonics(unknowns))), agreed(whitener.T, RESPONSE_BITS))
+    )
     frames = scenario.timing.frames(scenario.excitation.duration_s)
     scaled = ca.diag(known.guess.std * np.sqrt(frames / 2)) @ rows
     determinant = log_determinant(count)(scaled @ scaled.T + ca.DM(known.scaled_prior))
@@ -180,28 +219,38 @@ def sensitivity_spectrum(
     z: ca.MX,
     smoothing: float | None = None,
 ) -> ca.MX:
-    """Fourier coefficients of d(coordinates)/d(p parameters), (p, 2 m K): m real and m imaginary parts a harmonic.
+    """Fourier coefficients of d(coordinates)/d(p parameters), (p, 2 m K): m real and m imaginary
+    parts a harmonic.
 
     A coefficient x_k means Re(x_k exp(s_k t)).
     """
-    times, s = sample_times(unknowns.fundamental_hz, unknowns.harmonics), harmonics(unknowns)
+    times = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
+    s = harmonics(unknowns)
     response = torque_response(robot, parameters, scenario, s)
     tracking = tracking_response(robot, parameters, scenario, s[: unknowns.harmonics])
     moved = tracked_motion(unknowns, z, times, tracking)
     sampled = regressor(robot, smoothing, "torque").map(len(times))(*moved)
     waves = np.exp(-np.outer(times, s)) * 2 / len(times)
     transform = np.stack([waves.real, waves.imag], axis=-1).reshape(len(times), -1)
-    dynamic, joints = parameters[robot.layout.dynamic], robot.layout.joints
+    dynamic = parameters[robot.layout.dynamic]
+    joints = robot.layout.joints
     count = len(dynamic)
-    waved = ca.reshape(sampled, count * joints, len(times)) @ ca.DM(transform)
+    waved = ca.reshape(sampled, count * joints, len(times)) @ ca.DM(agreed(transform))
     spectrum = ca.reshape(waved, count, 2 * joints * len(s))
     error = 1 / pid_response(robot, parameters, s)
     torque = ca.DM(dynamic).T @ spectrum
-    gains = [torque @ _real_filter(response * f[:, None, None]) for f in (error, error / s, error * s)]
+    gains = [
+        torque @ _real_filter(response * f[:, None, None]) for f in (error, error / s, error * s)
+    ]
     return ca.vertcat(-spectrum @ _real_filter(response), *gains)
 
 
 def _real_filter(response: ComplexArray) -> ca.DM:
-    """Block-diagonal (2 n K, 2 m K): rows (Re y_k, Im y_k) times it are (Re x_k, Im x_k) of x_k = response_k y_k."""
-    blocks = [np.block([[r.real.T, r.imag.T], [-r.imag.T, r.real.T]]) for r in response]
+    """Block-diagonal (2 n K, 2 m K): rows (Re y_k, Im y_k) times it are (Re x_k, Im x_k) of x_k =
+    response_k y_k.
+    """
+    blocks = [
+        agreed(np.block([[r.real.T, r.imag.T], [-r.imag.T, r.real.T]]), RESPONSE_BITS)
+        for r in response
+    ]
     return ca.diagcat(*[ca.DM(block) for block in blocks])

@@ -1,12 +1,14 @@
-"""The unknowns of a smooth-start trajectory (eq. 37), and motion and regressors as CasADi expressions of them.
+"""The unknowns of a smooth-start trajectory (eq. 37), and motion and regressors as CasADi
+expressions of them.
 
-The conditions of a smooth start leave 2 (n - 1) free directions a coordinate: n - 1 combinations of the sines with
-sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. With Z (m, 2 (n - 1)), without unit, and a box (m,) the m
-coordinates q are
+The conditions of a smooth start leave 2 (n - 1) free directions a coordinate: n - 1 combinations of
+the sines with sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. With Z (m, 2 (n - 1)),
+without unit, and a box (m,) the m coordinates q are
 
     q(t) = home + box Z B_0(t)^T,    q_dot(t) = box Z B_1(t)^T,    q_ddot(t) = box Z B_2(t)^T,
 
-so that every trajectory that starts smoothly at home is one vector z of 2 m (n - 1) numbers, and each z one trajectory.
+so that every trajectory that starts smoothly at home is one vector z of 2 m (n - 1) numbers, and
+each z one trajectory.
 """
 
 from dataclasses import dataclass
@@ -23,7 +25,7 @@ from dynamics.kinematics.chart import Chart
 from dynamics.kinematics.platform import pose_rate_to_twist, twist_bias
 from dynamics.rigid_body.jacobians import freedoms, joint_jacobian
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
-from identify.arrays import Array
+from identify.arrays import Array, agreed
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory, box_of, from_home
 
@@ -58,10 +60,13 @@ class Unknowns:
         return self.coordinates * self.columns
 
     def basis(self, t: ArrayLike) -> tuple[Array, Array, Array]:
-        """B_0 (N, k) without unit, B_1 [1/s], B_2 [1/s²] at times ``t`` (N,) [s]; k = ``columns``."""
-        order, w0 = np.arange(1, self.harmonics + 1, dtype=float), 2 * np.pi * self.fundamental_hz
+        """B_0 (N, k) without unit, B_1 [1/s], B_2 [1/s²] at times ``t`` (N,) [s]; k =
+        ``columns``."""
+        order = np.arange(1, self.harmonics + 1, dtype=float)
+        w0 = 2 * np.pi * self.fundamental_hz
         phase = np.asarray(t, dtype=float)[:, None] * w0 * order
-        sin, cos = np.sin(phase), np.cos(phase)
+        sin = np.sin(phase)
+        cos = np.cos(phase)
         sines, cosines = self._directions()
         return (
             np.hstack([(sin / order) @ sines, ((1 - cos) / order) @ cosines]),
@@ -75,14 +80,17 @@ class Unknowns:
         speed = (self.box * 2 * np.pi * self.fundamental_hz)[:, None]
         half = self.columns // 2
         sines, cosines = self._directions()
-        sine, cosine = speed * matrix[:, :half] @ sines.T, speed * matrix[:, half:] @ cosines.T
+        sine = speed * matrix[:, :half] @ sines.T
+        cosine = speed * matrix[:, half:] @ cosines.T
         return from_home(self.chart, self.fundamental_hz, sine, cosine)
 
     def of(self, trajectory: FourierTrajectory) -> Array:
         """z (2 m (n - 1),) of a trajectory with a smooth start."""
         speed = (self.box * 2 * np.pi * self.fundamental_hz)[:, None]
         sines, cosines = self._directions()
-        return np.hstack([trajectory.sine / speed @ sines, trajectory.cosine / speed @ cosines]).ravel()
+        return np.hstack(
+            [trajectory.sine / speed @ sines, trajectory.cosine / speed @ cosines]
+        ).ravel()
 
     def _directions(self) -> tuple[Array, Array]:
         """Orthonormal coefficient directions (n, n - 1) of the sines and of the cosines."""
@@ -91,7 +99,9 @@ class Unknowns:
 
 
 def unknowns(chart: Chart, settings: Excitation) -> Unknowns:
-    """The unknowns of a scenario's excitation about a chart's home; the box is what its amplitudes allow."""
+    """The unknowns of a scenario's excitation about a chart's home; the box is what its amplitudes
+    allow.
+    """
     box = box_of(chart, settings.position_amplitude_m, settings.orientation_amplitude_rad)
     return Unknowns(chart, box, settings.fundamental_hz, settings.harmonics)
 
@@ -113,8 +123,8 @@ def is_whole_periods(duration_s: float, fundamental_hz: float) -> bool:
 
 
 def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Array:
-    """Instants (N,) [s] as dense as `sample_times`, over what a run plays of a trajectory: one period where it plays
-    whole ones, over which the motion repeats, else all of it."""
+    """Instants (N,) [s] as dense as `sample_times`, over what a run plays of a trajectory: one
+    period where it plays whole ones, over which the motion repeats, else all of it."""
     if is_whole_periods(duration_s, fundamental_hz):
         return sample_times(fundamental_hz, harmonics)
     count = max(1, round(SAMPLES_PER_HARMONIC * harmonics * fundamental_hz * duration_s))
@@ -122,21 +132,34 @@ def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Ar
 
 
 def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """Poses, pose rates and pose accelerations, each (6, N), of z at `times` (N,) [s]."""
+    """Poses, pose rates and pose accelerations, each (6, N), of z at `times` (N,) [s].
+
+    The basis is rounded to what all processors agree on, which moves the platform by less than a
+    nanometre.
+    """
     matrix = ca.reshape(z, unknowns.columns, unknowns.coordinates).T
     scale = ca.sparsify(ca.DM(unknowns.chart.basis @ np.diag(unknowns.box)))
-    offset, rate, acceleration = (scale @ matrix @ ca.DM(b.T) for b in unknowns.basis(times))
+    offset, rate, acceleration = (
+        scale @ matrix @ ca.DM(agreed(b.T)) for b in unknowns.basis(times)
+    )
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
+
+
+RESPONSE_BITS = 16
+"""Bits of a linearised loop's response on which processors agree: it stands on difference
+quotients.
+"""
 
 
 def tracked_motion(
     unknowns: Unknowns, z: ca.MX, times: Array, tracking: NDArray[np.complex128]
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """As `motion`, of a robot that follows harmonic k of the trajectory with `tracking` (harmonics, m, m), and its mean
-    exactly; in the steady state."""
+    """As `motion`, of a robot that follows harmonic k of the trajectory with `tracking` (harmonics,
+    m, m), and its mean exactly; in the steady state."""
     speeds = 2j * np.pi * unknowns.fundamental_hz * np.arange(1, unknowns.harmonics + 1)
     period = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
-    basis, box = unknowns.basis(period)[0], np.diag(unknowns.box)
+    basis = unknowns.basis(period)[0]
+    box = np.diag(unknowns.box)
     maps = [np.zeros((len(times), unknowns.coordinates, unknowns.size)) for _ in range(3)]
     maps[0] += np.kron(box, basis.mean(axis=0))
     for s, followed in zip(speeds, tracking, strict=True):
@@ -145,27 +168,41 @@ def tracked_motion(
         for derivative, total in enumerate(maps):
             total += (s**derivative * amplitude).real
     offset, rate, acceleration = (
-        ca.reshape(ca.DM(unknowns.chart.lifted(total, axis=1).reshape(-1, unknowns.size)) @ z, 6, len(times))
+        ca.reshape(
+            ca.DM(
+                agreed(unknowns.chart.lifted(total, axis=1), RESPONSE_BITS).reshape(
+                    -1, unknowns.size
+                )
+            )
+            @ z,
+            6,
+            len(times),
+        )
         for total in maps
     )
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
 
 
-def regressor(robot: Robot, smoothing: float | None, of: Literal["wrench", "torque"]) -> ca.Function:
-    """(pose, rate, acceleration) (6,) -> regressor of wrench (eq. 25), along the m coordinates, or of the n actuators'
-    torques, transposed (p, m) or (p, n).
+def regressor(
+    robot: Robot, smoothing: float | None, of: Literal["wrench", "torque"]
+) -> ca.Function:
+    """(pose, rate, acceleration) (6,) -> regressor of wrench (eq. 25), along the m coordinates, or
+    of the n actuators' torques, transposed (p, m) or (p, n).
 
-    The former is J_ad^T times the latter, projected on the chart. The sign of Coulomb friction has no derivative:
-    `smoothing` replaces it by tanh(theta_dot / v_s), v_s in rad/s, or m/s where actuators slide; None keeps it.
+    The former is J_ad^T times the latter, projected on the chart. The sign of Coulomb friction has
+    no derivative: `smoothing` replaces it by tanh(theta_dot / v_s), v_s in rad/s, or m/s where
+    actuators slide; None keeps it.
     """
     pose, rate, acceleration = (ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration"))
     to_twist = pose_rate_to_twist(pose)
-    twist, twist_dot = to_twist @ rate, to_twist @ acceleration + twist_bias(pose, rate)
+    twist = to_twist @ rate
+    twist_dot = to_twist @ acceleration + twist_bias(pose, rate)
     jacobian = joint_jacobian(robot.geometry, pose)
     velocity = jacobian @ twist
     sign = ca.sign(velocity) if smoothing is None else ca.tanh(velocity / smoothing)
     free = freedoms(robot.geometry)
-    rigid, along = free.T @ rigid_body_regressor(robot.geometry, pose, twist, twist_dot), jacobian @ free
+    rigid = free.T @ rigid_body_regressor(robot.geometry, pose, twist, twist_dot)
+    along = jacobian @ free
     friction = ca.horzcat(ca.diag(sign), ca.diag(velocity))
     if of == "torque":
         whole = ca.horzcat(ca.solve(along.T, rigid), friction)
@@ -176,7 +213,9 @@ def regressor(robot: Robot, smoothing: float | None, of: Literal["wrench", "torq
 
 @lru_cache(maxsize=4)
 def log_determinant(size: int) -> ca.Function:
-    """Matrix (size, size), of which the upper triangle is read -> ln det, by LDL^T; NaN where it is not positive."""
+    """Matrix (size, size), of which the upper triangle is read -> ln det, by LDL^T; NaN where it is
+    not positive.
+    """
     matrix = ca.SX.sym("matrix", size, size)
     upper = ca.triu(matrix)
     diagonal, _, _ = ca.ldl(upper + ca.triu(matrix, False).T, False)

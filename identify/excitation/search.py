@@ -1,7 +1,8 @@
-"""Searches for the trajectory that excites most: the best of random ones, differential evolution, and IPOPT.
+"""Searches for the trajectory that excites most: the best of random ones, differential evolution,
+and IPOPT.
 
-All maximise a criterion within the constraints of the motion, and begin with the same random candidates. To add one,
-write a function of the form `Search` and name it in `SEARCHES`.
+All maximise a criterion within the constraints of the motion, and begin with the same random
+candidates. To add one, write a function of the form `Search` and name it in `SEARCHES`.
 """
 
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import differential_evolution
 
-from identify.arrays import Array
+from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, Worst
 from identify.excitation.criteria import Criterion
@@ -26,12 +27,16 @@ CHECK_REFINEMENT = 8
 """How much finer constraints are checked in the end than while a search runs."""
 
 CLEARANCE = (np.pi / (SAMPLES_PER_HARMONIC * CHECK_REFINEMENT)) ** 2 / 2
-"""Share of every limit that is kept: by so much the highest harmonic can rise between the instants of the check."""
+"""Share of every limit that is kept: by so much the highest harmonic can rise between the instants
+of the check.
+"""
 
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """Maximise a criterion of the unknowns z under constraints; candidates: z of random trajectories, best first."""
+    """Maximise a criterion of the unknowns z under constraints; candidates: z of random
+    trajectories, best first.
+    """
 
     settings: Excitation
     unknowns: Unknowns
@@ -62,16 +67,20 @@ class SearchProblem:
         return all(w.share <= 1 - CLEARANCE for w in self.worst(z))
 
     def drawn_in(self, z: Array) -> Array:
-        """The largest share of z that is admissible: the home pose itself is, so shrinking the motion leads there.
+        """The largest share of z that is admissible: the home pose itself is, so shrinking the
+        motion leads there.
 
         Raises TrajectoryError, naming the constraint, where not even a thousandth of it is.
         """
         if self.is_admissible(z):
             return z
-        inside, outside = 0.0, 1.0
+        inside = 0.0
+        outside = 1.0
         while outside - inside > 1e-6:
             middle = (inside + outside) / 2
-            inside, outside = (middle, outside) if self.is_admissible(middle * z) else (inside, middle)
+            inside, outside = (
+                (middle, outside) if self.is_admissible(middle * z) else (inside, middle)
+            )
             if outside < 1e-3:
                 worst = max(self.worst(middle * z), key=Worst.excess)
                 raise TrajectoryError(f"no start is admissible, not even close to home: {worst}")
@@ -80,8 +89,8 @@ class SearchProblem:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The z that a search found, logarithm of its criterion, evaluations of the criterion (and of its gradient),
-    iterations or generations, and why the search stopped."""
+    """The z that a search found, logarithm of its criterion, evaluations of the criterion (and of
+    its gradient), iterations or generations, and why the search stopped."""
 
     z: Array
     log_value: float
@@ -98,9 +107,12 @@ class SearchResult:
 Search = Callable[[SearchProblem, np.random.SeedSequence, Progress], SearchResult]
 
 
-def best_of(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
+def best_of(
+    problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress
+) -> SearchResult:
     """The best random trajectory."""
-    best, count = problem.candidates[0], len(problem.candidates)
+    best = problem.candidates[0]
+    count = len(problem.candidates)
     return SearchResult(best, problem.value(best), count, 0, 0, f"best of {count}")
 
 
@@ -108,28 +120,38 @@ STALLED = 1e-10
 """The paper's stop criterion: spread of the population's values, relative."""
 
 FEWEST_MEMBERS, MOST_MEMBERS = 5, 32
-"""Differential evolution combines members with others; more of them converge more slowly than they find better."""
+"""Differential evolution combines members with others; more of them converge more slowly than they
+find better.
+"""
 
 RECOMBINATION = 0.9
-"""Share of the unknowns that a trial takes from its mutant; the best of what was tried, with MOST_MEMBERS."""
+"""Share of the unknowns that a trial takes from its mutant; the best of what was tried, with
+MOST_MEMBERS.
+"""
 
 NOT_ADMISSIBLE = 1e6
 """Added to the cost of a member that breaks a limit, beyond any value of a criterion."""
 
 
-def evolve(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
-    """What the generations of differential evolution find that begin with the best of the candidates.
+def evolve(
+    problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress
+) -> SearchResult:
+    """What the generations of differential evolution find that begin with the best of the
+    candidates.
 
-    A member of the population is scaled, a coordinate at a time, until it fills the box, as a random trajectory is:
-    its size is then no unknown any more, and no limit on the amplitude has to be found by chance. Among two members the
-    admissible one wins, among two that are not the one that breaks its limits less.
+    A member of the population is scaled, a coordinate at a time, until it fills the box, as a
+    random trajectory is: its size is then no unknown any more, and no limit on the amplitude has to
+    be found by chance. Among two members the admissible one wins, among two that are not the one
+    that breaks its limits less.
 
     Raises TrajectoryError where the candidates are too few.
     """
-    generations, candidates = problem.settings.generations, problem.candidates
+    generations = problem.settings.generations
+    candidates = problem.candidates
     if len(candidates) < FEWEST_MEMBERS:
         raise TrajectoryError(
-            f"excitation.candidates = {len(candidates)}: the evolutionary method needs at least {FEWEST_MEMBERS}"
+            f"excitation.candidates = {len(candidates)}: the evolutionary method needs at least "
+            f"{FEWEST_MEMBERS}"
         )
     filling = _Filling(problem)
     with progress.stage("evolutionary search", generations) as advance:
@@ -172,8 +194,11 @@ class _Filling:
         """Minus the logarithm of the criterion, or what is broken."""
         z = self.fill(member)
         unknowns = self._problem.unknowns
-        matrix, lifted = z.reshape(unknowns.coordinates, -1), unknowns.chart.lifted
-        poses = unknowns.home[:, None] + lifted(unknowns.box[:, None] * (matrix @ self._offset.T), axis=0)
+        matrix = z.reshape(unknowns.coordinates, -1)
+        lifted = unknowns.chart.lifted
+        poses = unknowns.home[:, None] + lifted(
+            unknowns.box[:, None] * (matrix @ self._offset.T), axis=0
+        )
         rates = lifted(unknowns.box[:, None] * (matrix @ self._rate.T), axis=0)
         shares = np.array(self._shares(poses, rates))[unknowns.coordinates :]
         worst = float(np.abs(shares).max())
@@ -204,26 +229,36 @@ STARTS = 3
 
 @honoured()
 def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
-    """The best of what IPOPT finds from the best candidates, with exact derivatives of criterion and constraints.
+    """The best of what IPOPT finds from the best candidates, with exact derivatives of criterion
+    and constraints.
 
-    The Hessian is approximated from gradients (limited memory): a criterion with 48 unknowns converges with it in some
-    tens of iterations, and an exact Hessian of a regressor costs more than it saves. Several starts, because the
-    criterion has many local optima. Limits that a start is far from are left out at first; those that the result breaks
-    are put in, and IPOPT climbs on. What goes over a limit between the instants of the constraints is drawn in towards
-    home until it is admissible at the finer instants of the check.
+    The Hessian is approximated from gradients (limited memory): a criterion with 48 unknowns
+    converges with it in some tens of iterations, and an exact Hessian of a regressor costs more
+    than it saves. Several starts, because the criterion has many local optima. Limits that a start
+    is far from are left out at first; those that the result breaks are put in, and IPOPT climbs on.
+    What goes over a limit between the instants of the constraints is drawn in towards home until it
+    is admissible at the finer instants of the check.
 
-    Raises TrajectoryError where no start is admissible, or IPOPT finds nothing from any of them, with its reasons.
+    Starts and problem are rounded to what all processors agree on, and IPOPT's own linear algebra
+    is the same on all. So are its steps and the trajectory at which it ends.
+
+    Raises TrajectoryError where no start is admissible, or IPOPT finds nothing from any of them,
+    with its reasons.
     """
-    starts, found, reasons = problem.candidates[:STARTS], [], []
+    starts = problem.candidates[:STARTS]
+    found = []
+    reasons = []
     with progress.stage("gradient search", len(starts)) as advance:
         for start in starts:
-            result = _climb_from(problem, INTERIOR * problem.drawn_in(start))
+            result = _climb_from(problem, INTERIOR * problem.drawn_in(agreed(start)))
             reasons.append(result.reason)
             if np.isfinite(result.log_value):
                 found.append(result)
             advance()
     if not found:
-        raise TrajectoryError(f"IPOPT found no trajectory from any of {len(starts)} starts: {', '.join(reasons)}")
+        raise TrajectoryError(
+            f"IPOPT found no trajectory from any of {len(starts)} starts: {', '.join(reasons)}"
+        )
     judge = problem.criterion.judge
     return max(found, key=lambda one: judge(one.trajectory(problem)) if judge else one.log_value)
 
@@ -235,16 +270,21 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
     while True:
         solver = _solver(problem, counted)
         done, stats = _solve(solver, z)
-        values, gradients = values + int(stats["n_call_nlp_f"]), gradients + int(stats["n_call_nlp_grad_f"])
-        iterations, reason = iterations + int(stats["iter_count"]), str(stats["return_status"])
+        values = values + int(stats["n_call_nlp_f"])
+        gradients = gradients + int(stats["n_call_nlp_grad_f"])
+        iterations = iterations + int(stats["iter_count"])
+        reason = str(stats["return_status"])
         found = np.array(done["x"]).ravel()
         if not np.isfinite(found).all() or not np.isfinite(float(done["f"])):
             return SearchResult(z, -np.inf, values, gradients, iterations, reason)
         broken = _used(problem, found, 1.0) - counted
         admissible = problem.drawn_in(found)
         if not broken:
-            return SearchResult(admissible, problem.value(admissible), values, gradients, iterations, reason)
-        counted, z = counted | broken, INTERIOR * admissible
+            return SearchResult(
+                admissible, problem.value(admissible), values, gradients, iterations, reason
+            )
+        counted = counted | broken
+        z = INTERIOR * admissible
 
 
 @one_thread

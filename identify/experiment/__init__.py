@@ -1,1 +1,3 @@
-"""The simulated experiment: true plant, images in the loop, and the truth that only validation and reports open."""
+"""The simulated experiment: true plant, images in the loop, and the truth that only validation and
+reports open.
+"""

@@ -1,9 +1,11 @@
-"""Optional instruments at the joints, simulated from the truth of a run: a torque sensor and an encoder in each joint.
+"""Optional instruments at the joints, simulated from the truth of a run: a torque sensor and an
+encoder in each joint.
 
-The visual experiment does without them; they are what the estimators of the literature need. Channels stand in a file
-of their own beside the record. The torque is the mean over one frame around the instant of exposure: with a held
-command the joint controller's torque is a sawtooth, and a sample at the frames would always see the same tooth (off by
-half a jump, which looks like viscous friction). An anti-aliasing filter does the same in a real instrument.
+The visual experiment does without them; they are what the estimators of the literature need.
+Channels stand in a file of their own beside the record. The torque is the mean over one frame
+around the instant of exposure: with a held command the joint controller's torque is a sawtooth, and
+a sample at the frames would always see the same tooth (off by half a jump, which looks like viscous
+friction). An anti-aliasing filter does the same in a real instrument.
 """
 
 from dataclasses import dataclass
@@ -14,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from dynamics import Robot
+from dynamics.closed_loop.command_schedule import acting_times
 from dynamics.closed_loop.drives import joint_law
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
@@ -31,7 +34,11 @@ from identify.files.dataset import (
 from identify.scenario import Timing
 
 VARIABLES: Variables = {
-    "joint_torque": (("time", "joint"), "N m", "measured torque of each joint, mean over one frame"),
+    "joint_torque": (
+        ("time", "joint"),
+        "N m",
+        "measured torque of each joint, mean over one frame",
+    ),
     "joint_angle": (("time", "joint"), "rad", "joint coordinate read from the encoder"),
 }
 ATTRIBUTES = {
@@ -41,13 +48,15 @@ ATTRIBUTES = {
 """Names of the instruments' figures where actuators turn, and where they slide."""
 
 SAME_INSTANT = 1e-9
-"""Frames by which a command that arrives with an exposure may be off; the plant's torque is recorded after it."""
+"""Frames by which a command that arrives with an exposure may be off; the plant's torque is
+recorded after it.
+"""
 
 
 @dataclass(frozen=True)
 class JointInstruments:
-    """Standard deviations of one sample of torque (N m) and angle (rad); the encoder's step (rad, 0: none). N and m of
-    actuators that slide, `prismatic`.
+    """Standard deviations of one sample of torque (N m) and angle (rad); the encoder's step (rad,
+    0: none). N and m of actuators that slide, `prismatic`.
 
     Defaults: 1 % of the holding torque of 2 to 3 N m of `rss6`, and an encoder of 17 bits.
     Raises ScenarioError for one that is negative or no finite number.
@@ -72,14 +81,18 @@ class JointInstruments:
 
 TURNING = JointInstruments()
 SLIDING = JointInstruments(0.5, 1e-6, 1e-6, prismatic=True)
-"""Of actuators that slide: 1 % of a holding force of some 50 N, and scales that read a micrometre."""
+"""Of actuators that slide: 1 % of a holding force of some 50 N, and scales that read a micrometre.
+"""
 
 
 def instruments_of(
-    robot: Robot, torque_noise: float | None = None, encoder_noise: float | None = None, bits: int | None = None
+    robot: Robot,
+    torque_noise: float | None = None,
+    encoder_noise: float | None = None,
+    bits: int | None = None,
 ) -> JointInstruments:
-    """The usual instruments of a robot's joints; others where a noise (N m and rad, or N and m) or the bits of an
-    encoder are given, a turn or the travel."""
+    """The usual instruments of a robot's joints; others where a noise (N m and rad, or N and m) or
+    the bits of an encoder are given, a turn or the travel."""
     usual = SLIDING if robot.layout.prismatic else TURNING
     whole = 2 * (robot.travel_limit if robot.layout.prismatic else pi)
     return JointInstruments(
@@ -103,10 +116,13 @@ def measure_joints(
     latencies (N,): of each frame's command, s, where they differ from the timing's.
     """
     at_encoder = "motor_angle" if "motor_angle" in truth else "joint_angle"
-    angle, command = truth[at_encoder].values, record["command"].values
+    angle = truth[at_encoder].values
+    command = record["command"].values
     known = true_parameters(truth)
     gains = np.array([known[f"joint_pid.{name}"] for name in JOINT_PID])
-    law = joint_law(truth.attrs.get("plant_drive", "pid"), gains, truth.attrs.get("plant_derivative_filter_s"))
+    law = joint_law(
+        truth.attrs.get("plant_drive", "pid"), gains, truth.attrs.get("plant_derivative_filter_s")
+    )
     each = np.full(len(command), timing.latency_s) if latencies is None else latencies
     sampled = truth["joint_torque"].values
     at_jump = np.array([law.lp, 0.0 if law.filter_time else law.rate_weight * law.ld])
@@ -115,27 +131,31 @@ def measure_joints(
     read = angle + instruments.encoder_noise * rng.standard_normal(angle.shape)
     step = instruments.encoder_resolution
     read = step * np.round(read / step) if step else read
-    values, variables = (
-        {"joint_torque": torque, "joint_angle": read},
-        with_joint_units(VARIABLES, instruments.prismatic),
+    values = {"joint_torque": torque, "joint_angle": read}
+    variables = with_joint_units(VARIABLES, instruments.prismatic)
+    channels = described_dataset(
+        values, record["time"].values, variables, joint=joint_numbers(torque)
     )
-    channels = described_dataset(values, record["time"].values, variables, joint=joint_numbers(torque))
     return channels.assign_attrs(instruments.figures)
 
 
-def frame_mean(torque: Array, command: Array, start: Array, gains: Array, timing: Timing, latencies: Array) -> Array:
-    """Torque (N, n) averaged over one frame around each sample, from samples of a torque that jumps with each command.
+def frame_mean(
+    torque: Array, command: Array, start: Array, gains: Array, timing: Timing, latencies: Array
+) -> Array:
+    """Torque (N, n) averaged over one frame around each sample, from samples of a torque that jumps
+    with each command.
 
-    The jump is lp dU + ld dU_dot, without lp dU where commands (N, n) ramp; before the first one the command is `start`
-    (n,). gains: lp, ld; latencies (N,), s, of the frames' commands. A jump s before or after a sample is
-    in it or not, and in the mean over a frame T for T/2 - s: the difference is taken off the sample.
+    The jump is lp dU + ld dU_dot, without lp dU where commands (N, n) ramp; before the first one
+    the command is `start` (n,). gains: lp, ld; latencies (N,), s, of the frames' commands. A jump s
+    before or after a sample is in it or not, and in the mean over a frame T for T/2 - s: the
+    difference is taken off the sample.
     """
     issued = np.vstack([start, start, command])
     step = np.diff(issued, axis=0)
     jump = gains[1] * timing.frame_rate_hz * np.diff(step, axis=0)
     if timing.hold == "zero":
         jump = jump + gains[0] * step[1:]
-    arrival = np.maximum.accumulate(np.arange(len(command)) + latencies * timing.frame_rate_hz)
+    arrival = acting_times(np.arange(len(command)), latencies * timing.frame_rate_hz)
     nearest = np.round(arrival - SAME_INSTANT).astype(int)
     late = arrival - nearest
     excess = late + np.where(late <= SAME_INSTANT, 0.5, -0.5)
@@ -148,7 +168,8 @@ def frame_mean(torque: Array, command: Array, start: Array, gains: Array, timing
 def read_channels(path: Path) -> xr.Dataset:
     """Read the channels of a file, checked.
 
-    Raises RecordError: truncated, a channel or a standard deviation missing, or values that are not finite.
+    Raises RecordError: truncated, a channel or a standard deviation missing, or values that are not
+    finite.
     """
     channels = read_group(path)
     check_variables(channels, VARIABLES, str(path))

@@ -1,10 +1,9 @@
-"""The rig as the estimator knows it: exactly, as calibrated from pictures of a board, or as well as a calibration says,
-that of a file or what fifteen photographs leave.
+"""The rig as the estimator knows it: exactly, as calibrated from pictures of a board, or as well as
+a calibration says, that of a file or what fifteen photographs leave.
 
 The cameras that take the pictures are the sensor file's in each case.
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,20 +14,23 @@ from scipy.spatial.transform import Rotation
 
 import cmmsim
 from cmmsim.calibration import PairView, board_poses, calibrate, default_board, render_pairs
-from cmmsim.calibration.detection import find_board
+from cmmsim.calibration.board_detection import find_board
 from cmmsim.files import SensorFile
 from cmmsim.files.setup import rig_from_file
-from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
+from dynamics.files import parse_json, read_text
 from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Scenario
 
 LARGEST_RATIO = 1.5
-"""Of the focal lengths and baselines of two rigs, one over the other, of which one may be calibrated for the other."""
+"""Of the focal lengths and baselines of two rigs, one over the other, of which one may be
+calibrated for the other.
+"""
 ANGLE, SHARE = np.deg2rad(10.0), 0.1
 """By which the directions of such may differ, and their principal points, of the image's size."""
 
@@ -38,9 +40,10 @@ def known_rig(
 ) -> KnownRig | None:
     """What is known of the rig of a scenario's sensor file; None where it is known exactly.
 
-    `calibrated`: a board is drawn in front of the true cameras, found in the pictures and calibrated from. A path, or
-    `photographs`: the rig that one calibration with that covariance would have found. Raises ScenarioError for a file
-    that holds no calibration, or that of another rig, CalibrationError where the pictures do not determine the cameras.
+    `calibrated`: a board is drawn in front of the true cameras, found in the pictures and
+    calibrated from. A path, or `photographs`: the rig that one calibration with that covariance
+    would have found. Raises ScenarioError for a file that holds no calibration, or that of another
+    rig, CalibrationError where the pictures do not determine the cameras.
     """
     section, (rig, _) = scenario.rig, rig_from_file(file.rig)
     if section.exact:
@@ -49,22 +52,36 @@ def known_rig(
     if section.known == "exact":
         return KnownRig(rig, np.zeros((len(PARAMETER_NAMES),) * 2), exposure)
     if section.known == "calibrated":
-        return replace(calibrated_rig(file, section.pairs, rng, progress or SilentProgress()), exposure_std=exposure)
-    stated = PHOTOGRAPHED if section.known == "photographs" else stated_covariance(Path(section.known), rig)
+        return replace(
+            calibrated_rig(file, section.pairs, rng, progress or SilentProgress()),
+            exposure_std=exposure,
+        )
+    stated = (
+        PHOTOGRAPHED
+        if section.known == "photographs"
+        else stated_covariance(Path(section.known), rig)
+    )
     return KnownRig.drawn(rig, stated, rng, exposure)
 
 
-def calibrated_rig(file: SensorFile, pairs: int, rng: np.random.Generator, progress: Progress) -> KnownRig:
-    """The rig of a sensor file as calibrated from pictures of a board of dots, drawn by the analytic renderer."""
+def calibrated_rig(
+    file: SensorFile, pairs: int, rng: np.random.Generator, progress: Progress
+) -> KnownRig:
+    """The rig of a sensor file as calibrated from pictures of a board of dots, drawn by the
+    analytic renderer.
+    """
     source = cmmsim.Sensor(file, renderer="analytic")
-    rig, noise = source.rig, source.noise
+    rig = source.rig
+    noise = source.noise
     board = default_board(rig)
     poses = board_poses(rig, board, pairs, rng)
     frames = render_pairs(rig, board, poses, choose_renderer("analytic"), source.optics, noise, rng)
     views = []
     with progress.stage("calibrate the cameras", pairs) as advance:
         for number, frame in enumerate(frames, start=1):
-            sides = (find_board(_as_read(image, noise), board) for image in (frame.left, frame.right))
+            sides = (
+                find_board(_as_read(image, noise), board) for image in (frame.left, frame.right)
+            )
             views.append(PairView(f"pair {number}", *sides))
             advance()
     return calibrate(board, views, (rig.left.width, rig.left.height)).known
@@ -78,23 +95,31 @@ def _as_read(image: NDArray[np.unsignedinteger[Any]], noise: CameraNoise) -> NDA
 
 
 def stated_covariance(path: Path, rig: StereoRig) -> Array:
-    """Covariance (24, 24) of the parameters of a rig from a calibration.json of it, or of one like it.
+    """Covariance (24, 24) of the parameters of a rig from a calibration.json of it, or of one like
+    it.
 
-    Raises ScenarioError: no such file, no calibration in it, or that of other cameras (what differs, and how much).
+    Raises ScenarioError: no such file, no calibration in it, or that of other cameras (what
+    differs, and how much).
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        names, matrix = content["covariance"]["names"], np.array(content["covariance"]["matrix"], dtype=float)
-        estimates = np.array([content["parameters"][name]["estimate"] for name in PARAMETER_NAMES], dtype=float)
+        text = read_text(path, str(path), ScenarioError)
+        content = parse_json(text, str(path), ScenarioError)
+        names = content["covariance"]["names"]
+        matrix = np.array(content["covariance"]["matrix"], dtype=float)
+        estimates = np.array(
+            [content["parameters"][name]["estimate"] for name in PARAMETER_NAMES], dtype=float
+        )
         size = content["image_size_px"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ScenarioError(
-            f"rig.known = {str(path)!r} is neither exact, calibrated, photographs, nor the calibration.json of "
+            f"rig.known = {str(path)!r} is neither exact, calibrated, photographs, nor the "
+            "calibration.json of "
             f"`cmmsim calibrate`: {type(error).__name__} {error}"
         ) from None
     if list(names) != list(PARAMETER_NAMES) or matrix.shape != (len(PARAMETER_NAMES),) * 2:
         raise ScenarioError(
-            f"rig.known = {str(path)!r}: its covariance is not of the {len(PARAMETER_NAMES)} parameters"
+            f"rig.known = {str(path)!r}: its covariance is not of the {len(PARAMETER_NAMES)} "
+            "parameters"
         )
     if size != [rig.left.width, rig.left.height]:
         raise ScenarioError(
@@ -112,7 +137,9 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
 
 
 def _other_rig(estimates: Array, rig: StereoRig) -> str:
-    """In what calibrated parameters (24,) are not those of a rig like this one; empty where they are."""
+    """In what calibrated parameters (24,) are not those of a rig like this one; empty where they
+    are.
+    """
 
     def both(name: str) -> tuple[float, float]:
         index = PARAMETER_NAMES.index(name)
@@ -121,17 +148,25 @@ def _other_rig(estimates: Array, rig: StereoRig) -> str:
     places = [(Rotation.from_rotvec(one[21:]), one[18:21]) for one in (estimates, rig.parameters)]
     turned = (places[0][0].inv() * places[1][0]).magnitude()
     lengths = [float(np.linalg.norm(place)) for _, place in places]
-    ratios = {f"{side}.fx_px": both(f"{side}.fx_px") for side in ("left", "right")} | {"baseline [m]": tuple(lengths)}
+    ratios = {f"{side}.fx_px": both(f"{side}.fx_px") for side in ("left", "right")} | {
+        "baseline [m]": tuple(lengths)
+    }
     for name, (there, here) in ratios.items():
         if not 1.0 / LARGEST_RATIO < there / here < LARGEST_RATIO:
             return f"{name} is {there:.4g} there, {here:.4g} of the sensor"
     for camera in ("left", "right"):
-        for name, size in ((f"{camera}.cx_px", rig.left.width), (f"{camera}.cy_px", rig.left.height)):
+        for name, size in (
+            (f"{camera}.cx_px", rig.left.width),
+            (f"{camera}.cy_px", rig.left.height),
+        ):
             there, here = both(name)
             if not abs(there - here) < SHARE * size:
                 return f"{name} is {there:.5g} there, {here:.5g} of the sensor"
     along = np.arccos(np.clip(places[0][1] @ places[1][1] / np.prod(lengths), -1.0, 1.0))
     for what, angle in (("the right camera looks", turned), ("the right camera stands", along)):
         if not angle < ANGLE:
-            return f"{what} {np.rad2deg(angle):.0f} degrees beside where that of the sensor does, from the left one"
+            return (
+                f"{what} {np.rad2deg(angle):.0f} degrees beside where that of the sensor does, "
+                "from the left one"
+            )
     return ""

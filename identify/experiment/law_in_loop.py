@@ -1,9 +1,7 @@
 """A control law with a model of the robot, made ready to follow a motion of a scenario's plant."""
 
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,17 +17,18 @@ from identify.errors import ScenarioError, TrajectoryError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop
 from identify.loop_parameters import model_settings
-from identify.plugins import LAWS, chosen, is_own
+from identify.plugins import LAWS, Telling, chosen, is_own
 from identify.scenario import Scenario
 from identify.scenario.plant_sections import FILTERED
 
 FASTEST = 1.0
-"""Bandwidth of computed_torque with an observer, times the time between two frames: its gains may then double before
-the loop is lost. At the noise of the sensors here a slower loop is further from the motion."""
+"""Bandwidth of computed_torque with an observer, times the time between two frames: its gains may
+then double before the loop is lost. At the noise of the sensors here a slower loop is further from
+the motion."""
 
 FASTEST_UNSEEN = 0.5
-"""The same without, times the delay from the motion to its torque: the latency, half a frame of hold, one frame of
-difference."""
+"""The same without, times the delay from the motion to its torque: the latency, half a frame of
+hold, one frame of difference."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,8 @@ class NamedMotion:
 
 @dataclass(frozen=True)
 class Seen:
-    """By what the loop sees: measure(frame, t, pose, rate) as `SensorInLoop` does; the covariance (6, 6) of the noise
-    of a frame's pose, and that of what all poses have in common."""
+    """By what the loop sees: measure(frame, t, pose, rate) as `SensorInLoop` does; the covariance
+    (6, 6) of the noise of a frame's pose, and that of what all poses have in common."""
 
     measure: Callable[[int, float, Array, Array], Array | None]
     noise: Callable[[int], Array]
@@ -53,8 +52,8 @@ class Seen:
 
 @dataclass(frozen=True)
 class KnownModel:
-    """What a law knows: parameters (p,), the law of the drives, None: the scenario's model's; and how far the torques
-    may be from the true ones (`inverse_dynamics.Model`)."""
+    """What a law knows: parameters (p,), the law of the drives, None: the scenario's model's; and
+    how far the torques may be from the true ones (`inverse_dynamics.Model`)."""
 
     parameters: Array
     drive: DriveName | None = None
@@ -76,11 +75,13 @@ def prepared(
 ) -> LawInLoop:
     """A law ready to follow a motion.
 
-    Raises ScenarioError: a law that is none, or needs torques which the drives do not take, or actuators that cannot
-    hold the platform. Raises TrajectoryError: a motion beyond reach or travel, with time and leg. Raises
-    SimulationError: gains that are unstable with this model, or a law of one's own that fails.
+    Raises ScenarioError: a law that is none, or needs torques which the drives do not take, or
+    actuators that cannot hold the platform. Raises TrajectoryError: a motion beyond reach or
+    travel, with time and leg. Raises SimulationError: gains that are unstable with this model, or a
+    law of one's own that fails.
     """
-    scenario, robot = plant.scenario, plant.nominal
+    scenario = plant.scenario
+    robot = plant.nominal
     chosen_law: Law = _telling(law, chosen(law, "law", LAWS))
     times = scenario.timing.frame_times(motion.duration_s)
     desired = motion.motion.pose(times)
@@ -92,8 +93,11 @@ def prepared(
     if known.drive is not None:
         stated = scenario.model.derivative_filter_s or scenario.plant.derivative_filter_s
         filter_time = stated if known.drive == FILTERED else None
-        settings = replace(settings, drives=replace(settings.drives, law=known.drive, filter_time=filter_time))
-    model, asked = Model(robot, known.parameters, settings.friction, known.doubt), feedback(scenario)
+        settings = replace(
+            settings, drives=replace(settings.drives, law=known.drive, filter_time=filter_time)
+        )
+    model = Model(robot, known.parameters, settings.friction, known.doubt)
+    asked = feedback(scenario)
     usual = np.full(len(times), scenario.timing.latency_s)
     found = chosen_law(
         Assignment(
@@ -112,7 +116,8 @@ def prepared(
         raise ScenarioError(f"law {law!r} must return a LawInLoop, returned {type(found).__name__}")
     if found.drives.torques and not scenario.control.torque_access:
         raise ScenarioError(
-            f"law {law} sets torques, which the drives of {robot.name} do not take: control.torque_access = false; "
+            f"law {law} sets torques, which the drives of {robot.name} do not take: "
+            "control.torque_access = false; "
             "feedforward needs joint commands only"
         )
     if law == "computed_torque":
@@ -123,22 +128,14 @@ def prepared(
 
 
 def _telling(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of a law, which tells what one of a user's own raises in one line, with its place in the file."""
-
-    def told(*given: Any) -> Any:
-        try:
-            return asked(*given)
-        except Exception as error:
-            at = traceback.extract_tb(error.__traceback__)[:2][-1]
-            place = f"{Path(at.filename).name}, line {at.lineno}"
-            raise SimulationError(f"law {law!r} raised {type(error).__name__}: {error} ({place})") from error
-
-    return told if is_own(law) else asked
+    """A function of a law; one of a user's own tells in one line what it raises."""
+    return Telling(f"law {law!r}", asked, SimulationError) if is_own(law) else asked
 
 
 def feedback(scenario: Scenario) -> Feedback:
     """What a scenario asks of the loop of computed_torque."""
-    control, timing = scenario.control, scenario.timing
+    control = scenario.control
+    timing = scenario.timing
     period = timing.frame_period_s
     delay = timing.latency_s + 1.5 * period
     fastest = FASTEST / period if control.observer else FASTEST_UNSEEN / delay

@@ -1,4 +1,6 @@
-"""The rendering stereo sensor as the pose sensor of the closed loop: it measures, and remembers what it said."""
+"""The rendering stereo sensor as the pose sensor of the closed loop: it measures, and remembers
+what it said.
+"""
 
 import time
 from collections.abc import Mapping
@@ -13,9 +15,9 @@ import cmmsim
 from cmmsim.files import SensorFile, read_sensor_file
 from cmmsim.files.schema import unit
 from cmmsim.files.setup import marked_body
-from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.imaging.renderer import choose_renderer
-from cmmsim.imaging.scene import PlacedBodies, rod_transforms
+from cmmsim.imaging.scene_bodies import PlacedBodies, rod_transforms
+from cmmsim.uncertainty.known_rig import KnownRig
 from dynamics import Robot
 from dynamics.bodies import Part, parts_of
 from dynamics.geometry import RobotGeometry
@@ -29,29 +31,43 @@ OFF_PLATFORM_M = 0.05
 
 
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
-    """Meshes [m] of the bodies of all legs, rods along their z axes from their first joints; they hide stickers."""
+    """Meshes [m] of the bodies of all legs, rods along their z axes from their first joints; they
+    hide stickers.
+    """
     return dict(_meshes(robot.geometry))
 
 
 @lru_cache(maxsize=4)
 def _meshes(geometry: RobotGeometry) -> dict[str, trimesh.Trimesh]:
-    """Those of a geometry, made once a process: rows of a study have a sensor each, and mostly the same robot."""
+    """Those of a geometry, made once a process: rows of a study have a sensor each, and mostly the
+    same robot.
+    """
     return {
-        part.name: cmmsim.rod(float(np.linalg.norm(np.diff(part.segment.rod, axis=0))), part.segment.radius)
+        part.name: cmmsim.rod(
+            float(np.linalg.norm(np.diff(part.segment.rod, axis=0))), part.segment.radius
+        )
         for part in _drawn(geometry)[0]
     }
 
 
 @lru_cache(maxsize=16)
 def _drawn(geometry: RobotGeometry) -> tuple[list[Part], tuple[str, ...], NDArray[np.int_]]:
-    """The parts of a geometry as its parameters are ordered, their names, and their places leg by leg."""
+    """The parts of a geometry as its parameters are ordered, their names, and their places leg by
+    leg.
+    """
     parts = parts_of(geometry).all
     places = sorted(range(len(parts)), key=lambda place: parts[place].body)
-    return [parts[place] for place in places], tuple(parts[place].name for place in places), np.array(places)
+    return (
+        [parts[place] for place in places],
+        tuple(parts[place].name for place in places),
+        np.array(places),
+    )
 
 
 def robot_transforms(robot: Robot, pose: Array) -> PlacedBodies:
-    """base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,), in the order of their meshes."""
+    """base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,), in the order
+    of their meshes.
+    """
     _, names, order = _drawn(robot.geometry)
     ends = parts_of(robot.geometry).rods(robot, pose)[order]
     return PlacedBodies(names, rod_transforms(ends[:, 0], ends[:, 1]))
@@ -64,14 +80,17 @@ def make_sensor(
     taught: cmmsim.Taught | None = None,
     known: KnownRig | None = None,
 ) -> cmmsim.Sensor:
-    """The scenario's sensor, with its timing and with the bodies of the robot's legs in its view, and with its rig as
-    it is known; None: exactly, or as it was when it was taught.
+    """The scenario's sensor, with its timing and with the bodies of the robot's legs in its view,
+    and with its rig as it is known; None: exactly, or as it was when it was taught.
 
-    One a process: it owns the renderer. Raises ScenarioError where the platform that it sees is not the robot's.
+    One a process: it owns the renderer. Raises ScenarioError where the platform that it sees is not
+    the robot's.
     """
     file = sensor_file(scenario)
     check_platform(robot, file, scenario.sensor)
-    sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer, known=known)
+    sensor = cmmsim.Sensor(
+        file, seed, scenario.pose_method, taught, renderer=scenario.renderer, known=known
+    )
     sensor.move_rig(scenario.rig.errors, scenario.rig.right_later_s or 0.0)
     sensor.drift_rig(scenario.rig.drift, scenario.timing.frames(scenario.excitation.duration_s))
     sensor.add_bodies(robot_meshes(robot))
@@ -79,9 +98,10 @@ def make_sensor(
 
 
 def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
-    """How far each leg of a robot ends outside of the platform of a sensor file (n,), and how far that is at home from
-    the robot's; m."""
-    body, cuts = marked_body("platform", file.platform), file.platform.cuts
+    """How far each leg of a robot ends outside of the platform of a sensor file (n,), and how far
+    that is at home from the robot's; m."""
+    body = marked_body("platform", file.platform)
+    cuts = file.platform.cuts
     normals = np.vstack([body.normals, *[unit(cut.normal) for cut in cuts]])
     reach = np.append(body.offsets, [unit(cut.normal) @ cut.point for cut in cuts])
     outside = (robot.geometry.platform_joints @ normals.T - reach).max(axis=1)
@@ -89,13 +109,14 @@ def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
 
 
 def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
-    """Raise ScenarioError, with leg and distance, where legs end in mid-air beside the platform of a sensor file, or
-    where that is at home elsewhere than the robot's."""
+    """Raise ScenarioError, with leg and distance, where legs end in mid-air beside the platform of
+    a sensor file, or where that is at home elsewhere than the robot's."""
     outside, away = platform_distances(robot, file)
     leg = int(np.argmax(outside))
     if outside[leg] > OFF_PLATFORM_M:
         raise ScenarioError(
-            f"platform joint {leg + 1} of {robot.name} is {outside[leg]:.3g} m outside of the platform that sensor "
+            f"platform joint {leg + 1} of {robot.name} is {outside[leg]:.3g} m outside of the "
+            "platform that sensor "
             f"{sensor} sees, limit {OFF_PLATFORM_M:g} m: its [platform] has to be that of the robot"
         )
     if away > OFF_PLATFORM_M:
@@ -112,7 +133,9 @@ def sensor_file(scenario: Scenario) -> SensorFile:
 
 
 def with_renderer(scenario: Scenario) -> Scenario:
-    """The scenario with what draws on this machine in place of "auto"; one line of warning where OpenGL is missing."""
+    """The scenario with what draws on this machine in place of "auto"; one line of warning where
+    OpenGL is missing.
+    """
     return scenario.with_overrides({"renderer": choose_renderer(scenario.renderer).name})
 
 
@@ -126,21 +149,31 @@ class PoseSensor(Protocol):
         """Begin a new run with noise of its own."""
 
     def measure(
-        self, pose: Array, obstacles: Mapping[str, Array] | None = None, pose_rate: Array | None = None
+        self,
+        pose: Array,
+        obstacles: Mapping[str, Array] | None = None,
+        pose_rate: Array | None = None,
     ) -> cmmsim.Measurement:
-        """Measure the platform at a pose (6,) [m, rad] in motion at pose_rate (6,), behind obstacles (4, 4)."""
+        """Measure the platform at a pose (6,) [m, rad] in motion at pose_rate (6,), behind
+        obstacles (4, 4).
+        """
         ...
 
 
 class SensorInLoop:
-    """Sensor for `closed_loop.simulate`: a measured pose (6,) a frame, or None where it lost the platform.
+    """Sensor for `closed_loop.simulate_servo`: a measured pose (6,) a frame, or None where it lost
+    the platform.
 
-    Keeps the covariances (6, 6) of every frame (NaN where lost), the reasons of lost frames, and the seconds spent on
-    rendering and measuring.
+    Keeps the covariances (6, 6) of every frame (NaN where lost), the reasons of lost frames, and
+    the seconds spent on rendering and measuring.
     """
 
-    def __init__(self, sensor: PoseSensor, robot: Robot, seed: int, advance: Advance = lambda n=1: None) -> None:
-        self._sensor, self._robot, self._advance = sensor, robot, advance
+    def __init__(
+        self, sensor: PoseSensor, robot: Robot, seed: int, advance: Advance = lambda n=1: None
+    ) -> None:
+        self._sensor = sensor
+        self._robot = robot
+        self._advance = advance
         self._sees_bodies = getattr(sensor, "sees_bodies", True)
         self.covariances: list[Array] = []
         self.lost: list[str] = []
@@ -149,12 +182,19 @@ class SensorInLoop:
 
     @property
     def common(self) -> Array:
-        """Covariance (6, 6) of what all its poses near home have in common, as far as teaching says."""
+        """Covariance (6, 6) of what all its poses near home have in common, as far as teaching
+        says.
+        """
         taught = getattr(self._sensor, "taught", None)
-        return np.zeros((6, 6)) if taught is None else taught.calibration_covariance(self._robot.home_pose)
+        return (
+            np.zeros((6, 6))
+            if taught is None
+            else taught.calibration_covariance(self._robot.home_pose)
+        )
 
     def measure(self, frame: int, t: float, pose: Array, rate: Array) -> Array | None:
-        """Measure the platform at its true pose in motion at its true rate; only the renderer sees these.
+        """Measure the platform at its true pose in motion at its true rate; only the renderer sees
+        these.
 
         The rate blurs the picture of an exposure that is not instantaneous.
         """

@@ -27,13 +27,29 @@ VARIABLES: Variables = {
     "joint_angle": (("time", "joint"), "rad", "true joint coordinate"),
     "joint_velocity": (("time", "joint"), "rad/s", "true joint velocity"),
     "joint_torque": (("time", "joint"), "N m", "torque or force of the joint controller"),
-    "parameter_value": (("parameter",), "SI", "true parameter of the plant and its joint controller"),
+    "parameter_value": (
+        ("parameter",),
+        "SI",
+        "true parameter of the plant and its joint controller",
+    ),
 }
 
 MISMATCH: Variables = {
-    "base_joint_error": (("joint", "axis"), "m", "true joint centre B on the base less the nominal one"),
-    "platform_joint_error": (("joint", "axis"), "m", "true joint centre A on the platform less the nominal one"),
-    "motor_angle": (("time", "joint"), "rad", "place of the motor of an elastic joint, which its encoder reads"),
+    "base_joint_error": (
+        ("joint", "axis"),
+        "m",
+        "true joint centre B on the base less the nominal one",
+    ),
+    "platform_joint_error": (
+        ("joint", "axis"),
+        "m",
+        "true joint centre A on the platform less the nominal one",
+    ),
+    "motor_angle": (
+        ("time", "joint"),
+        "rad",
+        "place of the motor of an elastic joint, which its encoder reads",
+    ),
 }
 """What is recorded of a plant only where it is not the nominal robot with rigid joints."""
 
@@ -50,8 +66,9 @@ def build_truth(
     mismatch: Mapping[str, ArrayLike] | None = None,
     prismatic: bool = False,
 ) -> xr.Dataset:
-    """Truth of one run at the frames: ``time`` (N,) [s], pose (N, 6), joint arrays (N, n), parameters (p,) with names;
-    ``mismatch``: values of some of `MISMATCH`; ``prismatic``: whether the joints slide.
+    """Truth of one run at the frames: ``time`` (N,) [s], pose (N, 6), joint arrays (N, n),
+    parameters (p,) with names; ``mismatch``: values of some of `MISMATCH`; ``prismatic``: whether
+    the joints slide.
 
     Raises RecordError: wrong shapes, or numbers that are not finite.
     """
@@ -83,7 +100,9 @@ def read_truth(path: Path | str, run: str = "") -> xr.Dataset:
 
 
 def read_truth_runs(path: Path | str) -> list[xr.Dataset]:
-    """Read the truth of all runs of a file in their order. Raises RecordError: as `read_truth`, or no runs in it."""
+    """Read the truth of all runs of a file in their order. Raises RecordError: as `read_truth`, or
+    no runs in it.
+    """
     return [read_truth(path, name) for name in run_names(path)]
 
 
@@ -94,11 +113,19 @@ def true_poses(truth: xr.Dataset) -> Array:
 
 def true_parameters(truth: xr.Dataset) -> dict[str, float]:
     """True parameters by name."""
-    return dict(zip(map(str, truth["parameter"].values), map(float, truth["parameter_value"].values), strict=True))
+    return dict(
+        zip(
+            map(str, truth["parameter"].values),
+            map(float, truth["parameter_value"].values),
+            strict=True,
+        )
+    )
 
 
 def check_truth(truth: xr.Dataset, source: str) -> xr.Dataset:
-    """Return the truth when it is complete and finite. Raises RecordError: the first thing that is not so."""
+    """Return the truth when it is complete and finite. Raises RecordError: the first thing that is
+    not so.
+    """
     expected = VARIABLES | {name: entry for name, entry in MISMATCH.items() if name in truth}
     check_variables(truth, expected, source)
     for name in expected:

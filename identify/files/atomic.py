@@ -1,74 +1,193 @@
-"""Files appear whole or not at all: written under a temporary name in the same folder, then renamed."""
+"""Files appear whole or not at all, and what keeps one from being written is one line.
 
+A file's content is made in memory: libraries such as netCDF's crash when the disk that they write
+to is full. It is then written beside its place, brought to the disk, and renamed.
+"""
+
+import errno
+import io
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 from typing import TYPE_CHECKING
+
+from identify.errors import WriteError
+from identify.runtime import held
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+TEMPORARY = ".cmmsim-"
+"""First characters of the names of files and folders that are being written."""
+
 
 @contextmanager
-def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that replaces it when the block ends without an error.
+def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
+    """Turn what keeps the block from writing a file into one line.
 
-    The temporary name keeps the suffix, because some writers choose their format by it.
+    size: bytes of the file, where they are known.
+    Raises WriteError.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+    except ValueError as error:  # a name that no file can have
+        reason = str(error)
+    else:
+        return
+    needed = "" if size is None else _needed(Path(path), size)
+    raise WriteError(f"cannot write {path}: {reason}{needed}; name another place")
+
+
+def write_bytes(path: Path | str, content: bytes, *, parents: bool = False) -> None:
+    """Write a file, whole or not at all.
+
+    parents: whether missing folders are made; if it fails, they are taken back.
+    Raises WriteError: no room, no permission, or no such folder.
+    """
+    write_files({Path(path): content}, parents=parents)
+
+
+def write_text(path: Path | str, text: str, *, parents: bool = False) -> None:
+    """Write ``text`` as UTF-8, as `write_bytes` does."""
+    write_bytes(path, text.encode(), parents=parents)
+
+
+def write_figure(path: Path | str, figure: "Figure") -> None:
+    """Write a figure in the format of its suffix, as `write_bytes` does."""
+    write_bytes(path, figure_bytes(figure, Path(path).suffix))
+
+
+def figure_bytes(figure: "Figure", suffix: str, dpi: int = 150) -> bytes:
+    """Return the content of a figure's file, whose format a suffix such as ``.png`` names."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format=suffix.removeprefix("."), dpi=dpi)
+    return stream.getvalue()
+
+
+@held()
+def write_files(
+    contents: Mapping[Path, bytes],
+    *,
+    parents: bool = False,
+    check: Callable[[Path], object] | None = None,
+) -> None:
+    """Write several files: all of them, or none.
+
+    parents: as in `write_bytes`. check: reads the first file before any is in place, and refuses
+    it by an exception.
+    Raises WriteError.
+    """
+    mark = token_hex(4)  # one for all, so that a reader finds what belongs to the first file
+    folders: list[Path] = []
+    beside: dict[Path, Path] = {}
+    placed: list[Path] = []
+    try:
+        for path, content in contents.items():
+            with writing(path, len(content)):
+                if parents:
+                    folders += make_folder(path.parent)
+                beside[path] = path.with_name(f"{TEMPORARY}{mark}-{path.name}")
+                _write_beside(beside[path], content)
+        if check is not None:
+            check(next(iter(beside.values())))
+        for path, temporary in beside.items():
+            with writing(path):
+                if not path.exists():
+                    placed.append(path)
+                temporary.replace(path)
+    except BaseException:
+        with suppress(OSError, ValueError):
+            for path in (*beside.values(), *placed):
+                path.unlink(missing_ok=True)
+            take_back(folders)
+        raise
+
+
+def check_writable(path: Path | str) -> None:
+    """Try whether a file could be written, before its content is made.
+
+    Raises WriteError: not into its folder, or that above it that is there; or it is a folder.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    with writing(path):
+        above = next(folder for folder in path.absolute().parents if folder.exists())
+        with tempfile.TemporaryFile(prefix=TEMPORARY, dir=above):
+            pass
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+
+
+def make_folder(folder: Path) -> list[Path]:
+    """Make a folder and those above it; return those that were missing, the outmost first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        take_back(missing[::-1])
+        raise
+    return missing[::-1]
+
+
+def take_back(folders: list[Path]) -> None:
+    """Remove folders that `make_folder` has made, as far as they are empty."""
+    for folder in reversed(folders):
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what a killed process was writing into a folder, and into the folders within it."""
+    for path in (*folder.glob(f"{TEMPORARY}*"), *folder.glob(f"*/{TEMPORARY}*")):
+        with suppress(OSError):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 @contextmanager
 def atomic_contents(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder whose contents stand in ``folder``, new or empty, when the block ends without an error.
+    """Yield a temporary folder whose contents stand in ``folder`` when the block has ended.
 
-    It lies within the folder, which so may be one that cannot be replaced, such as the one it is called from.
+    It lies within the folder, which so may be one that cannot be replaced, such as the one that
+    the command is called from. An exception leaves the folder as it was.
+    Raises WriteError.
     """
-    new = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
+    folders: list[Path] = []
     moved: list[Path] = []
     try:
-        with tempfile.TemporaryDirectory(prefix=".making-", dir=folder) as name:
-            yield Path(name)
-            for path in sorted(Path(name).iterdir()):
-                moved.append(folder / path.name)
-                path.rename(moved[-1])
+        with writing(folder):
+            folders = make_folder(folder)
+            with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as name:
+                yield Path(name)
+                for path in sorted(Path(name).iterdir()):
+                    moved.append(folder / path.name)
+                    path.rename(moved[-1])
     except BaseException:  # Ctrl-C as well
         for path in moved:
             shutil.rmtree(path, ignore_errors=True)
             path.unlink(missing_ok=True)
-        with suppress(OSError):
-            if new:
-                folder.rmdir()
+        take_back(folders)
         raise
 
 
-def write_text(path: Path | str, text: str) -> None:
-    """Write ``text`` as UTF-8, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+def _write_beside(path: Path, content: bytes) -> None:
+    with path.open("xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
-def write_figure(path: Path | str, figure: "Figure") -> None:
-    """Write a figure as PNG, whole or not at all."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+def _needed(path: Path, size: int) -> str:
+    """Say how many bytes a file takes and how many are free, in words for a message."""
+    needed = f"; it takes {_shown(size)}"
+    with suppress(OSError, ValueError):
+        return f"{needed}, {_shown(shutil.disk_usage(path.parent).free)} are free"
+    return needed
 
 
-def _umask() -> int:
-    value = os.umask(0)
-    os.umask(value)
-    return value
+def _shown(size: int) -> str:
+    return f"{size / 1e6:.3g} MB" if size >= 1e6 else f"{size / 1e3:.3g} kB"

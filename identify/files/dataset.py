@@ -1,14 +1,15 @@
-"""Described xarray datasets over time, checked for dimensions, units and names, and their groups in netCDF files.
+"""Described xarray datasets over time, checked for dimensions, units and names, and their groups in
+netCDF files.
 
-Files are written whole or not at all, and read with clear errors. `covariance.nc` holds the covariance of the estimated
-parameters, in their SI units.
+Files are written whole or not at all, and read with clear errors. `covariance.nc` holds the
+covariance of the estimated parameters, in their SI units.
 """
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import h5py
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
@@ -16,55 +17,74 @@ from numpy.typing import ArrayLike
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.files.atomic import atomic_path
-
-ENGINE: Literal["h5netcdf"] = "h5netcdf"
+from identify.files.atomic import write_bytes
+from identify.files.seal import is_sealed, sealed
+from identify.files.stranger import ENGINE, Content, StrangerError, load, load_elsewhere
 
 
 def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
-    """Write datasets as groups of one file; the name ``""`` is the main group.
+    """Write datasets as groups of one file, whole or not at all, as `netcdf` makes it.
 
-    Nothing is left behind, and an older file of this name stays as it was, when writing fails. Group by group: an
-    `xarray.DataTree` would give each truth the coordinates of its record.
+    Raises WriteError.
     """
-    with atomic_path(path) as temporary:
-        mode: Literal["w", "a"] = "w"
-        for name, dataset in groups.items():
-            dataset.to_netcdf(temporary, mode=mode, group=name or None, engine=ENGINE, encoding=_encoding(dataset))
-            mode = "a"
+    write_bytes(path, netcdf(groups))
+
+
+def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
+    """Return the file of datasets by the names of their groups; the name ``""`` is the main group.
+
+    Group by group: an `xarray.DataTree` would give each truth the coordinates of its record.
+    """
+    stream = io.BytesIO()
+    mode: Literal["w", "a"] = "w"
+    for name, dataset in groups.items():
+        dataset.to_netcdf(
+            stream, mode=mode, group=name or None, engine=ENGINE, encoding=_encoding(dataset)
+        )
+        mode = "a"
+    return sealed(stream.getvalue())
 
 
 def read_group(path: Path | str, group: str = "") -> xr.Dataset:
-    """Read one group into memory. Raises RecordError: no such file, not a whole netCDF file, or no such group."""
-    names = group_names(path)
-    if group and group not in names:
+    """Read one group into memory.
+
+    Raises RecordError: no such file, no such group, a damaged file, or one that carries no digest
+    and cannot be read within the limits of `identify.files.stranger`.
+    """
+    names, dataset = _read(path, group)
+    if dataset is None:
         raise RecordError(f"{path} has no group {group!r}; it has {', '.join(names) or 'none'}")
-    try:
-        with xr.open_dataset(path, group=group or None, engine=ENGINE) as dataset:
-            return dataset.load()
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise RecordError(f"{path} is truncated or not a netCDF file: {error}") from error
+    return dataset
 
 
 def group_names(path: Path | str) -> list[str]:
-    """Names of all groups, nested ones as ``run01/truth``.
+    """Return the names of all groups, nested ones as ``run01/truth``, sorted.
 
-    Raises RecordError: no such file, or no whole netCDF file.
+    Raises RecordError: as `read_group`.
     """
+    return _read(path, None)[0]
+
+
+def _read(path: Path | str, group: str | None) -> Content:
     if not Path(path).is_file():
         raise RecordError(f"there is no file {path}")
-    names: list[str] = []
     try:
-        with h5py.File(path, "r") as file:
-            file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Group) else None)
-    except (OSError, RuntimeError) as error:
-        raise RecordError(f"{path} is truncated or not a netCDF file: {error}") from error
-    return sorted(names)
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise RecordError(f"cannot read {path}: {error.strerror or error}") from None
+    if is_sealed(path, content):
+        return load(content, group)
+    try:
+        return load_elsewhere(content, group)
+    except StrangerError as error:
+        raise RecordError(f"{path} is truncated or not a netCDF file: {error}") from None
 
 
 def _encoding(dataset: xr.Dataset) -> dict[str, dict[str, object]]:
     numbers = [name for name, variable in dataset.variables.items() if variable.dtype.kind in "fiu"]
-    compressed = {str(name): {"zlib": True, "complevel": 4} for name in numbers if dataset[name].ndim > 1}
+    compressed = {
+        str(name): {"zlib": True, "complevel": 4} for name in numbers if dataset[name].ndim > 1
+    }
     plain = {str(name): {"_FillValue": None} for name in numbers}
     return {name: {**plain[name], **compressed.get(name, {})} for name in plain}
 
@@ -113,15 +133,20 @@ def joint_numbers(values: ArrayLike) -> list[int]:
 
 
 def pose_parts(values: ArrayLike, name: str, position: str, orientation: str) -> dict[str, Array]:
-    """Position and orientation (N, 3) of poses (N, 6), by the names of both. Raises RecordError: another shape."""
+    """Position and orientation (N, 3) of poses (N, 6), by the names of both. Raises RecordError:
+    another shape.
+    """
     array = np.asarray(values, dtype=float)
     if array.ndim != 2 or array.shape[1] != 6:
         raise RecordError(f"{name} has shape {array.shape}, expected (N, 6)")
     return {position: array[:, :3], orientation: array[:, 3:]}
 
 
-def described_dataset(values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: Any) -> xr.Dataset:
-    """Dataset of described variables on a time axis; ``labels`` are the coordinates of further dimensions.
+def described_dataset(
+    values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: Any
+) -> xr.Dataset:
+    """Dataset of described variables on a time axis; ``labels`` are the coordinates of further
+    dimensions.
 
     Raises RecordError: an array whose shape does not fit its dimensions.
     """
@@ -130,13 +155,17 @@ def described_dataset(values: dict[str, Any], time: ArrayLike, variables: Variab
     for name, (dims, _, _) in variables.items():
         expected = tuple(len(coordinates[dim]) for dim in dims)
         if np.shape(values[name]) != expected:
-            raise RecordError(f"{name} has shape {np.shape(values[name])}, expected {dims} = {expected}")
+            raise RecordError(
+                f"{name} has shape {np.shape(values[name])}, expected {dims} = {expected}"
+            )
     return xr.Dataset(
         {
             name: (dims, values[name], {"units": unit, "long_name": text})
             for name, (dims, unit, text) in variables.items()
         },
-        coords={dim: (dim, coordinates[dim], _description(dim)) for dim in coordinates if dim in used},
+        coords={
+            dim: (dim, coordinates[dim], _description(dim)) for dim in coordinates if dim in used
+        },
     )
 
 
@@ -153,16 +182,22 @@ def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None
             raise RecordError(f"{source}: {name} has dimensions {data[name].dims}, expected {dims}")
         expected = [len(LABELS[dim]) if dim in LABELS else data[name].sizes[dim] for dim in dims]
         if list(data[name].shape) != expected:
-            raise RecordError(f"{source}: {name} has shape {data[name].shape}, expected {tuple(expected)}")
+            raise RecordError(
+                f"{source}: {name} has shape {data[name].shape}, expected {tuple(expected)}"
+            )
     if "time" in data.dims and ("time" not in data.coords or data.sizes["time"] == 0):
         raise RecordError(f"{source} has no time")
 
 
 def check_finite(values: Array, name: str, source: str) -> None:
-    """Refuse values that are not finite. Raises RecordError, naming the variable and how many are wrong."""
+    """Refuse values that are not finite. Raises RecordError, naming the variable and how many are
+    wrong.
+    """
     bad = int(np.count_nonzero(~np.isfinite(values)))
     if bad:
-        raise RecordError(f"{source}: {bad} of {values.size} values of {name} are not finite numbers")
+        raise RecordError(
+            f"{source}: {bad} of {values.size} values of {name} are not finite numbers"
+        )
 
 
 def _description(dim: str) -> dict[str, str]:
@@ -182,25 +217,42 @@ def plain(value: object) -> object:
 
 def as_number(value: object) -> float:
     """An attribute's value that is a number and no truth value; NaN for anything else."""
-    return float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else np.nan
+    return (
+        float(value)
+        if isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        else np.nan
+    )
 
 
 VARIABLE = "covariance"
 DIMENSIONS = ("parameter", "parameter_2")
 
 
-def write_covariance(path: Path | str, layout: ParameterLayout, covariance: Array, others: Sequence[str] = ()) -> None:
-    """Write the covariance (p + k, p + k) of a robot's parameters and of k others, whose names end with their units."""
-    units = {name: layout.unit(name) for name in layout.names} | {name: name.rpartition("_")[2] for name in others}
-    write_covariance_of(path, units, covariance)
+def write_covariance(
+    path: Path | str, layout: ParameterLayout, covariance: Array, others: Sequence[str] = ()
+) -> None:
+    """Write the covariance (p + k, p + k) of a robot's parameters and of k others.
+
+    The names of the others end with their units. Raises WriteError.
+    """
+    write_bytes(path, covariance_netcdf(parameter_units(layout, others), covariance))
 
 
-def write_covariance_of(path: Path | str, units: Mapping[str, str], covariance: Array) -> None:
-    """Write the covariance (p, p) of numbers by their names, each with its unit."""
+def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict[str, str]:
+    """Return the units of a robot's parameters and of others, whose names end with theirs."""
+    units = {name: layout.unit(name) for name in layout.names}
+    return units | {name: name.rpartition("_")[2] for name in others}
+
+
+def covariance_netcdf(units: Mapping[str, str], covariance: Array) -> bytes:
+    """Return the file of a covariance (p, p) of numbers by their names, each with its unit."""
     labels = {name: list(units) for name in DIMENSIONS}
-    described = {"units": "product of the units of both parameters", "long_name": "covariance of the estimates"}
+    described = {
+        "units": "product of the units of both parameters",
+        "long_name": "covariance of the estimates",
+    }
     data = xr.Dataset({VARIABLE: (DIMENSIONS, covariance, described)}, coords=labels)
-    write_groups(path, {"": data.assign_coords(unit=(DIMENSIONS[0], list(units.values())))})
+    return netcdf({"": data.assign_coords(unit=(DIMENSIONS[0], list(units.values())))})
 
 
 def read_covariance(path: Path | str) -> tuple[tuple[str, ...], Array]:

@@ -5,15 +5,17 @@ That is standard JSON: a figure that does not exist is null.
 
 import json
 import math
-import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from identify.errors import OutputFolderError, RecordError
-from identify.files.atomic import write_figure, write_text
+from identify.files.atomic import figure_bytes, write_bytes, write_files
+from identify.files.lock import LOCK, working_in
+from identify.files.seal import check_toml, opened_json, sealed_json
 
 WRITTEN_BY = {
     "scenario.toml": "excite",
@@ -28,6 +30,12 @@ WRITTEN_BY = {
 }
 """The stage of ``cmmsim`` that writes each file."""
 
+UNFINISHED = ("geometry", "trajectories.json")
+"""What `excite` writes before the scenario: without that a plan is not finished."""
+
+BEGUN = ("geometry", "figures", *WRITTEN_BY)
+"""What the folder of a run may hold that goes on."""
+
 
 class RunFolder:
     """Paths of the files of one run, whose folder is `path`."""
@@ -37,7 +45,8 @@ class RunFolder:
         self.scenario = path / "scenario.toml"  # resolved
         self.trajectories = path / "trajectories.json"  # exciting and unseen ones, with the seed
         self.experiment = path / "experiment.nc"  # record and truth of the excitation run
-        self.payload = path / "payload.nc"  # of the same run under a known load, where that is the scale anchor
+        # of the same run under a known load, where that is the scale anchor
+        self.payload = path / "payload.nc"
         self.covariance = path / "covariance.nc"  # of the estimated parameters
         self.validation = path / "validation.nc"  # records and truth of the unseen runs
         self.model = path / "model.nc"  # what the models do on the same trajectories
@@ -46,8 +55,15 @@ class RunFolder:
         self.figures = path / "figures"
 
     @property
+    def whole_scenario(self) -> Path:
+        """Path of the scenario. Raises RecordError: the file is damaged, or changed by hand."""
+        return check_toml(self.scenario)
+
+    @property
     def holds_own_record(self) -> bool:
-        """Whether the record is one of the user's own: it follows no trajectories that were designed here."""
+        """Whether the record is one of the user's own: it follows no trajectories that were
+        designed here.
+        """
         return self.experiment.is_file() and not self.trajectories.exists()
 
     def require(self, *names: str) -> None:
@@ -56,73 +72,85 @@ class RunFolder:
         Raises OutputFolderError: naming the first missing file and the stage that writes it.
         """
         if not self.path.is_dir():
-            raise OutputFolderError(f"no run folder {self.path}; make it with: cmmsim excite --out {self.path}")
+            raise OutputFolderError(
+                f"no run folder {self.path}; make it with: cmmsim excite --out {self.path}"
+            )
         for name in names:
             if not (self.path / name).is_file():
                 stage = WRITTEN_BY[name]
-                raise OutputFolderError(f"{self.path} has no {name}; write it with: cmmsim {stage} --out {self.path}")
+                raise OutputFolderError(
+                    f"{self.path} has no {name}; write it with: cmmsim {stage} --out {self.path}"
+                )
 
 
-def new_run_folder(path: Path | str) -> RunFolder:
-    """A folder that does not exist yet or is empty; it is not made before something is written into it.
+@contextmanager
+def new_run_folder(path: Path | str, also: Collection[str] = ()) -> Iterator[RunFolder]:
+    """A folder that nobody else works in, see `working_in`; it must be new or empty.
 
-    Raises OutputFolderError: something is there already, or the folder cannot be made.
+    also: names of files and folders that it may hold. What a killed process left does not count.
+
+    Raises OutputFolderError: something is there already, or another process works in it. Raises
+    WriteError: it cannot be made.
     """
     folder = Path(path)
-    above = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if folder.exists() and not folder.is_dir():
         raise OutputFolderError(f"output folder {folder} is a file; name another with --out")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise OutputFolderError(f"output folder {folder} is not empty; name another with --out, or remove it")
-    try:
-        # Only a trial tells: permissions do not show file systems that are read-only or kept by the kernel.
-        tempfile.TemporaryDirectory(prefix=".cmmsim-", dir=above).cleanup()
-    except OSError:
-        raise OutputFolderError(
-            f"output folder {folder} cannot be made: {above} is not a folder one may write to"
-        ) from None
-    return RunFolder(folder)
+    with working_in(folder):
+        if any(found.name not in (LOCK, *also) for found in folder.iterdir()):
+            raise OutputFolderError(
+                f"output folder {folder} is not empty; name another with --out, or remove it"
+            )
+        yield RunFolder(folder)
 
 
 AXES = ("x", "y", "z", "alpha", "beta", "gamma")
 """Order of the RMS figures: three positions in um, three orientations in urad."""
 
-ENTRIES = {"identify": ("identification", "before", "after", "seconds"), "validate": ("sensor", "validation")}
+ENTRIES = {
+    "identify": ("identification", "before", "after", "seconds"),
+    "validate": ("sensor", "validation"),
+}
 """What the stages write into a result, and later ones read."""
 
 
 def save_result(path: Path | str, result: dict[str, Any]) -> None:
-    """Write a result, whole or not at all; arrays become lists, and numbers that are not finite become null."""
-    write_text(path, as_json(result))
+    """Write a result, whole or not at all. Raises WriteError."""
+    write_bytes(path, result_json(result))
+
+
+def result_json(result: dict[str, Any]) -> bytes:
+    """Return the file of a result, with its digest; its numbers are as in `as_json`."""
+    return _text(sealed_json(_plain(result))).encode()
 
 
 def as_json(result: dict[str, Any]) -> str:
-    """A result as the text that its file holds."""
-    return json.dumps(_plain(result), indent=2, allow_nan=False) + "\n"
+    """Return a result as text: arrays become lists, numbers that are not finite become null."""
+    return _text(_plain(result))
 
 
-def save_files(folder: Path, files: Mapping[str, Any]) -> None:
-    """Write files by their names in a folder: a text as it is, figures of a run (dict) as JSON, a drawn one as PNG."""
-    for name, content in files.items():
-        if isinstance(content, str):
-            write_text(folder / name, content)
-        elif isinstance(content, dict):
-            save_result(folder / name, content)
-        else:
-            write_figure(folder / name, content)
+def save_files(
+    folder: Path, files: Mapping[str, Any], check: Callable[[Path], object] | None = None
+) -> None:
+    """Write files by their names, all of them or none, into a folder, which is made if missing.
+
+    A file is bytes or a text as they are, figures of a run (dict) as JSON, or a drawn figure in the
+    format of its suffix. check: as in `write_files`. Raises WriteError.
+    """
+    contents = {folder / name: _content(name, content) for name, content in files.items()}
+    write_files(contents, parents=True, check=check)
 
 
 def load_result(path: Path | str) -> dict[str, Any]:
-    """Read a result. Raises RecordError: no such file, or no JSON object in it."""
+    """Read a result. Raises RecordError: no such file, no JSON object in it, or a damaged one."""
     try:
         result = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise RecordError(f"cannot read result: {error}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RecordError(f"{path} is truncated or not JSON: {error}") from error
     if not isinstance(result, dict):
         raise RecordError(f"{path} holds no JSON object")
-    return result
+    return opened_json(path, result)
 
 
 def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> None:
@@ -134,14 +162,17 @@ def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> Non
     first = next((stage for stage in stages if missing[stage]), None)
     if first is not None:
         names = ", ".join(name for stage in stages for name in missing[stage])
-        raise RecordError(f"{path} lacks {names}; write it with: cmmsim {first} --out {Path(path).parent}")
+        raise RecordError(
+            f"{path} lacks {names}; write it with: cmmsim {first} --out {Path(path).parent}"
+        )
 
 
 def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
     """Root mean square of pose errors (N, 6) [m, rad] as a result holds it, in um and urad.
 
-    ``counted`` (N,) bool names the rows that count, such as the frames that were not lost (default all). All figures
-    are NaN when none does, or when one of those that count is not finite: a model that diverged has no error.
+    ``counted`` (N,) bool names the rows that count, such as the frames that were not lost (default
+    all). All figures are NaN when none does, or when one of those that count is not finite: a model
+    that diverged has no error.
     """
     rows = np.asarray(errors, dtype=float)
     rows = rows if counted is None else rows[np.asarray(counted, dtype=bool)]
@@ -159,8 +190,24 @@ def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
 
 
 def predicted_row(run: dict[str, Any]) -> list[float]:
-    """The six predicted standard deviations [um, urad] of a validation entry; NaN where nothing was predicted."""
+    """The six predicted standard deviations [um, urad] of a validation entry; NaN where nothing was
+    predicted.
+    """
     return rms_row(run.get("predicted"), "std")
+
+
+def _text(entry: Mapping[str, Any]) -> str:
+    return json.dumps(entry, indent=2, allow_nan=False) + "\n"
+
+
+def _content(name: str, content: Any) -> bytes:
+    if isinstance(content, bytes):
+        return content
+    if isinstance(content, dict):
+        return as_json(content).encode()
+    if isinstance(content, str):
+        return content.encode()
+    return figure_bytes(content, Path(name).suffix)
 
 
 def _plain(value: Any) -> Any:

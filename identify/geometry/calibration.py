@@ -1,14 +1,16 @@
 """The geometry of a robot from static poses: least squares on the pose at which its loops close.
 
-A measured pose is the pose at which the loops close with the joint coordinates that the encoders read, seen between two
-frames that teaching put a little off: z = base o f(joints, geometry) o platform + noise. Unknown are the geometric
-numbers (`dynamics.legs.numbers`) and the twelve of the frames, each with its prior: the stated tolerance of a machine
-part about its nominal value, and what teaching says; other errors that all poses have in common, such as those of the
-cameras, join them as columns. Errors of the encoders come through the loops into the pose's covariance. So what poses
-cannot tell stays where the drawing has it, with the tolerance for a standard deviation.
+A measured pose is the pose at which the loops close with the joint coordinates that the encoders
+read, seen between two frames that teaching put a little off: z = base o f(joints, geometry) o
+platform + noise. Unknown are the geometric numbers (`dynamics.legs.geometric_numbers`) and the
+twelve of the frames, each with its prior: the stated tolerance of a machine part about its nominal
+value, and what teaching says; other errors that all poses have in common, such as those of the
+cameras, join them as columns. Errors of the encoders come through the loops into the pose's
+covariance. So what poses cannot tell stays where the drawing has it, with the tolerance for a
+standard deviation.
 
-A joint's offset is the twin of its zero angle, or of its base joint along its slide: the numbers of a calibrated robot
-are those with which its encoders are right.
+A joint's offset is the twin of its zero angle, or of its base joint along its slide: the numbers of
+a calibrated robot are those with which its encoders are right.
 """
 
 from dataclasses import dataclass
@@ -22,32 +24,35 @@ from scipy.spatial.transform import Rotation
 from dynamics import Robot
 from dynamics.closure import Closure
 from dynamics.errors import DynamicsError
-from dynamics.geometry_error import with_geometry
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 
 OBSERVABLE = 1 / 3
-"""A number is told when the poses leave at most this share of its tolerance as standard deviation: the prior is then a
-ninth of the information, and hardly moves an interval."""
+"""A number is told when the poses leave at most this share of its tolerance as standard deviation:
+the prior is then a ninth of the information, and hardly moves an interval."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Standard deviations of geometric numbers about the nominal ones: m of places and lengths, rad of turns."""
+    """Standard deviations of geometric numbers about the nominal ones: m of places and lengths, rad
+    of turns.
+    """
 
     m: float
     rad: float
 
     def of(self, robot: Robot) -> Array:
         """One a number of the robot (g,)."""
-        return np.array([self.m if unit == "m" else self.rad for unit in robot.geometry.number_units])
+        return np.array(
+            [self.m if unit == "m" else self.rad for unit in robot.geometry.number_units]
+        )
 
 
 @dataclass(frozen=True)
 class PoseModel:
-    """What poses say of the unknowns u (g + 12,): geometric numbers and errors of the frames, in units of their prior,
-    so that each has mean zero and variance one before the poses."""
+    """What poses say of the unknowns u (g + 12,): geometric numbers and errors of the frames, in
+    units of their prior, so that each has mean zero and variance one before the poses."""
 
     robot: Robot
     tolerance: Array
@@ -75,10 +80,14 @@ class PoseModel:
     def closed(self, joints: Array, unknowns: Array, start: Array) -> Array:
         """Poses (N, 6) at which the loops close, without the errors of the frames."""
         chart = self.robot.geometry.chart
-        return self.closure.poses(joints, self.split(unknowns)[0], chart.pose(chart.coordinates(start)))
+        return self.closure.poses(
+            joints, self.split(unknowns)[0], chart.pose(chart.coordinates(start))
+        )
 
     def columns(self, joints: Array, closed: Array, unknowns: Array) -> tuple[Array, Array]:
-        """How the coordinates (m) of measured poses change with unknowns (N, m, g + 12) and with joints (N, m, n)."""
+        """How the coordinates (m) of measured poses change with unknowns (N, m, g + 12) and with
+        joints (N, m, n).
+        """
         free = list(self.robot.geometry.chart.freedoms)
         by_numbers, by_joints = self.closure.derivatives(closed, joints, self.split(unknowns)[0])
         by_frames = frame_columns(self.robot, closed)[:, free]
@@ -86,8 +95,11 @@ class PoseModel:
 
 
 def seen_between(poses: Array, frames: Array) -> Array:
-    """Poses (N, 6) between frames with errors (12,): [dt, dphi] of the base, then of the platform, m and rad."""
-    base, platform = Rotation.from_rotvec(frames[3:6]), Rotation.from_rotvec(frames[9:12])
+    """Poses (N, 6) between frames with errors (12,): [dt, dphi] of the base, then of the platform,
+    m and rad.
+    """
+    base = Rotation.from_rotvec(frames[3:6])
+    platform = Rotation.from_rotvec(frames[9:12])
     turned = Rotation.from_euler("XYZ", poses[:, 3:])
     places = frames[:3] + base.apply(poses[:, :3] + turned.apply(frames[6:9]))
     return np.hstack([places, (base * turned * platform).as_euler("XYZ")])
@@ -109,10 +121,10 @@ def frame_columns(robot: Robot, poses: Array) -> Array:
 class Calibration:
     """What static poses say of a robot's geometry.
 
-    deviations (g,) from the nominal geometry, errors of the two frames (12,), and joint_covariance (g + 12, g + 12) of
-    both, m and rad; prior_std (g,): the tolerance; noise_ratio: mean square of the residuals in units of the stated
-    noise, near one where that and the model are right, with its standard deviation; frames_known: whether anything was
-    known of the frames.
+    deviations (g,) from the nominal geometry, errors of the two frames (12,), and joint_covariance
+    (g + 12, g + 12) of both, m and rad; prior_std (g,): the tolerance; noise_ratio: mean square of
+    the residuals in units of the stated noise, near one where that and the model are right, with
+    its standard deviation; frames_known: whether anything was known of the frames.
     """
 
     nominal: Robot
@@ -143,15 +155,16 @@ class Calibration:
     @property
     def robot(self) -> Robot:
         """The nominal robot with the estimated geometry."""
-        return with_geometry(self.nominal, self.nominal.geometry.moved(self.deviations))
+        return self.nominal.with_geometry(self.nominal.geometry.moved(self.deviations))
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Residuals of poses in units of their noise, below them the unknowns as residuals of their prior.
+    """Residuals of poses in units of their noise, below them the unknowns as residuals of their
+    prior.
 
-    Unknowns are those of the model, then the errors that all poses have in common. What an encoder's error makes of a
-    pose is taken at the nominal geometry.
+    Unknowns are those of the model, then the errors that all poses have in common. What an
+    encoder's error makes of a pose is taken at the nominal geometry.
     """
 
     model: PoseModel
@@ -166,15 +179,21 @@ class _Fit:
         """(N m + u,)"""
         of_model, common = np.split(unknowns, [len(self.model.scale)])
         closed = self.model.closed(self.data.joints, of_model, self.data.poses)
-        seen = seen_between(closed, self.model.split(of_model)[1]) + self.data.common_errors @ common
-        return np.append((self._whiteners @ (seen - self.data.poses)[:, self._free, None]).ravel(), unknowns)
+        seen = (
+            seen_between(closed, self.model.split(of_model)[1]) + self.data.common_errors @ common
+        )
+        return np.append(
+            (self._whiteners @ (seen - self.data.poses)[:, self._free, None]).ravel(), unknowns
+        )
 
     def jacobian(self, unknowns: Array) -> Array:
         """(N m + u, u)"""
         of_model = unknowns[: len(self.model.scale)]
         closed = self.model.closed(self.data.joints, of_model, self.data.poses)
         columns = self.model.columns(self.data.joints, closed, of_model)[0]
-        columns = self._whiteners @ np.concatenate([columns, self.data.common_errors[:, self._free]], axis=2)
+        columns = self._whiteners @ np.concatenate(
+            [columns, self.data.common_errors[:, self._free]], axis=2
+        )
         return np.vstack([columns.reshape(-1, len(unknowns)), np.eye(len(unknowns))])
 
     @property
@@ -187,24 +206,31 @@ class _Fit:
         none = np.zeros(len(self.model.scale))
         closed = self.model.closed(self.data.joints, none, self.data.poses)
         by_joints = self.model.columns(self.data.joints, closed, none)[1]
-        return whiteners(self.data.covariances[:, self._free][:, :, self._free], by_joints, self.data.joint_std)
+        return whiteners(
+            self.data.covariances[:, self._free][:, :, self._free], by_joints, self.data.joint_std
+        )
 
 
 def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibration:
     """Estimate the geometry of a robot, about its nominal one, from static poses.
 
-    Raises EstimationError where the loops do not close with what the encoders read, or the search does not end.
+    Raises EstimationError where the loops do not close with what the encoders read, or the search
+    does not end.
     """
     model = PoseModel(robot, tolerance.of(robot), data.frames)
-    fit, limit = _Fit(model, data), 1e-10
+    fit = _Fit(model, data)
+    limit = 1e-10
     none = fit.nothing
     try:
-        found = least_squares(fit.residuals, none, fit.jacobian, method="lm", xtol=limit, ftol=limit, gtol=limit)
+        found = least_squares(
+            fit.residuals, none, fit.jacobian, method="lm", xtol=limit, ftol=limit, gtol=limit
+        )
     except DynamicsError as error:
         raise EstimationError(f"the poses do not fit robot {robot.name}: {error}") from error
     if not found.success:
         raise EstimationError(f"the search for the geometry did not end: {found.message}")
-    rows, own = found.jac[: -len(none)], len(model.scale)
+    rows = found.jac[: -len(none)]
+    own = len(model.scale)
     spread = np.linalg.inv(found.jac.T @ found.jac)
     covariance = model.scale @ spread[:own, :own] @ model.scale.T
     spare = max(len(rows) - float(np.sum(spread * (rows.T @ rows))), 1.0)
@@ -222,7 +248,10 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
 
 
 def whiteners(covariances: Array, by_joints: Array, joint_std: Array) -> Array:
-    """Matrices (N, m, m) that make residuals of the coordinates of variance one: noise (N, m, m) of the pose, and
-    errors of the encoders through the loops, where coordinates change with joints by (N, m, n)."""
+    """Matrices (N, m, m) that make residuals of the coordinates of variance one: noise (N, m, m) of
+    the pose, and errors of the encoders through the loops, where coordinates change with joints by
+    (N, m, n)."""
     encoders = by_joints * joint_std
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances + encoders @ encoders.swapaxes(1, 2))))
+    return np.asarray(
+        np.linalg.inv(np.linalg.cholesky(covariances + encoders @ encoders.swapaxes(1, 2)))
+    )

@@ -1,8 +1,9 @@
-"""The simulated calibration: a robot whose geometry is off stands at poses, encoders and the optical CMM read it.
+"""The simulated calibration: a robot whose geometry is off stands at poses, encoders and the
+optical CMM read it.
 
-Its joints go where they are told, in the coordinates of its encoders; so the platform stands where the true geometry
-puts it, and an encoder's offset is part of that geometry. Poses are measured through images, or drawn with the noise
-that the sensor states for one image.
+Its joints go where they are told, in the coordinates of its encoders; so the platform stands where
+the true geometry puts it, and an encoder's offset is part of that geometry. Poses are measured
+through images, or drawn with the noise that the sensor states for one image.
 """
 
 from collections.abc import Mapping
@@ -35,12 +36,16 @@ FIRST_POSE_RUN = 2_000_000
 
 
 REST = 1e-3
-"""Share of the travel by which friction keeps joints from where they are sent; encoders say where that is."""
+"""Share of the travel by which friction keeps joints from where they are sent; encoders say where
+that is.
+"""
 
 
 @dataclass(frozen=True)
 class Encoders:
-    """Encoders of a robot's joints: noise of one reading, step, and standard deviation of offsets, rad or m."""
+    """Encoders of a robot's joints: noise of one reading, step, and standard deviation of offsets,
+    rad or m.
+    """
 
     noise: float
     resolution: float
@@ -49,12 +54,13 @@ class Encoders:
     def mean_std(self, readings: int) -> float:
         """Standard deviation of the mean of readings of a joint that stands still.
 
-        The step's error is that of a sawtooth, and noise smooths it: of its k-th wave, 1 / (pi k) steps high, readings
-        with noise of s steps keep exp(-2 (pi k s)^2) in their mean.
+        The step's error is that of a sawtooth, and noise smooths it: of its k-th wave, 1 / (pi k)
+        steps high, readings with noise of s steps keep exp(-2 (pi k s)^2) in their mean.
         """
         if not self.resolution:
             return self.noise / readings**0.5
-        waves, steps = np.pi * np.arange(1, 30), self.noise / self.resolution
+        waves = np.pi * np.arange(1, 30)
+        steps = self.noise / self.resolution
         kept = self.resolution**2 * np.sum(np.exp(-4 * (waves * steps) ** 2) / waves**2) / 2
         return float(np.sqrt(kept + (self.noise**2 + self.resolution**2 / 12 - kept) / readings))
 
@@ -67,7 +73,12 @@ class Encoders:
 
 def encoders_of(robot: Robot, settings: Geometry) -> Encoders:
     """The encoders of a scenario's calibration, for a robot whose actuators turn or slide."""
-    return Encoders(*(of_actuators(robot, settings, f"encoder_{name}") for name in ("noise", "resolution", "offset")))
+    return Encoders(
+        *(
+            of_actuators(robot, settings, f"encoder_{name}")
+            for name in ("noise", "resolution", "offset")
+        )
+    )
 
 
 def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> Array:
@@ -83,7 +94,9 @@ def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> 
 
 @dataclass(frozen=True)
 class Sighted:
-    """Means of frames at poses (N, 6), their covariances (N, 6, 6), which poses were seen (N,), and lost frames."""
+    """Means of frames at poses (N, 6), their covariances (N, 6, 6), which poses were seen (N,), and
+    lost frames.
+    """
 
     poses: Array
     covariances: Array
@@ -91,14 +104,19 @@ class Sighted:
     lost: int
 
 
-def measured(sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, seed: int, progress: Progress) -> Sighted:
+def measured(
+    sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, seed: int, progress: Progress
+) -> Sighted:
     """Poses measured through images.
 
-    The share of the stated variance that frames at rest do not scatter by, such as the errors of drawing and of
-    detection, does not average: it stays whole in the covariance of a mean.
+    The share of the stated variance that frames at rest do not scatter by, such as the errors of
+    drawing and of detection, does not average: it stays whole in the covariance of a mean.
     """
-    means, stated = np.full_like(poses, np.nan), np.full((len(poses), 6, 6), np.nan)
-    scatter, spare, counts = 0.0, 0, np.zeros(len(poses), dtype=int)
+    means = np.full_like(poses, np.nan)
+    stated = np.full((len(poses), 6, 6), np.nan)
+    scatter = 0.0
+    spare = 0
+    counts = np.zeros(len(poses), dtype=int)
     with progress.stage("measure poses", len(poses) * frames) as advance:
         for row, pose in enumerate(poses):
             bodies = robot_transforms(robot, pose)
@@ -106,38 +124,60 @@ def measured(sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, see
             values, covariances = _frames_at(sensor, pose, bodies, frames)
             advance(frames)
             if len(values):
-                means[row], counts[row] = values.mean(axis=0), len(values)
+                means[row] = values.mean(axis=0)
+                counts[row] = len(values)
                 stated[row] = covariances.mean(axis=0)
                 away = values - means[row]
-                scatter += float(np.sum(away * np.linalg.solve(stated[row], away.T).T)) / away.shape[1]
+                scatter += (
+                    float(np.sum(away * np.linalg.solve(stated[row], away.T).T)) / away.shape[1]
+                )
                 spare += len(values) - 1
-    seen, share = counts > 0, min(scatter / spare, 1.0) if spare else 0.0
+    seen = counts > 0
+    share = min(scatter / spare, 1.0) if spare else 0.0
     kept = 1 - share * (1 - 1 / np.maximum(counts, 1))
-    return Sighted(means, stated * kept[:, None, None], seen, int(len(poses) * frames - counts.sum()))
+    return Sighted(
+        means, stated * kept[:, None, None], seen, int(len(poses) * frames - counts.sum())
+    )
 
 
-def _frames_at(sensor: cmmsim.Sensor, pose: Array, bodies: Mapping[str, Array], frames: int) -> tuple[Array, Array]:
-    """Poses (k, 6) and covariances (k, 6, 6) of the frames at a pose that gave one: images are searched as a whole
-    until they give one, in all others stickers are looked for near that."""
+def _frames_at(
+    sensor: cmmsim.Sensor, pose: Array, bodies: Mapping[str, Array], frames: int
+) -> tuple[Array, Array]:
+    """Poses (k, 6) and covariances (k, 6, 6) of the frames at a pose that gave one: images are
+    searched as a whole until they give one, in all others stickers are looked for near that."""
     left = frames
     while left:
-        first, left = sensor.measure(pose, bodies), left - 1
+        first = sensor.measure(pose, bodies)
+        left = left - 1
         if not first.ok:
             continue
-        rest = sensor.measure_many(np.tile(pose, (left, 1)), obstacles=bodies, near=np.tile(first.pose, (left, 1)))
+        rest = sensor.measure_many(
+            np.tile(pose, (left, 1)), obstacles=bodies, near=np.tile(first.pose, (left, 1))
+        )
         ok = rest.stickers > 0
-        return np.stack([first.pose, *rest.poses[ok]]), np.stack([first.covariance, *rest.covariances[ok]])
+        return np.stack([first.pose, *rest.poses[ok]]), np.stack(
+            [first.covariance, *rest.covariances[ok]]
+        )
     return np.zeros((0, 6)), np.zeros((0, 6, 6))
 
 
 def drawn(
-    sensor: cmmsim.Sensor, sight: SightLines, poses: Array, frames: int, rng: np.random.Generator, progress: Progress
+    sensor: cmmsim.Sensor,
+    sight: SightLines,
+    poses: Array,
+    frames: int,
+    rng: np.random.Generator,
+    progress: Progress,
 ) -> Sighted:
-    """Poses without images: one frame a pose says the covariance, and the mean is drawn with a `frames`-th of it; and
-    so are one error of the frames with what teaching says of them, and one of the cameras where they are not exact."""
+    """Poses without images: one frame a pose says the covariance, and the mean is drawn with a
+    `frames`-th of it; and so are one error of the frames with what teaching says of them, and one
+    of the cameras where they are not exact."""
     taught = sensor.taught
-    offset = FrameKnowledge(taught.base_covariance, taught.platform_covariance).root @ rng.standard_normal(12)
-    covariances, seen = np.full((len(poses), 6, 6), np.nan), np.zeros(len(poses), dtype=bool)
+    offset = FrameKnowledge(
+        taught.base_covariance, taught.platform_covariance
+    ).root @ rng.standard_normal(12)
+    covariances = np.full((len(poses), 6, 6), np.nan)
+    seen = np.zeros(len(poses), dtype=bool)
     with progress.stage("draw poses", len(poses)) as advance:
         for row, pose in enumerate(poses):
             with suppress(LostError):
@@ -153,13 +193,21 @@ def drawn(
 
 
 def camera_errors(sensor: cmmsim.Sensor, poses: Array) -> Array | None:
-    """What cameras that are known only so well add to poses (N, 6) at rest: (N, 6, k) for each of k independent errors
-    of variance one, the same for all poses; None where they are exact."""
-    found = sensor.common_errors(poses, np.zeros_like(poses)) if sensor.method == "registration" else None
-    if found is None or not (kept := [k for k, name in enumerate(found.names) if kind_of(name) == "rig"]):
+    """What cameras that are known only so well add to poses (N, 6) at rest: (N, 6, k) for each of k
+    independent errors of variance one, the same for all poses; None where they are exact."""
+    found = (
+        sensor.common_errors(poses, np.zeros_like(poses))
+        if sensor.method == "registration"
+        else None
+    )
+    if found is None or not (
+        kept := [k for k, name in enumerate(found.names) if kind_of(name) == "rig"]
+    ):
         return None
     within = found.covariance[np.ix_(kept, kept)]
-    return CommonErrors(tuple(found.names[k] for k in kept), found.changes[:, :, kept], within).modes
+    return CommonErrors(
+        tuple(found.names[k] for k in kept), found.changes[:, :, kept], within
+    ).modes
 
 
 def stand_at(
@@ -172,13 +220,16 @@ def stand_at(
     seed: int,
     progress: Progress,
 ) -> tuple[StaticPoses, int]:
-    """What encoders and sensor say where the true robot stops that is sent to joint coordinates (N, n), near poses
-    `start` (N, 6) of the nominal one; and the number of frames that were lost. Poses without any are left out.
+    """What encoders and sensor say where the true robot stops that is sent to joint coordinates (N,
+    n), near poses `start` (N, 6) of the nominal one; and the number of frames that were lost. Poses
+    without any are left out.
 
     Raises EstimationError, naming the pose, for one that the true robot cannot reach.
     """
-    settings, taught = scenario.geometry, sensor.taught
-    encoders, frames = encoders_of(robot, settings), settings.frames_per_pose
+    settings = scenario.geometry
+    taught = sensor.taught
+    encoders = encoders_of(robot, settings)
+    frames = settings.frames_per_pose
     rng = np.random.default_rng(child(seed, ENCODERS))
     stopped = joints + REST * robot.travel_limit * rng.uniform(-1, 1, joints.shape)
     true = true_poses(robot, deviations, stopped, start)
@@ -186,7 +237,9 @@ def stand_at(
         found = measured(sensor, robot, true, frames, seed, progress)
     else:
         sight = sight_lines(scenario.sensor, scenario.sensor_changes)
-        found = drawn(sensor, sight, true, frames, np.random.default_rng(child(seed, STATIC_NOISE)), progress)
+        found = drawn(
+            sensor, sight, true, frames, np.random.default_rng(child(seed, STATIC_NOISE)), progress
+        )
     read = encoders.read(stopped, frames, rng)
     known = FrameKnowledge(taught.base_covariance, taught.platform_covariance)
     std = np.full(robot.layout.joints, encoders.mean_std(frames))

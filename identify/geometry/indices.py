@@ -1,10 +1,12 @@
-"""Observability indices: what makes some static poses better than others. Each is better where it is smaller.
+"""Observability indices: what makes some static poses better than others. Each is better where it
+is smaller.
 
-`determinant`: minus the logarithm of the determinant of the information, Borm and Menq's O1, the D-optimal one (Int. J.
-Robot. Res. 10(1), 1991). `prediction`: what the calibrated robot misses poses by, on average over candidates, the
-I-optimal one. `noise_amplification`: s_1 / s_r^2 of the extreme singular values of the whitened columns, the inverse of
-Nahvi and Hollerbach's index (ICRA 1996), over the combinations that all candidates together can tell: of the others no
-choice changes anything.
+`determinant`: minus the logarithm of the determinant of the information, Borm and Menq's O1, the
+D-optimal one (Int. J. Robot. Res. 10(1), 1991). `prediction`: what the calibrated robot misses
+poses by, on average over candidates, the I-optimal one. `noise_amplification`: s_1 / s_r^2 of the
+extreme singular values of the whitened columns, the inverse of Nahvi and Hollerbach's index (ICRA
+1996), over the combinations that all candidates together can tell: of the others no choice changes
+anything.
 """
 
 from abc import ABC, abstractmethod
@@ -16,14 +18,16 @@ from identify.arrays import Array
 from identify.geometry.calibration import OBSERVABLE
 
 EXTREMES, PROMISING = 24, 16
-"""Directions that are told least, and as many that are told most, among which candidates are judged first; and how many
-of these are judged exactly."""
+"""Directions that are told least, and as many that are told most, among which candidates are judged
+first; and how many of these are judged exactly."""
 HARDLY = 10.0
 """Information about a direction of which its prior, one, is much."""
 
 
 class ObservabilityIndex(ABC):
-    """Of the information (u, u) of poses and of what is known before them, about unknowns in units of their prior."""
+    """Of the information (u, u) of poses and of what is known before them, about unknowns in units
+    of their prior.
+    """
 
     @abstractmethod
     def value(self, information: Array) -> tuple[float, Array]:
@@ -31,7 +35,9 @@ class ObservabilityIndex(ABC):
 
     @abstractmethod
     def best(self, columns: Array, information: Array) -> int:
-        """Which of some poses, with whitened columns (N, m, u), improves the index of this information most."""
+        """Which of some poses, with whitened columns (N, m, u), improves the index of this
+        information most.
+        """
 
 
 class Determinant(ObservabilityIndex):
@@ -48,7 +54,9 @@ class Determinant(ObservabilityIndex):
 
 @dataclass(frozen=True)
 class Prediction(ObservabilityIndex):
-    """weight (u, u): mean square error of the candidates' coordinates, each in units of its noise, by the unknowns."""
+    """weight (u, u): mean square error of the candidates' coordinates, each in units of its noise,
+    by the unknowns.
+    """
 
     weight: Array
 
@@ -59,7 +67,9 @@ class Prediction(ObservabilityIndex):
 
     def best(self, columns: Array, information: Array) -> int:
         spread, inner = _spread(columns, information)
-        return int(np.argmax(np.einsum("nmu,nmu->n", np.linalg.solve(inner, spread), spread @ self.weight)))
+        return int(
+            np.argmax(np.einsum("nmu,nmu->n", np.linalg.solve(inner, spread), spread @ self.weight))
+        )
 
 
 @dataclass(frozen=True)
@@ -78,11 +88,14 @@ class NoiseAmplification(ObservabilityIndex):
         values, vectors = np.linalg.eigh(self.told.T @ information @ self.told)
         first, last = ((self.told @ vectors[:, place])[:, None] for place in (-1, 0))
         index = 0.5 * np.log(values[-1]) - np.log(values[0])
-        return float(index), np.asarray(last @ last.T / values[0] - 0.5 * first @ first.T / values[-1])
+        return float(index), np.asarray(
+            last @ last.T / values[0] - 0.5 * first @ first.T / values[-1]
+        )
 
     def best(self, columns: Array, information: Array) -> int:
-        """By the determinant as long as some direction is hardly told, then by the index: in the space of the extreme
-        directions of what is there, which bounds it, and among the best there, exactly."""
+        """By the determinant as long as some direction is hardly told, then by the index: in the
+        space of the extreme directions of what is there, which bounds it, and among the best there,
+        exactly."""
         within = self.told.T @ information @ self.told
         values, vectors = np.linalg.eigh(within)
         if values[0] < HARDLY:
@@ -101,8 +114,8 @@ def _eigenvalues(information: Array, columns: Array) -> Array:
 
 
 def _spread(columns: Array, information: Array) -> tuple[Array, Array]:
-    """Of each pose: columns times the covariance (N, m, u), and the covariance of its coordinates with noise (N, m,
-    m)."""
+    """Of each pose: columns times the covariance (N, m, u), and the covariance of its coordinates
+    with noise (N, m, m)."""
     spread = columns @ np.linalg.inv(information)
     return spread, np.eye(columns.shape[1]) + spread @ columns.swapaxes(1, 2)
 

@@ -11,24 +11,28 @@ SMALL = 0.05
 """Share of the largest coefficient below which a combination leaves a number out."""
 
 LONG_ENOUGH = 0.5
-"""A number names a combination if what is left of its share is at least this fraction of the largest one."""
+"""A number names a combination if what is left of its share is at least this fraction of the
+largest one.
+"""
 
 
 def untold(covariance: Array, prior_std: Array) -> Array:
-    """Directions (k, g) of geometric numbers in units of their tolerance that poses do not tell, orthonormal: along
-    them the standard deviation stays above OBSERVABLE of the tolerance."""
+    """Directions (k, g) of geometric numbers in units of their tolerance that poses do not tell,
+    orthonormal: along them the standard deviation stays above OBSERVABLE of the tolerance."""
     values, vectors = np.linalg.eigh(covariance / np.outer(prior_std, prior_std))
     return np.asarray(vectors[:, values > OBSERVABLE**2].T)
 
 
 def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) -> tuple[str, ...]:
-    """The combinations that poses do not tell, each named after its first number, as `a + 0.5 b`: when these numbers
-    move together by such amounts (m and rad), no pose changes enough to show it. Empty where all are told."""
+    """The combinations that poses do not tell, each named after its first number, as `a + 0.5 b`:
+    when these numbers move together by such amounts (m and rad), no pose changes enough to show it.
+    Empty where all are told."""
     directions = untold(covariance, prior_std)
     if not len(directions):
         return ()
     pivots = _pivots(directions)
-    rows = np.linalg.solve(directions[:, pivots], directions)  # each combination then has a number of its own
+    # each combination then has a number of its own
+    rows = np.linalg.solve(directions[:, pivots], directions)
     return tuple(
         _expression(names, row * prior_std / prior_std[pivot], np.abs(row), pivot)
         for row, pivot in zip(rows, pivots, strict=True)
@@ -36,8 +40,11 @@ def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) ->
 
 
 def _pivots(directions: Array) -> list[int]:
-    """As many columns as there are rows, which stand well apart: in their order, the first that is long enough."""
-    left, pivots = directions.copy(), list[int]()
+    """As many columns as there are rows, which stand well apart: in their order, the first that is
+    long enough.
+    """
+    left = directions.copy()
+    pivots = list[int]()
     while len(pivots) < len(directions):
         lengths = np.linalg.norm(left, axis=0)
         pivots.append(int(np.argmax(lengths >= LONG_ENOUGH * lengths.max())))
@@ -51,34 +58,45 @@ def _expression(names: tuple[str, ...], coefficients: Array, sizes: Array, pivot
     terms = [names[pivot]]
     for k in others:
         size = f"{abs(coefficients[k]):.2g}"
-        terms.append(f"{'-' if coefficients[k] < 0 else '+'} {'' if size == '1' else size + ' '}{names[k]}")
+        terms.append(
+            f"{'-' if coefficients[k] < 0 else '+'} {'' if size == '1' else size + ' '}{names[k]}"
+        )
     return " ".join(terms)
 
 
 def posterior(information: Array, scale: Array, count: int) -> Array:
-    """Covariance (g, g), m and rad, of the first `count` = g unknowns, the geometric numbers, from that prior and the
-    information (u, u) of poses about unknowns in units of their prior."""
+    """Covariance (g, g), m and rad, of the first `count` = g unknowns, the geometric numbers, from
+    that prior and the information (u, u) of poses about unknowns in units of their prior."""
     covariance = scale @ np.linalg.inv(information + np.eye(len(scale))) @ scale.T
     return np.asarray(covariance[:count, :count])
 
 
-def check_enough(robot: Robot, poses: int, information: Array, scale: Array, prior_std: Array) -> None:
-    """Raise EstimationError where so many poses have fewer equations than the numbers that poses can tell.
+def check_enough(
+    robot: Robot, poses: int, information: Array, scale: Array, prior_std: Array
+) -> None:
+    """Raise EstimationError where so many poses have fewer equations than the numbers that poses
+    can tell.
 
-    information (u, u): of many poses, about all unknowns in units of their prior. The message says how many poses are
-    needed, and which numbers the others would be for: those that are told least.
+    information (u, u): of many poses, about all unknowns in units of their prior. The message says
+    how many poses are needed, and which numbers the others would be for: those that are told least.
     """
-    names, rows = robot.geometry.number_names, len(robot.coordinate_names)
+    names = robot.geometry.number_names
+    rows = len(robot.coordinate_names)
     covariance = posterior(information, scale, len(names))
     told = len(names) - len(untold(covariance, prior_std))
     if poses * rows >= told:
         return
     worst = np.argsort(-np.sqrt(np.diagonal(covariance)) / prior_std, kind="stable")
-    unseen = [names[k] for k in worst if covariance[k, k] <= (OBSERVABLE * prior_std[k]) ** 2][: told - poses * rows]
+    unseen = [names[k] for k in worst if covariance[k, k] <= (OBSERVABLE * prior_std[k]) ** 2][
+        : told - poses * rows
+    ]
     shown = ", ".join(unseen[:6]) + (f" and {len(unseen) - 6} more" if len(unseen) > 6 else "")
-    needed, missing = -(-told // rows), told - poses * rows
+    needed = -(-told // rows)
+    missing = told - poses * rows
     raise EstimationError(
-        f"{poses} poses that differ give {poses * rows} equations for {told} combinations of the {len(names)} "
-        f"geometric numbers of {robot.name} that poses can tell: at least {needed} are needed; missing: {missing}, "
+        f"{poses} poses that differ give {poses * rows} equations for {told} combinations of the "
+        f"{len(names)} "
+        f"geometric numbers of {robot.name} that poses can tell: at least {needed} are needed; "
+        f"missing: {missing}, "
         f"hardest to tell: {shown}"
     )

@@ -1,4 +1,6 @@
-"""What a calibration of geometry leaves: its figures, the calibrated robot, the poses, and a page in words."""
+"""What a calibration of geometry leaves: its figures, the calibrated robot, the poses, and a page
+in words.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,9 +13,9 @@ import numpy as np
 from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
 from identify.arrays import Array
-from identify.files.atomic import atomic_contents
-from identify.files.dataset import write_covariance_of
+from identify.files.dataset import covariance_netcdf
 from identify.files.run_folder import rms_figures, save_files
+from identify.files.seal import sealed_toml
 from identify.files.versions import versions
 from identify.geometry.calibration import Calibration, PoseModel, frame_columns, seen_between
 from identify.geometry.experiment import true_poses
@@ -25,13 +27,16 @@ from identify.scenario import Scenario
 CURVE = 12
 """Numbers of random poses whose worth is told."""
 NOISY = 4.0
-"""Standard deviations of the noise ratio above one at which the model or the stated noise is said to be wrong."""
+"""Standard deviations of the noise ratio above one at which the model or the stated noise is said
+to be wrong.
+"""
 
 
 @dataclass(frozen=True)
 class GeometryOutcome:
-    """A calibration by poses; true deviations (g,) and the chosen poses where they are simulated, None otherwise;
-    unseen poses to judge it by, and the candidates among which the poses were chosen."""
+    """A calibration by poses; true deviations (g,) and the chosen poses where they are simulated,
+    None otherwise; unseen poses to judge it by, and the candidates among which the poses were
+    chosen."""
 
     scenario: Scenario
     seed: int
@@ -45,30 +50,34 @@ class GeometryOutcome:
     among: Candidates
 
     def write(self, folder: Path, pictures: Mapping[str, Any] | None = None) -> None:
-        """Write geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and scenario.toml, all or none.
+        """Write geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and
+        scenario.toml, all or none.
 
         pictures: figures and texts that are written with them, by the names of their files.
         """
         robot = self.calibration.robot
         description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
-        said = f"{robot.name} with the geometry of {len(self.data)} static poses; see geometry.json beside this file"
-        files = {
+        said = (
+            f"{robot.name} with the geometry of {len(self.data)} static poses; see "
+            "geometry.json beside this file"
+        )
+        files: dict[str, Any] = {
             "geometry.json": self.entry,
             "geometry.md": geometry_markdown(self.entry),
             "poses.json": self.data.entry(robot),
-            "robot.toml": robot_text(description, [said]),
+            "robot.toml": sealed_toml(robot_text(description, [said])),
             "scenario.toml": self.scenario.to_toml(),
             **(pictures or {}),
         }
-        with atomic_contents(folder) as temporary:
-            save_files(temporary, files)
-            units = dict(zip(robot.geometry.number_names, robot.geometry.number_units, strict=True))
-            write_covariance_of(temporary / "covariance.nc", units, self.calibration.covariance)
+        units = dict(zip(robot.geometry.number_names, robot.geometry.number_units, strict=True))
+        covariance = covariance_netcdf(units, self.calibration.covariance)
+        save_files(folder, files | {"covariance.nc": covariance})
 
     @cached_property
     def entry(self) -> dict[str, Any]:
         """The content of geometry.json."""
-        found, names = self.calibration, self.calibration.nominal.geometry.number_names
+        found = self.calibration
+        names = self.calibration.nominal.geometry.number_names
         entry: dict[str, Any] = {
             "scenario": self.scenario.name,
             "seed": self.seed,
@@ -92,8 +101,13 @@ class GeometryOutcome:
         return entry
 
     def _parameters(self) -> dict[str, dict[str, Any]]:
-        found, geometry = self.calibration, self.calibration.nominal.geometry
-        true = [None] * len(geometry.numbers) if self.true is None else (geometry.numbers + self.true).tolist()
+        found = self.calibration
+        geometry = self.calibration.nominal.geometry
+        true = (
+            [None] * len(geometry.numbers)
+            if self.true is None
+            else (geometry.numbers + self.true).tolist()
+        )
         columns = {
             "unit": geometry.number_units,
             "nominal": geometry.numbers.tolist(),
@@ -105,41 +119,61 @@ class GeometryOutcome:
         }
         rows = zip(*columns.values(), strict=True)
         return {
-            name: dict(zip(columns, row, strict=True)) for name, row in zip(geometry.number_names, rows, strict=True)
+            name: dict(zip(columns, row, strict=True))
+            for name, row in zip(geometry.number_names, rows, strict=True)
         }
 
     def _warnings(self) -> list[str]:
-        found, said = self.calibration, []
+        found = self.calibration
+        said = []
         off = (found.noise_ratio - 1) / found.noise_ratio_std
         if off > NOISY:
             said.append(
-                f"the poses miss the calibrated robot by {np.sqrt(found.noise_ratio):.2f} times what is stated of "
-                f"sensor and encoders ({off:.0f} standard deviations more than chance): intervals are too short, or "
-                f"the robot is not what {found.nominal.name} says, as where legs bend or joints have play"
+                f"the poses miss the calibrated robot by {np.sqrt(found.noise_ratio):.2f} times "
+                "what is stated of "
+                f"sensor and encoders ({off:.0f} standard deviations more than chance): intervals "
+                "are too short, or "
+                f"the robot is not what {found.nominal.name} says, as where legs bend or joints "
+                "have play"
             )
         missing = 0 if self.chosen is None else len(self.chosen) - len(self.data)
         if missing:
-            said.append(f"{missing} of {missing + len(self.data)} poses are left out: the sensor lost all their frames")
+            said.append(
+                f"{missing} of {missing + len(self.data)} poses are left out: the sensor lost all "
+                "their frames"
+            )
         return said
 
     def _judged(self) -> dict[str, Any]:
-        """By how much poses that were not measured are missed, as expected, and in truth where that is known."""
-        found, robot, closure = self.calibration, self.calibration.nominal, self.model.closure
-        joints, poses = self.unseen.joints, self.unseen.poses
-        columns, covariance = closure.derivatives(poses, joints, found.deviations)[0], found.covariance
-        if not found.frames_known:  # what the geometry lacks is then in the frames, and both together are known
+        """By how much poses that were not measured are missed, as expected, and in truth where that
+        is known.
+        """
+        found = self.calibration
+        robot = self.calibration.nominal
+        closure = self.model.closure
+        joints = self.unseen.joints
+        poses = self.unseen.poses
+        columns = closure.derivatives(poses, joints, found.deviations)[0]
+        covariance = found.covariance
+        if (
+            not found.frames_known
+        ):  # what the geometry lacks is then in the frames, and both together are known
             of_frames = frame_columns(robot, poses)[:, list(robot.geometry.chart.freedoms)]
-            columns, covariance = np.concatenate([columns, of_frames], axis=2), found.joint_covariance
+            columns = np.concatenate([columns, of_frames], axis=2)
+            covariance = found.joint_covariance
         judged = {"expected": self._spread(columns, covariance)}
         if self.true is None:
             return judged | {"unseen": rms_figures(np.full((1, 6), np.nan))}
         stands = true_poses(robot, self.true, joints, poses)
         predicted = seen_between(closure.poses(joints, found.deviations, poses), found.frames)
-        return judged | {"unseen": rms_figures(predicted - stands), "uncalibrated": rms_figures(poses - stands)}
+        return judged | {
+            "unseen": rms_figures(predicted - stands),
+            "uncalibrated": rms_figures(poses - stands),
+        }
 
     def _compared(self, chosen: Candidates) -> dict[str, Any]:
-        """What unseen poses are expected to be missed by after the chosen poses, after as many random ones, and after
-        twice as many."""
+        """What unseen poses are expected to be missed by after the chosen poses, after as many
+        random ones, and after twice as many."""
         count = len(chosen)
         sets = {"chosen": chosen, "random": self.among.of(list(range(count)))}
         if len(self.among) >= 2 * count:
@@ -147,17 +181,29 @@ class GeometryOutcome:
         return {name: self._left_by(one) for name, one in sets.items()}
 
     def _by_count(self, most: int) -> list[dict[str, Any]]:
-        """What unseen poses are expected to be missed by after so many random poses, up to a number of these."""
-        fewest = -(-len(self.calibration.deviations) // len(self.calibration.nominal.coordinate_names))
-        counts = np.unique(np.geomspace(fewest, max(fewest, min(most, len(self.among))), CURVE).astype(int))
+        """What unseen poses are expected to be missed by after so many random poses, up to a number
+        of these.
+        """
+        fewest = -(
+            -len(self.calibration.deviations) // len(self.calibration.nominal.coordinate_names)
+        )
+        counts = np.unique(
+            np.geomspace(fewest, max(fewest, min(most, len(self.among))), CURVE).astype(int)
+        )
         return [self._left_by(self.among.of(list(range(count)))) for count in counts.tolist()]
 
     def _left_by(self, poses: Candidates) -> dict[str, Any]:
-        columns = self.model.columns(self.unseen.joints, self.unseen.poses, np.zeros(len(self.model.scale)))[0]
-        return {"poses": len(poses)} | self._spread(columns, np.asarray(np.linalg.inv(poses.with_prior), dtype=float))
+        columns = self.model.columns(
+            self.unseen.joints, self.unseen.poses, np.zeros(len(self.model.scale))
+        )[0]
+        return {"poses": len(poses)} | self._spread(
+            columns, np.asarray(np.linalg.inv(poses.with_prior), dtype=float)
+        )
 
     def _spread(self, columns: Array, covariance: Array) -> dict[str, list[float]]:
-        """Expected errors of the unseen poses, for columns (N, m, u) and a covariance (u, u) of the unknowns."""
+        """Expected errors of the unseen poses, for columns (N, m, u) and a covariance (u, u) of the
+        unknowns.
+        """
         spread = np.sqrt(np.einsum("nmu,uv,nmv->nm", columns, covariance, columns))
         return rms_figures(self.calibration.nominal.geometry.chart.lifted(spread))
 
@@ -168,11 +214,14 @@ def geometry_markdown(entry: dict[str, Any]) -> str:
     lines = [
         f"# Geometry of {entry['robot']}",
         "",
-        f"From {entry['poses']} static poses of {entry['frames_per_pose']} frames each; {entry['lost_frames']} frames "
-        f"were lost. The poses tell {len(told)} of {len(entry['parameters'])} geometric numbers; the others stay where "
+        f"From {entry['poses']} static poses of {entry['frames_per_pose']} frames each; "
+        f"{entry['lost_frames']} frames "
+        f"were lost. The poses tell {len(told)} of {len(entry['parameters'])} geometric numbers; "
+        "the others stay where "
         "the robot file has them, give or take the stated tolerance.",
         "",
-        f"Residuals are {np.sqrt(entry['noise_ratio']):.3f} times what is stated of sensor and encoders.",
+        f"Residuals are {np.sqrt(entry['noise_ratio']):.3f} times what is stated of sensor and "
+        "encoders.",
     ]
     lines += [f"\nWarning: {text}." for text in entry["warnings"]]
     said = {
@@ -180,31 +229,55 @@ def geometry_markdown(entry: dict[str, Any]) -> str:
         "unseen": "After it, they are missed by",
         "expected": "Expected from the covariance of the geometry",
     }
-    figures = {f"{text} (root mean square)": entry[key] for key, text in said.items() if key in entry}
-    names = {"chosen": "chosen poses", "random": "random poses", "twice as many random": "random poses"}
+    figures = {
+        f"{text} (root mean square)": entry[key] for key, text in said.items() if key in entry
+    }
+    names = {
+        "chosen": "chosen poses",
+        "random": "random poses",
+        "twice as many random": "random poses",
+    }
     for key, one in entry.get("selection", {}).items():
-        figures[f"What {one['poses']} {names[key]} are expected to leave beside the error of teaching"] = one
+        figures[
+            f"What {one['poses']} {names[key]} are expected to leave beside the error of teaching"
+        ] = one
     for text, one in figures.items():
         if np.isfinite(one["position_rms_um"]).all():
             lines += ["", f"{text}: {_figures(one)}."]
-    lines += ["", "| number | nominal | true | estimate | standard deviation | told |", "|---|--:|--:|--:|--:|---|"]
+    lines += [
+        "",
+        "| number | nominal | true | estimate | standard deviation | told |",
+        "|---|--:|--:|--:|--:|---|",
+    ]
     for name, one in entry["parameters"].items():
-        values = ["" if one[key] is None else f"{1e3 * one[key]:.4f}" for key in ("nominal", "true", "estimate", "std")]
-        lines.append(f"| {name} [m{one['unit']}] | {' | '.join(values)} | {'yes' if one['observable'] else 'no'} |")
+        values = [
+            "" if one[key] is None else f"{1e3 * one[key]:.4f}"
+            for key in ("nominal", "true", "estimate", "std")
+        ]
+        lines.append(
+            f"| {name} [m{one['unit']}] | {' | '.join(values)} | "
+            f"{'yes' if one['observable'] else 'no'} |"
+        )
     if entry["cannot_be_told"]:
         lines += [
             "",
-            "Combinations that these poses cannot tell (numbers that move together, and no pose shows it):",
+            "Combinations that these poses cannot tell (numbers that move together, and no pose "
+            "shows it):",
             "",
         ]
         lines += [f"- {text}" for text in entry["cannot_be_told"]]
         if entry["frames"] == "unknown":
-            lines += ["", "Nothing was known of the frames of base and platform: their places are among these."]
+            lines += [
+                "",
+                "Nothing was known of the frames of base and platform: their places are among "
+                "these.",
+            ]
     return "\n".join(lines) + "\n"
 
 
 def _figures(figures: dict[str, Any]) -> str:
     position, turn = (
-        ", ".join(f"{value:.2f}" for value in figures[key]) for key in ("position_rms_um", "orientation_rms_urad")
+        ", ".join(f"{value:.2f}" for value in figures[key])
+        for key in ("position_rms_um", "orientation_rms_urad")
     )
     return f"{position} um in x, y, z and {turn} urad in alpha, beta, gamma"

@@ -1,4 +1,6 @@
-"""`cmmsim geometry` from a scenario to its outcome: choose poses, measure them, calibrate, judge on unseen ones."""
+"""`cmmsim geometry` from a scenario to its outcome: choose poses, measure them, calibrate, judge on
+unseen ones.
+"""
 
 import numpy as np
 
@@ -27,18 +29,24 @@ def run_geometry(
 ) -> GeometryOutcome:
     """Calibrate the geometry of a scenario's robot, simulated, or from measurements of one's own.
 
-    Raises EstimationError: too few poses, with how many are needed and for what; loops that do not close. RecordError:
-    encoders that read something else than the joints. UnreachablePoseError: a measured pose out of reach.
+    Raises EstimationError: too few poses, with how many are needed and for what; loops that do not
+    close. RecordError: encoders that read something else than the joints. UnreachablePoseError: a
+    measured pose out of reach.
     """
     scenario = with_renderer(scenario)
-    robot, settings = load_robot(scenario.robot), scenario.geometry
+    robot = load_robot(scenario.robot)
+    settings = scenario.geometry
     tolerance = Tolerance(settings.tolerance_m, settings.tolerance_rad)
-    lost, chosen, true = 0, None, None
+    lost = 0
+    chosen = None
+    true = None
     if measurements is not None:
         data = measurements
         check_encoders(robot, data)
         designer = _designer(robot, scenario, data.frames, data.covariances.mean(axis=0), None)
-        among = designer.candidates(settings.candidates, np.random.default_rng(child(seed, STATIC_POSES)))
+        among = designer.candidates(
+            settings.candidates, np.random.default_rng(child(seed, STATIC_POSES))
+        )
     else:
         sight = sight_lines(scenario.sensor, scenario.sensor_changes)
         designer = _designer(robot, scenario, *_expected(robot, scenario), sight)
@@ -46,46 +54,67 @@ def run_geometry(
         true = true_deviations(robot, scenario, seed)
         true_poses(robot, true, chosen.joints, chosen.poses)  # refused before the sensor is taught
         sensor = taught_sensor(scenario, robot, seed, progress)
-        data, lost = stand_at(robot, scenario, sensor, true, chosen.joints, chosen.poses, seed, progress)
+        data, lost = stand_at(
+            robot, scenario, sensor, true, chosen.joints, chosen.poses, seed, progress
+        )
         check_encoders(robot, data)
     _require_enough(designer, among, data.different)
     with progress.stage("calibrate", 1) as advance:
         found = calibrate(robot, data, tolerance)
         advance()
     unseen = designer.candidates(settings.unseen, np.random.default_rng(child(seed, UNSEEN_POSES)))
-    return GeometryOutcome(scenario, seed, designer.model, found, data, lost, true, unseen, chosen, among)
+    return GeometryOutcome(
+        scenario, seed, designer.model, found, data, lost, true, unseen, chosen, among
+    )
 
 
-def calibrated_for_a_run(scenario: Scenario, seed: int, progress: Progress) -> tuple[GeometryOutcome, KnownGeometry]:
-    """The calibration that precedes a run whose geometry is `calibrated`, and what is known after it. Raises as
-    `run_geometry`."""
+def calibrated_for_a_run(
+    scenario: Scenario, seed: int, progress: Progress
+) -> tuple[GeometryOutcome, KnownGeometry]:
+    """The calibration that precedes a run whose geometry is `calibrated`, and what is known after
+    it. Raises as `run_geometry`."""
     outcome = run_geometry(scenario, seed, progress)
-    nominal, found = outcome.calibration.nominal, outcome.calibration.robot.geometry
+    nominal = outcome.calibration.nominal
+    found = outcome.calibration.robot.geometry
     robot = nominal.moved(found.deviations_from(nominal.geometry))
     return outcome, KnownGeometry(robot, outcome.calibration.covariance)
 
 
 def _designer(
-    robot: Robot, scenario: Scenario, frames: FrameKnowledge, covariance: Array, sight: SightLines | None
+    robot: Robot,
+    scenario: Scenario,
+    frames: FrameKnowledge,
+    covariance: Array,
+    sight: SightLines | None,
 ) -> Designer:
-    settings, excitation = scenario.geometry, scenario.excitation
-    model = PoseModel(robot, Tolerance(settings.tolerance_m, settings.tolerance_rad).of(robot), frames)
+    settings = scenario.geometry
+    excitation = scenario.excitation
+    model = PoseModel(
+        robot, Tolerance(settings.tolerance_m, settings.tolerance_rad).of(robot), frames
+    )
     travel = robot.travel_limit - of_actuators(robot, excitation, "travel_margin")
     limits = Limits(robot, travel, excitation.least_leverage, excitation.most_condition, sight)
-    std = np.full(robot.layout.joints, encoders_of(robot, settings).mean_std(settings.frames_per_pose))
+    std = np.full(
+        robot.layout.joints, encoders_of(robot, settings).mean_std(settings.frames_per_pose)
+    )
     return Designer(model, limits, covariance, std, settings.criterion)
 
 
 def _expected(robot: Robot, scenario: Scenario) -> tuple[FrameKnowledge, Array]:
-    """What is known of the frames before they are taught, and the covariance (6, 6) of a pose's mean at home."""
-    changes, nothing = scenario.sensor_changes, np.zeros((6, 6))
+    """What is known of the frames before they are taught, and the covariance (6, 6) of a pose's
+    mean at home.
+    """
+    changes = scenario.sensor_changes
+    nothing = np.zeros((6, 6))
     one = expected_covariance(scenario.sensor, robot.home_pose, scenario.pose_method, changes)
     taught = scenario.geometry.frames == "taught"
     frames = FrameKnowledge(nothing, nothing) if taught else FrameKnowledge.none()
     return frames, one / scenario.geometry.frames_per_pose
 
 
-def _choose(designer: Designer, scenario: Scenario, seed: int, progress: Progress) -> tuple[Candidates, Candidates]:
+def _choose(
+    designer: Designer, scenario: Scenario, seed: int, progress: Progress
+) -> tuple[Candidates, Candidates]:
     """The poses, and the candidates that they were chosen from."""
     settings = scenario.geometry
     rng = np.random.default_rng(child(seed, STATIC_POSES))

@@ -1,8 +1,8 @@
 """Which poses to measure: chosen by an observability index over candidates within the travel.
 
-The index (`indices`) is of the information about geometry and frames together. Poses are taken one by one from the
-candidates (greedy), exchanged until none is better, and then moved in joint space along the index's gradient, all at
-once, within the travel.
+The index (`indices`) is of the information about geometry and frames together. Poses are taken one
+by one from the candidates (greedy), exchanged until none is better, and then moved in joint space
+along the index's gradient, all at once, within the travel.
 """
 
 from dataclasses import dataclass
@@ -35,8 +35,8 @@ TRIALS = 40
 
 @dataclass(frozen=True)
 class Limits:
-    """Where a robot may stand to be measured: within its travel (rad or m), far from singularities, and in sight, where
-    that is asked for."""
+    """Where a robot may stand to be measured: within its travel (rad or m), far from singularities,
+    and in sight, where that is asked for."""
 
     robot: Robot
     travel: float
@@ -50,7 +50,9 @@ class Limits:
         good = measures.reachable & (np.abs(measures.theta) <= self.travel * (1 + 1e-9)).all(axis=1)
         good &= measures.leverage.min(axis=1) >= self.least_leverage
         good &= measures.platform_condition <= self.most_condition
-        return np.array([ok and self._in_sight(pose) for ok, pose in zip(good, poses, strict=True)], dtype=bool)
+        return np.array(
+            [ok and self._in_sight(pose) for ok, pose in zip(good, poses, strict=True)], dtype=bool
+        )
 
     def _in_sight(self, pose: Array) -> bool:
         return self.sight is None or bool(self.sight.visible(pose)[self._stickers].all())
@@ -62,8 +64,8 @@ class Limits:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Joint coordinates (N, n), rad or m, the nominal robot's poses (N, 6) there, and what each pose would tell:
-    whitened columns (N, m, u) of the unknowns in units of their prior."""
+    """Joint coordinates (N, n), rad or m, the nominal robot's poses (N, 6) there, and what each
+    pose would tell: whitened columns (N, m, u) of the unknowns in units of their prior."""
 
     joints: Array
     poses: Array
@@ -89,8 +91,8 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Designer:
-    """Chooses poses for a model; covariance (6, 6): of a pose's mean, joint_std (n,): of its encoders' readings;
-    criterion: the name of the index."""
+    """Chooses poses for a model; covariance (6, 6): of a pose's mean, joint_std (n,): of its
+    encoders' readings; criterion: the name of the index."""
 
     model: PoseModel
     limits: Limits
@@ -105,7 +107,8 @@ class Designer:
         """
         kept_joints: list[Array] = []
         kept_poses: list[Array] = []
-        robot, travel = self.limits.robot, self.limits.travel
+        robot = self.limits.robot
+        travel = self.limits.travel
         for _ in range(TRIALS):
             joints = rng.uniform(-travel, travel, (count, robot.layout.joints))
             poses = self._poses(joints, np.tile(robot.home_pose, (count, 1)))
@@ -118,23 +121,34 @@ class Designer:
         joints, poses = (np.concatenate(parts)[:count] for parts in (kept_joints, kept_poses))
         if len(joints) < count:
             raise EstimationError(
-                f"only {len(joints)} of {count * TRIALS} random joint coordinates of {robot.name} within its travel "
-                f"({travel:.3g} {robot.layout.joint_unit}) are poses where it may stand and be seen; {count} are wanted"
+                f"only {len(joints)} of {count * TRIALS} random joint coordinates of {robot.name} "
+                "within its travel "
+                f"({travel:.3g} {robot.layout.joint_unit}) are poses where it may stand and be "
+                f"seen; {count} are wanted"
             )
         return self.seen(joints, poses)
 
     def seen(self, joints: Array, poses: Array) -> Candidates:
         """What poses (N, 6) of joint coordinates (N, n) would tell."""
-        none, free = np.zeros(len(self.model.scale)), list(self.limits.robot.geometry.chart.freedoms)
+        none = np.zeros(len(self.model.scale))
+        free = list(self.limits.robot.geometry.chart.freedoms)
         columns, by_joints = self.model.columns(joints, poses, none)
         return Candidates(
-            joints, poses, whiteners(self.covariance[np.ix_(free, free)], by_joints, self.joint_std) @ columns
+            joints,
+            poses,
+            whiteners(self.covariance[np.ix_(free, free)], by_joints, self.joint_std) @ columns,
         )
 
-    def greedy(self, among: Candidates, count: int, advance: Advance = lambda n=1: None) -> Candidates:
-        """The best candidates one by one, then exchanged until no other is better; the same one may stand twice."""
-        index, chosen = self.index(among), list[int]()
-        own, prior = among.columns.swapaxes(1, 2) @ among.columns, np.eye(among.columns.shape[2])
+    def greedy(
+        self, among: Candidates, count: int, advance: Advance = lambda n=1: None
+    ) -> Candidates:
+        """The best candidates one by one, then exchanged until no other is better; the same one may
+        stand twice.
+        """
+        index = self.index(among)
+        chosen = list[int]()
+        own = among.columns.swapaxes(1, 2) @ among.columns
+        prior = np.eye(among.columns.shape[2])
         information = prior
         for _ in range(count):
             chosen.append(index.best(among.columns, information))
@@ -143,7 +157,8 @@ class Designer:
         for _ in range(EXCHANGES):
             before = list(chosen)
             for place in range(count):
-                # Summed anew: the difference of two sums would hide what the other poses tell least.
+                # Summed anew: the difference of two sums would hide what the other poses tell
+                # least.
                 information = prior + own[chosen[:place] + chosen[place + 1 :]].sum(axis=0)
                 chosen[place] = index.best(among.columns, information)
             if chosen == before:
@@ -151,25 +166,36 @@ class Designer:
         return among.of(chosen)
 
     def moved(self, chosen: Candidates, among: Candidates) -> Candidates:
-        """The poses after a search along the gradient of the index in joint space, at which it is no worse; those that
-        it would lead to where the robot may not stand are held where they were."""
-        index, held, best = self.index(among), np.zeros(len(chosen), dtype=bool), chosen
+        """The poses after a search along the gradient of the index in joint space, at which it is
+        no worse; those that it would lead to where the robot may not stand are held where they
+        were."""
+        index = self.index(among)
+        held = np.zeros(len(chosen), dtype=bool)
+        best = chosen
         for _ in range(ROUNDS):
             joints = self._along_gradient(chosen, held, index)
             poses = self._poses(joints, chosen.poses)
             closed = np.flatnonzero(np.isfinite(poses).all(axis=1))
             forbidden = np.ones(len(chosen), dtype=bool)
             forbidden[closed] = ~self.limits.allowed(poses[closed])
-            joints[forbidden], poses[forbidden] = chosen.joints[forbidden], chosen.poses[forbidden]
-            best = min(best, self.seen(joints, poses), key=lambda found: index.value(found.with_prior)[0])
+            joints[forbidden] = chosen.joints[forbidden]
+            poses[forbidden] = chosen.poses[forbidden]
+            best = min(
+                best, self.seen(joints, poses), key=lambda found: index.value(found.with_prior)[0]
+            )
             if not forbidden.any():
                 break
             held |= forbidden
         return best
 
-    def _along_gradient(self, chosen: Candidates, held: NDArray[np.bool_], index: ObservabilityIndex) -> Array:
-        """Joint coordinates (N, n) within the travel with the best index nearby, some poses held."""
-        shape, travel, near = chosen.joints.shape, self.limits.travel, chosen.poses
+    def _along_gradient(
+        self, chosen: Candidates, held: NDArray[np.bool_], index: ObservabilityIndex
+    ) -> Array:
+        """Joint coordinates (N, n) within the travel with the best index nearby, some poses
+        held."""
+        shape = chosen.joints.shape
+        travel = self.limits.travel
+        near = chosen.poses
 
         def worth(values: Array) -> tuple[float, Array]:
             nonlocal near
@@ -177,20 +203,28 @@ class Designer:
             poses = self._poses(joints, near)
             if not np.isfinite(poses).all():
                 return np.inf, np.zeros(values.size)
-            near, at = poses, self.seen(joints, poses)
+            near = poses
+            at = self.seen(joints, poses)
             found, spread = index.value(at.with_prior)
-            pull, gradient = np.einsum("uv,nmv->nmu", spread, at.columns), np.empty(shape)
+            pull = np.einsum("uv,nmv->nmu", spread, at.columns)
+            gradient = np.empty(shape)
             for joint in range(shape[1]):
                 ahead = joints + STEP * travel * np.eye(shape[1])[joint]
                 columns = self.seen(ahead, self._poses(ahead, poses)).columns
-                gradient[:, joint] = -2 * np.einsum("nmu,nmu->n", pull, (columns - at.columns) / STEP)
+                gradient[:, joint] = -2 * np.einsum(
+                    "nmu,nmu->n", pull, (columns - at.columns) / STEP
+                )
             return found, gradient.ravel()
 
-        start, free = chosen.joints / travel, ~held[:, None]
-        low, high = np.where(free, -1.0, start), np.where(free, 1.0, start)
+        start = chosen.joints / travel
+        free = ~held[:, None]
+        low = np.where(free, -1.0, start)
+        high = np.where(free, 1.0, start)
         bounds = list(zip(low.ravel(), high.ravel(), strict=True))
         steps = {"maxiter": GRADIENT_STEPS}
-        found = minimize(worth, start.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=steps)
+        found = minimize(
+            worth, start.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=steps
+        )
         return np.asarray(found.x.reshape(shape) * travel)
 
     def index(self, among: Candidates) -> ObservabilityIndex:

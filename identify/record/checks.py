@@ -1,4 +1,5 @@
-"""What a whole record must be to carry an identification: of this robot and loop, long enough, and moving.
+"""What a whole record must be to carry an identification: of this robot and loop, long enough, and
+moving.
 
 Each check raises EstimationError with what it found, in frames counted from 0.
 """
@@ -29,11 +30,13 @@ REFERENCE_GAP = 0.05
 """Share of its travel by which a reference may differ from the integral of its rate."""
 
 ROUNDING = 1e-9
-"""m or rad: difference that means nothing, of a reference from its trajectory or from one that stands still; and
-relative, of a frame rate."""
+"""m or rad: difference that means nothing, of a reference from its trajectory or from one that
+stands still; and relative, of a frame rate."""
 
 ASYMMETRY = 1e-6
-"""Difference of two mirrored entries of a covariance that rounding may make, in units of the standard deviations."""
+"""Difference of two mirrored entries of a covariance that rounding may make, in units of the
+standard deviations.
+"""
 
 
 class TooFewFramesError(EstimationError):
@@ -41,7 +44,8 @@ class TooFewFramesError(EstimationError):
 
 
 def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
-    """The record must be whole, of this robot, and made with the timing and the servo that the model is to have.
+    """The record must be whole, of this robot, and made with the timing and the servo that the
+    model is to have.
 
     Raises RecordError too, for a record that is not whole or does not say so.
     """
@@ -49,22 +53,26 @@ def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
     check_robot(record, robot)
     if record.sizes["joint"] != robot.layout.joints:
         raise EstimationError(
-            f"the record has commands of {record.sizes['joint']} joints, robot {robot.name!r} has {robot.layout.joints}"
+            f"the record has commands of {record.sizes['joint']} joints, robot {robot.name!r} has "
+            f"{robot.layout.joints}"
         )
     recorded = recorded_scenario(record)
     for section in ("timing", "servo"):
-        theirs, ours = getattr(recorded, section).model_dump(), getattr(scenario, section).model_dump()
+        theirs = getattr(recorded, section).model_dump()
+        ours = getattr(scenario, section).model_dump()
         for key, value in theirs.items():
             if value != ours[key]:
                 raise EstimationError(
-                    f"the record was made with {section}.{key} = {value!r}, the scenario says {ours[key]!r}"
+                    f"the record was made with {section}.{key} = {value!r}, the scenario says "
+                    f"{ours[key]!r}"
                 )
     _check_stated_rate(record, scenario.timing.frame_rate_hz)
     steps = np.diff(np.asarray(record["time"].values, dtype=float)) * scenario.timing.frame_rate_hz
     if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
         worst = int(np.abs(steps - 1).argmax())
         raise EstimationError(
-            f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of {scenario.timing.frame_rate_hz:g} Hz "
+            f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of "
+            f"{scenario.timing.frame_rate_hz:g} Hz "
             "apart: frames are missing in the record; keep lost ones with measured_ok = 0"
         )
 
@@ -74,80 +82,101 @@ def _check_stated_rate(record: xr.Dataset, rate_hz: float) -> None:
     stated = record.attrs.get("frame_rate_hz", rate_hz)
     if not abs(as_number(stated) - rate_hz) <= ROUNDING * rate_hz:
         raise EstimationError(
-            f"the record contradicts itself: its attribute frame_rate_hz is {shown(stated)}, and timing.frame_rate_hz "
+            f"the record contradicts itself: its attribute frame_rate_hz is {shown(stated)}, and "
+            "timing.frame_rate_hz "
             f"of its attribute scenario is {rate_hz:g}"
         )
 
 
 def check_trajectory(record: xr.Dataset, trajectory: FourierTrajectory, scenario: Scenario) -> None:
-    """The record's reference must be the exciting trajectory (eq. 37) at the frames that the scenario asks for."""
+    """The record's reference must be the exciting trajectory (eq. 37) at the frames that the
+    scenario asks for.
+    """
     asked = scenario.timing.frame_times(scenario.excitation.duration_s)
     if record.sizes["time"] != len(asked):
         raise EstimationError(
             f"the record has {record.sizes['time']} frames, and the scenario asks for {len(asked)} "
-            f"(excitation.duration_s = {scenario.excitation.duration_s:g} s): it is of another experiment"
+            f"(excitation.duration_s = {scenario.excitation.duration_s:g} s): it is of another "
+            "experiment"
         )
     gap = np.abs(poses(record, "reference") - trajectory.pose(asked))
     if not gap.max() <= ROUNDING:
         frame, worst = np.unravel_index(int(np.argmax(gap)), gap.shape)
         raise EstimationError(
             f"the record's reference is not the exciting trajectory: its {POSE[worst]} differs by "
-            f"{gap[frame, worst]:.3g} {'m' if worst < 3 else 'rad'} at t = {asked[frame]:.2f} s: it is of another "
+            f"{gap[frame, worst]:.3g} {'m' if worst < 3 else 'rad'} at t = {asked[frame]:.2f} s: "
+            "it is of another "
             "experiment"
         )
 
 
 def check_reference(reference: Reference, scenario: Scenario) -> None:
-    """The reference must move, and its poses must be what its rates make of the first: a motion faster than half the
-    frame rate looks like a slow one in the poses."""
-    poses, rates = reference.poses, reference.rates
+    """The reference must move, and its poses must be what its rates make of the first: a motion
+    faster than half the frame rate looks like a slow one in the poses."""
+    poses = reference.poses
+    rates = reference.rates
     travel = np.ptp(poses, axis=0)
     if not travel.any():
-        raise EstimationError("the reference is the same pose in every frame: nothing was asked to move")
+        raise EstimationError(
+            "the reference is the same pose in every frame: nothing was asked to move"
+        )
     if len(poses) <= SPLINE_DEGREE:
         return
     times = np.arange(len(poses)) * scenario.timing.frame_period_s
-    gap = np.ptp(make_interp_spline(times, rates, k=SPLINE_DEGREE).antiderivative()(times) - poses, axis=0)
+    gap = np.ptp(
+        make_interp_spline(times, rates, k=SPLINE_DEGREE).antiderivative()(times) - poses, axis=0
+    )
     worst = int(np.argmax(gap - REFERENCE_GAP * travel))
     if gap[worst] > REFERENCE_GAP * travel[worst] + ROUNDING:
         raise EstimationError(
-            f"the reference's {POSE[worst]} travels {travel[worst]:.3g}, and its rate makes it another motion, up to "
-            f"{gap[worst]:.3g} away: it has harmonics above half of {scenario.timing.frame_rate_hz:g} Hz, or the rate "
+            f"the reference's {POSE[worst]} travels {travel[worst]:.3g}, and its rate makes it "
+            "another motion, up to "
+            f"{gap[worst]:.3g} away: it has harmonics above half of "
+            f"{scenario.timing.frame_rate_hz:g} Hz, or the rate "
             "is not its derivative"
         )
 
 
 def check_length(frames: int, scenario: Scenario, what: str = "the record has") -> None:
     """One period of the highest harmonic, and what the filter takes at its ends."""
-    timing, filtering = scenario.timing, scenario.filter
+    timing = scenario.timing
+    filtering = scenario.filter
     needed = max(
         padding_samples(timing.frame_rate_hz, filtering.cutoff_hz, filtering.order) + 1,
         timing.frames(1 / (scenario.excitation.fundamental_hz * scenario.excitation.harmonics)),
     )
     if frames < needed:
         raise EstimationError(
-            f"{what} {frames} frames ({frames / timing.frame_rate_hz:.3g} s), at least {needed} are needed: "
+            f"{what} {frames} frames ({frames / timing.frame_rate_hz:.3g} s), at least {needed} "
+            "are needed: "
             "one period of the highest harmonic, and what the filter takes at its ends"
         )
 
 
 def check_good_share(ok: NDArray[np.bool_], seen: Sequence[str] = ()) -> None:
-    """Enough frames (N,) that were measured; else TooFewFramesError, with what a watch saw of the cameras."""
+    """Enough frames (N,) that were measured; else TooFewFramesError, with what a watch saw of the
+    cameras.
+    """
     if ok.mean() < MINIMUM_GOOD_SHARE:
         why = "".join(f": {warning}" for warning in seen)
         raise TooFewFramesError(
-            f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} are needed{why}"
+            f"only {ok.sum()} of {len(ok)} frames were measured; at least "
+            f"{MINIMUM_GOOD_SHARE:.0%} are needed{why}"
         )
 
 
 def check_channels(chart: Chart, measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
-    """No coordinate of the poses (N, 6) in the good frames, `ok` (N,), and no command (N, n), that is dead. What the
-    chart does not let move may stand still."""
+    """No coordinate of the poses (N, 6) in the good frames, `ok` (N,), and no command (N, n), that
+    is dead. What the chart does not let move may stand still."""
     channels = list(zip(chart.coordinate_names, chart.coordinates(measured[ok]).T, strict=True))
-    channels += [(f"command of joint {joint}", column) for joint, column in enumerate(logged.T, start=1)]
+    channels += [
+        (f"command of joint {joint}", column) for joint, column in enumerate(logged.T, start=1)
+    ]
     for name, values in channels:
         if np.ptp(values) == 0:
-            raise EstimationError(f"{name} is {values[0]:g} in every frame: nothing moved, or the channel is dead")
+            raise EstimationError(
+                f"{name} is {values[0]:g} in every frame: nothing moved, or the channel is dead"
+            )
 
 
 def checked_covariance(covariances: Array, ok: NDArray[np.bool_]) -> Array:
@@ -160,7 +189,9 @@ def checked_covariance(covariances: Array, ok: NDArray[np.bool_]) -> Array:
 
 
 def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
-    """Covariances (n, 6, 6) of these frames (n,) must be symmetric: what follows reads one triangle only."""
+    """Covariances (n, 6, 6) of these frames (n,) must be symmetric: what follows reads one triangle
+    only.
+    """
     gap = np.abs(covariances - covariances.transpose(0, 2, 1))
     std = np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
     excess = gap - ASYMMETRY * std[:, :, None] * std[:, None, :]
@@ -168,7 +199,9 @@ def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
         return
     worst, row, column = np.unravel_index(int(np.argmax(excess > 0)), excess.shape)
     raise EstimationError(
-        f"measured_covariance is not symmetric in {np.sum((excess > 0).any(axis=(1, 2)))} frames: in frame "
-        f"{frames[worst]} its entry ({POSE[row]}, {POSE[column]}) is {covariances[worst, row, column]:.6g} and "
+        f"measured_covariance is not symmetric in {np.sum((excess > 0).any(axis=(1, 2)))} frames: "
+        "in frame "
+        f"{frames[worst]} its entry ({POSE[row]}, {POSE[column]}) is "
+        f"{covariances[worst, row, column]:.6g} and "
         f"({POSE[column]}, {POSE[row]}) is {covariances[worst, column, row]:.6g}"
     )

@@ -1,11 +1,14 @@
-"""What all measured poses of a record have in common: errors of cameras and taught frames that are known only so well.
+"""What all measured poses of a record have in common: errors of cameras and taught frames that are
+known only so well.
 
-They are one draw d a run, with a covariance, and move the measured poses by J(pose) d. A record states J of every
-frame and the covariance beside its poses. An estimator that whitens poses by the noise alone takes such an error for
-one of the model. Here it is marginalised: with noise of unit covariance and modes M = J L, L L^T the covariance of d,
-residuals have the covariance 1 + M M^T, and with M = U S V^T their whitener is 1 - U (1 - (1 + S^2)^-1/2) U^T. That is
-the same as estimating d beside everything else, d known beforehand by its covariance. Where M is not the same for all
-d, as of a latency, or of cameras within a servo, the model is given the most likely d, and M taken there.
+They are one draw d a run, with a covariance, and move the measured poses by J(pose) d. A record
+states J of every frame and the covariance beside its poses. An estimator that whitens poses by the
+noise alone takes such an error for one of the model. Here it is marginalised: with noise of unit
+covariance and modes M = J L, L L^T the covariance of d, residuals have the covariance 1 + M M^T,
+and with M = U S V^T their whitener is 1 - U (1 - (1 + S^2)^-1/2) U^T. That is the same as
+estimating d beside everything else, d known beforehand by its covariance. Where M is not the same
+for all d, as of a latency, or of cameras within a servo, the model is given the most likely d, and
+M taken there.
 """
 
 from dataclasses import dataclass
@@ -21,16 +24,18 @@ from identify.files.dataset import POSE
 from identify.record.covariance import covariance_fault, factor, noticed_directions
 from identify.record.geometry_errors import GeometryErrors
 
-CHANGES, COVARIANCE = "common_error", "common_error_covariance"
+CHANGES = "common_error"
+COVARIANCE = "common_error_covariance"
 LATENCY = "timing.latency_s"
 
 
 @dataclass(frozen=True)
 class CommonErrors:
-    """names of the errors, each ending with its unit; changes (N, 6, k) of the measured poses per unit of each;
-    covariance (k, k) of what is true minus what is known. latency_std: of the mean latency of the frames, s, which only
-    a model of the loop can turn into poses; and so it is with the geometry of the robot, None where that is exact.
-    whitener (6, 6): that of the poses' noise, which says which directions of the errors they notice; None: all."""
+    """names of the errors, each ending with its unit; changes (N, 6, k) of the measured poses per
+    unit of each; covariance (k, k) of what is true minus what is known. latency_std: of the mean
+    latency of the frames, s, which only a model of the loop can turn into poses; and so it is with
+    the geometry of the robot, None where that is exact. whitener (6, 6): that of the poses' noise,
+    which says which directions of the errors they notice; None: all."""
 
     names: tuple[str, ...]
     changes: Array
@@ -41,7 +46,8 @@ class CommonErrors:
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all errors, behind those of the poses the latency's and those of the geometry."""
+        """Names of all errors, behind those of the poses the latency's and those of the
+        geometry."""
         latency = (LATENCY,) if self.latency_std else ()
         return (*self.names, *latency, *(self.geometry.names if self.geometry else ()))
 
@@ -49,7 +55,9 @@ class CommonErrors:
     def whole_factor(self) -> Array:
         """`factor` of all errors."""
         latency = [np.full((1, 1), self.latency_std)] if self.latency_std else []
-        return np.asarray(block_diag(self.factor, *latency, *([self.geometry.factor] if self.geometry else [])))
+        return np.asarray(
+            block_diag(self.factor, *latency, *([self.geometry.factor] if self.geometry else []))
+        )
 
     def known_as(self, other: "CommonErrors") -> bool:
         """Whether these are the errors that others are, and as well known."""
@@ -60,15 +68,21 @@ class CommonErrors:
         return same and all(np.array_equal(*pair) for pair in pairs)
 
     def by_kind(self, modes: Array) -> dict[str, Array]:
-        """Of what independent numbers of standard deviation one, whose factor is `whole_factor`, do (..., k), the part
-        of each kind (..., k); errors of one kind say nothing of those of another."""
-        root, kinds = self.whole_factor, np.array([kind_of(name) for name in self.all_names])
+        """Of what independent numbers of standard deviation one, whose factor is `whole_factor`, do
+        (..., k), the part of each kind (..., k); errors of one kind say nothing of those of
+        another."""
+        root = self.whole_factor
+        kinds = np.array([kind_of(name) for name in self.all_names])
         per_error = modes @ np.linalg.pinv(root)
-        return {kind: (per_error * (kinds == kind)) @ root for kind in dict.fromkeys(kinds.tolist())}
+        return {
+            kind: (per_error * (kinds == kind)) @ root for kind in dict.fromkeys(kinds.tolist())
+        }
 
     @property
     def factor(self) -> Array:
-        """L (k, k) with L L^T the covariance; with a whitener, its columns that are noticed most come first."""
+        """L (k, k) with L L^T the covariance; with a whitener, its columns that are noticed most
+        come first.
+        """
         return self._noticed[0]
 
     @property
@@ -87,7 +101,9 @@ class CommonErrors:
 
     @cached_property
     def modes(self) -> Array:
-        """Errors (N, 6, k) of the measured poses, for each of k independent numbers of standard deviation one."""
+        """Errors (N, 6, k) of the measured poses, for each of k independent numbers of standard
+        deviation one.
+        """
         return np.asarray(self.changes @ self.factor)
 
 
@@ -96,9 +112,9 @@ NONE = CommonErrors((), np.zeros((0, 6, 0)), np.zeros((0, 0)))
 
 @dataclass(frozen=True)
 class Marginal:
-    """What whitens residuals of unit covariance that have modes M (m, k) in common: their directions U (m, k), and
-    seen: S (k,), the standard deviations along them. had (m,): what the model that leaves the residuals has of the
-    modes itself, which counts as none."""
+    """What whitens residuals of unit covariance that have modes M (m, k) in common: their
+    directions U (m, k), and seen: S (k,), the standard deviations along them. had (m,): what the
+    model that leaves the residuals has of the modes itself, which counts as none."""
 
     modes: Array
     had: Array
@@ -122,33 +138,46 @@ def store_common_errors(record: xr.Dataset, errors: CommonErrors) -> None:
     record[CHANGES] = xr.DataArray(
         errors.changes,
         dims=("time", "pose_component", "common_error_name"),
-        attrs={"units": "m or rad per unit of the error", "long_name": "change of the measured pose by a common error"},
+        attrs={
+            "units": "m or rad per unit of the error",
+            "long_name": "change of the measured pose by a common error",
+        },
     )
     record[COVARIANCE] = xr.DataArray(
         errors.covariance,
         dims=("common_error_name", "common_error_name_2"),
-        attrs={"units": "of both errors", "long_name": "covariance of the common errors, the same along the run"},
+        attrs={
+            "units": "of both errors",
+            "long_name": "covariance of the common errors, the same along the run",
+        },
     )
     names = list(errors.names)
     record.coords.update({"common_error_name": names, "common_error_name_2": names})
 
 
 def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErrors:
-    """What all poses of a record have in common, of these kinds (`kind_of`); NONE where it states nothing.
+    """What all poses of a record have in common, of these kinds (`kind_of`); NONE where it states
+    nothing.
 
-    Raises RecordError: one of the two without the other, another shape, numbers that are not finite, no covariance.
+    Raises RecordError: one of the two without the other, another shape, numbers that are not
+    finite, no covariance.
     """
     given = [name for name in (CHANGES, COVARIANCE) if name in record]
     if not given:
         return NONE
     if len(given) == 1:
-        raise RecordError(f"the record holds {given[0]} and not {({CHANGES, COVARIANCE} - {*given}).pop()}")
-    changes, covariance = (np.asarray(record[name].values, dtype=float) for name in (CHANGES, COVARIANCE))
+        raise RecordError(
+            f"the record holds {given[0]} and not {({CHANGES, COVARIANCE} - {*given}).pop()}"
+        )
+    changes, covariance = (
+        np.asarray(record[name].values, dtype=float) for name in (CHANGES, COVARIANCE)
+    )
     names = tuple(str(name) for name in record["common_error_name"].values)
     expected = (record.sizes["time"], len(POSE), len(names))
     if changes.shape != expected or covariance.shape != (len(names),) * 2:
         raise RecordError(
-            f"{CHANGES} has shape {changes.shape} and {COVARIANCE} {covariance.shape}, must be {expected} and "
+            f"{CHANGES} has shape {changes.shape} and {COVARIANCE} {covariance.shape}, must be "
+            f"{expected} and "
             f"{(len(names),) * 2}"
         )
     if not np.isfinite(changes).all():
@@ -156,10 +185,17 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
     if fault := covariance_fault(covariance):
         raise RecordError(f"{COVARIANCE} {fault}")
     kept = [k for k, name in enumerate(names) if kind_of(name) in kinds]
-    return CommonErrors(tuple(names[k] for k in kept), changes[:, :, kept], covariance[np.ix_(kept, kept)])
+    return CommonErrors(
+        tuple(names[k] for k in kept), changes[:, :, kept], covariance[np.ix_(kept, kept)]
+    )
 
 
 def kind_of(name: str) -> str:
     """Kind of a common error by its name: rig, teaching, exposure, latency or geometry."""
-    kinds = {"taught": "teaching", "exposure": "exposure", "timing": "latency", "geometry": "geometry"}
+    kinds = {
+        "taught": "teaching",
+        "exposure": "exposure",
+        "timing": "latency",
+        "geometry": "geometry",
+    }
     return kinds.get(name.split(".")[0], "rig")

@@ -1,11 +1,15 @@
-"""Covariances of errors that are one draw a run: is one valid, its factor, the directions that poses notice."""
+"""Covariances of errors that are one draw a run: is one valid, its factor, the directions that
+poses notice.
+"""
 
 import numpy as np
 
 from identify.arrays import Array
 
 NOTICED = 0.1
-"""Standard deviations of the noise of all frames together, below which a direction of the errors is left out."""
+"""Standard deviations of the noise of all frames together, below which a direction of the errors is
+left out.
+"""
 ROUNDING = 1e-9
 
 
@@ -20,7 +24,11 @@ def covariance_fault(covariance: Array) -> str:
     if np.abs(unit - unit.T).max() > ROUNDING:
         return "is no covariance: it is not symmetric"
     least = float(np.linalg.eigvalsh(unit)[0])
-    return f"is no covariance: as correlations it has the eigenvalue {least:.2g}, < 0" if least < -ROUNDING else ""
+    return (
+        f"is no covariance: as correlations it has the eigenvalue {least:.2g}, < 0"
+        if least < -ROUNDING
+        else ""
+    )
 
 
 def factor(covariance: Array) -> Array:
@@ -31,8 +39,8 @@ def factor(covariance: Array) -> Array:
 
 
 def noticed_directions(root: Array, seen: Array) -> tuple[Array, int]:
-    """Another factor (k, k) of the covariance that `root` is one of, whose columns are independent directions, the most
-    noticed ones first, and how many of them are noticed; seen (..., k): what the columns of `root` do to what is
-    measured, in standard deviations of its noise."""
+    """Another factor (k, k) of the covariance that `root` is one of, whose columns are independent
+    directions, the most noticed ones first, and how many of them are noticed; seen (..., k): what
+    the columns of `root` do to what is measured, in standard deviations of its noise."""
     sizes, turns = np.linalg.svd(np.linalg.qr(seen.reshape(-1, len(root)), mode="r"))[1:]
     return np.asarray(root @ turns.T), int(np.sum(sizes > NOTICED))

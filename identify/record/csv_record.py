@@ -1,7 +1,8 @@
-"""A record as a CSV table: which columns it has, how one is read, and the rules that hold for any record.
+"""A record as a CSV table: which columns it has, how one is read, and the rules that hold for any
+record.
 
-One row a frame, one column a number, its unit at the end of the name; lines that begin with # are comments. Messages
-name the line of the file, counted from 1.
+One row a frame, one column a number, its unit at the end of the name; lines that begin with # are
+comments. Messages name the line of the file, counted from 1.
 """
 
 import csv
@@ -12,21 +13,28 @@ from pathlib import Path
 import numpy as np
 
 from dynamics import Robot
+from dynamics.files import read_bytes
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
 
 RULES = """\
-A record begins at rest: before its first row the robot has stood still at the first reference pose, and the reference
-starts from there without a jump of its rate. It has one row a frame, at the frame rate of [timing], without gaps: a
-frame whose pose the sensor lost stays, with empty measured columns. Units are m, rad and s. Poses are those of the
-platform frame in the base frame of the robot file, R = Rx(alpha) Ry(beta) Rz(gamma); time is the instant at which the
-sensor saw the pose. A command is the joint coordinate that the servo asked for from its row on, with the zero and the
-direction of the robot file; it acts at its command_time_s, which may be empty only in a row whose pose was lost, and
-without that column after the latency of [timing]. Rates are time derivatives of the reference pose's six numbers, not
-the angular velocity; without these columns they are taken from a spline through the reference.
+A record begins at rest: before its first row the robot has stood still at the first reference pose,
+and the reference starts from there without a jump of its rate. It has one row a frame, at the frame
+rate of [timing],
+without gaps: a frame whose pose the sensor lost stays, with empty measured columns. Units are m,
+rad and s. Poses are those of the platform frame in the base frame of the robot file, R = Rx(alpha)
+Ry(beta) Rz(gamma); time is the instant at which the sensor saw the pose. A command is the joint
+coordinate that the servo asked for from its row on, with the zero and the direction of the robot
+file; it acts at its command_time_s, which may be empty only in a row whose pose was lost, and
+without that column after the latency of [timing]. Rates are time derivatives of the reference
+pose's six numbers, not the angular velocity; without these columns they are taken from a spline
+through the reference.
 """
 """What must hold of a record of one's own."""
+
+LARGEST = 200_000_000
+"""Bytes of a table, of which an hour at 60 Hz takes a hundred million."""
 
 TIME_ROUNDING = 1e-3
 """Share of a frame by which a stated time may miss its own."""
@@ -36,7 +44,9 @@ UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
 
 @dataclass(frozen=True)
 class Group:
-    """Columns that belong together: their names, what they hold, and whether all of them may be left out."""
+    """Columns that belong together: their names, what they hold, and whether all of them may be
+    left out.
+    """
 
     names: tuple[str, ...]
     meaning: str
@@ -45,42 +55,62 @@ class Group:
 
 def columns_of(robot: Robot) -> dict[str, Group]:
     """The columns of a robot's record, by what they make up."""
-    joints, unit = range(1, robot.layout.joints + 1), "m" if robot.layout.prismatic else "rad"
+    joints = range(1, robot.layout.joints + 1)
+    unit = "m" if robot.layout.prismatic else "rad"
     pairs = [(a, b) for k, a in enumerate(POSE) for b in POSE[k:]]
     return {
         "time": Group(("time_s",), "time since the first row"),
-        "reference": Group(tuple(f"reference_{a}_{UNITS[a]}" for a in POSE), "pose that was asked for"),
-        "measured": Group(tuple(f"measured_{a}_{UNITS[a]}" for a in POSE), "pose that the sensor measured, or empty"),
-        "command": Group(tuple(f"command_{n}_{unit}" for n in joints), "joint command from this row on"),
-        "command_time": Group(
-            ("command_time_s",), "time at which the row's command was written to the drives, or empty", True
+        "reference": Group(
+            tuple(f"reference_{a}_{UNITS[a]}" for a in POSE), "pose that was asked for"
         ),
-        "rate": Group(tuple(f"rate_{a}_{UNITS[a]}_s" for a in POSE), "time derivative of the reference", True),
+        "measured": Group(
+            tuple(f"measured_{a}_{UNITS[a]}" for a in POSE),
+            "pose that the sensor measured, or empty",
+        ),
+        "command": Group(
+            tuple(f"command_{n}_{unit}" for n in joints), "joint command from this row on"
+        ),
+        "command_time": Group(
+            ("command_time_s",),
+            "time at which the row's command was written to the drives, or empty",
+            True,
+        ),
+        "rate": Group(
+            tuple(f"rate_{a}_{UNITS[a]}_s" for a in POSE), "time derivative of the reference", True
+        ),
         "ok": Group(("measured_ok",), "1 where the pose was measured, 0 where it was lost", True),
         "covariance": Group(
-            tuple(f"covariance_{a}_{b}" for a, b in pairs), "covariance of the measured pose, m2, m rad and rad2", True
+            tuple(f"covariance_{a}_{b}" for a, b in pairs),
+            "covariance of the measured pose, m2, m rad and rad2",
+            True,
         ),
     }
 
 
 @dataclass(frozen=True)
 class Table:
-    """The groups of columns that a file has, each (N, k), NaN where a cell is empty; and the line (N,) of each row."""
+    """The groups of columns that a file has, each (N, k), NaN where a cell is empty; and the line
+    (N,) of each row.
+    """
 
     path: Path
     groups: Mapping[str, Array]
     lines: tuple[int, ...]
 
     def check_times(self, rate_hz: float) -> None:
-        """Refuse rows that are not one frame of this rate apart. Raises RecordError, with line and times."""
+        """Refuse rows that are not one frame of this rate apart. Raises RecordError, with line and
+        times.
+        """
         times = self.groups["time"][:, 0]
         frames = np.diff(times) * rate_hz
         wrong = np.flatnonzero(~(np.abs(frames - 1) <= TIME_ROUNDING))
         if len(wrong):
             row = int(wrong[0])
             raise RecordError(
-                f"{self.path} line {self.lines[row + 1]}: time_s is {times[row + 1]:g} after {times[row]:g} in the row "
-                f"before, which is {frames[row]:.4g} frames of {rate_hz:g} Hz (timing.frame_rate_hz) and not one; a "
+                f"{self.path} line {self.lines[row + 1]}: time_s is {times[row + 1]:g} after "
+                f"{times[row]:g} in the row "
+                f"before, which is {frames[row]:.4g} frames of {rate_hz:g} Hz "
+                "(timing.frame_rate_hz) and not one; a "
                 "frame that was lost keeps its row, with empty measured columns"
             )
 
@@ -88,7 +118,8 @@ class Table:
 def read_table(path: Path, robot: Robot) -> Table:
     """The table of a robot's record.
 
-    Raises RecordError: no such file; a column that is missing or unknown; a cell that is no number; no rows.
+    Raises RecordError: no such file; a column that is missing or unknown; a cell that is no number;
+    no rows.
     """
     groups = columns_of(robot)
     lines = _lines(path)
@@ -98,25 +129,36 @@ def read_table(path: Path, robot: Robot) -> Table:
     if not rows:
         raise RecordError(f"{path} has no rows below its header")
     values = np.array([row for _, row in rows])
-    taken = {name: values[:, [header.index(column) for column in groups[name].names]] for name in present}
+    taken = {
+        name: values[:, [header.index(column) for column in groups[name].names]] for name in present
+    }
     return Table(path, taken, tuple(number for number, _ in rows))
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Number and cells of each line that is neither empty nor a comment."""
+    content = read_bytes(path, f"record {path}", RecordError, LARGEST)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordError(f"cannot read record {path}: {getattr(error, 'strerror', None) or error}") from error
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RecordError(f"cannot read record {path}: {error}") from error
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
-            yield number, [cell.strip() for cell in next(csv.reader([line]))]
+            try:
+                cells = next(csv.reader([line]))
+            except csv.Error as error:
+                raise RecordError(f"{path} line {number}: {error}") from error
+            yield number, [cell.strip() for cell in cells]
 
 
-def _checked_header(path: Path, number: int, header: list[str], groups: Mapping[str, Group]) -> list[str]:
+def _checked_header(
+    path: Path, number: int, header: list[str], groups: Mapping[str, Group]
+) -> list[str]:
     """The groups that the header has, each whole."""
     if len(header) == 1 and ";" in header[0]:
-        raise RecordError(f"{path} line {number}: cells are separated by commas, and these by semicolons")
+        raise RecordError(
+            f"{path} line {number}: cells are separated by commas, and these by semicolons"
+        )
     known = [name for group in groups.values() for name in group.names]
     for name in header:
         if name not in known:
@@ -126,14 +168,20 @@ def _checked_header(path: Path, number: int, header: list[str], groups: Mapping[
     for group in groups.values():
         missing = [name for name in group.names if name not in header]
         if missing and not (group.optional and len(missing) == len(group.names)):
-            raise RecordError(f"{path} line {number}: there is no column {', '.join(missing)} ({group.meaning})")
+            raise RecordError(
+                f"{path} line {number}: there is no column {', '.join(missing)} ({group.meaning})"
+            )
     return [key for key, group in groups.items() if group.names[0] in header]
 
 
 def _meant(name: str, known: list[str]) -> str:
     """Which column a name may stand for, and its unit; else all of them."""
     stem = name.rpartition("_")[0]
-    meant = [one for one in known if stem and one.startswith(f"{stem}_") and "_s" not in one[len(stem) + 1 :]]
+    meant = [
+        one
+        for one in known
+        if stem and one.startswith(f"{stem}_") and "_s" not in one[len(stem) + 1 :]
+    ]
     if len(meant) == 1:
         return f": {meant[0]} is meant, in {meant[0].rpartition('_')[2]}"
     return f"; the columns are {', '.join(known)}"
@@ -141,13 +189,23 @@ def _meant(name: str, known: list[str]) -> str:
 
 def _numbers(path: Path, number: int, header: list[str], cells: list[str]) -> list[float]:
     if len(cells) != len(header):
-        raise RecordError(f"{path} line {number} has {len(cells)} cells, and the header has {len(header)} columns")
+        raise RecordError(
+            f"{path} line {number} has {len(cells)} cells, and the header has {len(header)} columns"
+        )
     values = []
     for name, cell in zip(header, cells, strict=True):
         try:
+            if "_" in cell:  # which float() overlooks
+                raise ValueError
             values.append(float(cell) if cell else np.nan)
         except ValueError:
-            raise RecordError(f"{path} line {number}: {name} is {cell[:40]!r}, which is no number") from None
-        if not (np.isfinite(values[-1]) or name.startswith(("measured_", "covariance_", "command_time"))):
-            raise RecordError(f"{path} line {number}: {name} is {cell or 'empty'}, must be a finite number")
+            raise RecordError(
+                f"{path} line {number}: {name} is {cell[:40]!r}, which is no number"
+            ) from None
+        if not (
+            np.isfinite(values[-1]) or name.startswith(("measured_", "covariance_", "command_time"))
+        ):
+            raise RecordError(
+                f"{path} line {number}: {name} is {cell or 'empty'}, must be a finite number"
+            )
     return values

@@ -1,10 +1,12 @@
-"""What a geometry that is known only so well does to all poses of a record: how the model's poses change with it.
+"""What a geometry that is known only so well does to all poses of a record: how the model's poses
+change with it.
 
-The true robot is off the known one by dg, one draw with the covariance of its calibration. To first order the measured
-poses are those of the model plus J dg, with J the derivative of the model's poses by the geometric numbers; the servo
-knows the known geometry all along. J is taken by central differences of whole runs, one standard deviation of dg to
-either side, along independent directions. Those that move no pose of the run by what its noise would show are left out,
-as the loops' closure says.
+The true robot is off the known one by dg, one draw with the covariance of its calibration. To first
+order the measured poses are those of the model plus J dg, with J the derivative of the model's
+poses by the geometric numbers; the servo knows the known geometry all along. J is taken by central
+differences of whole runs, one standard deviation of dg to either side, along independent
+directions. Those that move no pose of the run by what its noise would show are left out, as the
+loops' closure says.
 """
 
 from collections.abc import Callable
@@ -28,9 +30,11 @@ PREFIX = "geometry."
 
 @dataclass(frozen=True)
 class GeometryErrors:
-    """Errors of the geometry of a known robot: covariance (g, g) of the true numbers about its own, m and rad.
+    """Errors of the geometry of a known robot: covariance (g, g) of the true numbers about its own,
+    m and rad.
 
-    poses (N, 6) are those of the run, and whitener (6, 6) that of its noise: they say which directions are noticed.
+    poses (N, 6) are those of the run, and whitener (6, 6) that of its noise: they say which
+    directions are noticed.
     """
 
     robot: Robot
@@ -45,12 +49,14 @@ class GeometryErrors:
 
     @property
     def factor(self) -> Array:
-        """F (g, g) with F F^T the covariance: its columns are independent directions, the most noticed ones first."""
+        """F (g, g) with F F^T the covariance: its columns are independent directions, the most
+        noticed ones first.
+        """
         return self._noticed[0]
 
     def modes(self, poses_of: Callable[[Robot], Array]) -> Array:
-        """Changes (N, 6, g) of a run's poses by each direction, zero where it is not noticed; poses_of: the poses (N,
-        6) of a run of a robot near the known one."""
+        """Changes (N, 6, g) of a run's poses by each direction, zero where it is not noticed;
+        poses_of: the poses (N, 6) of a run of a robot near the known one."""
         with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
             found = list(pool.map(poses_of, [robot for pair in self._moved for robot in pair]))
         modes = np.zeros((*self.poses.shape, len(self.covariance)))
@@ -59,19 +65,33 @@ class GeometryErrors:
         return modes
 
     def joints(self, poses: Array) -> Array:
-        """Changes (N, n, k) of the joint coordinates at poses (N, 6) by each direction that is noticed."""
+        """Changes (N, n, k) of the joint coordinates at poses (N, 6) by each direction that is
+        noticed.
+        """
         chart = self.robot.geometry.chart
         held = chart.pose(chart.coordinates(poses))
-        apart = [more.inverse_kinematics(held) - less.inverse_kinematics(held) for more, less in self._moved]
-        return np.stack(apart, axis=2) / 2.0 if apart else np.zeros((len(poses), self.robot.layout.joints, 0))
+        apart = [
+            more.inverse_kinematics(held) - less.inverse_kinematics(held)
+            for more, less in self._moved
+        ]
+        return (
+            np.stack(apart, axis=2) / 2.0
+            if apart
+            else np.zeros((len(poses), self.robot.layout.joints, 0))
+        )
 
     @cached_property
     def _noticed(self) -> tuple[Array, int]:
         """The factor, and how many of its directions are noticed."""
-        geometry, root = self.robot.geometry, factor(self.covariance)
-        chart, nominal = geometry.chart, self.robot.functions_of
-        poses, off = chart.pose(chart.coordinates(self.poses)), geometry.deviations_from(nominal)
-        by_numbers = Closure(nominal).derivatives(poses, self.robot.inverse_kinematics(poses), off)[0]
+        geometry = self.robot.geometry
+        root = factor(self.covariance)
+        chart = geometry.chart
+        nominal = self.robot.functions_of
+        poses = chart.pose(chart.coordinates(self.poses))
+        off = geometry.deviations_from(nominal)
+        by_numbers = Closure(nominal).derivatives(poses, self.robot.inverse_kinematics(poses), off)[
+            0
+        ]
         return noticed_directions(root, self.whitener[:, list(chart.freedoms)] @ by_numbers @ root)
 
     @cached_property
@@ -87,7 +107,10 @@ def store_geometry_covariance(record: xr.Dataset, robot: Robot, covariance: Arra
     record[COVARIANCE] = xr.DataArray(
         covariance,
         dims=("geometric_number", "geometric_number_2"),
-        attrs={"units": "m2, m rad and rad2", "long_name": "covariance of the true geometric numbers about the known"},
+        attrs={
+            "units": "m2, m rad and rad2",
+            "long_name": "covariance of the true geometric numbers about the known",
+        },
     )
     record.coords.update({"geometric_number": names, "geometric_number_2": names})
 
@@ -100,10 +123,15 @@ def read_geometry_covariance(record: xr.Dataset, robot: Robot) -> Array | None:
     if COVARIANCE not in record:
         return None
     covariance = np.asarray(record[COVARIANCE].values, dtype=float)
-    names = tuple(map(str, record["geometric_number"].values)) if "geometric_number" in record.coords else ()
+    names = (
+        tuple(map(str, record["geometric_number"].values))
+        if "geometric_number" in record.coords
+        else ()
+    )
     if names != robot.geometry.number_names or covariance.shape != (len(names),) * 2:
         raise RecordError(
-            f"{COVARIANCE} has shape {covariance.shape} and is not of the {len(robot.geometry.number_names)} geometric "
+            f"{COVARIANCE} has shape {covariance.shape} and is not of the "
+            f"{len(robot.geometry.number_names)} geometric "
             f"numbers of {robot.name}, in their order"
         )
     if fault := covariance_fault(covariance):

@@ -1,7 +1,8 @@
-"""Under which law a record was made: the visual servo, around which a model can close its own loop, or another.
+"""Under which law a record was made: the visual servo, around which a model can close its own loop,
+or another.
 
-Of another law the record says its name, and what its commands are: joint commands or, where the drives took them,
-torques. A record that says nothing was made under the servo.
+Of another law the record says its name, and what its commands are: joint commands or, where the
+drives took them, torques. A record that says nothing was made under the servo.
 """
 
 import numpy as np
@@ -20,7 +21,11 @@ def store_law(record: xr.Dataset, law: str, drives: Drives) -> None:
     """Say in a record under which law it was made, and what the drives took."""
     record.attrs |= {"law": law, "torque_commands": np.int8(drives.torques)}
     said = record["command"].attrs
-    units, what = (TORQUE_UNITS[said["units"]], "torque") if drives.torques else (said["units"], "joint command")
+    units, what = (
+        (TORQUE_UNITS[said["units"]], "torque")
+        if drives.torques
+        else (said["units"], "joint command")
+    )
     said |= {"units": units, "long_name": f"{what} of the law {law} from this frame on"}
 
 
@@ -29,7 +34,8 @@ def recorded_law(record: xr.Dataset) -> str:
     law = record.attrs.get("law", SERVO)
     if not isinstance(law, str) or not law:
         raise RecordError(
-            f"the record's attribute law is {law!r}, must be the name of the law, or absent for the servo"
+            f"the record's attribute law is {law!r}, must be the name of the law, or absent for "
+            "the servo"
         )
     return law
 

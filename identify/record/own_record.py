@@ -1,11 +1,10 @@
 """Records of one's own, from netCDF or CSV, with all that an identification must know of them.
 
-A netCDF record states its scenario and its scale anchor itself. A CSV table has a TOML file of the same name beside it:
-a scenario, of which robot, timing, servo, model, filter, identification and payload count, with a table `[record]` for
-what was measured beside the poses.
+A netCDF record states its scenario and its scale anchor itself. A CSV table has a TOML file of the
+same name beside it: a scenario, of which robot, timing, servo, model, filter, identification and
+payload count, with a table `[record]` for what was measured beside the poses.
 """
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from pydantic import Field, ValidationError
 from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot, load_robot
+from dynamics.files import is_file, is_name, parse_toml, read_text
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
@@ -35,25 +35,39 @@ DESCRIPTION = "record"
 
 
 class Measured(Section):
-    """What was measured beside the poses: what fixes the scale, and how exact a measured pose is."""
+    """What was measured beside the poses: what fixes the scale, and how exact a measured
+    pose is."""
 
     anchor_value: float | None = quantity(
-        None, "kg, N m/rad or N/m", "what identification.scale_anchor measured: platform_mass or joint_gain", gt=0
+        None,
+        "kg, N m/rad or N/m",
+        "what identification.scale_anchor measured: platform_mass or joint_gain",
+        gt=0,
     )
     position_std_m: float | None = quantity(
-        None, "m", "standard deviation of a measured position, where the table has no covariance columns", gt=0
+        None,
+        "m",
+        "standard deviation of a measured position, where the table has no covariance columns",
+        gt=0,
     )
     orientation_std_rad: float | None = quantity(
-        None, "rad", "standard deviation of a measured angle, where the table has no covariance columns", gt=0
+        None,
+        "rad",
+        "standard deviation of a measured angle, where the table has no covariance columns",
+        gt=0,
     )
-    under_payload: bool = Field(False, description="whether the platform carried the load of [payload]")
+    under_payload: bool = Field(
+        False, description="whether the platform carried the load of [payload]"
+    )
 
 
 def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
-    """Records by file, and the scenario of the first; further ones are of the same robot under a known load.
+    """Records by file, and the scenario of the first; further ones are of the same robot under a
+    known load.
 
-    Raises RecordError: a file that cannot be read, or breaks a rule of records (`csv_record.RULES`), with its line.
-    Raises ScenarioError: no robot, timing or servo that can be. Raises dynamics.RobotFileError: no such robot.
+    Raises RecordError: a file that cannot be read, or breaks a rule of records
+    (`csv_record.RULES`), with its line. Raises ScenarioError: no robot, timing or servo that can
+    be. Raises dynamics.RobotFileError: no such robot.
     """
     pairs = [_of_csv(path) if path.suffix.lower() == ".csv" else _of_netcdf(path) for path in paths]
     return [record for record, _ in pairs], pairs[0][1]
@@ -74,7 +88,9 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
     robot = load_robot(scenario.robot)
     table = read_table(path, robot)
     table.check_times(scenario.timing.frame_rate_hz)
-    poses, ok, start = table.groups["measured"], _measured_ok(table), table.groups["time"][0, 0]
+    poses = table.groups["measured"]
+    ok = _measured_ok(table)
+    start = table.groups["time"][0, 0]
     record = build_record(
         time=table.groups["time"][:, 0] - start,
         reference_pose=table.groups["reference"],
@@ -83,7 +99,9 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
         measured_covariance=_covariances(table, measured, ok),
         measured_ok=ok,
         command=table.groups["command"],
-        command_time=table.groups["command_time"][:, 0] - start if "command_time" in table.groups else None,
+        command_time=table.groups["command_time"][:, 0] - start
+        if "command_time" in table.groups
+        else None,
         robot=robot.name,
         scenario_toml=scenario.to_toml(),
         frame_rate_hz=scenario.timing.frame_rate_hz,
@@ -97,27 +115,28 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
 
 
 def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
-    """What a CSV table is a record of. Raises RecordError, ScenarioError: no such file, no TOML, wrong content."""
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
+    """What a CSV table is a record of. Raises RecordError, ScenarioError: no such file, no TOML,
+    wrong content.
+    """
+    if not is_file(path):
         raise RecordError(
-            f"cannot read {path}, which says what {table.name} is a record of ({error.strerror or error}); cmmsim new "
+            f"there is no file {path}, which says what {table.name} is a record of; cmmsim new "
             "record writes both"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RecordError(f"{path} is not valid TOML: {error}") from error
+        )
+    content = parse_toml(read_text(path, str(path), RecordError), str(path), RecordError)
     own = content.pop(DESCRIPTION, {})
     try:
         measured = Measured.model_validate(own)
     except ValidationError as error:
         raise RecordError(f"{path}: [{DESCRIPTION}] {one_line(error, Measured)}") from error
-    return SCENARIOS.from_dict({"name": path.stem} | content, str(path), path.parent), measured
+    name = path.stem if is_name(path.stem) else DESCRIPTION
+    return SCENARIOS.from_dict({"name": name} | content, str(path), path.parent), measured
 
 
 def record_schema() -> dict[str, Any]:
     """JSON schema of the files beside CSV records, for editors; `record.schema.json` holds it."""
-    schema, own = scenario_schema(), Measured.model_json_schema()
+    schema = scenario_schema()
+    own = Measured.model_json_schema()
     schema["required"].remove("name")
     schema["properties"][DESCRIPTION] = {"$ref": "#/$defs/Measured"}
     schema["$defs"]["Measured"] = own
@@ -140,7 +159,8 @@ def _measured_ok(table: Table) -> NDArray[np.bool_]:
 
 
 def _rates(table: Table, scenario: Scenario) -> Array:
-    """Rates (N, 6) of the reference: stated, or of a spline through its poses that begins at rest."""
+    """Rates (N, 6) of the reference: stated, or of a spline through its poses that begins at
+    rest."""
     poses = table.groups["reference"]
     if "rate" in table.groups or len(poses) < 6:
         return table.groups.get("rate", np.zeros_like(poses))
@@ -149,7 +169,9 @@ def _rates(table: Table, scenario: Scenario) -> Array:
 
 
 def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Array:
-    """Covariances (N, 6, 6) of the measured poses: the table's, or those of the stated standard deviations."""
+    """Covariances (N, 6, 6) of the measured poses: the table's, or those of the stated standard
+    deviations.
+    """
     if "covariance" in table.groups:
         rows, columns = np.triu_indices(len(POSE))
         values = np.empty((len(ok), 6, 6))
@@ -157,7 +179,8 @@ def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Arr
         return values
     if measured.position_std_m is None or measured.orientation_std_rad is None:
         raise RecordError(
-            f"{table.path} has no covariance columns, so {description_file(table.path)} must state position_std_m and "
+            f"{table.path} has no covariance columns, so {description_file(table.path)} must "
+            "state position_std_m and "
             f"orientation_std_rad in [{DESCRIPTION}]: how exact a measured pose is"
         )
     std = np.repeat([measured.position_std_m, measured.orientation_std_rad], 3)
@@ -172,17 +195,25 @@ def _state_anchor(record: xr.Dataset, scenario: Scenario, measured: Measured, so
         return
     if measured.anchor_value is None or settings.anchor_std is None:
         raise RecordError(
-            f"{source}: the scale anchor {settings.scale_anchor} needs what was measured, anchor_value in "
+            f"{source}: the scale anchor {settings.scale_anchor} needs what was measured, "
+            "anchor_value in "
             f"[{DESCRIPTION}], and how exactly, anchor_std in [identification]"
         )
-    record.attrs |= {"scale_anchor_value": measured.anchor_value, "scale_anchor_std": settings.anchor_std}
+    record.attrs |= {
+        "scale_anchor_value": measured.anchor_value,
+        "scale_anchor_std": settings.anchor_std,
+    }
 
 
 def _state_payload(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
     """Keep with a record the load that the platform carried, and how well it is known."""
     load: Mapping[str, Any] = scenario.payload.model_dump()
     values, deviations = (
-        [load[f"{figure}{std}_{unit}"] for figure, unit in LOAD_UNITS.items()] for std in ("", "_std")
+        [load[f"{figure}{std}_{unit}"] for figure, unit in LOAD_UNITS.items()]
+        for std in ("", "_std")
     )
-    vectors = [payload_vector(robot.layout, one[0], (one[1], one[2], one[3])) for one in (values, deviations)]
+    vectors = [
+        payload_vector(robot.layout, one[0], (one[1], one[2], one[3]))
+        for one in (values, deviations)
+    ]
     store_payload(record, robot.layout, *vectors)

@@ -1,8 +1,10 @@
-"""A known load on the platform: the same motion with and without it shows the scale of all parameters.
+"""A known load on the platform: the same motion with and without it shows the scale of all
+parameters.
 
-The load is a rigid body whose centre lies in the origin of the platform frame; it adds its mass and its principal
-inertias to the platform's. Its figures stand with the record, as the experimenter's knowledge, and beside each its
-standard deviation: how well it was weighed or computed. Records that state the same figures carry the same load.
+The load is a rigid body whose centre lies in the origin of the platform frame; it adds its mass and
+its principal inertias to the platform's. Its figures stand with the record, as the experimenter's
+knowledge, and beside each its standard deviation: how well it was weighed or computed. Records that
+state the same figures carry the same load.
 """
 
 import numpy as np
@@ -20,19 +22,29 @@ ADDED = {
     "payload_Iyy": ("platform.Iyy", "kg m2"),
     "payload_Izz": ("platform.Izz", "kg m2"),
 }
-"""Attributes of a record, and the parameter and unit to which each adds; `payload_mass_std` is the deviation of one."""
+"""Attributes of a record, and the parameter and unit to which each adds; `payload_mass_std` is the
+deviation of one.
+"""
 
 
-def payload_vector(layout: ParameterLayout, mass_kg: float, inertia_kg_m2: tuple[float, float, float]) -> Array:
-    """What a load adds to a robot's parameters (p,); or, of standard deviations, the deviations of that."""
+def payload_vector(
+    layout: ParameterLayout, mass_kg: float, inertia_kg_m2: tuple[float, float, float]
+) -> Array:
+    """What a load adds to a robot's parameters (p,); or, of standard deviations, the deviations of
+    that.
+    """
     added = np.zeros(len(layout.names))
     for (parameter, _), value in zip(ADDED.values(), (mass_kg, *inertia_kg_m2), strict=True):
         added[layout.names.index(parameter)] = value
     return added
 
 
-def store_payload(record: xr.Dataset, layout: ParameterLayout, payload: Array, std: Array | None = None) -> None:
-    """Keep a load (p,) with the record made under it, and its standard deviations (p,); None: known exactly."""
+def store_payload(
+    record: xr.Dataset, layout: ParameterLayout, payload: Array, std: Array | None = None
+) -> None:
+    """Keep a load (p,) with the record made under it, and its standard deviations (p,); None: known
+    exactly.
+    """
     deviations = np.zeros(len(layout.names)) if std is None else std
     for name, (parameter, _) in ADDED.items():
         place = layout.names.index(parameter)
@@ -42,10 +54,12 @@ def store_payload(record: xr.Dataset, layout: ParameterLayout, payload: Array, s
 def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array, Array]:
     """The load (p,) of a record and its standard deviations (p,); zero where it states none.
 
-    Raises RecordError: some but not all of its figures, one or its deviation that is no finite number >= 0, moments of
-    no body, or a deviation that exceeds its figure.
+    Raises RecordError: some but not all of its figures, one or its deviation that is no finite
+    number >= 0, moments of no body, or a deviation that exceeds its figure.
     """
-    load, std, stated = np.zeros(len(layout.names)), np.zeros(len(layout.names)), record.attrs
+    load = np.zeros(len(layout.names))
+    std = np.zeros(len(layout.names))
+    stated = record.attrs
     if not any(name in stated or f"{name}_std" in stated for name in ADDED):
         return load, std
     try:
@@ -64,5 +78,7 @@ def _not_negative(name: str, value: object, unit: str) -> float:
     """An attribute's value, a finite number >= 0."""
     number = as_number(value)
     if not 0 <= number < 1e6:
-        raise RecordError(f"the record's attribute {name} is {shown(value)}, must be a number >= 0 in {unit}")
+        raise RecordError(
+            f"the record's attribute {name} is {shown(value)}, must be a number >= 0 in {unit}"
+        )
     return number

@@ -1,4 +1,6 @@
-"""Whether a record is one of this robot, from rest, in m and rad: rules that no shape and no type can show."""
+"""Whether a record is one of this robot, from rest, in m and rad: rules that no shape and no type
+can show.
+"""
 
 from collections.abc import Callable
 
@@ -16,15 +18,25 @@ REST_RATE = 0.05
 """Share of its largest rate with which a reference may begin."""
 
 REST_POSE = 0.1
-"""Share of the largest travel of the positions, or of the angles, by which the first measured pose may be away."""
+"""Share of the largest travel of the positions, or of the angles, by which the first measured pose
+may be away.
+"""
 
 TRAVELS = 2.0
-"""Travels by which a measured pose may be away from the reference, and a command from where that puts the joints."""
+"""Travels by which a measured pose may be away from the reference, and a command from where that
+puts the joints.
+"""
 
 BUILT = 0.05
-"""Share of the joints' travel limit by which a robot that is built otherwise than its file may need other commands."""
+"""Share of the joints' travel limit by which a robot that is built otherwise than its file may need
+other commands.
+"""
 
-OTHER_UNITS = {"mm": (1e-3, 1.0), "degrees": (1.0, np.pi / 180), "mm and degrees": (1e-3, np.pi / 180)}
+OTHER_UNITS = {
+    "mm": (1e-3, 1.0),
+    "degrees": (1.0, np.pi / 180),
+    "mm and degrees": (1e-3, np.pi / 180),
+}
 """Factors of positions and of angles from units in which records come by mistake."""
 
 
@@ -55,12 +67,15 @@ def _check_reach(robot: Robot, poses: Array) -> None:
 
 
 def _check_rest(reference: Reference) -> None:
-    first, largest = np.abs(reference.rates[0]), np.abs(reference.rates).max(axis=0)
+    first = np.abs(reference.rates[0])
+    largest = np.abs(reference.rates).max(axis=0)
     worst = int(np.argmax(first - REST_RATE * largest))
     if first[worst] > REST_RATE * largest[worst]:
         raise EstimationError(
-            f"the record does not begin at rest: the rate of {POSE[worst]} in its first frame is {first[worst]:.3g} "
-            f"{'m/s' if worst < 3 else 'rad/s'}, {100 * first[worst] / largest[worst]:.0f} % of its largest; begin the "
+            f"the record does not begin at rest: the rate of {POSE[worst]} in its first frame is "
+            f"{first[worst]:.3g} "
+            f"{'m/s' if worst < 3 else 'rad/s'}, {100 * first[worst] / largest[worst]:.0f} % of "
+            "its largest; begin the "
             "record where the robot stood still"
         )
 
@@ -68,7 +83,8 @@ def _check_rest(reference: Reference) -> None:
 def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]) -> None:
     """The measured poses stay within some travels of the reference, and begin where it does."""
     travel = np.repeat(np.ptp(reference.poses, axis=0).reshape(2, 3).max(axis=1), 3)
-    usual = np.where(travel > 0, travel, np.inf)  # of angles that nobody asked to move nothing is known
+    # of angles that nobody asked to move nothing is known
+    usual = np.where(travel > 0, travel, np.inf)
     limits = np.full(len(ok), TRAVELS)
     limits[0] = REST_POSE
 
@@ -84,8 +100,10 @@ def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]
         worst = int(np.argmax(found[frame]))
         rest = "the record does not begin at rest, or " if frame == 0 else ""
         raise EstimationError(
-            f"in frame {frame} the measured {POSE[worst]} is {measured[frame, worst]:.6g} and the reference "
-            f"{reference.poses[frame, worst]:.6g}, {100 * found[frame, worst]:.0f} % of its travel apart: {rest}both "
+            f"in frame {frame} the measured {POSE[worst]} is {measured[frame, worst]:.6g} and the "
+            "reference "
+            f"{reference.poses[frame, worst]:.6g}, {100 * found[frame, worst]:.0f} % of its "
+            f"travel apart: {rest}both "
             f"are in different frames or units{_unit_hint(measured, near)}"
         )
 
@@ -102,10 +120,16 @@ def _check_commands(robot: Robot, reference: Reference, logged: Array) -> None:
         frame, joint = np.unravel_index(int(np.argmax(np.abs(logged - wanted))), logged.shape)
         other, factor = ("mm", 1e-3) if robot.layout.prismatic else ("degrees", np.pi / 180)
         unit = "m" if robot.layout.prismatic else "rad"
-        hint = f"; in {other} it would fit, and records are in {unit}" if follows(factor * logged) else ""
+        hint = (
+            f"; in {other} it would fit, and records are in {unit}"
+            if follows(factor * logged)
+            else ""
+        )
         raise EstimationError(
-            f"the command of joint {joint + 1} in frame {frame} is {logged[frame, joint]:.6g}, and the reference needs "
-            f"{wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} {unit} away: zero, direction or unit of the "
+            f"the command of joint {joint + 1} in frame {frame} is {logged[frame, joint]:.6g}, "
+            "and the reference needs "
+            f"{wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} {unit} away: zero, "
+            "direction or unit of the "
             f"joints differ from the robot file's{hint}"
         )
 

@@ -1,7 +1,8 @@
-"""Where a record comes from, and what a result was made of: scenario, seed, robot, and digests of what was read.
+"""Where a record comes from, and what a result was made of: scenario, seed, robot, and digests of
+what was read.
 
-A stage that is repeated leaves the files of later ones where they are; by the digests these stages tell what is no
-longer theirs.
+A stage that is repeated leaves the files of later ones where they are; by the digests these stages
+tell what is no longer theirs.
 """
 
 import json
@@ -25,25 +26,38 @@ from identify.record.recording import VARIABLES, read, read_model_runs, read_run
 from identify.scenario import Scenario, scenario_from_toml
 
 ROBOT = "robot_geometry"
-"""Attribute with the geometry of the robot file: a name alone does not say which robot file was meant."""
+"""Attribute with the geometry of the robot file: a name alone does not say which robot file was
+meant.
+"""
 
 ROUNDING = 1e-9
-"""Largest difference of any number [SI] of a geometry that another computer's arithmetic may make."""
+"""Largest difference of any number [SI] of a geometry that another computer's arithmetic may make.
+"""
 
 SHARED = ("base_joints", "platform_joints", "home_pose", "travel_limit", "gravity")
 """Numbers of a geometry that do not depend on the kind of its legs."""
 
 OLDER = "crank_length"
-"""Stands in the geometry of records of older versions, which name the rest of the legs otherwise."""
+"""Stands in the geometry of records of older versions, which name the rest of the legs otherwise.
+"""
 
 STATED = (
-    "robot", ROBOT, "seed", "frame_rate_hz", "scale_anchor", "scale_anchor_value", "scale_anchor_std",
-    *ADDED, *(f"{name}_std" for name in ADDED),
-)  # fmt: skip
+    "robot",
+    ROBOT,
+    "seed",
+    "frame_rate_hz",
+    "scale_anchor",
+    "scale_anchor_value",
+    "scale_anchor_std",
+    *ADDED,
+    *(f"{name}_std" for name in ADDED),
+)
 """Attributes that an identification reads; beside them timing and servo of the scenario."""
 
 ENTRY = "made_of"
-"""Of a result: digests by the file's name. Results of older versions have none, and nothing is asked of them."""
+"""Of a result: digests by the file's name. Results of older versions have none, and nothing is
+asked of them.
+"""
 
 RECORDS = ("experiment.nc", "payload.nc")
 """What an identification may have read."""
@@ -60,11 +74,16 @@ def recorded_scenario(record: xr.Dataset) -> Scenario:
     text = record.attrs.get("scenario")
     if text is None:
         raise RecordError(
-            "the record has no attribute scenario, which says with what timing and servo it was made: set "
-            "record.attrs['scenario'] = scenario.to_toml(), or make the record by identify.build_record"
+            "the record has no attribute scenario, which says with what timing and servo it was "
+            "made: set "
+            "record.attrs['scenario'] = scenario.to_toml(), or make the record by "
+            "identify.build_record"
         )
     if not isinstance(text, str):
-        raise RecordError(f"the record's attribute scenario is {shown(text)}, must be TOML text: scenario.to_toml()")
+        raise RecordError(
+            f"the record's attribute scenario is {shown(text)}, must be TOML text: "
+            "scenario.to_toml()"
+        )
     try:
         return scenario_from_toml(text, "the record's attribute scenario")
     except ScenarioError as error:
@@ -78,7 +97,9 @@ def recorded_seed(record: xr.Dataset) -> int:
     """
     seed = record.attrs.get("seed", 0)
     if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise RecordError(f"the record's attribute seed is {shown(seed)}, must be a whole number >= 0")
+        raise RecordError(
+            f"the record's attribute seed is {shown(seed)}, must be a whole number >= 0"
+        )
     return int(seed)
 
 
@@ -90,26 +111,33 @@ def store_robot(record: xr.Dataset, robot: Robot) -> None:
 def check_robot(record: xr.Dataset, robot: Robot) -> None:
     """The record must be of a robot of this name and, where it states one, of this geometry.
 
-    Raises EstimationError: another name, or the first number of the geometry that differs. Raises RecordError: a
-    geometry that cannot be read.
+    Raises EstimationError: another name, or the first number of the geometry that differs. Raises
+    RecordError: a geometry that cannot be read.
     """
     if record.attrs.get("robot") != robot.name:
-        raise EstimationError(f"the record is of robot {shown(record.attrs.get('robot'))}, not of {robot.name!r}")
+        raise EstimationError(
+            f"the record is of robot {shown(record.attrs.get('robot'))}, not of {robot.name!r}"
+        )
     if ROBOT not in record.attrs:
         return
-    recorded, numbers = _read(record.attrs[ROBOT]), _numbers(robot)
+    recorded = _read(record.attrs[ROBOT])
+    numbers = _numbers(robot)
     if OLDER in recorded:
         numbers = {name: numbers[name] for name in SHARED}
     for name, ours in numbers.items():
-        theirs, known = recorded.get(name, np.zeros(0)), np.asarray(ours)
+        theirs = recorded.get(name, np.zeros(0))
+        known = np.asarray(ours)
         if theirs.shape != known.shape:
-            raise RecordError(f"{name} in the record's {ROBOT} has shape {theirs.shape}, expected {known.shape}")
+            raise RecordError(
+                f"{name} in the record's {ROBOT} has shape {theirs.shape}, expected {known.shape}"
+            )
         gap = np.abs(theirs - known)
         if not gap.max() <= ROUNDING:
             worst = np.unravel_index(int(np.argmax(gap)), gap.shape)
             place = "".join(f"[{k + 1}]" for k in worst)
             raise EstimationError(
-                f"the record is of another robot {robot.name!r}: {name}{place} was {theirs[worst]:.9g} when it was "
+                f"the record is of another robot {robot.name!r}: {name}{place} was "
+                f"{theirs[worst]:.9g} when it was "
                 f"made, the robot file says {known[worst]:.9g}"
             )
 
@@ -123,15 +151,21 @@ def _numbers(robot: Robot) -> dict[str, Any]:
     }
     for number, leg in enumerate(geometry.legs, start=1):
         own = leg.model_dump(exclude={"base_joint", "platform_joint", "type"})
-        numbers |= {f"leg{number}.{name}": np.asarray(value).tolist() for name, value in own.items()}
+        numbers |= {
+            f"leg{number}.{name}": np.asarray(value).tolist() for name, value in own.items()
+        }
     return numbers
 
 
 def _read(text: object) -> dict[str, Array]:
     try:
-        return {name: np.asarray(values, dtype=float) for name, values in json.loads(str(text)).items()}
+        return {
+            name: np.asarray(values, dtype=float) for name, values in json.loads(str(text)).items()
+        }
     except (ValueError, TypeError, AttributeError) as error:
-        raise RecordError(f"the record's attribute {ROBOT} is no JSON object of numbers: {error}") from error
+        raise RecordError(
+            f"the record's attribute {ROBOT} is no JSON object of numbers: {error}"
+        ) from error
 
 
 class RunFiles:
@@ -144,15 +178,19 @@ class RunFiles:
         self.folder = folder
 
     experiment = cached_property(lambda self: read(self.folder.experiment))
-    payload = cached_property(lambda self: read(self.folder.payload))  # of the same run under a known load
+    # of the same run under a known load
+    payload = cached_property(lambda self: read(self.folder.payload))
     validation = cached_property(lambda self: read_runs(self.folder.validation))
     model = cached_property(lambda self: read_model_runs(self.folder.model))  # by the run's name
 
-    named_covariance = cached_property(lambda self: read_covariance(self.folder.covariance))  # of the estimates
+    # of the estimates
+    named_covariance = cached_property(lambda self: read_covariance(self.folder.covariance))
 
     @property
     def covariance(self) -> Array:
-        """Of the estimates (p, p), and behind them of what all poses have in common, where a result has that."""
+        """Of the estimates (p, p), and behind them of what all poses have in common, where a result
+        has that.
+        """
         return self.named_covariance[1]
 
     def covariance_of(self, robot: Robot) -> Array:
@@ -161,7 +199,9 @@ class RunFiles:
         found = self.named_covariance[0][: len(names)]
         if found != names:
             said = ", ".join(sorted(set(found) ^ set(names))) or "another order"
-            raise RecordError(f"{self.folder.covariance} is of other parameters than the result: {said}")
+            raise RecordError(
+                f"{self.folder.covariance} is of other parameters than the result: {said}"
+            )
         return self.covariance
 
     def content(self, name: str) -> Any:
@@ -173,12 +213,13 @@ class RunFiles:
         return {name: digest(self.content(name)) for name in names}
 
     def check_made_of(self, *names: str, result: Mapping[str, Any] | None = None) -> None:
-        """Refuse files of these names that are not those that the result was made of, as far as it states them.
+        """Refuse files of these names that are not those that the result was made of, as far as it
+        states them.
 
         result: None: that of the folder, where it has one.
 
-        Raises OutputFolderError: one of them is gone. Raises RecordError: one of them is another, with the stage to
-        repeat; or damaged; or digests that are none.
+        Raises OutputFolderError: one of them is gone. Raises RecordError: one of them is another,
+        with the stage to repeat; or damaged; or digests that are none.
         """
         run = self.folder
         if result is None:
@@ -191,11 +232,14 @@ class RunFiles:
             if self.digests(name)[name] != known[name]:
                 what = f"another record than {name}" if name in RECORDS else f"another {name}"
                 stage = _AGAIN.get(name, "identify")
-                raise RecordError(f"{run.result} is of {what}: run `cmmsim {stage} --out {run.path}` again")
+                raise RecordError(
+                    f"{run.result} is of {what}: run `cmmsim {stage} --out {run.path}` again"
+                )
 
 
 def digest(content: xr.Dataset | Sequence[xr.Dataset] | Mapping[str, xr.Dataset] | Array) -> str:
-    """Digest, hexadecimal, of a record or of records in their order, of model runs by name, or of a covariance.
+    """Digest, hexadecimal, of a record or of records in their order, of model runs by name, or of a
+    covariance.
 
     Equal where what follows reads the same, in whatever file and whenever it was written.
     Raises RecordError for a record that does not state its scenario.
@@ -206,7 +250,11 @@ def digest(content: xr.Dataset | Sequence[xr.Dataset] | Mapping[str, xr.Dataset]
         return _record_digest([content])
     if isinstance(content, Mapping):
         return array_digest(
-            {f"{run}/{name}": one[name].values for run, one in content.items() for name in one.data_vars}
+            {
+                f"{run}/{name}": one[name].values
+                for run, one in content.items()
+                for name in one.data_vars
+            }
         )
     return _record_digest(content)
 
@@ -220,7 +268,8 @@ def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name], dtype="<f8")
         whole.update(f"{name} {values.shape}\n".encode())
-        whole.update(np.where(np.isnan(values), np.nan, values).tobytes())  # one of the many bit patterns of NaN
+        # one of the many bit patterns of NaN
+        whole.update(np.where(np.isnan(values), np.nan, values).tobytes())
     return whole.hexdigest()
 
 
@@ -231,6 +280,11 @@ def _record_digest(records: Sequence[xr.Dataset]) -> str:
         arrays = {name: record[name].values for name in held}
         stated = {name: plain(record.attrs[name]) for name in STATED if name in record.attrs}
         scenario = recorded_scenario(record)
-        stated |= {section: getattr(scenario, section).model_dump(mode="json") for section in ("timing", "servo")}
-        whole.update(f"{array_digest(arrays)} {json.dumps(stated, sort_keys=True, default=str)}\n".encode())
+        stated |= {
+            section: getattr(scenario, section).model_dump(mode="json")
+            for section in ("timing", "servo")
+        }
+        whole.update(
+            f"{array_digest(arrays)} {json.dumps(stated, sort_keys=True, default=str)}\n".encode()
+        )
     return whole.hexdigest()

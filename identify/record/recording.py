@@ -1,8 +1,10 @@
-"""What the experimenter sees of a run, as an xarray dataset in netCDF, and what models do on the same motion.
+"""What the experimenter sees of a run, as an xarray dataset in netCDF, and what models do on the
+same motion.
 
-A record is the main group of its file. The truth stands in a group of its own (`identify.experiment.truth`), so
-that an estimator that reads a record cannot see it. Several runs share a file as the groups ``run01``, ``run01/truth``,
-``run02``, ...; model runs (``model.nc``) are the groups ``excitation``, ``run01``, ``run02``, ...
+A record is the main group of its file. The truth stands in a group of its own
+(`identify.experiment.truth`), so that an estimator that reads a record cannot see it. Several runs
+share a file as the groups ``run01``, ``run01/truth``, ``run02``, ...; model runs (``model.nc``) are
+the groups ``excitation``, ``run01``, ``run02``, ...
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from dynamics.closed_loop import Reference
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import (
@@ -34,8 +37,10 @@ from identify.record.command_times import COMMAND_TIME, OPTIONAL, check_command_
 TRUTH_GROUP = "truth"
 
 CONVENTIONS = (
-    "SI units. Pose [x y z alpha beta gamma] of the platform frame in the base frame, R = Rx(alpha) Ry(beta) "
-    "Rz(gamma). Rates are time derivatives of the pose components, not the angular velocity. time is the instant of "
+    "SI units. Pose [x y z alpha beta gamma] of the platform frame in the base frame, R = "
+    "Rx(alpha) Ry(beta) "
+    "Rz(gamma). Rates are time derivatives of the pose components, not the angular velocity. time "
+    "is the instant of "
     "exposure."
 )
 
@@ -43,9 +48,21 @@ VARIABLES: Variables = {
     "reference_position": (("time", "axis"), "m", "desired position of the platform"),
     "reference_orientation": (("time", "angle"), "rad", "desired orientation of the platform"),
     "reference_velocity": (("time", "axis"), "m/s", "time derivative of the desired position"),
-    "reference_orientation_rate": (("time", "angle"), "rad/s", "time derivative of the desired Euler angles"),
-    "measured_position": (("time", "axis"), "m", "position measured by the sensor, NaN where it was lost"),
-    "measured_orientation": (("time", "angle"), "rad", "orientation measured by the sensor, NaN where it was lost"),
+    "reference_orientation_rate": (
+        ("time", "angle"),
+        "rad/s",
+        "time derivative of the desired Euler angles",
+    ),
+    "measured_position": (
+        ("time", "axis"),
+        "m",
+        "position measured by the sensor, NaN where it was lost",
+    ),
+    "measured_orientation": (
+        ("time", "angle"),
+        "rad",
+        "orientation measured by the sensor, NaN where it was lost",
+    ),
     "measured_covariance": (
         ("time", "pose_component", "pose_component_2"),
         "m2, m rad and rad2",
@@ -73,24 +90,32 @@ def build_record(
     seed: int | None = None,
     prismatic: bool = False,
 ) -> xr.Dataset:
-    """Record of one run: ``time`` (N,) [s], poses and rates (N, 6), ``command`` (N, n), covariance (N, 6, 6), ok (N,).
+    """Record of one run: ``time`` (N,) [s], poses and rates (N, 6), ``command`` (N, n), covariance
+    (N, 6, 6), ok (N,).
 
-    SI units; the poses, and what is a rate, as CONVENTIONS says. ``command``: of the n joints [rad, or m where they are
-    ``prismatic``], each from its frame on, or from ``command_time`` (N,) [s] on, when it was written to the drives, see
-    `identify.record.command_times`. Where ``measured_ok`` is 0 the pose was lost, and may be NaN.
-    ``scenario_toml``: timing and servo of the run, as `Scenario.to_toml` gives them. ``seed``: of a simulated run; that
-    of a real robot has none.
+    SI units; the poses, and what is a rate, as CONVENTIONS says. ``command``: of the n joints [rad,
+    or m where they are ``prismatic``], each from its frame on, or from ``command_time`` (N,) [s]
+    on, when it was written to the drives, see `identify.record.command_times`. Where
+    ``measured_ok`` is 0 the pose was lost, and may be NaN. ``scenario_toml``: timing and servo of
+    the run, as `Scenario.to_toml` gives them. ``seed``: of a simulated run; that of a real robot
+    has none.
 
-    Raises RecordError: wrong shapes, numbers that are not finite where a measurement was not lost, or a `measured_ok`
-    that is neither 1 nor 0.
+    Raises RecordError: wrong shapes, numbers that are not finite where a measurement was not lost,
+    or a `measured_ok` that is neither 1 nor 0.
     """
     logged = {} if command_time is None else {COMMAND_TIME: np.asarray(command_time, dtype=float)}
     record = described_dataset(
         {
             **logged,
-            **pose_parts(reference_pose, "reference_pose", "reference_position", "reference_orientation"),
-            **pose_parts(reference_rate, "reference_rate", "reference_velocity", "reference_orientation_rate"),
-            **pose_parts(measured_pose, "measured_pose", "measured_position", "measured_orientation"),
+            **pose_parts(
+                reference_pose, "reference_pose", "reference_position", "reference_orientation"
+            ),
+            **pose_parts(
+                reference_rate, "reference_rate", "reference_velocity", "reference_orientation_rate"
+            ),
+            **pose_parts(
+                measured_pose, "measured_pose", "measured_position", "measured_orientation"
+            ),
             "measured_covariance": np.asarray(measured_covariance, dtype=float),
             "measured_ok": np.asarray(measured_ok, dtype=np.int8),
             "command": np.asarray(command, dtype=float),
@@ -114,25 +139,38 @@ def build_record(
 
 def write(path: Path | str, record: xr.Dataset, truth: xr.Dataset | None = None) -> None:
     """Write one run: the record as the main group and the truth as the group ``truth``."""
-    write_groups(path, {"": record} if truth is None else {"": record, TRUTH_GROUP: truth})
+    write_groups(path, record_groups(record, truth))
+
+
+def record_groups(record: xr.Dataset, truth: xr.Dataset | None = None) -> dict[str, xr.Dataset]:
+    """Return the groups of one run's file, which `write` writes."""
+    return {"": record} if truth is None else {"": record, TRUTH_GROUP: truth}
 
 
 def read(path: Path | str, run: str = "") -> xr.Dataset:
     """Read the record of a file, or of one of its runs (``"run01"``), checked; never the truth.
 
-    Raises RecordError: truncated file, missing variables, wrong shapes, or numbers that are not finite.
+    Raises RecordError: truncated file, missing variables, wrong shapes, or numbers that are not
+    finite.
     """
     return check_record(read_group(path, run), f"{path}{':' + run if run else ''}")
 
 
 def write_runs(path: Path | str, runs: Sequence[tuple[xr.Dataset, xr.Dataset | None]]) -> None:
-    """Write several (record, truth) pairs as the groups ``run01``, ``run01/truth``, ``run02``, ..."""
+    """Write several (record, truth) pairs as the groups ``run01``, ``run01/truth``, ..."""
+    write_groups(path, run_groups(runs))
+
+
+def run_groups(
+    runs: Sequence[tuple[xr.Dataset, xr.Dataset | None]],
+) -> dict[str, xr.Dataset]:
+    """Return the groups of a file of several runs, which `write_runs` writes."""
     groups = {}
     for number, (record, truth) in enumerate(runs, start=1):
         groups[run_name(number)] = record
         if truth is not None:
             groups[f"{run_name(number)}/{TRUTH_GROUP}"] = truth
-    write_groups(path, groups)
+    return groups
 
 
 def read_runs(path: Path | str) -> list[xr.Dataset]:
@@ -168,7 +206,10 @@ def poses(record: xr.Dataset, kind: str) -> Array:
     """
     missing = [name for name in (f"{kind}_position", f"{kind}_orientation") if name not in record]
     if missing:
-        raise RecordError(f"the record has no {' and '.join(missing)}; it has {', '.join(map(str, record.data_vars))}")
+        raise RecordError(
+            f"the record has no {' and '.join(missing)}; it has "
+            f"{', '.join(map(str, record.data_vars))}"
+        )
     return np.hstack([record[f"{kind}_position"].values, record[f"{kind}_orientation"].values])
 
 
@@ -182,8 +223,8 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
     strange = np.flatnonzero((stated != 0) & (stated != 1))
     if len(strange):
         raise RecordError(
-            f"{source}: measured_ok must be 1 or 0, it is {stated[strange[0]]} in frame {strange[0]}"
-            + (f" and wrong in {len(strange) - 1} more" if len(strange) > 1 else "")
+            f"{source}: measured_ok must be 1 or 0, it is {stated[strange[0]]} in frame "
+            f"{strange[0]}" + (f" and wrong in {len(strange) - 1} more" if len(strange) > 1 else "")
         )
     ok = stated.astype(bool)
     for name in VARIABLES:
@@ -191,7 +232,9 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1) & (ok if name in MAY_BE_LOST else True))
         if len(bad):
             which = "frames that count as measured" if name in MAY_BE_LOST else "frames"
-            raise RecordError(f"{source}: {name} is not finite in {len(bad)} {which}, the first is frame {bad[0]}")
+            raise RecordError(
+                f"{source}: {name} is not finite in {len(bad)} {which}, the first is frame {bad[0]}"
+            )
     steps = np.diff(record["time"].values)
     if not (steps > 0).all():
         raise RecordError(f"{source}: time does not increase after frame {np.argmin(steps > 0)}")
@@ -202,29 +245,59 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
 EXCITATION = "excitation"
 
 MODEL_VARIABLES: Variables = {
-    "initial_position": (("time", "axis"), "m", "position of the model with the starting parameters"),
-    "initial_orientation": (("time", "angle"), "rad", "orientation of the model with the starting parameters"),
-    "identified_position": (("time", "axis"), "m", "position of the model with the identified parameters"),
-    "identified_orientation": (("time", "angle"), "rad", "orientation of the model with the identified parameters"),
+    "initial_position": (
+        ("time", "axis"),
+        "m",
+        "position of the model with the starting parameters",
+    ),
+    "initial_orientation": (
+        ("time", "angle"),
+        "rad",
+        "orientation of the model with the starting parameters",
+    ),
+    "identified_position": (
+        ("time", "axis"),
+        "m",
+        "position of the model with the identified parameters",
+    ),
+    "identified_orientation": (
+        ("time", "angle"),
+        "rad",
+        "orientation of the model with the identified parameters",
+    ),
 }
 
 PREDICTED: Variables = {
-    "std_position": (("time", "axis"), "m", "predicted deviation of the plant from the identified model"),
-    "std_orientation": (("time", "angle"), "rad", "predicted deviation of the plant from the identified model"),
+    "std_position": (
+        ("time", "axis"),
+        "m",
+        "predicted deviation of the plant from the identified model",
+    ),
+    "std_orientation": (
+        ("time", "angle"),
+        "rad",
+        "predicted deviation of the plant from the identified model",
+    ),
 }
 """Of unseen trajectories only: elsewhere nothing is predicted."""
 
 
 def build_model_run(
-    time: ArrayLike, initial_pose: ArrayLike, identified_pose: ArrayLike, std: ArrayLike | None = None
+    time: ArrayLike,
+    initial_pose: ArrayLike,
+    identified_pose: ArrayLike,
+    std: ArrayLike | None = None,
 ) -> xr.Dataset:
-    """Poses (N, 6) [m, rad] of both models at the frames ``time`` (N,) [s] of a run; NaN after a model has diverged.
+    """Poses (N, 6) [m, rad] of both models at the frames ``time`` (N,) [s] of a run; NaN after a
+    model has diverged.
 
-    std (N, 6): predicted deviations of the plant from the identified model, where they were predicted.
-    Raises RecordError: wrong shapes.
+    std (N, 6): predicted deviations of the plant from the identified model, where they were
+    predicted. Raises RecordError: wrong shapes.
     """
     values = pose_parts(initial_pose, "initial_pose", "initial_position", "initial_orientation")
-    values |= pose_parts(identified_pose, "identified_pose", "identified_position", "identified_orientation")
+    values |= pose_parts(
+        identified_pose, "identified_pose", "identified_position", "identified_orientation"
+    )
     variables = MODEL_VARIABLES
     if std is not None:
         values |= pose_parts(std, "std", "std_position", "std_orientation")
@@ -235,11 +308,17 @@ def build_model_run(
 
 def write_model_runs(
     path: Path | str, excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()
-) -> Mapping[str, xr.Dataset]:
-    """Write the model runs as the groups ``excitation``, ``run01``, ``run02``, ..., and return them so."""
-    runs = {EXCITATION: excitation} | {run_name(number): run for number, run in enumerate(validation, start=1)}
-    write_groups(path, runs)
-    return runs
+) -> None:
+    """Write the model runs as the groups ``excitation``, ``run01``, ``run02``, ..."""
+    write_groups(path, model_groups(excitation, validation))
+
+
+def model_groups(
+    excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()
+) -> dict[str, xr.Dataset]:
+    """Return the groups of a file of model runs, which `write_model_runs` writes."""
+    named = {run_name(number): run for number, run in enumerate(validation, start=1)}
+    return {EXCITATION: excitation} | named
 
 
 def read_model_runs(path: Path | str) -> Mapping[str, xr.Dataset]:
@@ -253,3 +332,11 @@ def read_model_runs(path: Path | str) -> Mapping[str, xr.Dataset]:
         check_variables(run, MODEL_VARIABLES, f"{path}:{name}")
         runs[name] = run
     return runs
+
+
+def recorded_reference(record: xr.Dataset) -> Reference:
+    """Reference motion of a record."""
+    rates = np.hstack(
+        [record["reference_velocity"].values, record["reference_orientation_rate"].values]
+    )
+    return Reference(poses(record, "reference"), rates)

@@ -1,4 +1,6 @@
-"""What a user fills in for a record of one's own: an empty table of a robot, and the file that goes with it."""
+"""What a user fills in for a record of one's own: an empty table of a robot, and the file that goes
+with it.
+"""
 
 from pathlib import Path
 from textwrap import wrap
@@ -25,33 +27,48 @@ def table_text(robot: Robot) -> str:
     groups = columns_of(robot)
     comments = [*wrap(RULES, WIDTH), ""]
     for group in groups.values():
-        shown = ", ".join(group.names if len(group.names) <= 6 else (*group.names[:3], "...", group.names[-1]))
+        shown = ", ".join(
+            group.names if len(group.names) <= 6 else (*group.names[:3], "...", group.names[-1])
+        )
         comments += wrap(f"{'Optional: ' if group.optional else ''}{group.meaning}: {shown}", WIDTH)
-    comments += ["", f"Replace the {SHOWN_ROWS} rows, in which {robot.name} stands still at its home pose."]
+    comments += [
+        "",
+        f"Replace the {SHOWN_ROWS} rows, in which {robot.name} stands still at its home pose.",
+    ]
     written = {name: groups[name] for name in ("time", "reference", "measured", "command")}
     pose = [f"{value:.9g}" for value in robot.home_pose]
     command = [f"{value:.9g}" for value in robot.inverse_kinematics(robot.home_pose)]
     rows = [[f"{row / FRAME_RATE_HZ:.6f}", *pose, *pose, *command] for row in range(SHOWN_ROWS)]
     header = [column for group in written.values() for column in group.names]
-    lines = [f"# {line}".rstrip() for line in comments] + [",".join(cells) for cells in [header, *rows]]
+    lines = [f"# {line}".rstrip() for line in comments] + [
+        ",".join(cells) for cells in [header, *rows]
+    ]
     return "\n".join(lines) + "\n"
 
 
 def description_text(robot: Robot, name_or_path: str, table: str) -> str:
-    """What goes with a table: robot, timing, servo and scale, to be replaced by those of the record."""
+    """What goes with a table: robot, timing, servo and scale, to be replaced by those of the
+    record.
+    """
     mass = float(robot.parameter_sets["initial"].vector[robot.layout.names.index("platform.mass")])
     made_with = Scenario.model_validate(
         {
             "name": "record",
             "robot": name_or_path,
             "timing": {"frame_rate_hz": FRAME_RATE_HZ, "latency_s": 0.0, "hold": "zero"},
-            "servo": {name: getattr(Scenario.model_fields["servo"].default, name) for name in ("kp", "kd", "ki")},
+            "servo": {
+                name: getattr(Scenario.model_fields["servo"].default, name)
+                for name in ("kp", "kd", "ki")
+            },
             "identification": {"scale_anchor": "platform_mass", "anchor_std": 0.005},
         }
     )
-    measured = Measured(anchor_value=mass, position_std_m=POSITION_STD_M, orientation_std_rad=ORIENTATION_STD_RAD)
+    measured = Measured(
+        anchor_value=mass, position_std_m=POSITION_STD_M, orientation_std_rad=ORIENTATION_STD_RAD
+    )
     head = [
-        f"# What {table} is a record of. Entries that are commented out have the value that holds without them; those",
+        f"# What {table} is a record of. Entries that are commented out have the value that holds "
+        "without them; those",
         "# that are not, replace by what your machine and its controller have.",
     ]
     own = starting_toml(measured).rstrip("\n").split("\n")

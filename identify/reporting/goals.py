@@ -1,4 +1,6 @@
-"""The goals of a run and whether its result meets them: accuracy and honesty, the same on every machine."""
+"""The goals of a run and whether its result meets them: accuracy and honesty, the same on every
+machine.
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,20 +11,27 @@ import numpy as np
 from identify.estimation.explanation import MISFIT, SIGNIFICANT, SUSPICIOUS
 from identify.files.run_folder import rms_row
 
-VALIDATION_UM, VALIDATION_URAD = 2.0, 10.0
-SENSOR_UM, SENSOR_URAD = 20.0, 100.0
-PARAMETER_FRACTION, PARAMETER_STDS = 0.05, 3.0
+VALIDATION_UM = 2.0
+VALIDATION_URAD = 10.0
+SENSOR_UM = 20.0
+SENSOR_URAD = 100.0
+PARAMETER_FRACTION = 0.05
+PARAMETER_STDS = 3.0
 
-UNSEEN_POSITION, UNSEEN_ORIENTATION = "unseen motion, position", "unseen motion, orientation"
-SENSOR_POSITION, SENSOR_ORIENTATION = "cameras, position", "cameras, orientation"
-LOST, RESIDUALS, CHANCE = "lost frames", "residuals of the model", "chance of such residuals"
+UNSEEN_POSITION = "unseen motion, position"
+UNSEEN_ORIENTATION = "unseen motion, orientation"
+SENSOR_POSITION = "cameras, position"
+SENSOR_ORIENTATION = "cameras, orientation"
+LOST = "lost frames"
+RESIDUALS = "residuals of the model"
+CHANCE = "chance of such residuals"
 FAR_OFF = "friction and gains far off"
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One goal: ``value`` against ``limit`` in ``unit``; ``relation`` is ``<=`` or ``>=``; ``detail``: what the value
-    is, in words that continue its name."""
+    """One goal: ``value`` against ``limit`` in ``unit``; ``relation`` is ``<=`` or ``>=``;
+    ``detail``: what the value is, in words that continue its name."""
 
     name: str
     value: float
@@ -38,25 +47,43 @@ class Goal:
 
 
 def check_goals(result: dict[str, Any]) -> list[Goal]:
-    """The goals that the parts of a result allow to judge; accuracy is that of the worst axis of the worst run."""
+    """The goals that the parts of a result allow to judge; accuracy is that of the worst axis of
+    the worst run.
+    """
     parts = (_validation, _sensor, explanation_goals, _parameters)
     return [goal for part in parts for goal in part(result)]
 
 
 def explanation_goals(result: dict[str, Any]) -> list[Goal]:
-    """Whether the model explains the record: what it leaves is no larger than noise alone makes it, and is white."""
-    found, goals = result.get("identification", {}), []
+    """Whether the model explains the record: what it leaves is no larger than noise alone makes it,
+    and is white.
+    """
+    found = result.get("identification", {})
+    goals = []
     if "noise_ratio_std" in found:
         ratio, expected, std = (math.nan if found[key] is None else found[key] for key in MISFIT)
         text = (
-            "mean square of measured minus identified pose, in units of the noise that the cameras state; noise alone "
+            "mean square of measured minus identified pose, in units of the noise that the "
+            "cameras state; noise alone "
             f"leaves {expected:.3f} ± {std:.3f}"
         )
         goals.append(Goal(RESIDUALS, ratio, "<=", expected + SIGNIFICANT * std, "× noise", text))
     if "whiteness" in found:
         chance = found["whiteness"]["p_value"]
-        text = "probability that noise alone leaves residuals that depend as much on those of the frames before"
-        goals.append(Goal(CHANCE, math.nan if chance is None else 100 * chance, ">=", 100 * SUSPICIOUS, "%", text))
+        text = (
+            "probability that noise alone leaves residuals that depend as much on those of the "
+            "frames before"
+        )
+        goals.append(
+            Goal(
+                CHANCE,
+                math.nan if chance is None else 100 * chance,
+                ">=",
+                100 * SUSPICIOUS,
+                "%",
+                text,
+            )
+        )
     return goals
 
 
@@ -64,7 +91,10 @@ def _validation(result: dict[str, Any]) -> list[Goal]:
     rows = np.array([rms_row(run["true"]) for run in result.get("validation", [])])
     if not len(rows):
         return []
-    text = f"identified model against the true robot, RMS of the worst axis in the worst of {len(rows)} unseen runs"
+    text = (
+        "identified model against the true robot, RMS of the worst axis in the worst of "
+        f"{len(rows)} unseen runs"
+    )
     return [
         Goal(UNSEEN_POSITION, float(rows[:, :3].max()), "<=", VALIDATION_UM, "µm", text),
         Goal(UNSEEN_ORIENTATION, float(rows[:, 3:].max()), "<=", VALIDATION_URAD, "µrad", text),
@@ -87,23 +117,37 @@ def _sensor(result: dict[str, Any]) -> list[Goal]:
 
 def _parameters(result: dict[str, Any]) -> list[Goal]:
     parameters = result.get("identification", {}).get("parameters", {})
-    judged = {name: p for name, p in parameters.items() if is_friction_or_pid(name) and p["true"] is not None}
+    judged = {
+        name: p
+        for name, p in parameters.items()
+        if is_friction_or_pid(name) and p["true"] is not None
+    }
     if not judged:
         return []
     outside = [name for name, p in judged.items() if not within_tolerance(p)]
-    text = f"of {len(judged)}: estimates off the truth by more than 5 % and more than 3 standard deviations"
+    text = (
+        f"of {len(judged)}: estimates off the truth by more than 5 % and more than 3 standard "
+        "deviations"
+    )
     text += f", {', '.join(outside)}" if outside else ""
     return [Goal(FAR_OFF, float(len(outside)), "<=", 0.0, "", text)]
 
 
 def is_friction_or_pid(name: str) -> bool:
-    """Whether the goals judge the parameter: friction of the joints and gains of the joint controller."""
+    """Whether the goals judge the parameter: friction of the joints and gains of the joint
+    controller.
+    """
     return name.startswith("joint_pid.") or name.endswith((".coulomb", ".viscous"))
 
 
 def within_tolerance(parameter: dict[str, Any]) -> bool:
-    """Whether an estimate lies within 5 % of the truth or within 3 of its reported standard deviations."""
+    """Whether an estimate lies within 5 % of the truth or within 3 of its reported standard
+    deviations.
+    """
     if parameter["estimate"] is None or parameter["true"] is None:
         return False
-    error, std = abs(parameter["estimate"] - parameter["true"]), parameter["std"]
-    return error <= PARAMETER_FRACTION * abs(parameter["true"]) or (std is not None and error <= PARAMETER_STDS * std)
+    error = abs(parameter["estimate"] - parameter["true"])
+    std = parameter["std"]
+    return error <= PARAMETER_FRACTION * abs(parameter["true"]) or (
+        std is not None and error <= PARAMETER_STDS * std
+    )

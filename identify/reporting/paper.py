@@ -1,13 +1,15 @@
-"""The paper whose experiment this is: its figures stand beside those of a run only where the run repeats its settings.
+"""The paper whose experiment this is: its figures stand beside those of a run only where the run
+repeats its settings.
 
-RMS of x, y, z [µm], alpha, beta, gamma [µrad] compare the paper's identified model with what was measured of a real
-robot; no truth was known there.
+RMS of x, y, z [µm], alpha, beta, gamma [µrad] compare the paper's identified model with what was
+measured of a real robot; no truth was known there.
 """
 
 from identify.reporting.settings import BUILT_IN_PAPER, changed_settings
 
 CITATION = (
-    "P. Li, A. Ghasemi, W. Xie, W. Tian: Visual Closed-Loop Dynamic Model Identification of Parallel Robots Based on "
+    "P. Li, A. Ghasemi, W. Xie, W. Tian: Visual Closed-Loop Dynamic Model Identification of "
+    "Parallel Robots Based on "
     "Optical CMM Sensor. Electronics 8(8), 836 (2019)"
 )
 
@@ -31,16 +33,21 @@ VALIDATION = (
     (342.0, 510.0, 557.0, 1411.0, 1156.0, 711.0),
     (318.0, 379.0, 473.0, 1219.0, 1023.0, 905.0),
 )
-"""Table 4, identified model on ten unseen trajectories. The 1411 is over the 1.4e-3 rad that the text states."""
+"""Table 4, identified model on ten unseen trajectories. The 1411 is over the 1.4e-3 rad that the
+text states.
+"""
 
 INDEX_FIRST, INDEX_BEST = 0.38, 1.345
-"""Observability index at the start and after 324 iterations of a genetic algorithm (section 4.2)."""
+"""Observability index at the start and after 324 iterations of a genetic algorithm (section 4.2).
+"""
 
 FREE = ("renderer", "description", "sensor_note")
 """Settings that are no part of its experiment."""
 
 
 def repeats_the_paper(recorded: str) -> bool:
-    """Whether a record, whose scenario this is (TOML), was made with the robot and the settings of the paper's."""
+    """Whether a record, whose scenario this is (TOML), was made with the robot and the settings of
+    the paper's.
+    """
     base, changed = changed_settings(recorded)
     return base == BUILT_IN_PAPER and not any(setting.key not in FREE for setting in changed)

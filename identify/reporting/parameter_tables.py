@@ -1,10 +1,12 @@
-"""Tables of the parameters: what is identified, what is not and why, and the sums that motion shows."""
+"""Tables of the parameters: what is identified, what is not and why, and the sums that motion
+shows.
+"""
 
 from collections.abc import Mapping
 from typing import Any
 
 from identify.estimation.identifiability import RESTS_ON_PRIOR
-from identify.reporting.numbers import interval, number, rounded, with_deviation
+from identify.reporting.number_format import interval, number, rounded, with_deviation
 from identify.reporting.tables import Table
 
 ON_GUESS = "rests on starting values"
@@ -13,7 +15,9 @@ Entry = dict[str, Any]
 
 
 def parameter_table(result: dict[str, Any]) -> Table:
-    """The identified parameters: starting value, truth where it is known, estimate with deviation and interval."""
+    """The identified parameters: starting value, truth where it is known, estimate with deviation
+    and interval.
+    """
     identification = result["identification"]
     rows = [
         (
@@ -25,27 +29,44 @@ def parameter_table(result: dict[str, Any]) -> Table:
         for name, p in identification["parameters"].items()
         if p["identifiable"]
     ]
-    note = "The interval holds the truth in 95 % of such experiments; it ends where no such value can exist. "
+    note = (
+        "The interval holds the truth in 95 % of such experiments; it ends where no such value "
+        "can exist. "
+    )
     if any(row[-1] for row in rows):
         note += (
-            f"One that {ON_GUESS} is shown only in sums with other parameters: it is right where their starting "
+            f"One that {ON_GUESS} is shown only in sums with other parameters: it is right where "
+            "their starting "
             "values are, within the standard deviations that were stated for them."
         )
-    header = ("parameter", "unit", "start", "truth", "estimate ± standard deviation", "95 % interval", "error [%]", "")
-    return Table(f"The {len(rows)} identified parameters", header, tuple(rows), note).without_empty()
+    header = (
+        "parameter",
+        "unit",
+        "start",
+        "truth",
+        "estimate ± standard deviation",
+        "95 % interval",
+        "error [%]",
+        "",
+    )
+    return Table(
+        f"The {len(rows)} identified parameters", header, tuple(rows), note
+    ).without_empty()
 
 
 def scale_sentence(identification: Mapping[str, Any]) -> str:
     """What fixes the common factor of all parameters, or that what was to fix it does not."""
     anchor = identification["scale_anchor"]
-    said, gain = ANCHORS.get(anchor, anchor), identification["parameters"].get("joint_pid.lp", {})
+    said = ANCHORS.get(anchor, anchor)
+    gain = identification["parameters"].get("joint_pid.lp", {})
     share = gain.get("prior_share") or 0.0
     if not identification.get("drive", {}).get("in_loop", True):
         return "The overall scale is that of the torques that were commanded."
     if anchor == "prior" or share <= RESTS_ON_PRIOR:
         return f"The overall scale is fixed by {said}."
     return (
-        f"The overall scale should be fixed by {said}, but is not: {100 * share:.0f} % of the variance of joint_pid.lp "
+        f"The overall scale should be fixed by {said}, but is not: {100 * share:.0f} % of the "
+        "variance of joint_pid.lp "
         "comes from the starting values, and all that is given in kg, N m or N is as good as those."
     )
 
@@ -59,31 +80,51 @@ ANCHORS = {
 
 
 def group_table(result: dict[str, Any]) -> Table:
-    """Base parameters: the combinations of parameters that motion can show, with truth, estimate and deviation."""
+    """Base parameters: the combinations of parameters that motion can show, with truth, estimate
+    and deviation.
+    """
     identification = result["identification"]
     rows = []
     for group in identification.get("groups", {}).values():
         if len(group["coefficients"]) > 1:
             known = _remark(group) if group["identifiable"] else "not identified"
             shown = _shown(group, _size(group, identification["parameters"]))
-            rows.append((group["expression"].replace(" - ", " − "), *shown[:-1], _deviations(group), known))
+            rows.append(
+                (group["expression"].replace(" - ", " − "), *shown[:-1], _deviations(group), known)
+            )
     note = (
-        "In the SI unit of the first parameter of each sum. A sum may be known where none of its members is: it "
-        "counts as identified when little of the size of its members is in doubt, though it may almost vanish itself."
+        "In the SI unit of the first parameter of each sum. A sum may be known where none of its "
+        "members is: it "
+        "counts as identified when little of the size of its members is in doubt, though it may "
+        "almost vanish itself."
     )
-    header = ("sum", "start", "truth", "estimate ± standard deviation", "95 % interval", "error / deviation", "")
-    return Table(f"The {len(rows)} sums that motion shows", header, tuple(rows), note, folded=True).without_empty()
+    header = (
+        "sum",
+        "start",
+        "truth",
+        "estimate ± standard deviation",
+        "95 % interval",
+        "error / deviation",
+        "",
+    )
+    return Table(
+        f"The {len(rows)} sums that motion shows", header, tuple(rows), note, folded=True
+    ).without_empty()
 
 
 def correlation_table(result: dict[str, Any]) -> Table:
     """The pairs of identified parameters that the record ties together most."""
     pairs = result["identification"].get("strongest_correlations", [])
-    rows = tuple((f"{p['first']}, {p['second']}", f"{p['correlation']:+.4f}".replace("-", "−")) for p in pairs)
+    rows = tuple(
+        (f"{p['first']}, {p['second']}", f"{p['correlation']:+.4f}".replace("-", "−"))
+        for p in pairs
+    )
     return Table(
         "Strongest correlations of identified parameters",
         ("parameters", "correlation"),
         rows,
-        "Poses show friction and gains relative to each other better than their common factor, which moves all of them "
+        "Poses show friction and gains relative to each other better than their common factor, "
+        "which moves all of them "
         "together: their ratios are known better than each of them.",
         folded=True,
     )
@@ -100,20 +141,38 @@ DRIVES = {
 
 
 def drive_sentence(identification: Mapping[str, Any]) -> str:
-    """What law the drives have, and how that is known; nothing of the usual one that nobody asked about."""
+    """What law the drives have, and how that is known; nothing of the usual one that nobody asked
+    about.
+    """
     drive = identification.get("drive")
     if drive is not None and not drive.get("in_loop", True):
-        return "The drives took torques: the record says nothing of the law by which they follow joint commands."
+        return (
+            "The drives took torques: the record says nothing of the law by which they follow "
+            "joint commands."
+        )
     if drive is None or (drive["decided_by"] == "scenario" and drive["law"] == "pid"):
         return ""
     said = f"The law of the drives is {DRIVES[drive['law']]}"
     if drive["decided_by"] == "scenario":
         said += ", as the scenario states."
     else:
-        others = {name: p for name, p in drive["probabilities"].items() if name != drive["law"] and p >= 0.001}
-        rest = ", ".join(f"{name} {100 * p:.2g} %" for name, p in others.items()) or "no other above 0.1 %"
-        known = "the record tells" if drive["sure"] else "the record cannot tell: this is the most probable"
-        said += f"; {known} (probability {100 * drive['probabilities'][drive['law']]:.3g} %; {rest})."
+        others = {
+            name: p
+            for name, p in drive["probabilities"].items()
+            if name != drive["law"] and p >= 0.001
+        }
+        rest = (
+            ", ".join(f"{name} {100 * p:.2g} %" for name, p in others.items())
+            or "no other above 0.1 %"
+        )
+        known = (
+            "the record tells"
+            if drive["sure"]
+            else "the record cannot tell: this is the most probable"
+        )
+        said += (
+            f"; {known} (probability {100 * drive['probabilities'][drive['law']]:.3g} %; {rest})."
+        )
     own = ", ".join(
         f"{name} = {with_deviation(one['estimate'], one['std'])} {one['unit']}"
         for name, one in drive.get("gains", {}).items()
@@ -122,10 +181,20 @@ def drive_sentence(identification: Mapping[str, Any]) -> str:
 
 
 def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
-    """Why parameters are not identified, in a sentence each, with the names of those that it is true of."""
-    parameters, groups = identification["parameters"], identification.get("groups", {}).values()
-    alone = {name for group in groups for name in group["coefficients"] if len(group["coefficients"]) == 1}
-    summed = {name for group in groups for name in group["coefficients"] if len(group["coefficients"]) > 1}
+    """Why parameters are not identified, in a sentence each, with the names of those that it is
+    true of.
+    """
+    parameters = identification["parameters"]
+    groups = identification.get("groups", {}).values()
+    alone = {
+        name
+        for group in groups
+        for name in group["coefficients"]
+        if len(group["coefficients"]) == 1
+    }
+    summed = {
+        name for group in groups for name in group["coefficients"] if len(group["coefficients"]) > 1
+    }
     left = [name for name, p in parameters.items() if not p["identifiable"]]
     if left and len(left) == len(parameters):
         return [("the model does not explain the record, so that no estimate can be trusted", left)]
@@ -135,13 +204,19 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
     shown -= outside
     kinds = {
         "the law of the drives has no such gain": [name for name in left if name in fixed],
-        "the drives took torques, and these gains had no part in the run": [name for name in left if name in outside],
-        "motion shows them only in sums with others, and not one by one; the sums are what is known": [
-            name for name in left if name in summed
+        "the drives took torques, and these gains had no part in the run": [
+            name for name in left if name in outside
         ],
-        "this record shows them too badly. It neither halves what the starting value left open, nor leaves less than "
-        "half of their size in doubt. More or faster motion may show them": [n for n in left if n in shown],
-        "no motion of this robot depends on them": [n for n in left if n not in summed | shown | fixed | outside],
+        "motion shows them only in sums with others, and not one by one; the sums are what is "
+        "known": [name for name in left if name in summed],
+        "this record shows them too badly. It neither halves what the starting value left open, "
+        "nor leaves less than "
+        "half of their size in doubt. More or faster motion may show them": [
+            n for n in left if n in shown
+        ],
+        "no motion of this robot depends on them": [
+            n for n in left if n not in summed | shown | fixed | outside
+        ],
     }
     return [(reason, names) for reason, names in kinds.items() if names]
 
@@ -151,7 +226,8 @@ def _remark(entry: Entry) -> str:
 
 
 def _shown(entry: Entry, size: float) -> tuple[str, ...]:
-    """Start, truth, estimate, interval and error; dashes for what is not identified, so that nobody quotes it.
+    """Start, truth, estimate, interval and error; dashes for what is not identified, so that nobody
+    quotes it.
 
     size: of what the entry is made of; what is nothing but rounding beside it is zero.
     """
@@ -160,12 +236,20 @@ def _shown(entry: Entry, size: float) -> tuple[str, ...]:
         return start, true, "-", "-", "-"
     ends = entry.get("interval") or [None, None]
     reach = "-" if None in ends else interval(*ends)
-    return start, true, with_deviation(entry["estimate"], entry["std"]), reach, _percent(entry, size)
+    return (
+        start,
+        true,
+        with_deviation(entry["estimate"], entry["std"]),
+        reach,
+        _percent(entry, size),
+    )
 
 
 def _deviations(group: Entry) -> str:
     """The error in standard deviations."""
-    true, estimate, std = group["true"], group["estimate"], group["std"]
+    true = group["true"]
+    estimate = group["estimate"]
+    std = group["std"]
     if not group["identifiable"] or true is None or estimate is None or not std:
         return "-"
     return f"{(estimate - true) / std:+.1f}".replace("-", "−")
@@ -173,11 +257,15 @@ def _deviations(group: Entry) -> str:
 
 def _size(group: Entry, parameters: Mapping[str, Entry]) -> float:
     """Of the parts of a sum, by their starting values."""
-    return sum(abs(weight * (parameters[name]["initial"] or 0.0)) for name, weight in group["coefficients"].items())
+    return sum(
+        abs(weight * (parameters[name]["initial"] or 0.0))
+        for name, weight in group["coefficients"].items()
+    )
 
 
 def _percent(entry: Entry, size: float) -> str:
-    true, estimate = rounded(entry["true"], size), entry["estimate"]
+    true = rounded(entry["true"], size)
+    estimate = entry["estimate"]
     if not true or estimate is None:
         return "-"
     return f"{100 * (estimate - true) / abs(true):+.2f}".replace("-", "−")

@@ -1,4 +1,5 @@
-"""The pictures of a run by the names of their files, each with a caption that says how to read it."""
+"""The pictures of a run by the names of their files, each with a caption that says how to
+read it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,15 +12,15 @@ from matplotlib.figure import Figure
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import RunFolder
 from identify.record.recording import poses
-from identify.reporting.figures import fit, motion, parameters, scene
+from identify.reporting.figures import estimates, fit, overview, paths
 from identify.reporting.figures.style import drawn, moving
 from identify.reporting.run_data import RunData, read_run
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What draws a figure, and what it shows in words; painted: whether a page takes it as an image, for it is of too
-    many strokes, or of grey values."""
+    """What draws a figure, and what it shows in words; painted: whether a page takes it as an
+    image, for it is of too many strokes, or of grey values."""
 
     draw: Callable[[], Figure]
     caption: str
@@ -27,58 +28,82 @@ class Picture:
 
 
 def run_figures(folder: Path | str) -> dict[str, Callable[[], Figure]]:
-    """The figures of a finished run by the names of their files: each is a function that draws it for print.
+    """The figures of a finished run by the names of their files: each is a function that draws it
+    for print.
 
-    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file of the run is damaged.
+    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file of the
+    run is damaged.
     """
-    return {name: partial(drawn, picture.draw) for name, picture in pictures(read_run(RunFolder(Path(folder)))).items()}
+    return {
+        name: partial(drawn, picture.draw)
+        for name, picture in pictures(read_run(RunFolder(Path(folder)))).items()
+    }
 
 
 def pictures(data: RunData) -> dict[str, Picture]:
     """The pictures that the files of a run allow, in the order of the report."""
     found = data.result["identification"]
-    names, groups = found["parameters"], found.get("groups", {})
+    names = found["parameters"]
+    groups = found.get("groups", {})
     several = any(len(group["coefficients"]) > 1 for group in groups.values())
     return {
         **_of_the_scene(data),
         "errors": _errors(data),
         **_of_the_sensor(data),
         **_of_the_motion(data),
-        "fit_excitation": Picture(lambda: fit.fit_figure(data.excitation_fit), FIT.format("exciting trajectory")),
-        "parameters": Picture(lambda: parameters.parameter_figure(names), _parameters_caption(names)),
-        **({"groups": Picture(lambda: parameters.group_figure(groups, names), GROUPS)} if several else {}),
-        "correlation": Picture(lambda: parameters.correlation_figure(*data.correlations), CORRELATION),
+        "fit_excitation": Picture(
+            lambda: fit.fit_figure(data.excitation_fit), FIT.format("exciting trajectory")
+        ),
+        "parameters": Picture(
+            lambda: estimates.parameter_figure(names), _parameters_caption(names)
+        ),
+        **(
+            {"groups": Picture(lambda: estimates.group_figure(groups, names), GROUPS)}
+            if several
+            else {}
+        ),
+        "correlation": Picture(
+            lambda: estimates.correlation_figure(*data.correlations), CORRELATION
+        ),
         **_of_the_validation(data),
     }
 
 
 FIT = (
-    "The {}: measured poses (circles), starting model (dashed) and identified model (line); beneath each component "
-    "what the identified model leaves of every measured pose, with its RMS for the starting and for the identified "
+    "The {}: measured poses (circles), starting model (dashed) and identified model (line); "
+    "beneath each component "
+    "what the identified model leaves of every measured pose, with its RMS for the starting and "
+    "for the identified "
     "model."
 )
 
 GROUPS = (
-    "Which parameters enter which sum that motion shows: one row a sum, one column a parameter. The area of a dot is "
-    "the share of coefficient times starting value; an open one is subtracted. A star marks a sum that is identified."
+    "Which parameters enter which sum that motion shows: one row a sum, one column a parameter. "
+    "The area of a dot is "
+    "the share of coefficient times starting value; an open one is subtracted. A star marks a sum "
+    "that is identified."
 )
 
 CORRELATION = (
-    "How the errors of identified parameters go together: the area of a dot is the size of their correlation, an open "
+    "How the errors of identified parameters go together: the area of a dot is the size of their "
+    "correlation, an open "
     "one is negative."
 )
 
 
 def _errors(data: RunData) -> Picture:
-    """Both models against the truth in one look; against the measurement where no truth is known."""
+    """Both models against the truth in one look; against the measurement where no truth is
+    known."""
     shown = data.validation_fit
     if shown is None:
         text = (
-            "How far both models are from the measured poses of the record; dotted: the noise that the cameras state."
+            "How far both models are from the measured poses of the record; dotted: the noise "
+            "that the cameras state."
         )
         return Picture(lambda: fit.error_figure(data.excitation_fit), text)
     text = (
-        "How far both models, and the single poses that the cameras measure, are from the true robot, on the first "
+        "How far both models, and the single poses that the cameras measure, are from the true "
+        "robot, on the first "
         "trajectory that no model was fitted to."
     )
     return Picture(lambda: fit.error_figure(shown), text)
@@ -86,46 +111,67 @@ def _errors(data: RunData) -> Picture:
 
 def _of_the_scene(data: RunData) -> dict[str, Picture]:
     """Robot and cameras, and what these see; nothing where the robot's file is gone."""
-    cell, view = data.scene, data.stereo_view
+    cell = data.scene
+    view = data.stereo_view
     if isinstance(cell, str):
         return {}
     if view is None:
         text = f"The robot {data.robot} half way along its path."
-        return {"scene": Picture(lambda: scene.overview_figure(cell, data.middle), text, painted=True)}
+        return {
+            "scene": Picture(
+                lambda: overview.overview_figure(cell, data.middle), text, painted=True
+            )
+        }
     text = (
-        f"The robot {data.robot} and both cameras, with their rays to the stickers of the platform, half way along the "
-        "exciting trajectory; beneath it what both cameras see at that time, with the stickers that were found."
+        f"The robot {data.robot} and both cameras, with their rays to the stickers of the "
+        "platform, half way along the "
+        "exciting trajectory; beneath it what both cameras see at that time, with the stickers "
+        "that were found."
     )
     residuals = (
-        "The same images, drawn anew from scenario, seed and true pose: detected ellipses, and arrows from each "
+        "The same images, drawn anew from scenario, seed and true pose: detected ellipses, and "
+        "arrows from each "
         "detected centre that show by how much it misses the true one, enlarged as written."
     )
     return {
-        "scene": Picture(lambda: scene.overview_figure(cell, data.middle, view), text, painted=True),
-        "stereo_frame": Picture(lambda: scene.residual_figure(view), residuals, painted=True),
+        "scene": Picture(
+            lambda: overview.overview_figure(cell, data.middle, view), text, painted=True
+        ),
+        "stereo_frame": Picture(lambda: overview.residual_figure(view), residuals, painted=True),
     }
 
 
 def _of_the_sensor(data: RunData) -> dict[str, Picture]:
-    measured, covariances = poses(data.experiment, "measured"), data.experiment["measured_covariance"].values
+    measured = poses(data.experiment, "measured")
+    covariances = data.experiment["measured_covariance"].values
     errors = None if data.truth is None else true_poses(data.truth) - measured
     shown = moving(poses(data.experiment, "reference"))
     text = (
-        "How well single poses are measured: ellipses that hold 95 % of true poses by what the cameras state, enlarged "
+        "How well single poses are measured: ellipses that hold 95 % of true poses by what the "
+        "cameras state, enlarged "
         "along the path as written above each row."
     )
     if errors is not None:
         text += " Dots: the true poses, their distance from the measured ones enlarged alike."
-    return {"ellipses": Picture(lambda: motion.ellipse_figure(measured, covariances, shown, errors), text)}
+    return {
+        "ellipses": Picture(
+            lambda: paths.ellipse_figure(measured, covariances, shown, errors), text
+        )
+    }
 
 
 def _of_the_motion(data: RunData) -> dict[str, Picture]:
-    time, reference = data.experiment["time"].values, poses(data.experiment, "reference")
-    path = "The exciting trajectory as a path in space, and the orientation on its way; the same times are marked."
+    time = data.experiment["time"].values
+    reference = poses(data.experiment, "reference")
+    path = (
+        "The exciting trajectory as a path in space, and the orientation on its way; the same "
+        "times are marked."
+    )
     return {
-        "path": Picture(lambda: motion.path_figure(time, reference), path),
+        "path": Picture(lambda: paths.path_figure(time, reference), path),
         "excitation": Picture(
-            lambda: motion.excitation_figure(time, reference), "The exciting trajectory over time, as it is asked for."
+            lambda: paths.excitation_figure(time, reference),
+            "The exciting trajectory over time, as it is asked for.",
         ),
     }
 
@@ -133,7 +179,8 @@ def _of_the_motion(data: RunData) -> dict[str, Picture]:
 def _parameters_caption(entries: dict[str, Any]) -> str:
     if any(entry["true"] is not None for entry in entries.values()):
         return (
-            "Error of each identified parameter with its 95 % interval, in per cent of the truth. Grey: 5 %. "
+            "Error of each identified parameter with its 95 % interval, in per cent of the truth. "
+            "Grey: 5 %. "
             "Nineteen of twenty intervals should reach zero."
         )
     return "95 % interval of each identified parameter, in per cent of the estimate. Grey: 5 %."
@@ -144,11 +191,17 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
     if shown is None:
         return {}
     bars = (
-        "The identified model on each unseen trajectory: bars against the truth, diamonds what the uncertainty of the "
+        "The identified model on each unseen trajectory: bars against the truth, diamonds what "
+        "the uncertainty of the "
         "parameters lets expect, dashes against the measurement, whose noise they hold."
     )
-    text = FIT.format("first unseen trajectory") + " Thick: what it misses of the truth; dotted: predicted."
+    text = (
+        FIT.format("first unseen trajectory")
+        + " Thick: what it misses of the truth; dotted: predicted."
+    )
     return {
-        "validation_errors": Picture(lambda: fit.validation_figure(data.result["validation"]), bars),
+        "validation_errors": Picture(
+            lambda: fit.validation_figure(data.result["validation"]), bars
+        ),
         "fit_validation": Picture(lambda: fit.fit_figure(shown), text),
     }

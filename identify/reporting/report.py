@@ -1,31 +1,123 @@
-"""The report of a run: its figures for print, and one page that opens without a network and runs no script."""
+"""The page of a report: one HTML text without a script, whose figures take on the colours of its
+reader's screen.
+"""
 
+import base64
+import io
+import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from identify.files.atomic import write_figure, write_text
+import jinja2
+from PIL import Image
+
+from identify.files.atomic import figure_bytes, write_files
 from identify.files.run_folder import RunFolder
 from identify.progress import Progress, SilentProgress
-from identify.reporting.figures.style import drawn, svg_text
-from identify.reporting.page import painting, render
-from identify.reporting.pictures import pictures
-from identify.reporting.run_data import read_run
+from identify.reporting import paper
+from identify.reporting.figures.style import PALETTE, drawn, svg_text
+from identify.reporting.goals import check_goals
+from identify.reporting.number_format import spelled
+from identify.reporting.pictures import Picture, pictures
+from identify.reporting.report_sections import SECTIONS
+from identify.reporting.run_data import RunData, read_run
+from identify.reporting.tables import goals_table
+from identify.reporting.verdict import key_numbers, verdict
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+FIRST_LOOK = ("scene", "errors")
+"""Pictures beside the verdict."""
+
+WIDEST_PX, QUALITY = 1500, 85
+"""Of an image on the page; the PNG file beside it has every pixel."""
+
+_NAMES = {code: name for name, code in PALETTE.items()}
+_CODES = re.compile("|".join(_NAMES))
 
 
 def write_report(folder: Path | str, progress: Progress | None = None) -> Path:
-    """Write ``figures/*.png``, ``figures/*.pdf`` and ``report.html`` of a run folder; return the path of the report.
+    """Write ``figures/*.png``, ``figures/*.pdf`` and ``report.html`` of a run folder, all or none;
+    return the path of the report.
 
-    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file of the run is damaged.
+    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file of the
+    run is damaged. Raises WriteError.
     """
     run = RunFolder(Path(folder))
     data = read_run(run)
-    shown, drawings = pictures(data), {}
+    shown = pictures(data)
+    drawings = {}
+    files: dict[Path, bytes] = {}
     with (progress or SilentProgress()).stage("report", len(shown) + 1) as advance:
         for name, picture in shown.items():
-            figure, png = drawn(picture.draw), run.figures / f"{name}.png"
-            write_figure(png, figure)
-            write_figure(png.with_suffix(".pdf"), figure)
+            figure = drawn(picture.draw)
+            png = figure_bytes(figure, ".png")
+            files[run.figures / f"{name}.png"] = png
+            files[run.figures / f"{name}.pdf"] = figure_bytes(figure, ".pdf")
             drawings[name] = painting(png) if picture.painted else svg_text(figure, name)
             advance()
-        write_text(run.report, render(data, shown, drawings))
+        files[run.report] = render(data, shown, drawings).encode()
+        write_files(files, parents=True)
         advance()
     return run.report
+
+
+def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, str]) -> str:
+    """The report as one HTML text; drawings: the pictures as elements, by their names."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    said = verdict(data.result, data.cameras_acquitted)
+    goals = check_goals(data.result)
+    return environment.get_template("report.html.j2").render(
+        title=f"Identification of {data.robot}",
+        subtitle=_subtitle(data.result),
+        verdict=said,
+        numbers=key_numbers(data.result),
+        goals=goals_table(data.result),
+        missed=sum(not goal.passed for goal in goals),
+        goal_count=len(goals),
+        warnings=[_sentence(text) for text in data.result["identification"].get("warnings", [])],
+        first_look=[name for name in FIRST_LOOK if name in shown],
+        sections=[build(data) for build in SECTIONS],
+        pictures=shown,
+        drawings={n: text if shown[n].painted else _coloured(text) for n, text in drawings.items()},
+        paper=paper,
+    )
+
+
+def painting(png: bytes) -> str:
+    """A PNG file as an <img> element that holds it, small enough for a page."""
+    stream = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as image:
+        whole = image.convert("RGB")
+        whole.thumbnail((WIDEST_PX, WIDEST_PX))
+        whole.save(stream, "webp", quality=QUALITY)
+    width, height = whole.size
+    data = base64.b64encode(stream.getvalue()).decode()
+    return f'<img alt="" width="{width}" height="{height}" src="data:image/webp;base64,{data}">'
+
+
+def _subtitle(result: Mapping[str, Any]) -> str:
+    """Scenario and, of a simulated run, seed."""
+    seed = result.get("seed")
+    return f"scenario {result.get('scenario')}" + ("" if seed is None else f", seed {seed}")
+
+
+def _sentence(text: str) -> str:
+    """A warning as a sentence."""
+    return f"{text[:1].upper()}{spelled(text[1:])}."
+
+
+def _coloured(element: str) -> str:
+    """A figure whose colours are variables of the page; what it shows is told by its caption."""
+    # an attribute takes no variables
+    text = re.sub(r'\sfill="(#[0-9a-f]{6})"', r' style="fill: \g<1>"', element)
+    text = _CODES.sub(lambda code: f"var(--{_NAMES[code[0]]})", text)
+    head, _, rest = text.partition(">")
+    return re.sub(r'\s(width|height)="[^"]*"', "", head) + f' aria-hidden="true">{rest}'

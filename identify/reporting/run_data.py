@@ -1,4 +1,5 @@
-"""All that a report shows of a run, read from its files; of a record of a real robot there is less."""
+"""All that a report shows of a run, read from its files; of a record of a real robot there is
+less."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -29,9 +30,10 @@ from identify.trajectory import TrajectorySet, load_trajectories
 
 @dataclass(frozen=True)
 class RunData:
-    """The result, the record with its truth, the unseen runs with the truth of the first one, what the models do on
-    both, the covariance (p, p) of the parameters with their names (p,), and the trajectories. What is not known of a
-    record of a real robot is None or empty: truth, unseen runs, trajectories."""
+    """The result, the record with its truth, the unseen runs with the truth of the first one, what
+    the models do on both, the covariance (p, p) of the parameters with their names (p,), and the
+    trajectories. What is not known of a record of a real robot is None or empty: truth, unseen
+    runs, trajectories."""
 
     result: dict[str, Any]
     experiment: xr.Dataset
@@ -55,43 +57,60 @@ class RunData:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The same, read. Raises RecordError: the record states none, or one that cannot be read."""
+        """The same, read. Raises RecordError: the record states none, or one that cannot be
+        read."""
         return recorded_scenario(self.experiment)
 
     @cached_property
     def beside_paper(self) -> bool:
-        """Whether this run repeats the paper's experiment, so that its figures may stand beside the paper's."""
+        """Whether this run repeats the paper's experiment, so that its figures may stand beside the
+        paper's.
+        """
         return repeats_the_paper(self.scenario_toml)
 
     @cached_property
     def cameras_acquitted(self) -> bool | None:
-        """Whether the cameras cannot be the cause of what a model leaves; None where no truth is known."""
+        """Whether the cameras cannot be the cause of what a model leaves; None where no truth is
+        known.
+        """
         return cameras_acquitted(self.experiment, self.truth)
 
     @cached_property
     def scene(self) -> Workcell | str:
-        """Robot and cameras as the scenario places them, the robot alone where the record is of a real one; why there
-        is nothing to draw where a file is gone."""
+        """Robot and cameras as the scenario places them, the robot alone where the record is of a
+        real one; why there is nothing to draw where a file is gone."""
         try:
             robot = load_robot(self.scenario.robot)
-            return workcell(robot) if self.truth is None else workcell_of_scenario(self.scenario, robot)
+            return (
+                workcell(robot)
+                if self.truth is None
+                else workcell_of_scenario(self.scenario, robot)
+            )
         except (CmmError, DynamicsError, IdentifyError) as error:
             return str(error)
 
     @cached_property
     def stereo_view(self) -> StereoView | None:
-        """What both cameras of a simulated run see at its middle, drawn anew from scenario, seed and true pose."""
+        """What both cameras of a simulated run see at its middle, drawn anew from scenario, seed
+        and true pose.
+        """
         if self.truth is None or isinstance(self.scene, str):
             return None
         try:
-            return stereo_view(self.scene, self.middle, seed=int(self.experiment.attrs.get("seed", 0)))
+            return stereo_view(
+                self.scene, self.middle, seed=int(self.experiment.attrs.get("seed", 0))
+            )
         except (CmmError, DynamicsError):
             return None
 
     @property
     def middle(self) -> Array:
-        """Pose (6,) of the platform half way through the record, m and rad: the true one where it is known."""
-        measured = poses(self.experiment, "reference") if self.truth is None else true_poses(self.truth)
+        """Pose (6,) of the platform half way through the record, m and rad: the true one where it
+        is known.
+        """
+        measured = (
+            poses(self.experiment, "reference") if self.truth is None else true_poses(self.truth)
+        )
         return measured[len(measured) // 2]
 
     @cached_property
@@ -104,10 +123,12 @@ class RunData:
 
     @cached_property
     def validation_fit(self) -> Fit | None:
-        """Measurement, models and truth on the first unseen trajectory; None where there is none."""
+        """Measurement, models and truth on the first unseen trajectory; None where there is
+        none."""
         if not self.validation or self.validation_truth is None:
             return None
-        fit, model = _fit(self.validation[0], self.models[run_name(1)]), self.models[run_name(1)]
+        fit = _fit(self.validation[0], self.models[run_name(1)])
+        model = self.models[run_name(1)]
         std = poses(model, "std") if "std_position" in model else None
         return replace(fit, truth=true_poses(self.validation_truth), std=std)
 
@@ -115,8 +136,12 @@ class RunData:
     def correlations(self) -> tuple[Array, list[str]]:
         """Correlations (n, n) of the identified parameters, and their names."""
         parameters = self.result["identification"]["parameters"]
-        chosen = [k for k, name in enumerate(self.names) if parameters.get(name, {}).get("identifiable")]
-        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [self.names[k] for k in chosen]
+        chosen = [
+            k for k, name in enumerate(self.names) if parameters.get(name, {}).get("identifiable")
+        ]
+        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [
+            self.names[k] for k in chosen
+        ]
 
 
 def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
@@ -132,11 +157,12 @@ def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
 def read_run(run: RunFolder) -> RunData:
     """Read what the stages of a run wrote. A record without truth needs no validation.
 
-    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file is damaged, or the files are
-    not of one run.
+    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file is
+    damaged, or the files are not of one run.
     """
     run.require("result.json", "covariance.nc", "experiment.nc")
-    files, simulated = RunFiles(run), TRUTH_GROUP in group_names(run.experiment)
+    files = RunFiles(run)
+    simulated = TRUTH_GROUP in group_names(run.experiment)
     run.require(*(["validation.nc"] if simulated else []), "model.nc")
     result = _checked_result(run, files, simulated)
     data = RunData(
@@ -154,7 +180,9 @@ def read_run(run: RunFolder) -> RunData:
     records |= {run_name(number): record for number, record in enumerate(data.validation, start=1)}
     for name, record in records.items():
         if name not in data.models or data.models[name].sizes["time"] != record.sizes["time"]:
-            raise RecordError(f"{run.model} does not belong to the records of {run.path}: run {name} differs")
+            raise RecordError(
+                f"{run.model} does not belong to the records of {run.path}: run {name} differs"
+            )
     return data
 
 
@@ -167,5 +195,7 @@ def _checked_result(run: RunFolder, files: RunFiles, simulated: bool) -> dict[st
     try:
         check_intervals(result["identification"])
     except RecordError as error:
-        raise RecordError(f"{run.result}: {error}; run `cmmsim identify --out {run.path}` again") from None
+        raise RecordError(
+            f"{run.result}: {error}; run `cmmsim identify --out {run.path}` again"
+        ) from None
     return result

@@ -6,7 +6,9 @@ import numpy as np
 import xarray as xr
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop.problem import checked_loop_parameters
+from dynamics.closed_loop.start_state import (
+    checked_loop_parameters,
+)
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.experiment.truth import true_poses
@@ -17,7 +19,8 @@ from identify.validation.unseen import PosePrediction
 
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
-    """Enter the true parameters, and the true values of their groups, into an identification entry."""
+    """Enter the true parameters, and the true values of their groups, into an identification
+    entry."""
     for name, value in truth.items():
         identification["parameters"][name]["true"] = value
     for group in identification.get("groups", {}).values():
@@ -25,7 +28,8 @@ def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
 
 
 def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) -> Array:
-    """A robot's parameters (p,) of one column ("initial", "estimate", ...) of an identification entry.
+    """A robot's parameters (p,) of one column ("initial", "estimate", ...) of an identification
+    entry.
 
     Raises RecordError: one that is missing or no number, or that no model can have.
     """
@@ -44,12 +48,18 @@ def check_intervals(identification: dict[str, Any]) -> None:
     for name, entry in parameter_entries(identification).items():
         estimate, (low, high) = entry["estimate"], entry.get("interval") or (-np.inf, np.inf)
         if estimate is not None and not low <= estimate <= high:
-            raise RecordError(f"the estimate {estimate:g} of {name} is outside its interval {low:g} to {high:g}")
+            raise RecordError(
+                f"the estimate {estimate:g} of {name} is outside its interval {low:g} to {high:g}"
+            )
 
 
 def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
-    """The sensor against the truth over all (record, truth) pairs; speed of rendering and measuring in one process."""
-    errors = np.vstack([recording.poses(record, "measured") - true_poses(truth) for record, truth in runs])
+    """The sensor against the truth over all (record, truth) pairs; speed of rendering and measuring
+    in one process.
+    """
+    errors = np.vstack(
+        [recording.poses(record, "measured") - true_poses(truth) for record, truth in runs]
+    )
     ok = np.concatenate([record["measured_ok"].values.astype(bool) for record, _ in runs])
     seconds = sum(float(record.attrs["sensor_seconds"]) for record, _ in runs)
     return {
@@ -60,10 +70,13 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
     }
 
 
-def validation_entry(record: xr.Dataset, truth: xr.Dataset, initial: Array, identified: Array) -> dict[str, Any]:
+def validation_entry(
+    record: xr.Dataset, truth: xr.Dataset, initial: Array, identified: Array
+) -> dict[str, Any]:
     """One unseen run: both models (N, 6) against the measured and against the true plant pose."""
     ok = record["measured_ok"].values.astype(bool)
-    measured, true = recording.poses(record, "measured"), true_poses(truth)
+    measured = recording.poses(record, "measured")
+    true = true_poses(truth)
     return {
         "measured": rms_figures(identified - measured, ok),
         "true": rms_figures(identified - true),
@@ -73,9 +86,10 @@ def validation_entry(record: xr.Dataset, truth: xr.Dataset, initial: Array, iden
 
 
 def prediction_entry(prediction: PosePrediction, truth: xr.Dataset) -> dict[str, Any]:
-    """How far the plant was expected from the predicted poses, RMS over the run, how far it was, and that squared in
-    units of what was expected."""
-    std, true = 1e6 * np.sqrt(np.mean(prediction.std**2, axis=0)), true_poses(truth)
+    """How far the plant was expected from the predicted poses, RMS over the run, how far it was,
+    and that squared in units of what was expected."""
+    std = 1e6 * np.sqrt(np.mean(prediction.std**2, axis=0))
+    true = true_poses(truth)
     return {
         "predicted": {
             "position_std_um": std[:3].tolist(),

@@ -1,4 +1,6 @@
-"""Variation of the estimates beside the paper's table 5: a table, a figure, and the entry of `variation.json`."""
+"""Variation of the estimates beside the paper's table 5: a table, a figure, and the entry of
+`variation.json`.
+"""
 
 from typing import Any
 
@@ -24,12 +26,18 @@ PAPER_PERCENT = {
     "link4.mass": 19.1,
     "link5.mass": 10.1,
     "link6.mass": 12.9,
-    **{f"joint{leg}.coulomb": value for leg, value in enumerate((15.9, 21.4, 9.0, 17.8, 15.1, 23.4), start=1)},
-    **{f"joint{leg}.viscous": value for leg, value in enumerate((11.7, 13.9, 16.4, 15.2, 21.8, 13.0), start=1)},
+    **{
+        f"joint{leg}.coulomb": value
+        for leg, value in enumerate((15.9, 21.4, 9.0, 17.8, 15.1, 23.4), start=1)
+    },
+    **{
+        f"joint{leg}.viscous": value
+        for leg, value in enumerate((11.7, 13.9, 16.4, 15.2, 21.8, 13.0), start=1)
+    },
     **dict(zip(("joint_pid.lp", "joint_pid.li", "joint_pid.ld"), (2.82, 0.44, 3.7), strict=True)),
 }
-"""Table 5 of the paper's robot, as far as its rows can be told apart (in our copy a cell is missing in its left column)
-and as far as these parameters can be identified at all."""
+"""Table 5 of the paper's robot, as far as its rows can be told apart (in our copy a cell is missing
+in its left column) and as far as these parameters can be identified at all."""
 
 
 def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
@@ -56,7 +64,9 @@ def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
 
 
 def variation_table(found: Variation) -> Table:
-    """The parameters that every run identifies: mean, variation, what the intervals let expect, and the paper's."""
+    """The parameters that every run identifies: mean, variation, what the intervals let expect, and
+    the paper's.
+    """
     rows = tuple(
         (
             found.names[k],
@@ -72,21 +82,33 @@ def variation_table(found: Variation) -> Table:
         f"Variation of {found.runs} identifications (like the paper's table 5)",
         ("parameter", "unit", "mean", "variation [%]", "expected [%]", "paper [%]"),
         rows,
-        "Variation: standard deviation over mean. Expected: from the standard deviations that the runs state. "
+        "Variation: standard deviation over mean. Expected: from the standard deviations that the "
+        "runs state. "
         "Parameters that are identified in every run; the platform is weighed once for all.",
     )
 
 
 def variation_figure(found: Variation) -> Figure:
-    """Variation of each identified parameter, with what was expected, the paper's, and both limits."""
+    """Variation of each identified parameter, with what was expected, the paper's, and both
+    limits."""
     shown = np.flatnonzero(found.identified)
     figure = Figure(figsize=(9, 2.0 + 0.28 * len(shown)), layout="constrained")
-    axes, places = figure.subplots(), np.arange(len(shown))
+    axes = figure.subplots()
+    places = np.arange(len(shown))
     axes.barh(places, 100 * found.variation[shown], color="tab:blue", label="variation")
-    axes.plot(100 * found.expected[shown], places, "kd", markersize=5, markerfacecolor="none", label="expected")
+    axes.plot(
+        100 * found.expected[shown],
+        places,
+        "kd",
+        markersize=5,
+        markerfacecolor="none",
+        label="expected",
+    )
     paper = [PAPER_PERCENT.get(found.names[k], np.nan) for k in shown]
     axes.plot(paper, places, "x", color="tab:red", label="paper, its robot")
-    axes.axvline(GOAL_PERCENT, color="black", linestyle="--", linewidth=1, label=f"goal {GOAL_PERCENT:g} %")
+    axes.axvline(
+        GOAL_PERCENT, color="black", linestyle="--", linewidth=1, label=f"goal {GOAL_PERCENT:g} %"
+    )
     axes.set_yticks(places, [found.names[k] for k in shown], fontsize="small")
     axes.invert_yaxis()
     axes.set_xscale("log")

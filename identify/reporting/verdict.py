@@ -1,7 +1,9 @@
-"""The verdict of a run in whole sentences: what is right, what is not, who may be the cause, and what nobody can tell.
+"""The verdict of a run in whole sentences: what is right, what is not, who may be the cause, and
+what nobody can tell.
 
-A model is called wrong only where the cameras cannot be the cause: where the truth is known, and what they measured
-misses it by no more than the noise that they state, without dependence from frame to frame.
+A model is called wrong only where the cameras cannot be the cause: where the truth is known, and
+what they measured misses it by no more than the noise that they state, without dependence from
+frame to frame.
 """
 
 from dataclasses import dataclass
@@ -18,10 +20,12 @@ from identify.files.run_folder import rms_row
 from identify.record.recording import poses
 from identify.reporting import goals
 from identify.reporting.goals import check_goals, explanation_goals
-from identify.reporting.numbers import number, share
+from identify.reporting.number_format import number, share
 
 CAMERAS_MISS = 1.5
-"""Mean squared error of measured poses, in units of what the cameras state, beyond which they may be the cause."""
+"""Mean squared error of measured poses, in units of what the cameras state, beyond which they may
+be the cause.
+"""
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,9 @@ class KeyNumber:
 
 @dataclass(frozen=True)
 class Verdict:
-    """good: whether nothing speaks against the result; headline: in one sentence; sentences: the reasons."""
+    """good: whether nothing speaks against the result; headline: in one sentence; sentences: the
+    reasons.
+    """
 
     good: bool
     headline: str
@@ -43,8 +49,8 @@ class Verdict:
 
 
 def cameras_acquitted(record: xr.Dataset, truth: xr.Dataset | None) -> bool | None:
-    """Whether what the cameras measured misses the truth only by the noise that they state; None: no truth is known, or
-    the record is too short to judge."""
+    """Whether what the cameras measured misses the truth only by the noise that they state; None:
+    no truth is known, or the record is too short to judge."""
     if truth is None:
         return None
     ok = record["measured_ok"].values.astype(bool)
@@ -60,14 +66,21 @@ def cameras_acquitted(record: xr.Dataset, truth: xr.Dataset | None) -> bool | No
 
 
 def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
-    """What a result says; acquitted: whether the cameras cannot be the cause of what the model leaves (see above)."""
-    every, unseen = check_goals(result), bool(result.get("validation"))
+    """What a result says; acquitted: whether the cameras cannot be the cause of what the model
+    leaves (see above).
+    """
+    every = check_goals(result)
+    unseen = bool(result.get("validation"))
     missed = [goal for goal in every if not goal.passed]
     explained = all(goal.passed for goal in explanation_goals(result))
     sentences = [_residual_sentence(result, explained, acquitted)]
     if unseen:
         sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
-    sentences += [f"Not met: {sentence(goal)}" for goal in missed if goal.name not in (goals.RESIDUALS, goals.CHANCE)]
+    sentences += [
+        f"Not met: {sentence(goal)}"
+        for goal in missed
+        if goal.name not in (goals.RESIDUALS, goals.CHANCE)
+    ]
     if not unseen:
         headline = EXPLAINED if explained else _blame(None, result)
         return Verdict(explained, headline, (*sentences, NO_TRUTH))
@@ -80,15 +93,18 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
 
 
 NO_TRUTH = (
-    "No truth is known of this record. So nobody can tell here how far the measured poses, the estimates and the "
-    "model's predictions are from the real robot: an error that the cameras repeat in every frame, and an error of "
+    "No truth is known of this record. So nobody can tell here how far the measured poses, the "
+    "estimates and the "
+    "model's predictions are from the real robot: an error that the cameras repeat in every "
+    "frame, and an error of "
     "the model that the parameters take up, leave no trace in the residuals."
 )
 
 
 def sentence(goal: goals.Goal) -> str:
     """A goal with its value and limit."""
-    limit = f"{'at most' if goal.relation == '<=' else 'at least'} {number(goal.limit)} {goal.unit}".strip()
+    relation = "at most" if goal.relation == "<=" else "at least"
+    limit = f"{relation} {number(goal.limit)} {goal.unit}".strip()
     value = f"{number(goal.value)} {goal.unit}".strip()
     return f"{goal.name} {value} where {limit} is wanted ({goal.detail})."
 
@@ -96,9 +112,14 @@ def sentence(goal: goals.Goal) -> str:
 def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
     """Three numbers of the first look."""
     identification = result["identification"]
-    parameters, validation = identification["parameters"], result.get("validation")
+    parameters = identification["parameters"]
+    validation = result.get("validation")
     known = sum(bool(p["identifiable"]) for p in parameters.values())
-    meaning = "parameters are identified, each with an interval." if known else "parameters are identified."
+    meaning = (
+        "parameters are identified, each with an interval."
+        if known
+        else "parameters are identified."
+    )
     shown = KeyNumber(f"{known}", f"of {len(parameters)}", meaning)
     if validation:
         rows = np.array([rms_row(run["true"])[:3] for run in validation])
@@ -108,13 +129,19 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
             "from the true robot: the identified model, on motion that it never saw.",
         )
         measured = max(rms_row(result["sensor"])[:3])
-        seen = KeyNumber(number(measured, 2), "µm", "from the true pose: one pose as the cameras measure it.")
+        seen = KeyNumber(
+            number(measured, 2), "µm", "from the true pose: one pose as the cameras measure it."
+        )
         return [worst, seen, shown]
     before, after = (max(rms_row(result.get(key))[:3]) for key in ("before", "after"))
-    left = KeyNumber(number(after, 2), "µm", "between the identified model and the measured poses of the record.")
+    left = KeyNumber(
+        number(after, 2), "µm", "between the identified model and the measured poses of the record."
+    )
     began = KeyNumber(
         *((number(before, 2), "µm") if np.isfinite(before) else ("–", "")),
-        "between the starting model and the same poses." if np.isfinite(before) else "The starting model is unstable.",
+        "between the starting model and the same poses."
+        if np.isfinite(before)
+        else "The starting model is unstable.",
     )
     return [left, began, shown]
 
@@ -122,11 +149,15 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
 def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
     """How far both models are from the true robot on unseen trajectories."""
     runs = result["validation"]
-    identified, started = (np.array([rms_row(run.get(key)) for run in runs]) for key in ("true", "initial_true"))
+    identified, started = (
+        np.array([rms_row(run.get(key)) for run in runs]) for key in ("true", "initial_true")
+    )
     turns = bool((identified[:, 3:] != 0).any())
     text = f"On {len(runs)} trajectories that it never saw, the identified model "
     if np.isfinite(identified).all():
-        text += f"stays within {_distance(identified, turns)} of the true robot (RMS of the worst axis)"
+        text += (
+            f"stays within {_distance(identified, turns)} of the true robot (RMS of the worst axis)"
+        )
     else:
         text += "is unstable"
     if not all("initial_true" in run for run in runs):
@@ -138,26 +169,36 @@ def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
 
 def _distance(rows: Array, turns: bool) -> str:
     """The worst of errors (n, 6) [µm, µrad], of the orientation where the robot turns."""
-    position, orientation = float(rows[:, :3].max()), float(rows[:, 3:].max())
+    position = float(rows[:, :3].max())
+    orientation = float(rows[:, 3:].max())
     return f"{number(position, 2)} µm" + (f" and {number(orientation, 2)} µrad" if turns else "")
 
 
 def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool | None) -> str:
-    """Whether noise is all that the model leaves of the record, and who may be the cause where it is not."""
+    """Whether noise is all that the model leaves of the record, and who may be the cause where it
+    is not.
+    """
     found = {goal.name: goal for goal in explanation_goals(result)}
     if not found:
         return "How well the model explains the record was not tested."
     parts = []
     if goals.RESIDUALS in found:
-        size, limit = number(found[goals.RESIDUALS].value, 3), number(found[goals.RESIDUALS].limit, 3)
-        parts.append(f"its mean square is {size} times what they state, where noise alone makes up to {limit}")
+        size = number(found[goals.RESIDUALS].value, 3)
+        limit = number(found[goals.RESIDUALS].limit, 3)
+        parts.append(
+            f"its mean square is {size} times what they state, where noise alone makes up to "
+            f"{limit}"
+        )
     if goals.CHANCE in found:
         chance = share(found[goals.CHANCE].value / 100)
         parts.append(f"noise alone would look as regular in {chance} of cases")
     said = "; ".join(parts)
     if explained:
         return f"What it leaves of the record is the cameras' noise: {said}."
-    return f"What it leaves of the record is more than the cameras' noise: {said}. {_cause(acquitted, result)}"
+    return (
+        f"What it leaves of the record is more than the cameras' noise: {said}. "
+        f"{_cause(acquitted, result)}"
+    )
 
 
 def _drift_warning(result: dict[str, Any]) -> str | None:
@@ -167,17 +208,25 @@ def _drift_warning(result: dict[str, Any]) -> str | None:
 
 def _cause(acquitted: bool | None, result: dict[str, Any]) -> str:
     if warning := _drift_warning(result):
-        return f"{warning[0].upper()}{warning[1:]}. Calibrate them again; whether the model is right cannot be told."
+        return (
+            f"{warning[0].upper()}{warning[1:]}. Calibrate them again; whether the model is "
+            "right cannot be told."
+        )
     if acquitted:
         return (
-            "The cameras are not the cause, for they miss the truth only by the noise that they state: the model's "
+            "The cameras are not the cause, for they miss the truth only by the noise that they "
+            "state: the model's "
             "geometry, joints or friction are not those of the robot."
         )
     if acquitted is None:
         return (
-            "The cause may be the model, or cameras with errors that they do not state; the record alone cannot tell."
+            "The cause may be the model, or cameras with errors that they do not state; the "
+            "record alone cannot tell."
         )
-    return "The cameras miss the truth by more than they state, or not by chance: they may be the cause, or the model."
+    return (
+        "The cameras miss the truth by more than they state, or not by chance: they may be the "
+        "cause, or the model."
+    )
 
 
 EXPLAINED = "The identified model explains the record to within the cameras' noise."

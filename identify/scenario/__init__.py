@@ -1,4 +1,5 @@
-"""Scenarios: everything that decides a synthetic experiment, read from TOML and checked as a whole."""
+"""Scenarios: everything that decides a synthetic experiment, read from TOML and checked as a
+whole."""
 
 from identify.scenario.plant_sections import Model, Plant
 from identify.scenario.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names

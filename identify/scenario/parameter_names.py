@@ -8,11 +8,13 @@ if TYPE_CHECKING:
 
 
 def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
-    """Raise ValueError for a name that is no parameter's of a robot, given by name or path, with the valid ones; also
-    where there is no such robot."""
+    """Raise ValueError for a name that is no parameter's of a robot, given by name or path, with
+    the valid ones; also where there is no such robot."""
     if not known:
         return
-    from dynamics.errors import RobotFileError  # dynamics loads CasADi, for which the command line must not wait
+    from dynamics.errors import (
+        RobotFileError,
+    )  # dynamics loads CasADi, for which the command line must not wait
     from dynamics.parameters import parameter_layout
     from dynamics.robot_file import read_robot_file
 
@@ -23,8 +25,14 @@ def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
     for name in known:
         if name not in layout.names:
             unquoted = any(full.startswith(f"{name}.") for full in layout.names)
-            hint = f'; its dot needs quotes: {{"{name}.…" = {{value = …, std = …}}}}' if unquoted else ""
-            raise ValueError(f"identification.prior: no parameter {name!r}; valid: {in_words(layout)}{hint}")
+            hint = (
+                f'; its dot needs quotes: {{"{name}.…" = {{value = …, std = …}}}}'
+                if unquoted
+                else ""
+            )
+            raise ValueError(
+                f"identification.prior: no parameter {name!r}; valid: {in_words(layout)}{hint}"
+            )
 
 
 def in_words(layout: "ParameterLayout") -> str:
@@ -35,7 +43,8 @@ def in_words(layout: "ParameterLayout") -> str:
     bodies = " or ".join(_range(names) for names in kinds.values())
     gains = ", ".join(f".{name.split('.')[1]}" for name in layout.joint_pid_names[1:])
     return (
-        f"mass, Ixx, Iyy or Izz of {bodies} (platform.mass), coulomb or viscous of {_range(layout.joint_names)}, and "
+        f"mass, Ixx, Iyy or Izz of {bodies} (platform.mass), coulomb or viscous of "
+        f"{_range(layout.joint_names)}, and "
         f"{layout.joint_pid_names[0]}, {gains}"
     )
 

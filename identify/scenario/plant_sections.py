@@ -1,15 +1,18 @@
-"""The sections of a scenario about the robot in its loop: servo, law of control, true plant and model of it."""
+"""The sections of a scenario about the robot in its loop: servo, law of control, true plant and
+model of it.
+"""
 
 from typing import Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
+from dynamics.quantities import Gain, within
 from identify.plugins import LAWS, check_choice
 from identify.scenario.section import Section, quantity
 
 FrictionName = Literal["coulomb_viscous", "smoothed", "stribeck"]
-"""``coulomb_viscous``: the exact law with stick and slip (eq. 24); ``smoothed``: tanh(theta_dot / v_s);
-``stribeck``: exact, with a breakaway torque above the Coulomb torque."""
+"""``coulomb_viscous``: the exact law with stick and slip (eq. 24); ``smoothed``: tanh(theta_dot /
+v_s); ``stribeck``: exact, with a breakaway torque above the Coulomb torque."""
 
 FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
     "coulomb_viscous": (),
@@ -19,8 +22,8 @@ FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
 """The constants each law needs, one key of each; it takes no others."""
 
 DriveName = Literal["pid", "pd", "pi", "cascade", "pid_filtered"]
-"""Laws by which drives make torques of joint commands: the paper's PID, parts of it, P-PI, or with a filtered rate; see
-`closed_loop.drives`."""
+"""Laws by which drives make torques of joint commands: the paper's PID, parts of it, P-PI, or with
+a filtered rate; see `closed_loop.drives`."""
 
 FILTERED: DriveName = "pid_filtered"
 
@@ -31,7 +34,8 @@ def check_filter(drive: str, seconds: float | None) -> None:
     """Raise ValueError for a drive without its filter, or a filter that belongs to another."""
     if (drive == FILTERED) != (seconds is not None):
         raise ValueError(
-            f"drive = {drive!r} with derivative_filter_s = {seconds}: the law {FILTERED} needs it, and no other has it"
+            f"drive = {drive!r} with derivative_filter_s = {seconds}: the law {FILTERED} needs "
+            "it, and no other has it"
         )
 
 
@@ -48,24 +52,32 @@ DRIVE_GAINS: dict[str, tuple[str, ...]] = {
 class Servo(Section):
     """Gains of the outer visual servo (eq. 30)."""
 
-    kp: float = quantity(0.3, "1", "proportional gain", ge=0)
+    kp: float = quantity(0.3, "1", "proportional gain", ge=0, le=1e6)
     kd: float = quantity(0.001, "s", "derivative gain", ge=0)
     ki: float = quantity(2.4, "1/s", "integral gain", ge=0)
 
 
 class Control(Section):
-    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the law pid, but for
-    the excitation, which has a key of its own. The torque limit is that of all runs, and the model knows it."""
+    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the
+    law pid, but for the excitation, which has a key of its own. The torque limit is that of all
+    runs, and the model knows it."""
 
     law: str = Field("pid", description=f"{', '.join(LAWS)}, or module:function")
     observer: bool = Field(
-        True, description="whether a law that knows a model predicts the pose over latency, jitter and lost frames"
+        True,
+        description="whether a law that knows a model predicts the pose over latency, jitter and "
+        "lost frames",
     )
-    torque_access: bool = Field(True, description="whether the drives take torques, or joint commands only")
+    torque_access: bool = Field(
+        True, description="whether the drives take torques, or joint commands only"
+    )
     torque_limit_N_m: float | None = quantity(None, "N m", "largest torque of an actuator", gt=0)
     torque_limit_N: float | None = quantity(None, "N", "the same, where actuators slide", gt=0)
     bandwidth_rad_s: float | None = quantity(
-        None, "rad/s", "of the loop of computed_torque; by default as fast as frame rate and latency allow", gt=0
+        None,
+        "rad/s",
+        "of the loop of computed_torque; by default as fast as frame rate and latency allow",
+        gt=0,
     )
     damping: float = quantity(1.0, "1", "of that loop", gt=0, le=10)
     servo_bandwidth_rad_s: float | None = quantity(
@@ -82,11 +94,21 @@ class Control(Section):
 
 class _Friction(Section):
     friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
-    smoothing_velocity_rad_s: float | None = quantity(None, "rad/s", "v_s of the law smoothed", gt=0)
-    smoothing_velocity_m_s: float | None = quantity(None, "m/s", "the same, where actuators slide", gt=0)
-    static_ratio: float | None = quantity(None, "1", "breakaway over Coulomb torque of the law stribeck", ge=1)
-    stribeck_velocity_rad_s: float | None = quantity(None, "rad/s", "velocity at which the excess fades", gt=0)
-    stribeck_velocity_m_s: float | None = quantity(None, "m/s", "the same, where actuators slide", gt=0)
+    smoothing_velocity_rad_s: float | None = quantity(
+        None, "rad/s", "v_s of the law smoothed", gt=0
+    )
+    smoothing_velocity_m_s: float | None = quantity(
+        None, "m/s", "the same, where actuators slide", gt=0
+    )
+    static_ratio: float | None = quantity(
+        None, "1", "breakaway over Coulomb torque of the law stribeck", ge=1, le=1e3
+    )
+    stribeck_velocity_rad_s: float | None = quantity(
+        None, "rad/s", "velocity at which the excess fades", gt=0
+    )
+    stribeck_velocity_m_s: float | None = quantity(
+        None, "m/s", "the same, where actuators slide", gt=0
+    )
 
     @model_validator(mode="after")
     def _constants_fit_the_law(self) -> "_Friction":
@@ -94,46 +116,81 @@ class _Friction(Section):
             for keys in constants:
                 given = {name: value for name in keys if (value := getattr(self, name)) is not None}
                 if (law == self.friction) != (len(given) == 1):
-                    said = " and ".join(f"{name} = {value}" for name, value in (given or {keys[0]: None}).items())
+                    said = " and ".join(
+                        f"{name} = {value}" for name, value in (given or {keys[0]: None}).items()
+                    )
                     needed = " and ".join(" or ".join(names) for names in constants)
                     raise ValueError(
-                        f"friction = {self.friction!r} with {said}: the law {law} needs {needed}, and no other law "
+                        f"friction = {self.friction!r} with {said}: the law {law} needs {needed}, "
+                        "and no other law "
                         "has them"
                     )
         return self
 
 
 class Plant(_Friction):
-    """The simulated real robot. Each way in which it may differ from any model of the estimator is a switch.
+    """The simulated real robot. Each way in which it may differ from any model of the estimator is
+    a switch.
 
-    At the largest geometry error all of 100 robots reach the whole box of +-10 mm and +-0.04 rad, at twice that one
-    does not. At the largest stiffness a run differs from that of rigid joints by 0.03 um, and takes 1000 steps a frame.
+    At the largest geometry error all of 100 robots reach the whole box of +-10 mm and +-0.04 rad,
+    at twice that one does not. At the largest stiffness a run differs from that of rigid joints by
+    0.03 um, and takes 1000 steps a frame.
     """
 
-    parameters: str = Field("identified", description="named parameter set of the robot file, the truth")
-    drive: DriveName = Field("pid", description="law of the drives: the paper's PID, PD, PI, P-PI, or a filtered PID")
-    derivative_filter_s: float | None = quantity(None, "s", "time constant of the drive pid_filtered", gt=0, le=1)
-    drive_gains: dict[str, float] = Field(
-        {}, description="of the drives, instead of the set's: { lp = 10.5, li = 30.0, ld = 0.3 }, in the units of these"
+    parameters: str = Field(
+        "identified", description="named parameter set of the robot file, the truth"
     )
-    steps_per_frame: int = quantity(16, "1", "integration steps a frame; elastic joints take more", ge=1, le=10_000)
+    drive: DriveName = Field(
+        "pid", description="law of the drives: the paper's PID, PD, PI, P-PI, or a filtered PID"
+    )
+    derivative_filter_s: float | None = quantity(
+        None, "s", "time constant of the drive pid_filtered", gt=0, le=1
+    )
+    drive_gains: dict[str, float] = Field(
+        {},
+        description="of the drives, instead of the set's: { lp = 10.5, li = 30.0, ld = 0.3 }, in "
+        "the units of these",
+    )
+    steps_per_frame: int = quantity(
+        16, "1", "integration steps a frame; elastic joints take more", ge=1, le=10_000
+    )
     geometry_error_m: float = quantity(
-        0.0, "m", "standard deviation of each coordinate of the joint centres from the robot file's", ge=0, le=1e-3
+        0.0,
+        "m",
+        "standard deviation of each coordinate of the joint centres from the robot file's",
+        ge=0,
+        le=1e-3,
     )
     length_error_m: float = quantity(
-        0.0, "m", "standard deviation of each length of the legs, as of cranks, from the robot file's", ge=0, le=1e-3
+        0.0,
+        "m",
+        "standard deviation of each length of the legs, as of cranks, from the robot file's",
+        ge=0,
+        le=1e-3,
     )
     axis_error_rad: float = quantity(
-        0.0, "rad", "standard deviation of each turn of an axis of the legs, of which there are two", ge=0, le=1e-2
+        0.0,
+        "rad",
+        "standard deviation of each turn of an axis of the legs, of which there are two",
+        ge=0,
+        le=1e-2,
     )
     geometry_seed: int = quantity(0, "1", "which of the robots with such errors", ge=0)
     joint_stiffness_N_m_rad: float | None = quantity(
-        None, "N m/rad", "of a spring between motor and driven body, makes the joints elastic", gt=0, le=1e6
+        None,
+        "N m/rad",
+        "of a spring between motor and driven body, makes the joints elastic",
+        gt=0,
+        le=1e6,
     )
-    joint_stiffness_N_m: float | None = quantity(None, "N/m", "the same, where actuators slide", gt=0, le=1e9)
+    joint_stiffness_N_m: float | None = quantity(
+        None, "N/m", "the same, where actuators slide", gt=0, le=1e9
+    )
     joint_damping_N_m_s_rad: float = quantity(0.05, "N m s/rad", "damping of that spring", ge=0)
     joint_damping_N_s_m: float = quantity(50.0, "N s/m", "the same, where actuators slide", ge=0)
-    motor_inertia_kg_m2: float = quantity(3e-4, "kg m2", "share of a driven body's inertia before that spring", gt=0)
+    motor_inertia_kg_m2: float = quantity(
+        3e-4, "kg m2", "share of a driven body's inertia before that spring", gt=0
+    )
     motor_mass_kg: float = quantity(0.3, "kg", "share of its mass, where actuators slide", gt=0)
 
     @property
@@ -148,20 +205,31 @@ class Plant(_Friction):
         for name, value in self.drive_gains.items():
             if name not in reads or not value > 0:
                 raise ValueError(
-                    f"drive_gains.{name} = {value:g}: the law {self.drive} has the gains {', '.join(reads)}, all > 0"
+                    f"drive_gains.{name} = {value:g}: the law {self.drive} has the gains "
+                    f"{', '.join(reads)}, all > 0"
                 )
+            try:
+                within(Gain).check(value)
+            except ValueError as error:
+                raise ValueError(f"drive_gains.{name}: {error}") from None
         return self
 
 
 class Model(_Friction):
     """The estimator's model of the robot."""
 
-    start_parameters: str = Field("initial", description="named parameter set of the robot file, the starting guess")
+    start_parameters: str = Field(
+        "initial", description="named parameter set of the robot file, the starting guess"
+    )
     drive: Literal["pid", "pd", "pi", "cascade", "pid_filtered", "auto"] = Field(
         "pid", description="law of the drives; auto: that for which the record speaks"
     )
     derivative_filter_s: float | None = quantity(
-        None, "s", "time constant of the drive pid_filtered, which auto considers where it is stated", gt=0, le=1
+        None,
+        "s",
+        "time constant of the drive pid_filtered, which auto considers where it is stated",
+        gt=0,
+        le=1,
     )
     steps_per_frame: int = quantity(4, "1", "integration steps a frame", ge=1, le=10_000)
 
@@ -173,7 +241,9 @@ class Model(_Friction):
     @property
     def drives_considered(self) -> tuple[DriveName, ...]:
         """Laws of the drives that `auto` chooses between."""
-        return tuple(law for law in get_args(DriveName) if law != FILTERED or self.derivative_filter_s)
+        return tuple(
+            law for law in get_args(DriveName) if law != FILTERED or self.derivative_filter_s
+        )
 
     @model_validator(mode="after")
     def _filter_fits_the_law(self) -> "Model":

@@ -1,6 +1,8 @@
-"""A scenario: everything that decides a synthetic experiment, read from TOML and checked as a whole.
+"""A scenario: everything that decides a synthetic experiment, read from TOML and checked as a
+whole.
 
-Each field states its unit; an error names the key, the value, the unit and, for a wrong name, the valid names.
+Each field states its unit; an error names the key, the value, the unit and, for a wrong name, the
+valid names.
 """
 
 from collections.abc import Iterator, Mapping
@@ -9,6 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
+from dynamics.files import Name
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
 from identify.scenario.parameter_names import check_parameter_names
@@ -32,15 +35,22 @@ from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, 
 class Scenario(Section):
     """A whole synthetic experiment; load one with `load_scenario`."""
 
-    name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
+    name: Name = Field(description="short name, used for folders")
     description: str = ""
-    robot: str = Field("rss6", description="built-in robot, or path of a robot file from this file on")
-    sensor: str = Field("ctrack780", description="built-in sensor, or path of a sensor file from this file on")
+    robot: str = Field(
+        "rss6", description="built-in robot, or path of a robot file from this file on"
+    )
+    sensor: str = Field(
+        "ctrack780", description="built-in sensor, or path of a sensor file from this file on"
+    )
     sensor_note: str = Field("", description="what the sensor's file says about its own figures")
-    sensor_changes: dict[str, Any] = Field({}, description="entries that hold instead of the sensor file's")
+    sensor_changes: dict[str, Any] = Field(
+        {}, description="entries that hold instead of the sensor file's"
+    )
     renderer: str = Field(
         "auto",
-        description="what draws the images: pyrender, analytic, auto: pyrender where OpenGL works, or module:name; "
+        description="what draws the images: pyrender, analytic, auto: pyrender where OpenGL "
+        "works, or module:name; "
         "statistical: nothing, it says what would be found in them",
     )
     pose_method: Literal["registration", "planes"] = "registration"
@@ -53,14 +63,17 @@ class Scenario(Section):
     excitation: Excitation = Excitation()
     filter: Filter = Filter()
     identification: Identification = Identification()
-    payload: Payload = Field(default_factory=Payload)  # made late: its check is one of dynamics, which loads CasADi
+    # made late: its check is one of dynamics, which loads CasADi
+    payload: Payload = Field(default_factory=Payload)
     validation: Validation = Validation()
     geometry: Geometry = Geometry()
 
     @field_validator("renderer")
     @classmethod
     def _known_renderer(cls, name: str) -> str:
-        from cmmsim.plugins import require_renderer  # the command line's help must not wait for the sensor
+        from cmmsim.plugins import (
+            require_renderer,
+        )  # the command line's help must not wait for the sensor
 
         return require_renderer(name)
 
@@ -73,8 +86,13 @@ class Scenario(Section):
     @classmethod
     def _names_parameters_of_its_robot(cls, values: Any) -> Any:
         if isinstance(values, Mapping):
-            section, robot = values.get("identification"), values.get("robot", cls.model_fields["robot"].default)
-            known = section.get("prior") if isinstance(section, Mapping) else getattr(section, "prior", None)
+            section = values.get("identification")
+            robot = values.get("robot", cls.model_fields["robot"].default)
+            known = (
+                section.get("prior")
+                if isinstance(section, Mapping)
+                else getattr(section, "prior", None)
+            )
             if isinstance(known, Mapping) and isinstance(robot, str):
                 check_parameter_names(known, robot)
         return values
@@ -91,7 +109,10 @@ class Scenario(Section):
 
     def _complete_from_the_sensor(self) -> None:
         """Fill in the timing and the note that the scenario leaves to its sensor."""
-        whole = self.timing.model_fields_set.issuperset(IN_FILE) and "sensor_note" in self.model_fields_set
+        whole = (
+            self.timing.model_fields_set.issuperset(IN_FILE)
+            and "sensor_note" in self.model_fields_set
+        )
         if whole and not self.sensor_changes:
             return
         timing, note = completed(self.timing, self.sensor, self.sensor_changes)
@@ -100,16 +121,19 @@ class Scenario(Section):
             self.__dict__["sensor_note"] = note
 
     def _check_filter(self) -> None:
-        nyquist, cutoff = self.timing.frame_rate_hz / 2, self.filter.cutoff_hz
+        nyquist = self.timing.frame_rate_hz / 2
+        cutoff = self.filter.cutoff_hz
         highest = self.excitation.fundamental_hz * self.excitation.harmonics
         if nyquist <= highest:
             raise ValueError(
-                f"timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz is not above twice the highest harmonic of "
+                f"timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz is not above twice the "
+                "highest harmonic of "
                 f"the excitation, {highest:g} Hz"
             )
         if cutoff >= nyquist:
             raise ValueError(
-                f"filter.cutoff_hz = {cutoff:g} Hz is not below the Nyquist frequency {nyquist:g} Hz "
+                f"filter.cutoff_hz = {cutoff:g} Hz is not below the Nyquist frequency {nyquist:g} "
+                "Hz "
                 f"of timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz"
             )
         if cutoff <= highest:
@@ -119,10 +143,13 @@ class Scenario(Section):
             )
 
     def _check_excitation_fits_the_filter(self) -> None:
-        padding = padding_samples(self.timing.frame_rate_hz, self.filter.cutoff_hz, self.filter.order)
+        padding = padding_samples(
+            self.timing.frame_rate_hz, self.filter.cutoff_hz, self.filter.order
+        )
         if self.timing.frames(self.excitation.duration_s) <= padding:
             raise ValueError(
-                f"excitation.duration_s = {self.excitation.duration_s:g} s is too short for the filter, which needs "
+                f"excitation.duration_s = {self.excitation.duration_s:g} s is too short for the "
+                "filter, which needs "
                 f"more than {padding} frames ({padding / self.timing.frame_rate_hz:.3g} s)"
             )
 
@@ -130,17 +157,20 @@ class Scenario(Section):
         frames = duration_s * self.timing.frame_rate_hz
         if abs(frames - round(frames)) > 1e-6 or round(frames) < 1:
             raise ValueError(
-                f"{key} = {duration_s:g} s is {frames:g} frames at {self.timing.frame_rate_hz:g} Hz, "
+                f"{key} = {duration_s:g} s is {frames:g} frames at {self.timing.frame_rate_hz:g} "
+                "Hz, "
                 "not a whole number of frames"
             )
 
     def with_overrides(self, overrides: Mapping[str, Any]) -> "Scenario":
-        """Copy with values replaced by dotted path, such as ``{"timing.frame_rate_hz": 30.0}``; None takes one back.
+        """Copy with values replaced by dotted path, such as ``{"timing.frame_rate_hz": 30.0}``;
+        None takes one back.
 
-        A path among them starts from the current folder, and the copy holds it absolute, as files leave it. What this
-        scenario took from its sensor is taken again, from the copy's.
+        A path among them starts from the current folder, and the copy holds it absolute, as files
+        leave it. What this scenario took from its sensor is taken again, from the copy's.
 
-        Raises ScenarioError: a path that does not exist (with the valid names) or a value that does not fit.
+        Raises ScenarioError: a path that does not exist (with the valid names) or a value that does
+        not fit.
         """
         data = self.model_dump(exclude_none=True, exclude_unset=True)
         for path, value in overrides.items():
@@ -148,7 +178,9 @@ class Scenario(Section):
         return SCENARIOS.from_dict(data, f"scenario {self.name!r}")
 
     def to_toml(self) -> str:
-        """Fully resolved TOML text, every default written out with its unit; reading it gives an equal scenario."""
+        """Fully resolved TOML text, every default written out with its unit; reading it gives an
+        equal scenario.
+        """
         return to_toml(self)
 
 
@@ -186,7 +218,8 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
 
 
 def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
-    """Scenario from TOML text; ``source`` names it in error messages, and its paths start from the current folder.
+    """Scenario from TOML text; ``source`` names it in error messages, and its paths start from the
+    current folder.
 
     Raises ScenarioError: no TOML, or wrong content.
     """
@@ -199,15 +232,23 @@ def scenario_schema() -> dict[str, Any]:
 
 
 def numbers_by_name() -> Iterator[str]:
-    """The keys of a scenario, dotted, whose values are tables of numbers by names, which may have dots themselves."""
+    """The keys of a scenario, dotted, whose values are tables of numbers by names, which may have
+    dots themselves.
+    """
     for section, field in Scenario.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
             entries = field.annotation.model_fields.items()
-            yield from (f"{section}.{name}" for name, entry in entries if entry.annotation == dict[str, float])
+            yield from (
+                f"{section}.{name}"
+                for name, entry in entries
+                if entry.annotation == dict[str, float]
+            )
 
 
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:
-    table = next((one for one in ("sensor_changes", *numbers_by_name()) if path.startswith(f"{one}.")), "")
+    table = next(
+        (one for one in ("sensor_changes", *numbers_by_name()) if path.startswith(f"{one}.")), ""
+    )
     *sections, key = path.split(".", table.count(".") + 1 if table else -1)
     for section in sections:
         data = data.setdefault(section, {})
@@ -220,24 +261,28 @@ def _replace(data: dict[str, Any], path: str, value: Any) -> None:
 
 
 SECTIONS = ("identification", "model", "filter")
-"""What of a scenario is the estimator's alone: it may change after the record was made, all else may not."""
+"""What of a scenario is the estimator's alone: it may change after the record was made, all else
+may not.
+"""
 
 RECORDED = ("identification.scale_anchor", "identification.anchor_std")
-"""Settings of these sections that a record follows all the same: it holds what its anchor measured."""
+"""Settings of these sections that a record follows all the same: it holds what its anchor measured.
+"""
 
 
 def with_estimator_settings(scenario: Scenario, overrides: Mapping[str, Any]) -> Scenario:
     """Copy of the scenario of a record with other settings of the estimator, by dotted path.
 
-    Raises ScenarioError: a setting that the record was made with (with the sections allowed), or as `with_overrides`
-    does.
+    Raises ScenarioError: a setting that the record was made with (with the sections allowed), or as
+    `with_overrides` does.
     """
     for path in overrides:
         section, _, name = path.partition(".")
         if section not in SECTIONS or not name or path in RECORDED:
             allowed = ", ".join(f"{allowed}.*" for allowed in SECTIONS)
             raise ScenarioError(
-                f"{path!r} cannot be set for an identification: the record was made with the rest of the scenario; "
+                f"{path!r} cannot be set for an identification: the record was made with the rest "
+                "of the scenario; "
                 f"allowed: {allowed}, except {' and '.join(RECORDED)}"
             )
     return scenario.with_overrides(overrides) if overrides else scenario

@@ -1,8 +1,23 @@
-"""What every section of a scenario is: fields with units and limits, and the keys of a robot's actuators."""
+"""What every section of a scenario is: fields with units and limits, and the keys of a robot's
+actuators.
+"""
 
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from dynamics.quantities import (
+    Damping,
+    Duration,
+    Force,
+    Frequency,
+    Gain,
+    Inertia,
+    Margin,
+    Mass,
+    Speed,
+    within,
+)
 
 ACTUATOR_KEYS = {
     "smoothing_velocity": ("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),
@@ -20,9 +35,36 @@ ACTUATOR_KEYS = {
 """Settings of the joints: their key where a robot's actuators turn, and where they slide."""
 
 
+RANGES = {
+    "Hz": within(Frequency),
+    "rad/s": within(Speed),
+    "m/s": within(Speed),
+    "s": within(Duration),
+    "m": within(Margin),
+    "rad": within(Margin),
+    "kg": within(Mass),
+    "kg m2": within(Inertia),
+    "N m": within(Force),
+    "N": within(Force),
+    "N m/rad": within(Gain),
+    "N/m": within(Gain),
+    "N m s/rad": within(Damping),
+    "N s/m": within(Damping),
+    "1/s": within(Gain),
+}
+"""Ranges of quantities by their unit."""
+
+
 def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
-    """A field with a unit; `limits`: as pydantic names them, such as ge and lt."""
-    return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)
+    """A field with a unit, in whose range its values must be.
+
+    limits: further ones, as pydantic names them, such as ge and lt. A field that may be negative
+    has the range that these say.
+    """
+    field = Field(default, description=what, json_schema_extra={"unit": unit}, **limits)
+    if unit in RANGES and not limits.get("ge", 0) < 0:
+        field.metadata.append(RANGES[unit])
+    return field
 
 
 class Section(BaseModel):

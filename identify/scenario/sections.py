@@ -1,10 +1,13 @@
-"""The sections of a scenario. Each field states its unit and its limits; what a section checks concerns it alone."""
+"""The sections of a scenario. Each field states its unit and its limits; what a section checks
+concerns it alone.
+"""
 
 from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from dynamics.quantities import Within
 from identify.plugins import CRITERIA, LAWS, check_choice
 from identify.scenario.section import Section, quantity
 
@@ -31,7 +34,8 @@ def check_load_std(name: str, std: float, load_name: str, load: float, unit: str
     """
     if std > load:
         raise ValueError(
-            f"{name} = {std:g} {unit} exceeds {load_name} = {load:g} {unit}: a load that may be none is not known"
+            f"{name} = {std:g} {unit} exceeds {load_name} = {load:g} {unit}: a load that may be "
+            "none is not known"
         )
 
 
@@ -41,15 +45,26 @@ class Excitation(Section):
     fundamental_hz: float = quantity(0.1, "Hz", "fundamental frequency f0", gt=0)
     harmonics: int = quantity(5, "1", "number of harmonics n", ge=2, le=100)
     duration_s: float = quantity(20.0, "s", "length of the excitation run", gt=0, le=3600)
-    position_amplitude_m: float = quantity(0.010, "m", "largest distance from home in x, y and z", gt=0)
-    orientation_amplitude_rad: float = quantity(0.04, "rad", "largest angle from home in each axis", gt=0, lt=1.5)
-    travel_margin_rad: float = quantity(0.10, "rad", "distance kept from the travel limit of the joints", ge=0)
+    position_amplitude_m: float = quantity(
+        0.010, "m", "largest distance from home in x, y and z", gt=0
+    )
+    orientation_amplitude_rad: float = quantity(
+        0.04, "rad", "largest angle from home in each axis", gt=0, lt=1.5
+    )
+    travel_margin_rad: float = quantity(
+        0.10, "rad", "distance kept from the travel limit of the joints", ge=0
+    )
     travel_margin_m: float = quantity(0.01, "m", "the same, where actuators slide", ge=0)
     candidates: int = quantity(
-        64, "1", "random trajectories: the best is chosen, is where a search begins, or they evolve", ge=1, le=100_000
+        64,
+        "1",
+        "random trajectories: the best is chosen, is where a search begins, or they evolve",
+        ge=1,
+        le=100_000,
     )
     method: Literal["random", "evolutionary", "gradient"] = Field(
-        "random", description="best random trajectory, differential evolution (the paper's kind), or IPOPT"
+        "random",
+        description="best random trajectory, differential evolution (the paper's kind), or IPOPT",
     )
     criterion: str = Field(
         "observability",
@@ -57,14 +72,21 @@ class Excitation(Section):
     )
     max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a joint", gt=0)
     max_joint_velocity_m_s: float = quantity(0.2, "m/s", "the same, where actuators slide", gt=0)
-    least_leverage: float = quantity(0.05, "1", "least leverage of an actuator on its leg (J_a1)", ge=0, lt=1)
-    most_condition: float = quantity(20.0, "1", "largest condition number of J_a2 without unit, of the 2-norm", ge=1)
+    least_leverage: float = quantity(
+        0.05, "1", "least leverage of an actuator on its leg (J_a1)", ge=0, lt=1
+    )
+    most_condition: float = quantity(
+        20.0, "1", "largest condition number of J_a2 without unit, of the 2-norm", ge=1, le=1e9
+    )
     law: str = Field(
         "pid",
-        description=f"law of the run, which knows the starting model: {', '.join(LAWS)}, or module:function; under "
+        description=f"law of the run, which knows the starting model: {', '.join(LAWS)}, or "
+        "module:function; under "
         "another than pid the model gets the logged commands",
     )
-    generations: int = quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)
+    generations: int = quantity(
+        324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000
+    )
 
     @property
     def singularity_limits(self) -> dict[str, float]:
@@ -94,40 +116,64 @@ class Filter(Section):
 class PriorValue(Section):
     """What is known of a parameter before the experiment, in its SI unit."""
 
-    value: float = quantity(..., "SI", "expected value", ge=0)
-    std: float = quantity(..., "SI", "its standard deviation", gt=0)
+    value: float = quantity(..., "SI", "expected value", ge=0, le=1e12)
+    std: float = quantity(..., "SI", "its standard deviation", ge=1e-24, le=1e12)
 
+
+CAMERA_CHANGE = Within(-1e3, 1e3, "in the unit of the parameter")
 
 RIG_KNOWN = ["exact", "calibrated", "photographs"]
 """How well a rig may be known, beside the path of a calibration's result."""
 
 
 class Rig(Section):
-    """How well the estimator knows the cameras; those that take the pictures are the sensor file's."""
+    """How well the estimator knows the cameras; those that take the pictures are the sensor
+    file's."""
 
     known: str = Field(
         "exact",
-        description="exact; calibrated: from pictures of a board that the run takes first; photographs: as fifteen "
+        description="exact; calibrated: from pictures of a board that the run takes first; "
+        "photographs: as fifteen "
         "photographs of a board leave it; or a calibration.json, whose covariance says how well",
     )
     pairs: int = quantity(20, "1", "pairs of pictures of the board, where calibrated", ge=3, le=500)
     errors: dict[str, float] = Field(
-        {}, description='true minus known, of which no covariance knows: { "left.cx_px" = 0.1 }, px, m or rad'
+        {},
+        description='true minus known, of which no covariance knows: { "left.cx_px" = 0.1 }, px, '
+        "m or rad",
     )
     right_later_s: float | None = quantity(
-        None, "s", "by how much the right camera truly exposes later; left out: drawn", ge=-0.1, le=0.1
+        None,
+        "s",
+        "by how much the right camera truly exposes later; left out: drawn",
+        ge=-0.1,
+        le=0.1,
     )
-    right_later_std_s: float = quantity(0.0, "s", "how well that is known to be nothing", ge=0, le=0.1)
+    right_later_std_s: float = quantity(
+        0.0, "s", "how well that is known to be nothing", ge=0, le=0.1
+    )
     drift: dict[str, float] = Field(
         {},
-        description="how far the true cameras move, evenly from the first to the last frame of each run, and the "
+        description="how far the true cameras move, evenly from the first to the last frame of "
+        "each run, and the "
         'estimator is not told: { "right.cx_px" = 0.1 }, px, m or rad',
     )
     watch: Literal["platform", "both", "none"] = Field(
         "platform",
-        description="whose stickers tell a run whether the cameras still are as they were; both: the base's, too, "
+        description="whose stickers tell a run whether the cameras still are as they were; both: "
+        "the base's, too, "
         "in twice the time",
     )
+
+    @field_validator("errors", "drift")
+    @classmethod
+    def _are_small(cls, changes: dict[str, float]) -> dict[str, float]:
+        for name, value in changes.items():
+            try:
+                CAMERA_CHANGE.check(value)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from None
+        return changes
 
     @property
     def exact(self) -> bool:
@@ -143,34 +189,58 @@ class Identification(Section):
     """Output-error estimation and its stop criteria (eq. 35)."""
 
     method: Literal["closed_loop", "command_driven"] = Field(
-        "closed_loop", description="the model closes its own loop (the paper), or gets the logged commands"
+        "closed_loop",
+        description="the model closes its own loop (the paper), or gets the logged commands",
     )
     scale_anchor: Literal["platform_mass", "joint_gain", "payload", "prior"] = Field(
-        "platform_mass", description="what fixes the overall scale of the parameters; payload records a second run"
+        "platform_mass",
+        description="what fixes the overall scale of the parameters; payload records a second run",
     )
-    anchor_std: float | None = quantity(None, "unit of the anchor", "standard deviation of the anchor", gt=0)
-    start_std: float = quantity(1.0, "1", "standard deviation of the starting guess, relative to each value", gt=0)
+    anchor_std: float | None = quantity(
+        None, "unit of the anchor", "standard deviation of the anchor", gt=0
+    )
+    start_std: float = quantity(
+        1.0,
+        "1",
+        "standard deviation of the starting guess, relative to each value",
+        ge=1e-9,
+        le=1e9,
+    )
     prior: dict[str, PriorValue] = Field(
         {}, description="parameters known better than the starting guess: { name = { value, std } }"
     )
     nuisances: list[Literal["rig", "teaching", "exposure", "latency", "geometry"]] = Field(
         ["rig", "teaching", "exposure", "latency", "geometry"],
-        description="of what all poses of a record have in common, what is estimated beside the parameters",
+        description="of what all poses of a record have in common, what is estimated beside the "
+        "parameters",
     )
     physical_consistency: bool = Field(
-        False, description="only masses and moments of inertia that a rigid body can have (the paper's have others)"
+        False,
+        description="only masses and moments of inertia that a rigid body can have (the paper's "
+        "have others)",
     )
     max_iterations: int = quantity(30, "1", "iterations at most", ge=1, le=1000)
-    cost_tolerance: float = quantity(1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1)
-    parameter_tolerance: float = quantity(1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1)
-    qr_threshold: float = quantity(1e-3, "1", "entries of R below it count as zero in base_rank (section 4.2)", gt=0)
+    cost_tolerance: float = quantity(
+        1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1
+    )
+    parameter_tolerance: float = quantity(
+        1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1
+    )
+    qr_threshold: float = quantity(
+        1e-3, "1", "entries of R below it count as zero in base_rank (section 4.2)", ge=1e-15, le=1
+    )
 
     @model_validator(mode="after")
     def _anchor_measures_what_is_stated(self) -> "Identification":
         if self.anchor_std is not None and self.scale_anchor in ("payload", "prior"):
-            hint = "; payload.mass_std_kg says how well its load is known" if self.scale_anchor == "payload" else ""
+            hint = (
+                "; payload.mass_std_kg says how well its load is known"
+                if self.scale_anchor == "payload"
+                else ""
+            )
             raise ValueError(
-                f"anchor_std = {self.anchor_std:g}: the anchor {self.scale_anchor} measures no parameter{hint}"
+                f"anchor_std = {self.anchor_std:g}: the anchor {self.scale_anchor} measures no "
+                f"parameter{hint}"
             )
         return self
 
@@ -180,31 +250,48 @@ LOAD_UNITS = {"mass": "kg", "Ixx": "kg_m2", "Iyy": "kg_m2", "Izz": "kg_m2"}
 
 
 class Payload(Section):
-    """The known load that the platform carries in the second run, where the scale anchor is a payload.
+    """The known load that the platform carries in the second run, where the scale anchor is a
+    payload.
 
-    A load that is a percent heavier than stated makes all parameters a percent too small, and no residual tells. So
-    state how well it is known: intervals allow for it, and a synthetic experiment draws its true load accordingly.
+    A load that is a percent heavier than stated makes all parameters a percent too small, and no
+    residual tells. So state how well it is known: intervals allow for it, and a synthetic
+    experiment draws its true load accordingly.
     """
 
-    mass_kg: float = quantity(8.0, "kg", "mass, its centre in the origin of the platform frame", gt=0)
-    Ixx_kg_m2: float = quantity(0.02, "kg m2", "moment of inertia about the platform's x axis", ge=0)
-    Iyy_kg_m2: float = quantity(0.02, "kg m2", "moment of inertia about the platform's y axis", ge=0)
-    Izz_kg_m2: float = quantity(0.04, "kg m2", "moment of inertia about the platform's z axis", ge=0)
-    mass_std_kg: float = quantity(0.0, "kg", "standard deviation of the mass, as weighed; 0: exactly known", ge=0)
+    mass_kg: float = quantity(
+        8.0, "kg", "mass, its centre in the origin of the platform frame", gt=0
+    )
+    Ixx_kg_m2: float = quantity(
+        0.02, "kg m2", "moment of inertia about the platform's x axis", ge=0
+    )
+    Iyy_kg_m2: float = quantity(
+        0.02, "kg m2", "moment of inertia about the platform's y axis", ge=0
+    )
+    Izz_kg_m2: float = quantity(
+        0.04, "kg m2", "moment of inertia about the platform's z axis", ge=0
+    )
+    mass_std_kg: float = quantity(
+        0.0, "kg", "standard deviation of the mass, as weighed; 0: exactly known", ge=0
+    )
     Ixx_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Ixx_kg_m2", ge=0)
     Iyy_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Iyy_kg_m2", ge=0)
     Izz_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Izz_kg_m2", ge=0)
 
     @model_validator(mode="after")
     def _can_exist(self) -> "Payload":
-        check_moments({name: getattr(self, name) for name in ("Ixx_kg_m2", "Iyy_kg_m2", "Izz_kg_m2")})
+        check_moments(
+            {name: getattr(self, name) for name in ("Ixx_kg_m2", "Iyy_kg_m2", "Izz_kg_m2")}
+        )
         return self
 
     @model_validator(mode="after")
     def _is_known(self) -> "Payload":
         for figure, unit in LOAD_UNITS.items():
-            name, std = f"{figure}_{unit}", f"{figure}_std_{unit}"
-            check_load_std(std, getattr(self, std), name, getattr(self, name), unit.replace("_", " "))
+            name = f"{figure}_{unit}"
+            std = f"{figure}_std_{unit}"
+            check_load_std(
+                std, getattr(self, std), name, getattr(self, name), unit.replace("_", " ")
+            )
         return self
 
 
@@ -216,44 +303,67 @@ class Validation(Section):
 
 
 class Geometry(Section):
-    """Kinematic calibration by static poses, `cmmsim geometry`, and what servo and estimator of a run know of it."""
+    """Kinematic calibration by static poses, `cmmsim geometry`, and what servo and estimator of a
+    run know of it.
+    """
 
     known: str = Field(
         "exact",
-        description="exact: the robot file's; calibrated: by static poses, which the run measures first; or the "
+        description="exact: the robot file's; calibrated: by static poses, which the run measures "
+        "first; or the "
         "robot.toml of a calibration, with its covariance beside it",
     )
     poses: int = quantity(60, "1", "number of poses that are measured", ge=1, le=10_000)
     frames_per_pose: int = quantity(20, "1", "frames whose mean counts as a pose", ge=1, le=10_000)
     selection: Literal["random", "greedy", "gradient"] = Field(
-        "gradient", description="random poses, the best of the candidates, or those moved along the index's gradient"
+        "gradient",
+        description="random poses, the best of the candidates, or those moved along the index's "
+        "gradient",
     )
     criterion: Literal["prediction", "determinant", "noise_amplification"] = Field(
         "prediction",
-        description="index: mean error of other poses, determinant of the information, or Nahvi and Hollerbach's",
+        description="index: mean error of other poses, determinant of the information, or Nahvi "
+        "and Hollerbach's",
     )
-    candidates: int = quantity(400, "1", "random poses within the travel to choose from", ge=1, le=100_000)
+    candidates: int = quantity(
+        400, "1", "random poses within the travel to choose from", ge=1, le=100_000
+    )
     measurement: Literal["images", "drawn"] = Field(
         "images", description="poses through images, or drawn with the noise that the sensor states"
     )
     frames: Literal["taught", "unknown"] = Field(
-        "taught", description="base and platform frame as well as the sensor's teaching says, or not known at all"
+        "taught",
+        description="base and platform frame as well as the sensor's teaching says, or not known "
+        "at all",
     )
-    tolerance_m: float = quantity(1e-3, "m", "standard deviation of places and lengths about the drawing's", gt=0)
-    tolerance_rad: float = quantity(1e-2, "rad", "standard deviation of axes and zero angles about it", gt=0)
-    encoder_noise_rad: float = quantity(1e-5, "rad", "standard deviation of one reading of an encoder", ge=0)
+    tolerance_m: float = quantity(
+        1e-3, "m", "standard deviation of places and lengths about the drawing's", gt=0
+    )
+    tolerance_rad: float = quantity(
+        1e-2, "rad", "standard deviation of axes and zero angles about it", gt=0
+    )
+    encoder_noise_rad: float = quantity(
+        1e-5, "rad", "standard deviation of one reading of an encoder", ge=0
+    )
     encoder_noise_m: float = quantity(1e-6, "m", "the same, where actuators slide", ge=0)
-    encoder_resolution_rad: float = quantity(4.8e-5, "rad", "its step, here of 17 bits; 0: none", ge=0)
+    encoder_resolution_rad: float = quantity(
+        4.8e-5, "rad", "its step, here of 17 bits; 0: none", ge=0
+    )
     encoder_resolution_m: float = quantity(1e-6, "m", "the same, where actuators slide", ge=0)
-    encoder_offset_rad: float = quantity(0.0, "rad", "standard deviation of what each reads at zero", ge=0, le=0.05)
+    encoder_offset_rad: float = quantity(
+        0.0, "rad", "standard deviation of what each reads at zero", ge=0, le=0.05
+    )
     encoder_offset_m: float = quantity(0.0, "m", "the same, where actuators slide", ge=0, le=0.01)
-    unseen: int = quantity(200, "1", "poses that are not measured and judge the result", ge=1, le=100_000)
+    unseen: int = quantity(
+        200, "1", "poses that are not measured and judge the result", ge=1, le=100_000
+    )
 
     @model_validator(mode="after")
     def _stands_where_it_is_known(self) -> "Geometry":
         if self.known == "calibrated" and self.frames == "unknown":
             raise ValueError(
-                "known = 'calibrated' with frames = 'unknown': the geometry would be known up to where the robot "
+                "known = 'calibrated' with frames = 'unknown': the geometry would be known up to "
+                "where the robot "
                 "stands, and a run needs frames = 'taught'"
             )
         return self

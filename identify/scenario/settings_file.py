@@ -1,8 +1,9 @@
-"""Files of settings (TOML), such as scenarios and studies: which there are, how one is read, written and refused."""
+"""Files of settings (TOML), such as scenarios and studies: which there are, how one is read,
+written and refused.
+"""
 
 import dataclasses
 import json
-import tomllib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from dynamics.checks import shown
+from dynamics.files import is_file, parse_toml, read_text
 from identify.errors import IdentifyError
 
 Settings = TypeVar("Settings", bound=BaseModel)
@@ -19,11 +22,12 @@ Settings = TypeVar("Settings", bound=BaseModel)
 
 @dataclass(frozen=True)
 class SettingsFiles(Generic[Settings]):
-    """The files of one kind, as ``scenario``: those of a folder of the package, by name, and a user's own, by path.
+    """The files of one kind, as ``scenario``: those of a folder of the package, by name, and a
+    user's own, by path.
 
-    model: what they hold; error: what a refusal raises, with the reason in one line; files: keys, dotted where they
-    stand in tables, that name files of another kind, each with the names that are built in. Such a path, also one in a
-    list of them, starts from the file that states it.
+    model: what they hold; error: what a refusal raises, with the reason in one line; files: keys,
+    dotted where they stand in tables, that name files of another kind, each with the names that are
+    built in. Such a path, also one in a list of them, starts from the file that states it.
     """
 
     kind: str
@@ -39,7 +43,8 @@ class SettingsFiles(Generic[Settings]):
     def load(self, name_or_path: str | Path) -> Settings:
         """Read a built-in file by name, or a user's own by path.
 
-        Raises IdentifyError: of this kind: neither a built-in name nor a file (with the names), no TOML, wrong content.
+        Raises IdentifyError: of this kind: neither a built-in name nor a file (with the names), no
+        TOML, wrong content.
         """
         text, path = self.text(name_or_path)
         built_in = path.parent == self.folder
@@ -47,22 +52,25 @@ class SettingsFiles(Generic[Settings]):
         return self.from_toml(text, source, path.parent)
 
     def text(self, name_or_path: str | Path) -> tuple[str, Path]:
-        """The text of a built-in file by name, or of a user's own by path, and where it stands. Raises as `load`."""
-        name, built_in = str(name_or_path), self.names()
+        """The text of a built-in file by name, or of a user's own by path, and where it stands.
+        Raises as `load`.
+        """
+        name = str(name_or_path)
+        built_in = self.names()
         path = self.folder / f"{name}.toml" if name in built_in else Path(name)
-        try:
-            return path.read_text(encoding="utf-8"), path
-        except (OSError, UnicodeDecodeError) as error:
-            reason = f", and {error}" if path.is_file() else " nor a file" + ", but a folder" * path.is_dir()
-            raise self.error(f"{self.kind} {name!r} is neither built in ({', '.join(built_in)}){reason}") from error
+        if not is_file(path):
+            folder = "\0" not in name and len(name) < 200 and path.is_dir()
+            reason = " nor a file" + ", but a folder" * folder
+            raise self.error(
+                f"{self.kind} {name[:200]!r} is neither built in ({', '.join(built_in)}){reason}"
+            )
+        return read_text(path, f"{self.kind} file {name}", self.error), path
 
     def from_toml(self, text: str, source: str, folder: Path = Path()) -> Settings:
-        """Settings from TOML text; `source` names it in messages, its paths start from `folder`. Raises as `load`."""
-        try:
-            content = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise self.error(f"{source} is not valid TOML: {error}") from error
-        return self.from_dict(content, source, folder)
+        """Settings from TOML text; `source` names it in messages, its paths start from `folder`.
+        Raises as `load`.
+        """
+        return self.from_dict(parse_toml(text, source, self.error), source, folder)
 
     def from_dict(self, content: Mapping[str, Any], source: str, folder: Path = Path()) -> Settings:
         """Settings from nested mappings, all wrong entries named in one line. Raises as `load`."""
@@ -74,7 +82,10 @@ class SettingsFiles(Generic[Settings]):
     def _placed(self, value: Any, folder: Path, key: str = "") -> Any:
         """What stands at a dotted key, with its paths made absolute from a folder on."""
         if isinstance(value, Mapping):
-            return {name: self._placed(one, folder, f"{key}.{name}".lstrip(".")) for name, one in value.items()}
+            return {
+                name: self._placed(one, folder, f"{key}.{name}".lstrip("."))
+                for name, one in value.items()
+            }
         if isinstance(value, list):
             return [self._placed(one, folder, key) for one in value]
         names = self.files.get(key)
@@ -87,11 +98,16 @@ def file_path(name: str, folder: Path, built_in: Collection[str]) -> str:
     So does what is neither: it is left for whoever reads the file to refuse, with the valid names.
     """
     path = folder / name
-    return name if name in built_in or not (path.suffix == ".toml" or path.is_file()) else str(path.resolve())
+    return (
+        name
+        if name in built_in or not (path.suffix == ".toml" or is_file(path))
+        else str(path.resolve())
+    )
 
 
 def to_toml(model: BaseModel) -> str:
-    """TOML text of a two-level pydantic model: plain values first, then one table a section, units as comments.
+    """TOML text of a two-level pydantic model: plain values first, then one table a section, units
+    as comments.
 
     Fields whose value is None have no TOML form and are left out.
     """
@@ -99,23 +115,31 @@ def to_toml(model: BaseModel) -> str:
 
 
 def starting_toml(model: BaseModel, only: Collection[str] | None = None) -> str:
-    """The same text to start from: what is not stated is a comment, with the value that holds so, or with none.
+    """The same text to start from: what is not stated is a comment, with the value that holds so,
+    or with none.
 
     only: the fields and sections that are written, all by default.
     """
     return _text(model, lambda owner, name: "" if name in owner.model_fields_set else "# ", only)
 
 
-def _text(model: BaseModel, before: Callable[[BaseModel, str], str | None], only: Collection[str] | None = None) -> str:
+def _text(
+    model: BaseModel,
+    before: Callable[[BaseModel, str], str | None],
+    only: Collection[str] | None = None,
+) -> str:
     """TOML text; before: what stands before the entry of a field, None where it has no entry."""
 
     def entries(section: BaseModel) -> list[str]:
         fields = type(section).model_fields.items()
         return [
-            f"{mark}{_entry(n, getattr(section, n), f)}" for n, f in fields if (mark := before(section, n)) is not None
+            f"{mark}{_entry(n, getattr(section, n), f)}"
+            for n, f in fields
+            if (mark := before(section, n)) is not None
         ]
 
-    lines, sections = [], []
+    lines = []
+    sections = []
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
         mark = before(model, name)
@@ -131,16 +155,29 @@ def _text(model: BaseModel, before: Callable[[BaseModel, str], str | None], only
     return "\n".join(lines + sections) + "\n"
 
 
-DOTTED = """; a name with a dot stands in quotes, which a shell leaves inside of others: 'key={"a.b"=0.1}'"""
+MOST_COMPLAINTS = 8
+"""Complaints about one file; more are counted."""
+
+DOTTED = (
+    "; a name with a dot stands in quotes, which a shell leaves inside of others: "
+    """'key={"a.b"=0.1}'"""
+)
 
 
 def one_line(error: ValidationError, model: type[BaseModel]) -> str:
-    """All complaints of a validation in one line, each with key, value, unit and, where wrong, the valid names."""
-    return "; ".join(_complaint(details, model) for details in error.errors())
+    """All complaints of a validation in one line, each with key, value, unit and, where wrong, the
+    valid names.
+    """
+    found = error.errors()
+    said = [_complaint(details, model) for details in found[:MOST_COMPLAINTS]]
+    more = len(found) - len(said)
+    return "; ".join(said + ([f"and {more} more"] if more else []))
 
 
 def _entry(name: str, value: Any, field: FieldInfo) -> str:
-    comment = "".join([f" [{unit}]" if (unit := _unit(field)) else "", f" {field.description or ''}"]).strip()
+    comment = "".join(
+        [f" [{unit}]" if (unit := _unit(field)) else "", f" {field.description or ''}"]
+    ).strip()
     entry = f"{name} = {_toml_value(value)}" if value is not None else f"{name} ="
     return f"{entry:<40} # {comment}" if comment else entry
 
@@ -153,7 +190,8 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, BaseModel):
         return _toml_value(dict(value))
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{json.dumps(key)} = {_toml_value(one)}' for key, one in value.items())}}}"
+        entries = (f"{json.dumps(key)} = {_toml_value(one)}" for key, one in value.items())
+        return f"{{{', '.join(entries)}}}"
     return repr(value).lower() if isinstance(value, bool) else repr(value)
 
 
@@ -172,16 +210,23 @@ def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
     unit = f" [{u}]" if path and path[-1] in fields and (u := _unit(fields[path[-1]])) else ""
     message = details["msg"]
     nested = isinstance(details["input"], dict) and details["type"] == "float_type"
-    return f"{key} = {details['input']!r}{unit}: {message[0].lower()}{message[1:]}{DOTTED if nested else ''}"
+    return (
+        f"{key} = {shown(details['input'])}{unit}: "
+        f"{message[0].lower()}{message[1:]}{DOTTED if nested else ''}"
+    )
 
 
 def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
-    """The model whose field the path's last part names; a part of the path may be the key of a mapping to models."""
+    """The model whose field the path's last part names; a part of the path may be the key of a
+    mapping to models.
+    """
     owner: Any = model
     for part in path[:-1]:
         if get_origin(owner) is dict:
             owner = get_args(owner)[1]
-        elif isinstance(owner, type) and issubclass(owner, BaseModel) and part in owner.model_fields:
+        elif (
+            isinstance(owner, type) and issubclass(owner, BaseModel) and part in owner.model_fields
+        ):
             owner = owner.model_fields[part].annotation
         else:
             return None

@@ -1,8 +1,8 @@
 """When the sensor looks and when its poses are used: the one timing of sensor, servo and model.
 
-The sensor's file states it, in keys without units, and a scenario may state single values otherwise; this is the only
-place that knows both spellings. Imports of the sensor stand in the functions: the command line's help must not wait for
-them.
+The sensor's file states it, in keys without units, and a scenario may state single values
+otherwise; this is the only place that knows both spellings. Imports of the sensor stand in the
+functions: the command line's help must not wait for them.
 """
 
 from collections.abc import Mapping
@@ -34,15 +34,25 @@ IN_FILE = {
 class Timing(Section):
     """Sampling of the pose sensor and of the visual servo.
 
-    All but the hold is the sensor file's where a scenario does not state it. A measured pose is that in the middle of
-    its exposure, which is the time of its frame.
+    All but the hold is the sensor file's where a scenario does not state it. A measured pose is
+    that in the middle of its exposure, which is the time of its frame.
     """
 
-    frame_rate_hz: float = quantity(60.0, "Hz", "stereo frames a second; the servo acts once a frame", gt=0, le=2000)
-    exposure_s: float = quantity(0.0, "s", "time in which a picture gathers light; 0 is an instant", ge=0, le=1)
-    latency_s: float = quantity(0.0, "s", "mean delay from the middle of the exposure to the command", ge=0, le=1)
-    latency_jitter_s: float = quantity(0.0, "s", "standard deviation of the latency between frames", ge=0, le=1)
-    latency_std_s: float = quantity(0.0, "s", "how well the mean latency is known, standard deviation", ge=0, le=0.1)
+    frame_rate_hz: float = quantity(
+        60.0, "Hz", "stereo frames a second; the servo acts once a frame", gt=0, le=2000
+    )
+    exposure_s: float = quantity(
+        0.0, "s", "time in which a picture gathers light; 0 is an instant", ge=0, le=1
+    )
+    latency_s: float = quantity(
+        0.0, "s", "mean delay from the middle of the exposure to the command", ge=0, le=1
+    )
+    latency_jitter_s: float = quantity(
+        0.0, "s", "standard deviation of the latency between frames", ge=0, le=1
+    )
+    latency_std_s: float = quantity(
+        0.0, "s", "how well the mean latency is known, standard deviation", ge=0, le=0.1
+    )
     dropout: float = quantity(0.0, "1", "probability that a frame is lost on its way", ge=0, le=1)
     hold: Literal["zero", "linear"] = Field("zero", description="joint command between two frames")
 
@@ -56,7 +66,9 @@ class Timing(Section):
         return round(duration_s * self.frame_rate_hz)
 
     def frame_times(self, duration_s: float) -> Array:
-        """Instants of exposure (N,) [s], each the middle of one, of a run: whole frames, its end excluded."""
+        """Instants of exposure (N,) [s], each the middle of one, of a run: whole frames, its end
+        excluded.
+        """
         return np.arange(self.frames(duration_s), dtype=float) * self.frame_period_s
 
     def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array | None:
@@ -64,7 +76,9 @@ class Timing(Section):
         return self.of_sensor().drawn_latencies(frames, rng) if self.latency_jitter_s else None
 
     def of_sensor(self) -> "SensorTiming":
-        """The same values as a sensor's file holds them. Raises ValueError: values that contradict each other."""
+        """The same values as a sensor's file holds them. Raises ValueError: values that contradict
+        each other.
+        """
         from cmmsim.files import Timing as SensorTiming
 
         try:
@@ -73,30 +87,36 @@ class Timing(Section):
             raise ValueError(f"timing: {error.errors()[0]['ctx']['error']}") from error
 
     def check(self) -> None:
-        """Refuse values that contradict each other, and a latency that the closed loop cannot hold back.
+        """Refuse values that contradict each other, and a latency that the closed loop cannot hold
+        back.
 
         Raises ValueError: with the longest latency that is possible.
         """
-        from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
+        from dynamics.closed_loop.loop_settings import (
+            MAX_DELAY_FRAMES,
+        )
 
         longest = self.of_sensor().largest_latency + LATENCY_STDS * self.latency_std_s
         if longest * self.frame_rate_hz > MAX_DELAY_FRAMES:
             raise ValueError(
-                f"timing.latency_s = {self.latency_s:g} s with timing.latency_jitter_s = {self.latency_jitter_s:g} s "
+                f"timing.latency_s = {self.latency_s:g} s with timing.latency_jitter_s = "
+                f"{self.latency_jitter_s:g} s "
                 f"and timing.latency_std_s = {self.latency_std_s:g} s reaches {longest:.4g} s, "
-                f"{longest * self.frame_rate_hz:.1f} frames of {self.frame_rate_hz:g} Hz; at most {MAX_DELAY_FRAMES} "
+                f"{longest * self.frame_rate_hz:.1f} frames of {self.frame_rate_hz:g} Hz; at most "
+                f"{MAX_DELAY_FRAMES} "
                 "frames are possible"
             )
 
 
 def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[Timing, str]:
-    """Timing with what it does not state itself from a built-in sensor or a sensor's file, and the note of that file.
+    """Timing with what it does not state itself from a built-in sensor or a sensor's file, and the
+    note of that file.
 
-    What comes from the sensor does not count as set: with another sensor it is taken from that one. ``changes``: a
-    scenario's ``[sensor_changes]`` by dotted key.
+    What comes from the sensor does not count as set: with another sensor it is taken from that one.
+    ``changes``: a scenario's ``[sensor_changes]`` by dotted key.
 
-    Raises ValueError: changes without effect, as the scenario itself states otherwise; or a timing that none may have.
-    Raises cmmsim.CmmError: no such sensor, or a bad file.
+    Raises ValueError: changes without effect, as the scenario itself states otherwise; or a timing
+    that none may have. Raises cmmsim.CmmError: no such sensor, or a bad file.
     """
     from cmmsim.files import read_sensor_file
 
@@ -106,7 +126,8 @@ def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[
     for name in own.keys() & IN_FILE.keys():
         if f"timing.{IN_FILE[name]}" in changes and own[name] != of_file[name]:
             raise ValueError(
-                f"sensor_changes.timing.{IN_FILE[name]} = {of_file[name]:g} has no effect where the scenario itself "
+                f"sensor_changes.timing.{IN_FILE[name]} = {of_file[name]:g} has no effect where "
+                "the scenario itself "
                 f"states timing.{name} = {own[name]:g}"
             )
     try:
@@ -124,7 +145,9 @@ def sensor_names() -> list[str]:
 
 
 def by_dotted_key(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A scenario's ``[sensor_changes]``, also as tables in tables, by dotted key of the sensor's file."""
+    """A scenario's ``[sensor_changes]``, also as tables in tables, by dotted key of the sensor's
+    file.
+    """
     from cmmsim.files import dotted
 
     return dotted(changes)

@@ -1,4 +1,5 @@
-"""The bodies of a workcell as one glTF file (binary), which the page's three.js, Blender and others open.
+"""The bodies of a workcell as one glTF file (binary), which the page's three.js, Blender and others
+open.
 
 Its nodes are called as bodies and legs are; lengths in m, axes of the base, z up.
 """
@@ -11,9 +12,9 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from cmmsim.geometry.pose import rigid
-from cmmsim.imaging.scene import rod_transform
+from cmmsim.imaging.scene_bodies import rod_transform
 from identify.arrays import Array
-from identify.scene.figures import BRIGHT, CAMERA, DARK, SOLIDS, camera_box, leg_colour
+from identify.scene.drawings import BRIGHT, CAMERA, DARK, SOLIDS, camera_box, leg_colour
 from identify.scene.workcell import Solid, Workcell
 
 ABOVE_M = 0.0004
@@ -23,8 +24,9 @@ ABOVE_M = 0.0004
 def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
     """A workcell with its platform at a pose (6,), by default home.
 
-    Nodes: "platform" and "base" with their stickers; one for each body of a leg, a rod along its z axis from its
-    origin; "left camera" and "right camera". Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    Nodes: "platform" and "base" with their stickers; one for each body of a leg, a rod along its z
+    axis from its origin; "left camera" and "right camera". Raises dynamics.UnreachablePoseError,
+    dynamics.ChartError.
     """
     at = cell.home if pose is None else pose
     scene = trimesh.Scene()
@@ -33,7 +35,14 @@ def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
         _add_stickers(scene, body)
     for part, ends in zip(cell.parts, cell.rods(at), strict=True):
         mesh = trimesh.creation.cylinder(part.segment.radius, segment=_upright(ends), sections=20)
-        _add(scene, part.name, mesh.vertices, mesh.faces, leg_colour(cell, part.leg, part.body), rod_transform(*ends))
+        _add(
+            scene,
+            part.name,
+            mesh.vertices,
+            mesh.faces,
+            leg_colour(cell, part.leg, part.body),
+            rod_transform(*ends),
+        )
     for camera in cell.cameras:
         _add(scene, f"{camera.name} camera", *camera_box(camera), CAMERA, np.eye(4))
     return bytes(scene.export(file_type="glb"))
@@ -51,7 +60,15 @@ def _add_stickers(scene: trimesh.Scene, body: Solid) -> None:
         discs = [_disc(*one, radius, above) for one in zip(body.places, body.normals, strict=True)]
         if discs:
             mesh = trimesh.util.concatenate(discs)
-            _add(scene, f"{body.name} {words}", mesh.vertices, mesh.faces, colour, np.eye(4), body.name)
+            _add(
+                scene,
+                f"{body.name} {words}",
+                mesh.vertices,
+                mesh.faces,
+                colour,
+                np.eye(4),
+                body.name,
+            )
 
 
 def _disc(place: Array, normal: Array, radius: float, above: float) -> trimesh.Trimesh:
@@ -72,6 +89,10 @@ def _add(
 ) -> None:
     """Add a body without normals: whoever shows it shades each face for itself."""
     linear = [((share + 0.055) / 1.055) ** 2.4 for share in to_rgb(colour)]  # as glTF has it
-    material = PBRMaterial(baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9, name=name)
+    material = PBRMaterial(
+        baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9, name=name
+    )
     mesh = trimesh.Trimesh(vertices, faces, process=False, visual=TextureVisuals(material=material))
-    scene.add_geometry(mesh, node_name=name, geom_name=name, parent_node_name=parent, transform=place)
+    scene.add_geometry(
+        mesh, node_name=name, geom_name=name, parent_node_name=parent, transform=place
+    )

@@ -1,7 +1,9 @@
-"""Bodies drawn as shaded polygons in perspective, far ones first: vector graphics for print, without OpenGL.
+"""Bodies drawn as shaded polygons in perspective, far ones first: vector graphics for print,
+without OpenGL.
 
-Large faces and long lines are cut into pieces, so that the order of their middles is the order in which they hide each
-other. Where two bodies pierce each other, what hides what is right to a piece's size.
+Large faces and long lines are cut into pieces, so that the order of their middles is the order in
+which they hide each other. Where two bodies pierce each other, what hides what is right to a
+piece's size.
 """
 
 from collections.abc import Sequence
@@ -25,8 +27,8 @@ SHADE = 0.62
 
 @dataclass(frozen=True)
 class View:
-    """From where a scene is looked at: azimuth from the x axis about z and elevation, degrees; distance from the middle
-    of the scene in sizes of it."""
+    """From where a scene is looked at: azimuth from the x axis about z and elevation, degrees;
+    distance from the middle of the scene in sizes of it."""
 
     azimuth_deg: float = -50.0
     elevation_deg: float = 23.0
@@ -43,7 +45,8 @@ class Painter:
         across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         self._eye = centre + view.distance * size * back
         self._axes = np.column_stack([across, np.cross(back, across), back])
-        self._far, self._piece = view.distance * size, PIECE * size
+        self._far = view.distance * size
+        self._piece = PIECE * size
         self._pieces: list[tuple[float, Array, tuple, tuple, float]] = []
 
     def pixels(self, points: Array) -> Array:
@@ -51,8 +54,11 @@ class Painter:
         seen = (points - self._eye) @ self._axes
         return np.asarray(self._far * seen[..., :2] / -seen[..., 2:], dtype=float)
 
-    def faces(self, vertices: Array, faces: NDArray[np.int_], colour: str, towards: float = 0.0) -> None:
-        """Triangles (m, 3) of a closed body, counter-clockwise from outside, as its light falls on them.
+    def faces(
+        self, vertices: Array, faces: NDArray[np.int_], colour: str, towards: float = 0.0
+    ) -> None:
+        """Triangles (m, 3) of a closed body, counter-clockwise from outside, as its light falls on
+        them.
 
         towards: by how much they are drawn before what lies as far away, m.
         """
@@ -61,24 +67,35 @@ class Painter:
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         middles = triangles.mean(axis=1)
         facing = np.einsum("ni,ni->n", normals, self._eye - middles) > 0
-        lit = normals[facing] @ LIGHT / (np.linalg.norm(normals[facing], axis=1) * np.linalg.norm(LIGHT))
+        lit = (
+            normals[facing]
+            @ LIGHT
+            / (np.linalg.norm(normals[facing], axis=1) * np.linalg.norm(LIGHT))
+        )
         bright = SHADE + (1 - SHADE) * np.maximum(lit, 0.0)
         base = np.array(to_rgb(colour))
-        closed = self.pixels(triangles[facing])[:, [0, 1, 2, 0]]  # its outline fills the seams between pieces
+        closed = self.pixels(triangles[facing])[
+            :, [0, 1, 2, 0]
+        ]  # its outline fills the seams between pieces
         for flat, middle, share in zip(closed, middles[facing], bright, strict=True):
             self._add(middle, flat, (*(share * base), 1.0), None, 0.5, towards)
 
-    def edges(self, vertices: Array, faces: NDArray[np.int_], colour: str, width: float = 0.7) -> None:
+    def edges(
+        self, vertices: Array, faces: NDArray[np.int_], colour: str, width: float = 0.7
+    ) -> None:
         """The edges of a convex body that its visible faces have."""
         body = trimesh.Trimesh(vertices, faces, process=True)
         sharp = body.face_adjacency_angles > 1e-3
-        normals, middles = body.face_normals, body.triangles_center
+        normals = body.face_normals
+        middles = body.triangles_center
         facing = np.einsum("ni,ni->n", normals, self._eye - middles) > 0
         shown = sharp & facing[body.face_adjacency].any(axis=1)
         for ends in np.asarray(body.vertices)[body.face_adjacency_edges[shown]]:
             self.line(ends, colour, width, towards=0.5 * self._piece)
 
-    def disc(self, centre: Array, normal: Array, radius: float, colour: str, towards: float) -> None:
+    def disc(
+        self, centre: Array, normal: Array, radius: float, colour: str, towards: float
+    ) -> None:
         """A flat disc, where its outward normal (3,) looks this way."""
         if normal @ (self._eye - centre) <= 0:
             return
@@ -88,7 +105,9 @@ class Painter:
         rim = centre + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(normal, first))
         self._add(centre, self.pixels(rim), to_rgba(colour), None, 0.2, towards)
 
-    def line(self, ends: Array, colour: str, width: float, alpha: float = 1.0, towards: float = 0.0) -> None:
+    def line(
+        self, ends: Array, colour: str, width: float, alpha: float = 1.0, towards: float = 0.0
+    ) -> None:
         """A straight line between two points (2, 3)."""
         count = int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / self._piece)) + 1
         places = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
@@ -102,7 +121,12 @@ class Painter:
         self._pieces.sort(key=lambda piece: -piece[0])
         polygons, filled, lines, widths = zip(*(piece[1:] for piece in self._pieces), strict=True)
         drawn = PolyCollection(
-            polygons, closed=False, facecolors=filled, edgecolors=lines, linewidths=widths, capstyle="round"
+            polygons,
+            closed=False,
+            facecolors=filled,
+            edgecolors=lines,
+            linewidths=widths,
+            capstyle="round",
         )
         axes.add_collection(drawn)
         axes.set_aspect("equal")
@@ -110,7 +134,13 @@ class Painter:
         axes.autoscale_view()
 
     def _add(
-        self, middle: Array, flat: Array, fill: tuple | None, stroke: tuple | None, width: float, towards: float
+        self,
+        middle: Array,
+        flat: Array,
+        fill: tuple | None,
+        stroke: tuple | None,
+        width: float,
+        towards: float,
     ) -> None:
         depth = float(np.linalg.norm(middle - self._eye)) - towards
         nothing = (0.0, 0.0, 0.0, 0.0)
@@ -118,7 +148,9 @@ class Painter:
 
 
 def tube(ends: Array, radius: float, sides: int = 14) -> tuple[Array, NDArray[np.int_]]:
-    """A closed cylinder between two points (2, 3): vertices (n, 3) and faces (m, 3), counter-clockwise from outside."""
+    """A closed cylinder between two points (2, 3): vertices (n, 3) and faces (m, 3),
+    counter-clockwise from outside.
+    """
     body = trimesh.creation.cylinder(radius=radius, segment=ends, sections=sides)
     return np.asarray(body.vertices), np.asarray(body.faces)
 
@@ -126,5 +158,6 @@ def tube(ends: Array, radius: float, sides: int = 14) -> tuple[Array, NDArray[np
 def extent(points: Sequence[Array]) -> tuple[Array, float]:
     """Middle (3,) and diagonal, m, of the box about points (n, 3) of several bodies."""
     every = np.vstack(points)
-    low, high = every.min(axis=0), every.max(axis=0)
+    low = every.min(axis=0)
+    high = every.max(axis=0)
     return 0.5 * (low + high), float(np.linalg.norm(high - low))

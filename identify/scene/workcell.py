@@ -1,4 +1,6 @@
-"""A robot and the stereo sensor that looks at it, as they stand: bodies, stickers, legs and cameras, to be drawn."""
+"""A robot and the stereo sensor that looks at it, as they stand: bodies, stickers, legs and
+cameras, to be drawn.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,13 +16,18 @@ from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.imaging.scene import scene_body
+from cmmsim.imaging.scene_bodies import scene_body
 from cmmsim.visibility import SightLines
 from dynamics import Robot, load_robot
 from dynamics.bodies import Part, parts_of
 from identify.arrays import Array
 from identify.errors import ScenarioError
-from identify.experiment.sensor_in_loop import check_platform, robot_meshes, robot_transforms, sensor_file
+from identify.experiment.sensor_in_loop import (
+    check_platform,
+    robot_meshes,
+    robot_transforms,
+    sensor_file,
+)
 from identify.scenario import Scenario
 
 PLATE_M = 0.012
@@ -31,8 +38,8 @@ PLATE_M = 0.012
 class Solid:
     """A convex body with its stickers, in its own axes, m.
 
-    vertices (n, 3) and faces (m, 3), triangles seen counter-clockwise from outside; ids (k,) of the stickers, their
-    true places (k, 3) and outward normals (k, 3); radius and ring_radius of each.
+    vertices (n, 3) and faces (m, 3), triangles seen counter-clockwise from outside; ids (k,) of the
+    stickers, their true places (k, 3) and outward normals (k, 3); radius and ring_radius of each.
     """
 
     name: str
@@ -59,8 +66,11 @@ class ViewingCamera:
         return np.asarray(self.base_from_camera[:3, 3])
 
     def frustum(self, depth: float) -> Array:
-        """Corners (4, 3) of what it sees at a depth, m, base axes, clockwise from the top left of its image."""
-        right, low = self.lens.width - 0.5, self.lens.height - 0.5
+        """Corners (4, 3) of what it sees at a depth, m, base axes, clockwise from the top left of
+        its image.
+        """
+        right = self.lens.width - 0.5
+        low = self.lens.height - 0.5
         pixels = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
         ideal = self.lens.undistort(pixels)[0]
         rays = np.column_stack([ideal, np.ones(4)]) @ np.linalg.inv(self.lens.matrix).T
@@ -91,11 +101,15 @@ class Workcell:
 
     @cached_property
     def bodies(self) -> tuple[Solid, ...]:
-        """The platform in its own axes, and the sensor's body with stickers on the base, in base axes."""
+        """The platform in its own axes, and the sensor's body with stickers on the base, in base
+        axes.
+        """
         if self.sensor is None:
             assert self.robot is not None
             return (_plate("platform", self.robot.geometry.platform_joints),)
-        return tuple(_marked(name, self.sensor, stream) for stream, name in enumerate(("platform", "base")))
+        return tuple(
+            _marked(name, self.sensor, stream) for stream, name in enumerate(("platform", "base"))
+        )
 
     def placed(self, pose: Array) -> list[tuple[Solid, Array]]:
         """The bodies, and base_from_body (4, 4) of each with the platform at a pose (6,)."""
@@ -107,15 +121,22 @@ class Workcell:
         return () if self.robot is None else tuple(parts_of(self.robot.geometry).all)
 
     def rods(self, pose: Array) -> Array:
-        """Ends (parts, 2, 3) of the bodies of the legs, m, base axes, with the platform at a pose (6,).
+        """Ends (parts, 2, 3) of the bodies of the legs, m, base axes, with the platform at a pose
+        (6,).
 
         Raises dynamics.UnreachablePoseError, dynamics.ChartError.
         """
-        return np.zeros((0, 2, 3)) if self.robot is None else parts_of(self.robot.geometry).rods(self.robot, pose)
+        return (
+            np.zeros((0, 2, 3))
+            if self.robot is None
+            else parts_of(self.robot.geometry).rods(self.robot, pose)
+        )
 
     @cached_property
     def frame(self) -> Array:
-        """Lines (n, 2, 3), m, base axes, from one leg's joint on the base to the next one's; none without a robot."""
+        """Lines (n, 2, 3), m, base axes, from one leg's joint on the base to the next one's; none
+        without a robot.
+        """
         if self.robot is None:
             return np.zeros((0, 2, 3))
         joints = self.robot.geometry.base_joints
@@ -135,10 +156,13 @@ class Workcell:
             return ()
         rig, camera_from_base = self.rig
         sides = zip(("left", "right"), rig.cameras, rig.from_camera, strict=True)
-        return tuple(ViewingCamera(name, lens, invert(move @ camera_from_base)) for name, lens, move in sides)
+        return tuple(
+            ViewingCamera(name, lens, invert(move @ camera_from_base)) for name, lens, move in sides
+        )
 
     def seen(self, pose: Array) -> Array:
-        """Places (k, 3), m, base axes, of the platform's stickers that both cameras can look for at a pose (6,).
+        """Places (k, 3), m, base axes, of the platform's stickers that both cameras can look for at
+        a pose (6,).
 
         What stands between a sticker and a camera is not asked.
         """
@@ -161,7 +185,9 @@ class Workcell:
         return sensor
 
     def obstacles(self, pose: Array) -> Mapping[str, Array]:
-        """base_from_body (4, 4) by name of the legs' bodies, which may hide stickers, at a pose (6,)."""
+        """base_from_body (4, 4) by name of the legs' bodies, which may hide stickers, at a pose
+        (6,).
+        """
         return {} if self.robot is None else robot_transforms(self.robot, pose)
 
 
@@ -187,12 +213,16 @@ def workcell_of_scenario(scenario: Scenario, robot: Robot | None = None) -> Work
 
 def _marked(name: str, file: SensorFile, stream: int) -> Solid:
     """A body of a sensor file with its stickers where they truly are."""
-    section, stickers = getattr(file, name), file.stickers
+    section = getattr(file, name)
+    stickers = file.stickers
     marked = marked_body(name, section)
     drawn = scene_body(marked, section, stickers, stream)
-    ids, normals = tuple(map(str, marked.sticker_ids)), marked.sticker_normals
+    ids = tuple(map(str, marked.sticker_ids))
+    normals = marked.sticker_normals
     radii = stickers.radius, stickers.ring_radius
-    return Solid(name, drawn.solid.vertices, drawn.solid.faces, ids, drawn.sticker_places, normals, *radii)
+    return Solid(
+        name, drawn.solid.vertices, drawn.solid.faces, ids, drawn.sticker_places, normals, *radii
+    )
 
 
 def _plate(name: str, joints: Array) -> Solid:
@@ -200,7 +230,15 @@ def _plate(name: str, joints: Array) -> Solid:
     around = PLATE_M * np.vstack([np.eye(3), -np.eye(3)]) * np.array([1.5, 1.5, 1.0])
     points = (joints[:, None] + around).reshape(-1, 3)
     hull = ConvexHull(points)
-    corners, outward = points[hull.simplices], hull.equations[:, :3]
-    turned = np.einsum("ni,ni->n", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), outward) < 0
+    corners = points[hull.simplices]
+    outward = hull.equations[:, :3]
+    turned = (
+        np.einsum(
+            "ni,ni->n",
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+            outward,
+        )
+        < 0
+    )
     faces = np.where(turned[:, None], hull.simplices[:, ::-1], hull.simplices).astype(int)
     return Solid(name, points, faces)

@@ -1,15 +1,18 @@
-"""What a study varies: its keys, values and laws, checked before any row is computed, and what holds in each row.
+"""What a study varies: its keys, values and laws, checked before any row is computed, and what
+holds in each row.
 
-Rows are numbered repeat by repeat, and within a repeat point by point, the last factor fastest. The seed of row n is
-the n-th child that ``numpy.random.SeedSequence(seed).spawn`` gives. So neither the machines, nor the order of work, nor
-further repeats change the numbers of a row; nor do further points of a sample, as long as there are no repeats. No row
-is kept, so that a large grid takes no memory.
+Rows are numbered repeat by repeat, and within a repeat point by point, the last factor fastest. The
+seed of row n is the n-th child that ``numpy.random.SeedSequence(seed).spawn`` gives. So neither the
+machines, nor the order of work, nor further repeats change the numbers of a row; nor do further
+points of a sample, as long as there are no repeats. No row is kept, so that a large grid takes no
+memory.
 """
 
 import difflib
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from functools import cached_property, lru_cache
 from typing import Annotated, Any, ClassVar, get_args
 
@@ -19,6 +22,7 @@ from pydantic.fields import FieldInfo
 
 from cmmsim import CmmError, Sensor
 from cmmsim.files import SensorFile
+from cmmsim.plugins import allowed_plugins
 from identify.errors import ScenarioError, StudyError
 from identify.experiment.sensor_in_loop import sensor_file, with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
@@ -42,7 +46,9 @@ STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 @dataclass(frozen=True)
 class Case:
-    """One row that is to be computed: its number, its repeat, and the value of each factor by dotted path."""
+    """One row that is to be computed: its number, its repeat, and the value of each factor by
+    dotted path.
+    """
 
     number: int
     repeat: int
@@ -63,12 +69,15 @@ class Finished:
 
 @dataclass(frozen=True)
 class Setup:
-    """What all rows of a study share: kind, scenario with the changes of all rows, options, seed."""
+    """What all rows of a study share: kind, scenario with the changes of all rows, options,
+    seed."""
 
     kind: str
     scenario: Scenario
     options: dict[str, Any]
     seed: int
+    plugins: tuple[str, ...] = dataclass_field(default_factory=allowed_plugins)
+    """Modules whose parts may run, also on other machines."""
 
     def row_scenario(self, case: Case) -> Scenario:
         """The scenario of a row. Raises ScenarioError where its factors contradict each other."""
@@ -76,7 +85,9 @@ class Setup:
 
     def row_options(self, case: Case) -> dict[str, Any]:
         """The options of a row."""
-        varied = {path: value for path, value in case.factors.items() if path.startswith("options.")}
+        varied = {
+            path: value for path, value in case.factors.items() if path.startswith("options.")
+        }
         return self.options | {path.partition(".")[2]: value for path, value in varied.items()}
 
     def row_seed(self, number: int) -> np.random.SeedSequence:
@@ -96,12 +107,18 @@ class Design:
     def case(self, number: int) -> Case:
         """The row of a number."""
         repeat, point = divmod(number, self._study.points)
-        return Case(number, repeat, self._drawn(point) if self._study.sample else self._on_grid(point))
+        return Case(
+            number, repeat, self._drawn(point) if self._study.sample else self._on_grid(point)
+        )
 
     def _on_grid(self, point: int) -> dict[str, Any]:
-        lists = {path: values for path, values in self._study.factors.items() if isinstance(values, list)}
+        lists = {
+            path: values for path, values in self._study.factors.items() if isinstance(values, list)
+        }
         places = np.unravel_index(point, [len(values) for values in lists.values()])
-        return {path: values[place] for (path, values), place in zip(lists.items(), places, strict=True)}
+        return {
+            path: values[place] for (path, values), place in zip(lists.items(), places, strict=True)
+        }
 
     def _drawn(self, point: int) -> dict[str, Any]:
         shares = zip(self._study.factors, self._shares[point], strict=True)
@@ -117,7 +134,8 @@ class Design:
         values = self._study.factors[path]
         if isinstance(values, list):
             return values[int(share * len(values))]
-        kind = KINDS.get(self._study.kind)  # a table is read where the module of one's own kind may not be
+        # a table is read where the module of one's own kind may not be
+        kind = KINDS.get(self._study.kind)
         field = field_of(path, kind.options if kind else None)
         if field is not None and field.annotation is int:
             return int(values.low) + int(share * (values.high - values.low + 1))
@@ -141,29 +159,36 @@ def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
 def prepare(study: Study) -> Setup:
     """Check a study's keys, values, kind and laws, and load what its rows share.
 
-    The first row is checked as a whole. Values that contradict each other only in other rows are errors of these.
+    The first row is checked as a whole. Values that contradict each other only in other rows are
+    errors of these.
 
-    Raises StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid ones; a wrong value; a
-    key that the kind's rows do not read; a sensor that the statistical renderer was not proved for. Raises
-    ScenarioError: no such scenario, or changes that contradict it.
+    Raises StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid
+    ones; a wrong value; a key that the kind's rows do not read; a sensor that the statistical
+    renderer was not proved for. Raises ScenarioError: no such scenario, or changes that contradict
+    it.
     """
     kind = find_kind(study.kind)
     kind.checked(study.options)
     _check_keys(study, kind)
     try:  # what draws the images is decided here, once for all machines
-        scenario = with_renderer(load_scenario(study.scenario).with_overrides(overrides(study.changes)))
+        scenario = with_renderer(
+            load_scenario(study.scenario).with_overrides(overrides(study.changes))
+        )
     except ScenarioError as error:
         raise StudyError(f"scenario of the study: {error}") from error
     setup = Setup(study.kind, scenario, study.options, study.seed)
     first = Design(study).case(0)
-    row_scenario, row_options = setup.row_scenario(first), kind.checked(setup.row_options(first))
+    row_scenario = setup.row_scenario(first)
+    row_options = kind.checked(setup.row_options(first))
     if kind.reads is not None:
         check_read(study, kind.reads, row_scenario, row_options)
     if getattr(row_options, "sensor", "images") == "images":
         _check_proved(row_scenario)
     for name in study.figures or [] if kind.columns else []:
         if name not in kind.columns:
-            raise StudyError(f"figures has {name!r}, no figure of {study.kind}; {_nearest(name, kind.columns)}")
+            raise StudyError(
+                f"figures has {name!r}, no figure of {study.kind}; {_nearest(name, kind.columns)}"
+            )
     for place, law in enumerate(study.theory, start=1):
         try:
             _check_law(law, study, list(kind.columns))
@@ -173,7 +198,9 @@ def prepare(study: Study) -> Setup:
 
 
 def _check_proved(scenario: Scenario) -> None:
-    """Refuse a sensor for which frames without images were not proved, where the scenario's have none."""
+    """Refuse a sensor for which frames without images were not proved, where the scenario's have
+    none.
+    """
     if scenario.renderer != "statistical":
         return
     try:
@@ -194,18 +221,28 @@ def _check_keys(study: Study, kind: Kind) -> None:
         _check_values(path, values.ends if isinstance(values, Range) else values, kind)
         if not isinstance(values, list):
             continue
-        types = {"number" if type(value) in (int, float) else type(value).__name__ for value in values}
+        types = {
+            "number" if type(value) in (int, float) else type(value).__name__ for value in values
+        }
         if len(types) > 1:
-            raise StudyError(f"factors.{path} = {values} has values of several kinds: {', '.join(sorted(types))}")
+            raise StudyError(
+                f"factors.{path} = {values} has values of several kinds: {', '.join(sorted(types))}"
+            )
         if len({repr(value) for value in values}) < len(values):
-            raise StudyError(f"factors.{path} = {values} has a value twice; repeats = N computes every point N times")
+            raise StudyError(
+                f"factors.{path} = {values} has a value twice; repeats = N computes every point N "
+                "times"
+            )
 
 
 def _check_values(path: str, values: list[Any], kind: Kind) -> None:
-    """Refuse a path that does not exist and values that are not of its type; options of one's own kind may be any."""
+    """Refuse a path that does not exist and values that are not of its type; options of one's own
+    kind may be any.
+    """
     if kind.options is None and path.startswith("options."):
         return
-    known, field = valid_keys(kind.options), field_of(path, kind.options)
+    known = valid_keys(kind.options)
+    field = field_of(path, kind.options)
     if field is None:
         own = [key for key in known if path.startswith("options.") and key.startswith("options.")]
         valid = f"the kind has {', '.join(own)}" if own else _nearest(path, known)
@@ -223,7 +260,8 @@ def _check_values(path: str, values: list[Any], kind: Kind) -> None:
 
 @lru_cache(maxsize=8)
 def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
-    """Every dotted path that a study may vary, with its field; `options`: the model of a kind's options, if it has one.
+    """Every dotted path that a study may vary, with its field; `options`: the model of a kind's
+    options, if it has one.
 
     A path is one of a scenario, of a sensor file, or of the options.
     """
@@ -234,7 +272,9 @@ def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
 
 
 def field_of(path: str, options: type[BaseModel] | None = None) -> FieldInfo | None:
-    """The field of a dotted path that a study may vary, or of a number by its name in a table of such; None: none."""
+    """The field of a dotted path that a study may vary, or of a number by its name in a table of
+    such; None: none.
+    """
     tables = (f"scenario.{table}." for table in numbers_by_name())
     entry = FieldInfo(annotation=float) if path.startswith(tuple(tables)) else None
     return valid_keys(options).get(path, entry)
@@ -247,12 +287,18 @@ def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
         kinds = (field.annotation, *get_args(field.annotation))
         inner = next((a for a in kinds if isinstance(a, type) and issubclass(a, BaseModel)), None)
         listed = getattr(field.annotation, "__origin__", None) is list
-        found |= {f"{prefix}{name}": field} if inner is None or listed else _leaves(inner, f"{prefix}{name}.")
+        found |= (
+            {f"{prefix}{name}": field}
+            if inner is None or listed
+            else _leaves(inner, f"{prefix}{name}.")
+        )
     return found
 
 
 def _nearest(name: str, known: Collection[str]) -> str:
-    """The valid names with the same last part or spelled alike, else the first of the same root or of all, in words."""
+    """The valid names with the same last part or spelled alike, else the first of the same root or
+    of all, in words.
+    """
     last = [key for key in known if key.rpartition(".")[2] == name.rpartition(".")[2]]
     alike = difflib.get_close_matches(name, known, n=NEAREST, cutoff=0.5)
     root = [key for key in known if key.startswith(name.partition(".")[0] + ".")]
@@ -261,20 +307,28 @@ def _nearest(name: str, known: Collection[str]) -> str:
 
 
 def _check_law(law: Law, study: Study, figures: list[str]) -> None:
-    """Refuse a law of figures that rows do not have, or of factors and values that the study does not vary.
+    """Refuse a law of figures that rows do not have, or of factors and values that the study does
+    not vary.
 
-    The figures of a kind of one's own are not known before its rows are; there are none, and they are not checked.
+    The figures of a kind of one's own are not known before its rows are; there are none, and they
+    are not checked.
     """
     for key in ("figure", "per", "equals"):
         name = getattr(law, key)
         if figures and name is not None and name not in figures:
-            raise StudyError(f"{key} = {name!r} is no figure of {study.kind}; {_nearest(name, figures)}")
+            raise StudyError(
+                f"{key} = {name!r} is no figure of {study.kind}; {_nearest(name, figures)}"
+            )
     if law.factor is None:
         return
     known = [*study.factors, *figures]
     if law.factor not in known and (figures or law.factor.startswith(ROOTS)):
-        raise StudyError(f"factor = {law.factor!r} is not varied by the study; {_nearest(law.factor, known)}")
+        raise StudyError(
+            f"factor = {law.factor!r} is not varied by the study; {_nearest(law.factor, known)}"
+        )
     values = study.factors.get(law.factor)
-    unknown = [value for value in law.order or [] if isinstance(values, list) and value not in values]
+    unknown = [
+        value for value in law.order or [] if isinstance(values, list) and value not in values
+    ]
     if unknown:
         raise StudyError(f"order has {unknown[0]!r}, and {law.factor} has the values {values}")

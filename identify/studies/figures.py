@@ -1,4 +1,6 @@
-"""Figures of a study, PNG, PDF and SVG: its figures against each factor with bands, two factors as a map, the laws."""
+"""Figures of a study, PNG, PDF and SVG: its figures against each factor with bands, two factors as
+a map, the laws.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -14,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from identify.arrays import Array
-from identify.files.atomic import write_figure
+from identify.files.atomic import figure_bytes, write_files
 from identify.reporting.figures import panel_grid
 from identify.studies.labels import axis_label, number, setting
 from identify.studies.study_file import Law, Study
@@ -36,7 +38,10 @@ STYLE: Any = {
 CURVES: list[dict[str, Any]] = [
     {"fmt": f"{marker}{line}", "color": color}
     for marker, line, color in zip(
-        "osD^vP", ("-", "--", "-.", ":", "-", "--"), ("C0", "C1", "C2", "C3", "C4", "C5"), strict=True
+        "osD^vP",
+        ("-", "--", "-.", ":", "-", "--"),
+        ("C0", "C1", "C2", "C3", "C4", "C5"),
+        strict=True,
     )
 ]
 """Markers, lines and colours, so that curves differ without colour."""
@@ -44,7 +49,9 @@ FORMATS = ("png", "pdf", "svg")
 LEAST_SPAN = 2.0
 """Smallest ratio of the ends of a logarithmic axis: small differences shall look small."""
 WIDEST_BAND = 3.0
-"""Factor by which a logarithmic axis goes beyond what is drawn for the sake of bands; wider ones run out of it."""
+"""Factor by which a logarithmic axis goes beyond what is drawn for the sake of bands; wider ones
+run out of it.
+"""
 LETTERS_PER_INCH = 14.0
 """Letters of a title, a little fewer than there is room for."""
 BESIDE = 1.02
@@ -52,7 +59,9 @@ BESIDE = 1.02
 MOST_CURVES = 6
 """Settings of the other factors that are drawn as curves of their own; more are drawn as one."""
 NEAREST_TICKS, LETTER = 0.09, 0.034
-"""Shares of an axis: that two numbers above each other are apart, at least; of a letter of a number."""
+"""Shares of an axis: that two numbers above each other are apart, at least; of a letter of a
+number.
+"""
 TICKS: list[list[float]] = [
     [1 + k / 10 for k in range(90)],
     [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8],
@@ -68,28 +77,42 @@ Others = Sequence[tuple[str, pd.DataFrame]]
 """Names and finished rows of other studies."""
 
 
-def draw(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]) -> None:
-    """Write the figures of a study's finished rows; `shown`: the figures of the rows that are drawn."""
+def draw(
+    folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]
+) -> None:
+    """Write the figures of a study's finished rows; `shown`: the figures of the rows that are
+    drawn.
+    """
     if not len(done) or not shown:
         return
     _write(folder, _figures(study, done, shown, verdicts))
 
 
-def draw_side_by_side(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], others: Others) -> None:
-    """Write the figures against each factor, or against the studies where they vary nothing, with the finished rows of
-    other studies, by their names, beside them."""
+def draw_side_by_side(
+    folder: Path, study: Study, done: pd.DataFrame, shown: list[str], others: Others
+) -> None:
+    """Write the figures against each factor, or against the studies where they vary nothing, with
+    the finished rows of other studies, by their names, beside them."""
     names, tables = zip((study.name, done), *others, strict=True)
-    together = pd.concat([table.assign(study=name) for name, table in zip(names, tables, strict=True)])
+    together = pd.concat(
+        [table.assign(study=name) for name, table in zip(names, tables, strict=True)]
+    )
     named = study.model_copy(update={"factors": study.factors | {"study": list(names)}})
     paths = list(study.factors) or ["study"]
-    _write(folder, ((f"side_by_side_{path}", factor_figure(named, together, path, shown)) for path in paths))
+    _write(
+        folder,
+        ((f"side_by_side_{path}", factor_figure(named, together, path, shown)) for path in paths),
+    )
 
 
 def _write(folder: Path, figures: Iterable[tuple[str, Figure]]) -> None:
+    contents: dict[Path, bytes] = {}
     with mpl.rc_context(STYLE):
         for name, figure in figures:
             for kind in FORMATS:
-                write_figure(folder / f"{name}.{kind}", figure)
+                path = folder / f"{name}.{kind}"
+                contents[path] = figure_bytes(figure, path.suffix)
+    write_files(contents, parents=True)
 
 
 def _figures(
@@ -111,7 +134,9 @@ def _figures(
 
 
 def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str]) -> Figure:
-    """Rms of each figure against one factor with its band, a curve for each setting of the other factors."""
+    """Rms of each figure against one factor with its band, a curve for each setting of the other
+    factors.
+    """
     figure, panels = panel_grid(len(shown), *PANEL)
     others = [other for other in study.factors if other != path]
     for axes, name in zip(panels, shown, strict=True):
@@ -121,8 +146,21 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
         else:
             curves = _curves(have, others)
             for place, (label, rows) in enumerate(curves):
-                _curve(axes, _beside(rows[path], place, len(curves)), rows[name].to_numpy(dtype=float), label, place)
-        law = next((one for one in study.theory if (one.figure, one.per, one.factor) == (name, None, path)), None)
+                _curve(
+                    axes,
+                    _beside(rows[path], place, len(curves)),
+                    rows[name].to_numpy(dtype=float),
+                    label,
+                    place,
+                )
+        law = next(
+            (
+                one
+                for one in study.theory
+                if (one.figure, one.per, one.factor) == (name, None, path)
+            ),
+            None,
+        )
         if law is not None and law.exponent is not None:
             _theory_line(axes, have[path], have[name].to_numpy(dtype=float), law.exponent)
         scale(axes, have[path])
@@ -135,7 +173,9 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
     return figure
 
 
-def map_figure(study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: list[str]) -> Figure:
+def map_figure(
+    study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: list[str]
+) -> Figure:
     """Rms of each figure over two factors, over all settings of the others."""
     figure, panels = panel_grid(len(shown), *PANEL)
     for axes, name in zip(panels, shown, strict=True):
@@ -146,7 +186,9 @@ def map_figure(study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: 
         bright = 0.4 * np.nanmin(rms) + 0.6 * np.nanmax(rms)
         for (row, column), value in np.ndenumerate(rms):
             ink = "black" if value > bright else "white"
-            axes.text(column, row, f"{value:.3g}", ha="center", va="center", color=ink, fontsize="small")
+            axes.text(
+                column, row, f"{value:.3g}", ha="center", va="center", color=ink, fontsize="small"
+            )
         axes.set_xticks(range(table.shape[1]), [number(value) for value in table.columns])
         axes.set_yticks(range(table.shape[0]), [number(value) for value in table.index])
         axes.set_xlabel(axis_label(paths[1], study))
@@ -158,7 +200,9 @@ def map_figure(study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: 
 
 
 def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]]) -> Figure:
-    """What each law speaks of against its factor, on logarithmic axes, with the power that it states."""
+    """What each law speaks of against its factor, on logarithmic axes, with the power that it
+    states.
+    """
     figure, panels = panel_grid(len(laws), *PANEL)
     for axes, (law, verdict) in zip(panels, laws, strict=True):
         factor = str(law.factor)
@@ -171,17 +215,23 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
         _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
         scale(axes, _levels(study, have, factor))
         axes.set_title(
-            f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})", fontsize="medium"
+            f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})",
+            fontsize="medium",
         )
         axes.set_xlabel(axis_label(factor, study))
         axes.set_ylabel(axis_label(law.figure, study, law.per))
         axes.legend(fontsize="small")
-    _title(figure, f"{study.title or study.name}: measured exponent and its {100 * LAWS:.0f} % interval")
+    _title(
+        figure,
+        f"{study.title or study.name}: measured exponent and its {100 * LAWS:.0f} % interval",
+    )
     return figure
 
 
 def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
-    """The factor's value in each row; where it is a figure, its mean over the rows of a point, if there are several."""
+    """The factor's value in each row; where it is a figure, its mean over the rows of a point, if
+    there are several.
+    """
     if factor in study.factors or not study.factors:
         return rows[factor]
     return rows.groupby(list(study.factors))[factor].transform("mean")
@@ -189,11 +239,15 @@ def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
 
 def _title(figure: Figure, text: str) -> None:
     """A title above all panels, in as many lines as the width of the figure asks for."""
-    figure.suptitle("\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))), fontsize=9)
+    figure.suptitle(
+        "\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))), fontsize=9
+    )
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:
-    """Rows of each setting of the other factors, with a label; all together where there are too many."""
+    """Rows of each setting of the other factors, with a label; all together where there are too
+    many.
+    """
     groups = list(done.groupby(others, sort=False)) if others else []
     if len(groups) > MOST_CURVES:
         return [(f"rows of all {len(groups)} other settings", done)]
@@ -206,7 +260,8 @@ def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFra
 
 
 def _beside(levels: pd.Series, place: int, count: int) -> pd.Series:
-    """Levels of one of several curves, moved a little, so that their bands do not cover each other."""
+    """Levels of one of several curves, moved a little, so that their bands do not cover each
+    other."""
     if count == 1 or not pd.api.types.is_numeric_dtype(levels) or not (levels > 0).all():
         return levels
     return levels * BESIDE ** (place - (count - 1) / 2)
@@ -214,9 +269,14 @@ def _beside(levels: pd.Series, place: int, count: int) -> pd.Series:
 
 def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, place: int) -> None:
     """Rms at each level with its band."""
-    groups = pd.Series(values, index=levels.index).groupby(levels, sort=pd.api.types.is_numeric_dtype(levels))
-    places, points = zip(*[(level, point_statistics(one.to_numpy())) for level, one in groups], strict=True)
-    shown, rms = _shown(pd.Series(places)), np.array([point.rms for point in points])
+    groups = pd.Series(values, index=levels.index).groupby(
+        levels, sort=pd.api.types.is_numeric_dtype(levels)
+    )
+    places, points = zip(
+        *[(level, point_statistics(one.to_numpy())) for level, one in groups], strict=True
+    )
+    shown = _shown(pd.Series(places))
+    rms = np.array([point.rms for point in points])
     low, high = np.array([point.rms_band or (point.rms, point.rms) for point in points]).T
     axes.errorbar(
         shown,
@@ -231,28 +291,48 @@ def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, place: int)
 
 
 def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) -> None:
-    """The power law with that exponent through the middle of the data; none where the factor has no powers."""
+    """The power law with that exponent through the middle of the data; none where the factor has no
+    powers.
+    """
     x = pd.to_numeric(factor, errors="coerce").to_numpy(dtype=float)
     if not np.all(x > 0.0):
         return
     level = np.sqrt(np.mean((values / x**exponent) ** 2))
     ends = np.geomspace(x.min(), x.max(), 50)
-    axes.plot(ends, level * ends**exponent, "--", color="black", linewidth=1, label=f"theory, power {exponent:g}")
+    axes.plot(
+        ends,
+        level * ends**exponent,
+        "--",
+        color="black",
+        linewidth=1,
+        label=f"theory, power {exponent:g}",
+    )
 
 
 def scale(axes: Axes, factor: pd.Series) -> None:
     """Logarithmic axes where everything is positive, with numbers that do not touch each other."""
     if pd.api.types.is_numeric_dtype(factor) and (factor > 0).all() and factor.nunique() > 1:
         axes.set_xscale("log")
-        levels = sorted(factor.unique()) if factor.nunique() <= MOST_TICKS else _log_ticks(*axes.get_xlim())
+        levels = (
+            sorted(factor.unique())
+            if factor.nunique() <= MOST_TICKS
+            else _log_ticks(*axes.get_xlim())
+        )
         letters = max(len(number(float(value))) for value in levels)
         _set_ticks(axes.xaxis, _far_apart(levels, *axes.get_xlim(), 0.02 + LETTER * letters))
-    drawn = np.concatenate([np.asarray(line.get_ydata(), dtype=float).ravel() for line in axes.lines])
+    drawn = np.concatenate(
+        [np.asarray(line.get_ydata(), dtype=float).ravel() for line in axes.lines]
+    )
     if (drawn > 0).all():
         axes.set_yscale("log")
-        curves = [np.asarray(line.get_ydata(), dtype=float) for line in axes.lines if line.get_linestyle() != "None"]
+        curves = [
+            np.asarray(line.get_ydata(), dtype=float)
+            for line in axes.lines
+            if line.get_linestyle() != "None"
+        ]
         middle = np.concatenate(curves or [drawn])
-        low, high = max(drawn.min(), middle.min() / WIDEST_BAND), min(drawn.max(), middle.max() * WIDEST_BAND)
+        low = max(drawn.min(), middle.min() / WIDEST_BAND)
+        high = min(drawn.max(), middle.max() * WIDEST_BAND)
         widen = 1.08 * max(1.0, np.sqrt(LEAST_SPAN * low / high))
         axes.set_ylim(low / widen, high * widen)
         _set_ticks(axes.yaxis, _log_ticks(*axes.get_ylim()))
@@ -279,8 +359,12 @@ def _set_ticks(axis: Axis, values: list[float]) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def _far_apart(values: list[float], low: float, high: float, share: float = NEAREST_TICKS) -> list[float]:
-    """Those of ascending values that are this share of a logarithmic axis from the last that was kept, or more."""
+def _far_apart(
+    values: list[float], low: float, high: float, share: float = NEAREST_TICKS
+) -> list[float]:
+    """Those of ascending values that are this share of a logarithmic axis from the last that was
+    kept, or more.
+    """
     kept: list[float] = []
     for value in values:
         if not kept or np.log(value / kept[-1]) >= share * np.log(high / low):
@@ -289,4 +373,8 @@ def _far_apart(values: list[float], low: float, high: float, share: float = NEAR
 
 
 def _shown(values: pd.Series) -> Any:
-    return values.to_numpy() if pd.api.types.is_numeric_dtype(values) else values.astype(str).to_numpy()
+    return (
+        values.to_numpy()
+        if pd.api.types.is_numeric_dtype(values)
+        else values.astype(str).to_numpy()
+    )

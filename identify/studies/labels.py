@@ -1,4 +1,6 @@
-"""What the columns of a study are called: by their keys with units in tables, and in words in figures."""
+"""What the columns of a study are called: by their keys with units in tables, and in words in
+figures.
+"""
 
 import re
 from textwrap import wrap
@@ -39,7 +41,9 @@ def factor_unit(path: str) -> str:
 
 
 def unit_of(name: str, study: Study) -> str:
-    """Unit of a column of a study's table, a factor or a figure; empty where it has none, or where nobody says it."""
+    """Unit of a column of a study's table, a factor or a figure; empty where it has none, or where
+    nobody says it.
+    """
     if name == "seconds":
         return "s"
     if name in study.factors:
@@ -55,12 +59,19 @@ def labelled(name: str, study: Study) -> str:
 
 
 def axis_label(name: str, study: Study, per: str | None = None) -> str:
-    """What a column, or one divided by another, is in words, with its unit in brackets, in lines of WIDEST letters."""
-    words, unit = _words(name, study), _unit(name, study)
+    """What a column, or one divided by another, is in words, with its unit in brackets, in lines of
+    WIDEST letters.
+    """
+    words = _words(name, study)
+    unit = _unit(name, study)
     if per is not None:  # both in words would be a paragraph
         words = f"{_plain_name(name)} / {_plain_name(per)}"
         unit = "/".join(filter(None, (unit, _unit(per, study))))
-    lines = wrap(words[:1].upper() + words[1:] + (f" [{unit}]" if unit else ""), WIDEST, break_long_words=False)
+    lines = wrap(
+        words[:1].upper() + words[1:] + (f" [{unit}]" if unit else ""),
+        WIDEST,
+        break_long_words=False,
+    )
     return "\n".join(lines)
 
 
@@ -77,7 +88,8 @@ def number(value: object) -> str:
 
 
 def _words(name: str, study: Study) -> str:
-    """The first statement of what is said of a column; its name in plain letters where nothing is."""
+    """The first statement of what is said of a column; its name in plain letters where
+    nothing is."""
     columns = KINDS[study.kind].columns if study.kind in KINDS else {}
     if name in columns:
         said = columns[name].meaning
@@ -90,7 +102,9 @@ def _words(name: str, study: Study) -> str:
 
 
 def _unit(name: str, study: Study) -> str:
-    unit = unit_of(name, study) or ("" if study.kind in KINDS or name in study.factors else _suffix(name)[1])
+    unit = unit_of(name, study) or (
+        "" if study.kind in KINDS or name in study.factors else _suffix(name)[1]
+    )
     return PRINTED.get(unit, unit)
 
 

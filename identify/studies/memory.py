@@ -1,4 +1,5 @@
-"""Whether the rows of a study find room in the memory of this machine, told before the first one."""
+"""Whether the rows of a study find room in the memory of this machine, told before the first
+one."""
 
 import psutil
 
@@ -28,11 +29,13 @@ def check_memory(study: Study, workers: int) -> None:
     longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
     case = Case(0, 0, longest)
     row = setup.row_scenario(case), kind.checked(setup.row_options(case))
-    needed, there = PROCESS + kind.memory(*row), psutil.virtual_memory().total
+    needed = PROCESS + kind.memory(*row)
+    there = psutil.virtual_memory().total
     if workers * needed > there:
         fit = int(there // needed)
         raise StudyError(
-            f"the longest rows of study {study.name!r} need {needed / GB:.3g} GB each, in {workers} processes "
+            f"the longest rows of study {study.name!r} need {needed / GB:.3g} GB each, in "
+            f"{workers} processes "
             f"{workers * needed / GB:.3g} GB, and this machine has {there / GB:.3g} GB: "
             + (f"--workers {fit} fits" if fit else "shorten its rows")
         )

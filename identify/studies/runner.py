@@ -1,7 +1,10 @@
-"""A study from its first to its last row: what is not done yet is computed, kept at once, and tabulated at the end."""
+"""A study from its first to its last row: what is not done yet is computed, kept at once, and
+tabulated at the end.
+"""
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -10,6 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from cmmsim.plugins import allow_plugin
 from identify.errors import StudyInterrupted
 from identify.progress import Progress
 from identify.runtime import honoured, raise_noted
@@ -77,15 +81,17 @@ def run_study(
     workers: Workers = in_this_process,
     so_far: SoFar = lambda frame: None,
 ) -> Outcome:
-    """Run a study in its folder, or go on with it there; the same study gives the same figures whatever the workers.
+    """Run a study in its folder, or go on with it there; the same study gives the same figures
+    whatever the workers.
 
-    so_far: gets the table of what is done now and then while it runs.
-    Raises StudyError: see `identify.studies.design.prepare` and `identify.studies.store.open_folder`; the
-    disk is full; the workers are lost. Finished rows are kept, and the same call goes on from there. Raises
+    so_far: gets the table of what is done now and then while it runs. Raises StudyError: see
+    `identify.studies.design.prepare` and `identify.studies.store.open_folder`; the disk is full;
+    the workers are lost. Finished rows are kept, and the same call goes on from there. Raises
     StudyInterrupted: Ctrl-C, likewise.
     """
     setup = prepare(study)
-    entry, design = resolved(study, setup), Design(study)
+    entry = resolved(study, setup)
+    design = Design(study)
     with open_folder(folder, entry, len(design)) as journal:
         found = int(journal.finished.sum())
         try:
@@ -94,7 +100,9 @@ def run_study(
                 _compute_pending(study.name, setup, design, journal, progress, workers, shown)
         except KeyboardInterrupt:
             done = sum(1 for _ in journal.rows())  # it may have come while some were being noted
-            raise StudyInterrupted(f"stopped: {done} of {len(design)} rows are done and kept") from None
+            raise StudyInterrupted(
+                f"stopped: {done} of {len(design)} rows are done and kept"
+            ) from None
         frame = tidy_table(study, journal.rows())
         write_table(folder / TABLE, frame, entry)
         write_view(folder / VIEW, frame, study)
@@ -139,16 +147,21 @@ def _compute_pending(
 
 
 BATCH_SECONDS = 0.25
-"""Work in a batch, so that sending it costs little; what is lost at most with each worker when everything is killed."""
+"""Work in a batch, so that sending it costs little; what is lost at most with each worker when
+everything is killed.
+"""
 
 LARGEST_BATCH = 500
 
 
 class Batches:
-    """Hands out the rows that are still to be done, in batches sized by how long the last ones took."""
+    """Hands out the rows that are still to be done, in batches sized by how long the last ones
+    took.
+    """
 
     def __init__(self, cases: Iterator[Case], count: int) -> None:
-        self._cases, self._left = cases, count
+        self._cases = cases
+        self._left = count
         self._row_seconds = BATCH_SECONDS
 
     def take(self, workers: int) -> list[Case]:
@@ -168,11 +181,36 @@ class Batches:
         self._row_seconds = max(0.5 * (self._row_seconds + mean), 1e-6)
 
 
+class Suspects:
+    """Rows whose process died. Each is computed again, alone, and then is an error if its process
+    dies again: the first death may be the fault of another row.
+    """
+
+    def __init__(self) -> None:
+        self._rows: list[Case] = []
+        self._deaths: Counter[int] = Counter()
+
+    def take(self) -> list[Case]:
+        """A row to be computed while no other is; empty when there is none."""
+        return [self._rows.pop()] if self._rows else []
+
+    def blame(self, cases: list[Case], fate: str = "died") -> list[Finished]:
+        """Note what became of the process of some rows; one that was alone again, as an error."""
+        self._deaths.update(case.number for case in cases)
+        if len(cases) == 1 and self._deaths[cases[0].number] > 1:
+            error = f"KilledWorker: its process {fate}, and again when it computed this row alone"
+            return [Finished(cases[0].number, {}, 0.0, error)]
+        self._rows += cases
+        return []
+
+
 def compute(setup: Setup, cases: list[Case]) -> list[Finished]:
-    """Compute rows one after the other; what goes wrong in one is noted there, and the others go on.
+    """Compute rows one after the other; what goes wrong in one is noted there, and the others go
+    on.
 
     The only part of a study that runs on other processes and machines.
     """
+    allow_plugin(*setup.plugins)
     return [_compute(setup, case) for case in cases]
 
 
@@ -180,7 +218,9 @@ def _compute(setup: Setup, case: Case) -> Finished:
     start = time.perf_counter()
     try:
         kind = find_kind(setup.kind)
-        row = kind.row(setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case))
+        row = kind.row(
+            setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case)
+        )
         figures = _plain(row, {*FIRST, *case.factors, *LAST})
     except KeyboardInterrupt:
         raise
@@ -192,10 +232,12 @@ def _compute(setup: Setup, case: Case) -> Finished:
 
 
 def _plain(figures: Mapping[str, float], taken: set[str]) -> dict[str, float]:
-    """Figures as plain numbers; one that is none is an error of the row, so that no average hides it, and so is one
-    that no column of the table is left for."""
+    """Figures as plain numbers; one that is none is an error of the row, so that no average hides
+    it, and so is one that no column of the table is left for."""
     if hidden := sorted(taken & set(figures)):
-        raise ValueError(f"a figure must not be called {hidden[0]!r}: the table has a column of this name")
+        raise ValueError(
+            f"a figure must not be called {hidden[0]!r}: the table has a column of this name"
+        )
     plain = {name: float(value) for name, value in figures.items()}
     for name, value in plain.items():
         if not math.isfinite(value):

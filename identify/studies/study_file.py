@@ -1,7 +1,9 @@
-"""What a user writes: which scenario is varied how, and the laws that its rows should follow, read from TOML.
+"""What a user writes: which scenario is varied how, and the laws that its rows should follow, read
+from TOML.
 
-The help of ``cmmsim study`` shows a file. The keys of what is varied are dotted paths: ``scenario.`` and a key of a
-scenario, ``sensor.`` and a key of a sensor file, ``options.`` and an option of the kind.
+The help of ``cmmsim study`` shows a file. The keys of what is varied are dotted paths:
+``scenario.`` and a key of a scenario, ``sensor.`` and a key of a sensor file, ``options.`` and an
+option of the kind.
 """
 
 import math
@@ -11,6 +13,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from dynamics.files import Name
 from identify.errors import StudyError
 from identify.scenario.scenario import SCENARIOS
 from identify.scenario.section import Section
@@ -18,29 +21,41 @@ from identify.scenario.settings_file import SettingsFiles, one_line
 
 
 class Law(Section):
-    """A law: one of three statements about the rms of a figure over rows, with all other factors held where they are.
+    """A law: one of three statements about the rms of a figure over rows, with all other factors
+    held where they are.
 
-    exponent: it grows with a numeric factor as ``factor ** exponent``; equals: it is that of another figure;
-    order: it grows along these values of a factor. Valid to ``tolerance``, an amount that the statement itself is known
-    to be off by: of the exponent, or of the logarithm of a ratio.
+    exponent: it grows with a numeric factor as ``factor ** exponent``; equals: it is that of
+    another figure; order: it grows along these values of a factor. Valid to ``tolerance``, an
+    amount that the statement itself is known to be off by: of the exponent, or of the logarithm of
+    a ratio.
     """
 
     figure: str = Field(description="figure of the rows, its rms over rows is meant")
     per: str | None = Field(None, description="figure that it is divided by, row by row")
     factor: str | None = Field(None, description="factor by dotted path")
-    exponent: float | None = Field(None, description="the figure grows as this power of the factor")
+    exponent: float | None = Field(
+        None, ge=-100, le=100, description="the figure grows as this power of the factor"
+    )
     equals: str | None = Field(None, description="figure of the same rms")
-    order: list[Any] | None = Field(None, description="values of the factor, the smallest rms first")
-    tolerance: float = Field(0.0, ge=0, description="by how much the law itself may be off")
+    order: list[Any] | None = Field(
+        None, description="values of the factor, the smallest rms first"
+    )
+    tolerance: float = Field(0.0, ge=0, le=1e3, description="by how much the law itself may be off")
     why: str = Field("", description="where the law comes from")
 
     @model_validator(mode="after")
     def _states_one_thing(self) -> "Law":
-        stated = [name for name in ("exponent", "equals", "order") if getattr(self, name) is not None]
+        stated = [
+            name for name in ("exponent", "equals", "order") if getattr(self, name) is not None
+        ]
         if len(stated) != 1:
-            raise ValueError(f"a law states one of exponent, equals and order, got {', '.join(stated) or 'none'}")
+            raise ValueError(
+                f"a law states one of exponent, equals and order, got {', '.join(stated) or 'none'}"
+            )
         if (self.factor is None) != (self.equals is not None):
-            raise ValueError(f"a law with {stated[0]} {'needs a' if self.factor is None else 'has no'} factor")
+            raise ValueError(
+                f"a law with {stated[0]} {'needs a' if self.factor is None else 'has no'} factor"
+            )
         if self.order is not None and len(self.order) < 2:
             raise ValueError(f"order needs two values or more, got {self.order}")
         return self
@@ -69,7 +84,9 @@ class Law(Section):
 
 
 class Range(Section):
-    """A factor of a random sample, drawn evenly between two bounds or evenly between their logarithms."""
+    """A factor of a random sample, drawn evenly between two bounds or evenly between their
+    logarithms.
+    """
 
     low: float
     high: float
@@ -92,19 +109,27 @@ class Range(Section):
 class Study(Section):
     """A whole study; load one with `load_study`."""
 
-    name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
+    name: Name = Field(description="short name, used for folders")
     title: str = Field("", description="what the study asks")
     kind: str = Field(description="kind of row: a built-in one, or module:function")
-    scenario: str = Field("paper", description="built-in scenario, or path of a scenario file from this file on")
+    scenario: str = Field(
+        "paper", description="built-in scenario, or path of a scenario file from this file on"
+    )
     changes: dict[str, Any] = Field({}, description="values that hold in every row, by dotted path")
-    factors: dict[str, list[Any] | Range] = Field({}, description="values of each factor, by dotted path")
-    sample: int | None = Field(None, description="points drawn at random; none: the whole grid", ge=1)
+    factors: dict[str, list[Any] | Range] = Field(
+        {}, description="values of each factor, by dotted path"
+    )
+    sample: int | None = Field(
+        None, description="points drawn at random; none: the whole grid", ge=1
+    )
     repeats: int = Field(1, description="rows at each point", ge=1)
     seed: int = Field(0, description="seed of all randomness", ge=0)
     theory: list[Law] = Field([], description="laws with which the summary compares")
     options: dict[str, Any] = Field({}, description="options of the kind")
     figures: list[str] | None = Field(
-        None, description="figures of the rows that are drawn and tabulated; none: the main ones of the kind"
+        None,
+        description="figures of the rows that are drawn and tabulated; none: the main ones of the "
+        "kind",
     )
 
     @field_validator("changes", mode="before")
@@ -116,13 +141,19 @@ class Study(Section):
     @classmethod
     def _factors_by_path(cls, tables: Any) -> Any:
         found = _by_path(tables, keep=("low", "high"))
-        return {path: _factor(path, value) for path, value in found.items()} if isinstance(found, dict) else found
+        return (
+            {path: _factor(path, value) for path, value in found.items()}
+            if isinstance(found, dict)
+            else found
+        )
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Study":
         for path, values in self.factors.items():
             if isinstance(values, Range) and self.sample is None:
-                raise ValueError(f"factors.{path} has low and high, which needs sample = N; a grid needs a list")
+                raise ValueError(
+                    f"factors.{path} has low and high, which needs sample = N; a grid needs a list"
+                )
             if isinstance(values, list) and not values:
                 raise ValueError(f"factors.{path} has no values")
             if path in self.changes:
@@ -134,7 +165,9 @@ class Study(Section):
         """Number of different settings."""
         if self.sample is not None:
             return self.sample
-        return math.prod(len(values) for values in self.factors.values() if isinstance(values, list))
+        return math.prod(
+            len(values) for values in self.factors.values() if isinstance(values, list)
+        )
 
     @property
     def rows(self) -> int:
@@ -142,39 +175,60 @@ class Study(Section):
         return self.points * self.repeats
 
     def with_settings(self, settings: Mapping[str, Any]) -> "Study":
-        """Copy with entries replaced by dotted path, such as ``{"repeats": 5, "scenario.timing.latency_s": 0.01}``.
+        """Copy with entries replaced by dotted path, such as ``{"repeats": 5,
+        "scenario.timing.latency_s": 0.01}``.
 
-        A key of the scenario, of the sensor or of the options with a list of values, or with a table of low and high,
-        becomes a factor; with any other value it holds in every row.
+        A key of the scenario, of the sensor or of the options with a list of values, or with a
+        table of low and high, becomes a factor; with any other value it holds in every row.
 
         Raises StudyError: no such entry (with the valid names), or a value that does not fit.
         """
         data = {"factors": {}, "changes": {}, "options": {}} | self.model_dump(exclude_unset=True)
-        single = [name for name in Study.model_fields if name not in ("factors", "changes", "options", "theory")]
+        single = [
+            name
+            for name in Study.model_fields
+            if name not in ("factors", "changes", "options", "theory")
+        ]
         for path, value in settings.items():
             root, _, key = path.partition(".")
             if path in single:
                 data[path] = value
             elif root in ("scenario", "sensor", "options") and key:
                 place, name = ("options", key) if root == "options" else ("changes", path)
-                for held, old in (("factors", path), (place, name)):  # and what stands in a table of this name
-                    data[held] = {key: one for key, one in data[held].items() if not f"{key}.".startswith(f"{old}.")}
-                varied = isinstance(value, list) or (isinstance(value, dict) and set(value) & set(Range.model_fields))
+                for held, old in (
+                    ("factors", path),
+                    (place, name),
+                ):  # and what stands in a table of this name
+                    data[held] = {
+                        key: one
+                        for key, one in data[held].items()
+                        if not f"{key}.".startswith(f"{old}.")
+                    }
+                varied = isinstance(value, list) or (
+                    isinstance(value, dict) and set(value) & set(Range.model_fields)
+                )
                 table, name = ("factors", path) if varied else (place, name)
                 data[table][name] = value
             else:
                 raise StudyError(
-                    f"unknown key {path!r} of study {self.name!r}; valid names: {', '.join(single)}, and scenario.*, "
+                    f"unknown key {path!r} of study {self.name!r}; valid names: "
+                    f"{', '.join(single)}, and scenario.*, "
                     "sensor.* and options.* for what its rows vary"
                 )
         return STUDIES.from_dict(data, f"study {self.name!r}")
 
 
 _VARIED = {
-    f"{table}.scenario.{key}": names for table in ("changes", "factors") for key, names in SCENARIOS.files.items()
+    f"{table}.scenario.{key}": names
+    for table in ("changes", "factors")
+    for key, names in SCENARIOS.files.items()
 }
 STUDIES = SettingsFiles(
-    "study", Path(__file__).parent / "built_in", Study, StudyError, {"scenario": SCENARIOS.names, **_VARIED}
+    "study",
+    Path(__file__).parent / "built_in",
+    Study,
+    StudyError,
+    {"scenario": SCENARIOS.names, **_VARIED},
 )
 
 
@@ -185,8 +239,8 @@ STARTING = Path(__file__).parent / "starting.toml"
 def load_study(name_or_path: str | Path) -> Study:
     """Load a built-in study by name, or one from a TOML file, from whose folder its paths start.
 
-    Raises StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys of factors and
-    changes are checked by `identify.studies.design`.
+    Raises StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys
+    of factors and changes are checked by `identify.studies.design`.
     """
     return STUDIES.load(name_or_path)
 
@@ -194,7 +248,8 @@ def load_study(name_or_path: str | Path) -> Study:
 def study_schema() -> dict[str, Any]:
     """JSON schema of study files, for editors; `built_in/study.schema.json` holds it.
 
-    What is varied stands in tables in tables, whose keys are those of scenarios, sensors and kinds of row.
+    What is varied stands in tables in tables, whose keys are those of scenarios, sensors and kinds
+    of row.
     """
     schema = Study.model_json_schema()
     for name in ("changes", "factors"):
@@ -213,7 +268,10 @@ def _factor(path: str, value: Any) -> Any:
     if isinstance(value, (list, Range)):
         return value
     if not isinstance(value, Mapping):
-        raise ValueError(f"{path} = {value!r} is no list of values; to hold it in every row write it under [changes]")
+        raise ValueError(
+            f"{path} = {value!r} is no list of values; to hold it in every row write it under "
+            "[changes]"
+        )
     try:
         return Range.model_validate(value)
     except ValidationError as error:
@@ -221,7 +279,9 @@ def _factor(path: str, value: Any) -> Any:
 
 
 def _by_path(tables: Any, keep: Collection[str] = (), section: str = "") -> Any:
-    """Tables in tables as one table by dotted path; a table with one of the keys ``keep`` is a value."""
+    """Tables in tables as one table by dotted path; a table with one of the keys ``keep`` is a
+    value.
+    """
     if not isinstance(tables, Mapping):
         return tables
     found: dict[str, Any] = {}

@@ -11,8 +11,7 @@ from typing import Any
 import pandas as pd
 
 from identify.errors import StudyError
-from identify.files.atomic import write_text
-from identify.files.run_folder import save_result
+from identify.files.run_folder import save_files
 from identify.files.versions import versions
 from identify.studies import theory
 from identify.studies.figures import Others, draw, draw_side_by_side
@@ -22,7 +21,8 @@ from identify.studies.study_file import Study
 from identify.studies.table import figure_names
 from identify.studies.theory import Statistics, Verdict, check_laws
 
-JSON, MARKDOWN = "summary.json", "summary.md"
+JSON = "summary.json"
+MARKDOWN = "summary.md"
 NAMED = 20
 """Failed rows that the summary names one by one."""
 LONGEST = 60
@@ -32,14 +32,19 @@ Points = list[tuple[dict[str, Any], dict[str, Statistics]]]
 """Factors and statistics of points."""
 
 
-def write(folder: Path, study: Study, frame: pd.DataFrame, figures: bool = True, others: Others = ()) -> dict[str, Any]:
-    """Write summary.json, summary.md and, where wanted, figures into a study's folder; `frame` is its table.
+def write(
+    folder: Path, study: Study, frame: pd.DataFrame, figures: bool = True, others: Others = ()
+) -> dict[str, Any]:
+    """Write summary.json, summary.md and, where wanted, figures into a study's folder; `frame` is
+    its table.
 
-    others: names and finished rows of other studies, which are drawn beside its own. Returns what summary.json holds.
-    Raises OSError where it cannot be written.
+    others: names and finished rows of other studies, which are drawn beside its own. Returns what
+    summary.json holds. Raises WriteError.
     """
     done = frame[frame["error"] == ""]
-    names = [name for name in figure_names(frame, study) if pd.api.types.is_numeric_dtype(frame[name])]
+    names = [
+        name for name in figure_names(frame, study) if pd.api.types.is_numeric_dtype(frame[name])
+    ]
     points = _points(study, done, names)
     verdicts = check_laws(study, frame)
     entry = {
@@ -57,17 +62,18 @@ def write(folder: Path, study: Study, frame: pd.DataFrame, figures: bool = True,
         },
         "failures": _failures(study, frame),
         "confidence": {"bands": theory.BAND_CONFIDENCE, "laws": theory.CONFIDENCE},
-        "units": {name: unit for name in [*study.factors, *names] if (unit := unit_of(name, study))},
+        "units": {
+            name: unit for name in [*study.factors, *names] if (unit := unit_of(name, study))
+        },
         "theory": [verdict.entry for verdict in verdicts],
         "points": [
             {"factors": factors, "figures": {name: asdict(one) for name, one in figures.items()}}
             for factors, figures in points
         ],
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    save_result(folder / JSON, entry)
     shown = main_figures(study, names)
-    write_text(folder / MARKDOWN, _markdown(study, entry, verdicts, points, shown))
+    text = _markdown(study, entry, verdicts, points, shown)
+    save_files(folder, {JSON: entry, MARKDOWN: text})
     if figures:
         draw(folder / "figures", study, done, shown, verdicts)
     if others and len(done):
@@ -76,24 +82,30 @@ def write(folder: Path, study: Study, frame: pd.DataFrame, figures: bool = True,
 
 
 def main_figures(study: Study, names: list[str]) -> list[str]:
-    """The figures, of those that the rows have, that are drawn and tabulated: those that the study chooses; else the
-    main ones of a built-in kind, or the first six of one's own kind.
+    """The figures, of those that the rows have, that are drawn and tabulated: those that the study
+    chooses; else the main ones of a built-in kind, or the first six of one's own kind.
 
     Raises StudyError: the study chooses one that no row has.
     """
     if study.figures is not None:
-        known = KINDS[study.kind].columns if study.kind in KINDS else {}  # of which the first rows may have none
-        missing = [name for name in study.figures if names and name not in names and name not in known]
+        # of which the first rows may have none
+        known = KINDS[study.kind].columns if study.kind in KINDS else {}
+        missing = [
+            name for name in study.figures if names and name not in names and name not in known
+        ]
         if missing:
             raise StudyError(f"figures has {missing[0]!r}, and the rows have {', '.join(names)}")
         return [name for name in study.figures if name in names]
     if study.kind not in KINDS:
         return names[:6]
-    return [name for name, column in KINDS[study.kind].columns.items() if column.main and name in names]
+    return [
+        name for name, column in KINDS[study.kind].columns.items() if column.main and name in names
+    ]
 
 
 def _points(study: Study, done: pd.DataFrame, names: list[str]) -> Points:
-    """Factors and statistics of each point that has a row, those of a grid in its order and those of a sample by size.
+    """Factors and statistics of each point that has a row, those of a grid in its order and those
+    of a sample by size.
 
     A sample with single rows is one point as a whole.
     """
@@ -117,15 +129,21 @@ def _statistics(rows: pd.DataFrame, names: list[str]) -> dict[str, Statistics]:
 def _failures(study: Study, frame: pd.DataFrame) -> dict[str, Any]:
     failed = frame[frame["error"] != ""]
     named = failed.head(NAMED)[["row", "repeat", *study.factors, "error"]]
-    return {"reasons": failed["error"].value_counts().head(NAMED).to_dict(), "first": named.to_dict("records")}
+    return {
+        "reasons": failed["error"].value_counts().head(NAMED).to_dict(),
+        "first": named.to_dict("records"),
+    }
 
 
-def _markdown(study: Study, entry: dict[str, Any], verdicts: list[Verdict], points: Points, shown: list[str]) -> str:
+def _markdown(
+    study: Study, entry: dict[str, Any], verdicts: list[Verdict], points: Points, shown: list[str]
+) -> str:
     rows = entry["rows"]
     lines = [
         f"# {study.title or study.name}",
         "",
-        f"Study `{study.name}`, rows of kind `{study.kind}`, scenario `{study.scenario}`, seed {study.seed}: "
+        f"Study `{study.name}`, rows of kind `{study.kind}`, scenario `{study.scenario}`, seed "
+        f"{study.seed}: "
         f"{rows['done']} rows done, {rows['failed']} failed, {rows['missing']} missing.",
     ]
     if verdicts:
@@ -142,21 +160,30 @@ def _markdown(study: Study, entry: dict[str, Any], verdicts: list[Verdict], poin
     if rows["failed"]:
         lines += ["", "## Failed rows", "", "They are in no figure below."]
         lines += [f"- {count} x {reason}" for reason, count in entry["failures"]["reasons"].items()]
-        lines += ["", f"The first: {', '.join(str(one['row']) for one in entry['failures']['first'])}."]
+        lines += [
+            "",
+            f"The first: {', '.join(str(one['row']) for one in entry['failures']['first'])}.",
+        ]
     lines += ["", "## Points", "", _bands_text(points), "", *_table(study, points, shown)]
     return "\n".join(lines) + "\n"
 
 
 def _law_row(verdict: Verdict) -> str:
-    law, measured, interval = verdict.law, verdict.reason, ""
+    law = verdict.law
+    measured = verdict.reason
+    interval = ""
     if verdict.measured is not None:
-        measured, interval = f"{verdict.measured:.4g}", f"{verdict.low:.4g} to {verdict.high:.4g}"
+        measured = f"{verdict.measured:.4g}"
+        interval = f"{verdict.low:.4g} to {verdict.high:.4g}"
     return f"| {law.statement} | {law.expected} | {measured} | {interval} | {verdict.verdict} |"
 
 
 def _bands_text(points: Points) -> str:
     if points and all(one.rows < 2 for _, figures in points for one in figures.values()):
-        return "Rms over rows. With a single repeat there is no band: the same command with --repeats 10 adds some."
+        return (
+            "Rms over rows. With a single repeat there is no band: the same command with "
+            "--repeats 10 adds some."
+        )
     return f"Rms over rows, with its {theory.BAND_CONFIDENCE:.0%} band."
 
 
@@ -167,10 +194,16 @@ def _table(study: Study, points: Points, shown: list[str]) -> list[str]:
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for values, figures in points[:LONGEST]:
         count = max((one.rows for one in figures.values()), default=0)
-        cells = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values.values()]
+        cells = [
+            f"{value:.6g}" if isinstance(value, float) else str(value) for value in values.values()
+        ]
         cells += [str(count), *(_cell(figures.get(name)) for name in shown)]
         lines.append(f"| {' | '.join(cells)} |")
-    return lines + ([f"\n{len(points) - LONGEST} more points stand in `{JSON}`."] if len(points) > LONGEST else [])
+    return lines + (
+        [f"\n{len(points) - LONGEST} more points stand in `{JSON}`."]
+        if len(points) > LONGEST
+        else []
+    )
 
 
 def _cell(one: Statistics | None) -> str:

@@ -1,10 +1,13 @@
-"""Finished rows as one tidy table with units: Parquet with the study in its metadata, and a view by factors.
+"""Finished rows as one tidy table with units: Parquet with the study in its metadata, and a view by
+factors.
 
-Columns: ``row``, ``repeat``, the seed as ``seed_entropy`` and ``seed_spawn_key`` (what ``numpy.random.SeedSequence``
-takes), one a factor under its dotted path, one a figure with its unit in the name, ``seconds`` and ``error``. A row
-that failed has NaN figures and says why in ``error``; a figure that rows of one's own do not all have is NaN in others.
+Columns: ``row``, ``repeat``, the seed as ``seed_entropy`` and ``seed_spawn_key`` (what
+``numpy.random.SeedSequence`` takes), one a factor under its dotted path, one a figure with its unit
+in the name, ``seconds`` and ``error``. A row that failed has NaN figures and says why in ``error``;
+a figure that rows of one's own do not all have is NaN in others.
 """
 
+import io
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -18,8 +21,8 @@ import pyarrow.parquet as pq
 import xarray as xr
 
 from identify.arrays import Array
-from identify.errors import StudyError
-from identify.files.atomic import atomic_path
+from identify.errors import StudyError, WriteError
+from identify.files.atomic import write_bytes, writing
 from identify.files.dataset import write_groups
 from identify.files.versions import versions
 from identify.studies.design import Design, Finished
@@ -31,17 +34,22 @@ LAST = ("seconds", "error")
 """Columns of a study's table before its factors and behind its figures."""
 
 TABLE = "study.parquet"
-STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
+STUDY_KEY = b"cmmsim.study"
+VERSIONS_KEY = b"cmmsim.versions"
 
 
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
-    """The table of a study's finished rows, ordered by row. A factor whose values are lists has them as JSON text."""
+    """The table of a study's finished rows, ordered by row. A factor whose values are lists has
+    them as JSON text.
+    """
     design = Design(study)
     count = len(design)
     figures: dict[str, Array] = {}
-    seconds, errors = np.full(count, np.nan), [""] * count
+    seconds = np.full(count, np.nan)
+    errors = [""] * count
     for row in finished:
-        seconds[row.number], errors[row.number] = row.seconds, row.error
+        seconds[row.number] = row.seconds
+        errors[row.number] = row.error
         for name, value in row.figures.items():
             figures.setdefault(name, np.full(count, np.nan))[row.number] = value
     done = np.flatnonzero(np.isfinite(seconds))
@@ -54,7 +62,9 @@ def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
     }
     columns |= {path: [plain(case.factors[path]) for case in cases] for path in study.factors}
     columns |= {name: values[done] for name, values in figures.items()}
-    return pd.DataFrame(columns | {"seconds": seconds[done], "error": [errors[number] for number in done]})
+    return pd.DataFrame(
+        columns | {"seconds": seconds[done], "error": [errors[number] for number in done]}
+    )
 
 
 def figure_names(frame: pd.DataFrame, study: Study) -> list[str]:
@@ -69,11 +79,15 @@ def plain(value: Any) -> Any:
 
 @contextmanager
 def written(path: Path, more: str = "") -> Iterator[None]:
-    """What keeps the block from writing a file is an error of the study. Raises StudyError with the reason."""
+    """Turn what keeps the block from writing a file into an error of the study.
+
+    more: said behind the reason. Raises StudyError.
+    """
     try:
-        yield
-    except OSError as error:
-        raise StudyError(f"{path} cannot be written: {error.strerror or error}{more}") from error
+        with writing(path):
+            yield
+    except WriteError as error:
+        raise StudyError(f"{error}{more}") from None
 
 
 def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
@@ -83,8 +97,11 @@ def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
     """
     table = pa.Table.from_pandas(frame, preserve_index=False)
     own = {STUDY_KEY: json.dumps(entry).encode(), VERSIONS_KEY: json.dumps(versions()).encode()}
-    with written(path), atomic_path(path) as temporary:
-        pq.write_table(table.replace_schema_metadata((table.schema.metadata or {}) | own), temporary)
+    stream = io.BytesIO()
+    described = table.replace_schema_metadata((table.schema.metadata or {}) | own)
+    pq.write_table(described, stream, write_page_checksum=True)
+    with written(path):
+        write_bytes(path, stream.getvalue())
 
 
 def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
@@ -95,19 +112,28 @@ def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
     entry = study_in(Path(path))
     if entry is None:
         raise StudyError(f"no table {path}")
-    return pd.read_parquet(path), Study.model_validate(entry["study"])
+    try:
+        frame = pd.read_parquet(path, page_checksum_verification=True)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise StudyError(f"{path} is damaged: {' '.join(str(error).split())}") from None
+    return frame, Study.model_validate(entry["study"])
 
 
 def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.DataFrame]]:
-    """Names and finished rows of other studies, of their folders, to be shown beside those of a study.
+    """Names and finished rows of other studies, of their folders, to be shown beside those of a
+    study.
 
-    A name that is taken gives way to that of the folder, and that to its path. Raises StudyError: no table there, rows
-    of another kind or with other factors, or a folder named twice.
+    A name that is taken gives way to that of the folder, and that to its path. Raises StudyError:
+    no table there, rows of another kind or with other factors, or a folder named twice.
     """
     found: dict[str, pd.DataFrame] = {}
     for folder in folders:
         own, rows = _rows_beside(study, folder)
-        names = [name for name in (own, folder.name, str(folder.resolve())) if name not in (study.name, *found)]
+        names = [
+            name
+            for name in (own, folder.name, str(folder.resolve()))
+            if name not in (study.name, *found)
+        ]
         if not names:
             raise StudyError(f"{folder} is to stand beside this study twice")
         found[names[0]] = rows
@@ -119,28 +145,36 @@ def _rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
     frame, other = read_table(folder / TABLE)
     if other.kind != study.kind or set(other.factors) != set(study.factors):
         ours, theirs = (
-            f"rows of kind {one.kind!r} by {', '.join(one.factors) or 'no factor'}" for one in (study, other)
+            f"rows of kind {one.kind!r} by {', '.join(one.factors) or 'no factor'}"
+            for one in (study, other)
         )
-        raise StudyError(f"{folder} has {theirs}, and this study {ours}: they cannot stand side by side")
+        raise StudyError(
+            f"{folder} has {theirs}, and this study {ours}: they cannot stand side by side"
+        )
     return other.name, frame[frame["error"] == ""]
 
 
 def study_in(path: Path) -> dict[str, Any] | None:
-    """The resolved study that a table is of; None where there is no file. Raises StudyError: no table of a study."""
+    """The resolved study that a table is of; None where there is no file. Raises StudyError: no
+    table of a study.
+    """
     if not path.exists():
         return None
     try:
         metadata = pq.read_schema(path).metadata or {}
         return dict(json.loads(metadata[STUDY_KEY]))
     except (pa.ArrowException, KeyError, ValueError, OSError) as error:
-        raise StudyError(f"{path} is no table of a study: {' '.join(str(error).split())}") from error
+        raise StudyError(
+            f"{path} is no table of a study: {' '.join(str(error).split())}"
+        ) from error
 
 
 def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
-    """The figures by factors and repeat, with their units as ``attrs``; NaN where a row failed or is not done.
+    """The figures by factors and repeat, with their units as ``attrs``; NaN where a row failed or
+    is not done.
 
-    Dimensions are one a factor (its dotted path) and ``repeat`` for a grid, ``point`` and ``repeat`` for a sample,
-    whose factors are coordinates of ``point``.
+    Dimensions are one a factor (its dotted path) and ``repeat`` for a grid, ``point`` and
+    ``repeat`` for a sample, whose factors are coordinates of ``point``.
     """
     dimensions = list(study.factors) if study.sample is None else ["point"]
     indexed = frame if study.sample is None else frame.assign(point=frame["row"] % study.points)
@@ -153,7 +187,9 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
         design = Design(study)
         cases = [design.case(point) for point in range(study.points)]
         view = view.reindex(point=np.arange(study.points))
-        view = view.assign_coords({path: ("point", [plain(c.factors[path]) for c in cases]) for path in study.factors})
+        view = view.assign_coords(
+            {path: ("point", [plain(c.factors[path]) for c in cases]) for path in study.factors}
+        )
     for name, variable in view.variables.items():
         if unit := unit_of(str(name), study):
             variable.attrs["units"] = unit
@@ -169,4 +205,7 @@ def write_view(path: Path, frame: pd.DataFrame, study: Study) -> None:
     """
     view = to_xarray(frame, study)
     with written(path):
-        write_groups(path, {"": view.rename({name: str(name).replace("/", "_per_") for name in view.data_vars})})
+        write_groups(
+            path,
+            {"": view.rename({name: str(name).replace("/", "_per_") for name in view.data_vars})},
+        )

@@ -1,20 +1,23 @@
-"""Whether a study's rows follow the laws that it states: the measured exponent or ratio with its interval.
+"""Whether a study's rows follow the laws that it states: the measured exponent or ratio with its
+interval.
 
-How the mean square of a positive figure depends on other quantities is told by regression of its logarithm. The mean
-square of a row's figure is taken as exp(X beta). The estimate solves X^T (y^2 / mean - 1) = 0, the score of a
-gamma-distributed y^2 with logarithmic link (McCullagh and Nelder 1989, section 8.3); unlike a straight line through
-logarithms it says how the mean square itself scales, whatever the figure's distribution is and however it changes from
-row to row. Its covariance is the sandwich of that score, so rows need not be alike either.
+How the mean square of a positive figure depends on other quantities is told by regression of its
+logarithm. The mean square of a row's figure is taken as exp(X beta). The estimate solves X^T (y^2 /
+mean - 1) = 0, the score of a gamma-distributed y^2 with logarithmic link (McCullagh and Nelder
+1989, section 8.3); unlike a straight line through logarithms it says how the mean square itself
+scales, whatever the figure's distribution is and however it changes from row to row. Its covariance
+is the sandwich of that score, so rows need not be alike either.
 
-The figures of one point of a study have bands that hold 95 % of the time. That of the mean is Student's; that of the
-rms is Student's of the logarithm of the mean square. A chi-square band would need to know how many independent errors a
-row's figure is made of; this one takes their scatter from the rows. Counted, it holds the rms of three normal numbers
-or more in 95 to 97 % of cases from two rows on, and that of single normal numbers, the worst case, in 92 % at least.
-One row alone has no band.
+The figures of one point of a study have bands that hold 95 % of the time. That of the mean is
+Student's; that of the rms is Student's of the logarithm of the mean square. A chi-square band would
+need to know how many independent errors a row's figure is made of; this one takes their scatter
+from the rows. Counted, it holds the rms of three normal numbers or more in 95 to 97 % of cases from
+two rows on, and that of single normal numbers, the worst case, in 92 % at least. One row alone has
+no band.
 
-A law fails when the interval excludes what the law says, give or take its own tolerance. Else it passes, unless the
-rows are too few to say anything: it is undecided where the interval is wide. At 99 % one true law in a hundred fails by
-chance.
+A law fails when the interval excludes what the law says, give or take its own tolerance. Else it
+passes, unless the rows are too few to say anything: it is undecided where the interval is wide. At
+99 % one true law in a hundred fails by chance.
 """
 
 from dataclasses import dataclass
@@ -36,7 +39,9 @@ SMALLEST = 1e-12
 
 @dataclass(frozen=True)
 class ScaleRegression:
-    """Coefficients (k,) of the logarithm of the mean square, their covariance (k, k), and the degrees of freedom."""
+    """Coefficients (k,) of the logarithm of the mean square, their covariance (k, k), and the
+    degrees of freedom.
+    """
 
     coefficients: Array
     covariance: Array
@@ -49,14 +54,17 @@ class ScaleRegression:
 
 
 def reach(confidence: float, freedom: int) -> float:
-    """Half-width of Student's interval in standard deviations; scipy's own interval is NaN where these are zero."""
+    """Half-width of Student's interval in standard deviations; scipy's own interval is NaN where
+    these are zero.
+    """
     return float(student.ppf(0.5 + 0.5 * confidence, freedom))
 
 
 def scale_regression(squares: Array, design: Array) -> ScaleRegression:
     """Fit squares (n,), not negative, to exp(design (n, k) @ beta).
 
-    Raises StudyError with too few rows, a design that does not tell its columns apart, or figures that are all zero.
+    Raises StudyError with too few rows, a design that does not tell its columns apart, or figures
+    that are all zero.
     """
     rows, columns = design.shape
     if rows <= columns:
@@ -65,7 +73,9 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
         raise StudyError("the factors do not vary, or not independently of each other")
     if not squares.max() > 0.0:
         raise StudyError("the figure is zero in every row")
-    beta = np.linalg.lstsq(design, np.log(np.maximum(squares, SMALLEST * squares.max())), rcond=None)[0]
+    beta = np.linalg.lstsq(
+        design, np.log(np.maximum(squares, SMALLEST * squares.max())), rcond=None
+    )[0]
     for _ in range(ITERATIONS):
         ratio = squares / np.exp(design @ beta)
         step = np.linalg.lstsq(design, ratio - 1.0, rcond=None)[0]
@@ -75,11 +85,15 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
         beta = beta + step / max(1.0, change)
     else:
         raise StudyError(f"the fit of the scale has not settled after {ITERATIONS} steps")
-    return ScaleRegression(beta, _sandwich(design, squares / np.exp(design @ beta) - 1.0), rows - columns)
+    return ScaleRegression(
+        beta, _sandwich(design, squares / np.exp(design @ beta) - 1.0), rows - columns
+    )
 
 
 def _sandwich(design: Array, residuals: Array) -> Array:
-    """Covariance of the coefficients, with residuals enlarged by their leverage (HC3) against few rows."""
+    """Covariance of the coefficients, with residuals enlarged by their leverage (HC3) against few
+    rows.
+    """
     bread = np.linalg.inv(design.T @ design)
     leverage = np.einsum("ni,ij,nj->n", design, bread, design)
     scores = design * (residuals / np.maximum(1.0 - leverage, 1e-6))[:, None]
@@ -91,7 +105,9 @@ BAND_CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of `rows` rows: mean, std (n - 1), rms, and the bands of mean and rms; None with a single row."""
+    """Of `rows` rows: mean, std (n - 1), rms, and the bands of mean and rms; None with a single
+    row.
+    """
 
     rows: int
     mean: float
@@ -103,28 +119,36 @@ class Statistics:
 
 def point_statistics(values: Array) -> Statistics:
     """Statistics of one figure's values (n,), n >= 1, all finite."""
-    count, mean, rms = len(values), float(np.mean(values)), float(np.sqrt(np.mean(values**2)))
+    count = len(values)
+    mean = float(np.mean(values))
+    rms = float(np.sqrt(np.mean(values**2)))
     if count < 2:
         return Statistics(count, mean, None, rms, None, None)
     std = float(np.std(values, ddof=1))
     wide = reach(BAND_CONFIDENCE, count - 1)
     half = wide * std / np.sqrt(count)
-    spread = float(np.linalg.norm(values**2 / np.mean(values**2) - 1.0)) / (count - 1) if rms else 0.0
+    spread = (
+        float(np.linalg.norm(values**2 / np.mean(values**2) - 1.0)) / (count - 1) if rms else 0.0
+    )
     factor = float(np.exp(0.5 * wide * spread))
-    return Statistics(count, mean, std, rms, (mean - half, mean + half), (rms / factor, rms * factor))
+    return Statistics(
+        count, mean, std, rms, (mean - half, mean + half), (rms / factor, rms * factor)
+    )
 
 
 CONFIDENCE = 0.99
 RESOLUTION = 0.2
-"""Half-width of the interval, of an exponent or of the logarithm of a ratio, beyond which a law is not decided."""
+"""Half-width of the interval, of an exponent or of the logarithm of a ratio, beyond which a law is
+not decided.
+"""
 
 
 @dataclass(frozen=True)
 class Verdict:
     """What the rows say about a law: verdict "passed", "failed" or "undecided".
 
-    measured, an exponent or a ratio, with its interval low to high; rows that counted; reason where nothing could be
-    measured.
+    measured, an exponent or a ratio, with its interval low to high; rows that counted; reason where
+    nothing could be measured.
     """
 
     law: Law
@@ -140,18 +164,24 @@ class Verdict:
         """The verdict as `summary.json` holds it."""
         law = {"statement": self.law.statement, "why": self.law.why, "verdict": self.verdict}
         return (
-            law | {"expected": self.law.expected} | {k: v for k, v in vars(self).items() if k not in ("law", "verdict")}
+            law
+            | {"expected": self.law.expected}
+            | {k: v for k, v in vars(self).items() if k not in ("law", "verdict")}
         )
 
 
 def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
-    """A verdict for each law of a study; `frame`: its table, of which rows that failed do not count."""
+    """A verdict for each law of a study; `frame`: its table, of which rows that failed do not
+    count.
+    """
     done = frame[frame["error"] == ""]
     return [_check(law, study, done) for law in study.theory]
 
 
 def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows that have all figures of a law. Raises StudyError where none has one of them, with what they have."""
+    """The rows that have all figures of a law. Raises StudyError where none has one of them, with
+    what they have.
+    """
     needed = [name for name in (law.figure, law.per, law.equals) if name is not None]
     for name in needed:
         if name not in frame.columns:
@@ -161,7 +191,9 @@ def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def law_data(law: Law, frame: pd.DataFrame) -> Array:
-    """The quantity of a law (n,) in each row, all of which have it. Raises StudyError where it is divided by zero."""
+    """The quantity of a law (n,) in each row, all of which have it. Raises StudyError where it is
+    divided by zero.
+    """
     values = frame[law.figure].to_numpy(dtype=float)
     return values if law.per is None else values / _divisor(law.per, frame)
 
@@ -169,12 +201,16 @@ def law_data(law: Law, frame: pd.DataFrame) -> Array:
 def _divisor(name: str, frame: pd.DataFrame) -> Array:
     values = frame[name].to_numpy(dtype=float)
     if zeros := int(np.sum(values == 0.0)):
-        raise StudyError(f"{name} is zero in {zeros} of {len(values)} rows, and nothing can be divided by it")
+        raise StudyError(
+            f"{name} is zero in {zeros} of {len(values)} rows, and nothing can be divided by it"
+        )
     return values
 
 
 def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    check = _exponent if law.exponent is not None else _equality if law.equals is not None else _order
+    check = (
+        _exponent if law.exponent is not None else _equality if law.equals is not None else _order
+    )
     try:
         return check(law, study, with_data(law, frame))
     except StudyError as error:
@@ -187,7 +223,8 @@ def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     design = np.column_stack([_beside(law, study, frame), 2.0 * np.log(factor)])
     fit = scale_regression(law_data(law, frame) ** 2, design)
     low, high = fit.interval(design.shape[1] - 1, CONFIDENCE)
-    expected, half = float(law.exponent or 0.0), 0.5 * (high - low)
+    expected = float(law.exponent or 0.0)
+    half = 0.5 * (high - low)
     verdict = _decided(low - law.tolerance <= expected <= high + law.tolerance, half)
     return Verdict(law, verdict, float(fit.coefficients[-1]), low, high, len(frame))
 
@@ -203,16 +240,22 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """The smallest step of the logarithm from one value of the factor to the next, beside the other factors."""
+    """The smallest step of the logarithm from one value of the factor to the next, beside the other
+    factors.
+    """
     if law.factor not in frame.columns:
         raise StudyError(f"the rows have no factor {law.factor!r}")
     values = list(law.order or [])
     chosen = frame[frame[law.factor].isin(values)]
     place = chosen[law.factor].map(values.index).to_numpy(dtype=float)
     steps = np.column_stack([2.0 * (place >= k) for k in range(1, len(values))])
-    fit = scale_regression(law_data(law, chosen) ** 2, np.column_stack([_beside(law, study, chosen), steps]))
+    fit = scale_regression(
+        law_data(law, chosen) ** 2, np.column_stack([_beside(law, study, chosen), steps])
+    )
     low, middle, high = _smallest_step(fit, len(values) - 1)
-    verdict = "passed" if low > -law.tolerance else "failed" if high < -law.tolerance else "undecided"
+    verdict = (
+        "passed" if low > -law.tolerance else "failed" if high < -law.tolerance else "undecided"
+    )
     measured, low, high = np.exp([middle, low, high]).tolist()
     return Verdict(law, verdict, measured, low, high, len(chosen))
 
@@ -225,7 +268,9 @@ def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, floa
 
 
 def _beside(law: Law, study: Study, frame: pd.DataFrame) -> Array:
-    """Columns for what else varies: a level for each setting of the other factors, or their logarithms in a sample."""
+    """Columns for what else varies: a level for each setting of the other factors, or their
+    logarithms in a sample.
+    """
     if law.factor not in study.factors and len(study.factors) > 1:
         raise StudyError(f"a law against the figure {law.factor!r} needs a study of one factor")
     others = [path for path in study.factors if path != law.factor and law.factor in study.factors]
@@ -238,7 +283,9 @@ def _beside(law: Law, study: Study, frame: pd.DataFrame) -> Array:
 
 
 def _covariates(values: pd.Series) -> Array:
-    """Columns (n, k) of another factor of a sample: its logarithm, or one for each value but the first."""
+    """Columns (n, k) of another factor of a sample: its logarithm, or one for each value but the
+    first.
+    """
     if pd.api.types.is_numeric_dtype(values) and (values > 0).all():
         return np.log(values.to_numpy(dtype=float))[:, None]
     return np.asarray(pd.get_dummies(values, drop_first=True), dtype=float)

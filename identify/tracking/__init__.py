@@ -1,1 +1,3 @@
-"""Tracking: how well the robot follows motions under a law and a model, with images in the loop (`cmmsim track`)."""
+"""Tracking: how well the robot follows motions under a law and a model, with images in the loop
+(`cmmsim track`).
+"""

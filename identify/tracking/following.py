@@ -1,4 +1,6 @@
-"""One run of a robot that follows a motion under a law with a model, by the sensor or by what stands for it."""
+"""One run of a robot that follows a motion under a law with a model, by the sensor or by what
+stands for it.
+"""
 
 from dataclasses import dataclass
 
@@ -16,13 +18,15 @@ from identify.experiment.run import Latencies
 USUAL = Latencies()
 
 NEARLY_EXACT = 1e-3
-"""Share of the noise's covariance that is stated of exact poses: with none an observer has nothing to divide by."""
+"""Share of the noise's covariance that is stated of exact poses: with none an observer has nothing
+to divide by.
+"""
 
 
 @dataclass(frozen=True)
 class Followed:
-    """A run: its loop, what was desired of it (N, 6), and what the observer expected of each frame before it saw it:
-    the coordinates (N, m) and their covariances (N, m, m), None without."""
+    """A run: its loop, what was desired of it (N, 6), and what the observer expected of each frame
+    before it saw it: the coordinates (N, m) and their covariances (N, m, m), None without."""
 
     run: ClosedLoopRun
     desired: Array
@@ -40,7 +44,9 @@ class Followed:
         return saturated_frames(self.run.torque, self.torque_limit)
 
     def normalised_squared_error(self, robot: Robot) -> float | None:
-        """Mean e^T P^-1 e / m of what the observer expected of the robot's true coordinates; None without observer."""
+        """Mean e^T P^-1 e / m of what the observer expected of the robot's true coordinates; None
+        without observer.
+        """
         if self.expected is None:
             return None
         errors = robot.coordinates(self.run.pose) - self.expected[0]
@@ -48,9 +54,12 @@ class Followed:
         return float(np.mean(np.sum(errors * weighted, axis=1)) / errors.shape[1])
 
 
-def by_drawing(covariance: Array, lost: NDArray[np.bool_], rng: np.random.Generator, exact: bool = False) -> Seen:
-    """By poses drawn about the true ones with a covariance (6, 6), none at lost frames (N,); or by the true ones, which
-    are told to be nearly exact: an observer that takes them for noisy makes less of them than it can."""
+def by_drawing(
+    covariance: Array, lost: NDArray[np.bool_], rng: np.random.Generator, exact: bool = False
+) -> Seen:
+    """By poses drawn about the true ones with a covariance (6, 6), none at lost frames (N,); or by
+    the true ones, which are told to be nearly exact: an observer that takes them for noisy makes
+    less of them than it can."""
     factor = np.linalg.cholesky(covariance)
     drawn = rng.standard_normal((len(lost), 6)) @ factor.T
 

@@ -1,7 +1,8 @@
-"""Motions to follow, all from rest: unseen Fourier trajectories, a circle, a square with corners, poses of one's own.
+"""Motions to follow, all from rest: unseen Fourier trajectories, a circle, a square with corners,
+poses of one's own.
 
-Circle and square lie in the first two coordinates of the platform, within the box of the scenario's excitation, and
-start at home.
+Circle and square lie in the first two coordinates of the platform, within the box of the scenario's
+excitation, and start at home.
 """
 
 from collections.abc import Callable
@@ -29,7 +30,9 @@ FEWEST_ROWS = 6
 
 @dataclass(frozen=True)
 class AlongCoordinates:
-    """A motion by its coordinates (N, m) at times (N,), s, given as functions: them and their first two derivatives."""
+    """A motion by its coordinates (N, m) at times (N,), s, given as functions: them and their first
+    two derivatives.
+    """
 
     chart: Chart
     coordinates: tuple[Callable[[Array], Array], ...]
@@ -47,18 +50,27 @@ class AlongCoordinates:
         return self.chart.lifted(self.coordinates[2](t))
 
 
-def motions(robot: Robot, scenario: Scenario, seed: int, own: Path | None = None) -> list[NamedMotion]:
-    """The scenario's unseen trajectories, a circle and a square; or only the poses of a file, `read_motion`.
+def motions(
+    robot: Robot, scenario: Scenario, seed: int, own: Path | None = None
+) -> list[NamedMotion]:
+    """The scenario's unseen trajectories, a circle and a square; or only the poses of a file,
+    `read_motion`.
 
     Raises TrajectoryError.
     """
     if own is not None:
-        return [read_motion(own, robot, of_actuators(robot, scenario.excitation, "max_joint_velocity"))]
+        return [
+            read_motion(own, robot, of_actuators(robot, scenario.excitation, "max_joint_velocity"))
+        ]
     duration = scenario.validation.duration_s
     unseen = unseen_trajectories(robot, scenario, seed)
-    found: list[NamedMotion] = [NamedMotion(f"unseen {k}", path, duration) for k, path in enumerate(unseen, start=1)]
+    found: list[NamedMotion] = [
+        NamedMotion(f"unseen {k}", path, duration) for k, path in enumerate(unseen, start=1)
+    ]
     limits = scenario.excitation
-    box = box_of(robot.geometry.chart, limits.position_amplitude_m, limits.orientation_amplitude_rad)
+    box = box_of(
+        robot.geometry.chart, limits.position_amplitude_m, limits.orientation_amplitude_rad
+    )
     turn_s = 1 / (limits.fundamental_hz * limits.harmonics)
     found.append(NamedMotion("circle", circle(robot, float(box[0]) / 2, turn_s), duration))
     found.append(NamedMotion("corner", square(robot, float(box[:2].min()), duration / 5), duration))
@@ -66,16 +78,24 @@ def motions(robot: Robot, scenario: Scenario, seed: int, own: Path | None = None
 
 
 def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
-    """Round and round through home with a time for each turn, s, which it reaches smoothly within the first."""
+    """Round and round through home with a time for each turn, s, which it reaches smoothly within
+    the first.
+    """
     home = robot.coordinates(robot.home_pose)
     speed = 2 * np.pi / turn_s
 
     def angle(t: Array) -> tuple[Array, Array, Array]:
         share = np.clip(t / turn_s, 0.0, 1.0)
-        travelled = share**4 * (2.5 - 3 * share + share**2)  # the integral of the smooth step of fifth degree
+        travelled = share**4 * (
+            2.5 - 3 * share + share**2
+        )  # the integral of the smooth step of fifth degree
         step = share**3 * (10 - 15 * share + 6 * share**2)
         rising = 30 * share**2 * (1 - share) ** 2 / turn_s
-        return speed * (turn_s * travelled + np.maximum(t - turn_s, 0.0)), speed * step, speed * rising
+        return (
+            speed * (turn_s * travelled + np.maximum(t - turn_s, 0.0)),
+            speed * step,
+            speed * rising,
+        )
 
     def laid(first: Array, second: Array, base: Array) -> Array:
         rows = np.tile(base, (len(first), 1))
@@ -93,14 +113,18 @@ def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
 
     def acceleration(t: Array) -> Array:
         phi, w, rising = angle(np.asarray(t))
-        return laid(-np.cos(phi) * w**2 - np.sin(phi) * rising, np.cos(phi) * rising - np.sin(phi) * w**2, 0 * home)
+        return laid(
+            -np.cos(phi) * w**2 - np.sin(phi) * rising,
+            np.cos(phi) * rising - np.sin(phi) * w**2,
+            0 * home,
+        )
 
     return AlongCoordinates(robot.geometry.chart, (place, rate, acceleration))
 
 
 def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
-    """From home along the first coordinate, then the second, and back, each edge from rest to rest in a time, s: as a
-    polynomial of fifth degree, whose jerk is at most 60 side / edge_s^3."""
+    """From home along the first coordinate, then the second, and back, each edge from rest to rest
+    in a time, s: as a polynomial of fifth degree, whose jerk is at most 60 side / edge_s^3."""
     home = robot.coordinates(robot.home_pose)
     corners = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
 
@@ -130,37 +154,54 @@ def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
 
 
 def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
-    """A motion through the poses of a CSV file with the columns t, x, y, z, alpha, beta, gamma, s, m and rad: a spline
-    of fifth degree, at rest and without acceleration at both ends; fastest: a joint may turn or slide, rad/s or m/s.
+    """A motion through the poses of a CSV file with the columns t, x, y, z, alpha, beta, gamma, s,
+    m and rad: a spline of fifth degree, at rest and without acceleration at both ends; fastest: a
+    joint may turn or slide, rad/s or m/s.
 
-    Raises TrajectoryError: unreadable, columns missing, too few rows, times that do not begin at 0 or do not increase,
-    numbers that are not finite, poses that the platform cannot have, or a jump that asks more speed of a joint.
+    Raises TrajectoryError: unreadable, columns missing, too few rows, times that do not begin at 0
+    or do not increase, numbers that are not finite, poses that the platform cannot have, or a jump
+    that asks more speed of a joint.
     """
     try:
-        lines = [line.split(",") for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+        lines = [
+            line.split(",")
+            for line in path.read_text(encoding="utf-8-sig").splitlines()
+            if line.strip()
+        ]
     except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"cannot read the motion {path}: {getattr(error, 'strerror', None) or error}") from None
+        raise TrajectoryError(
+            f"cannot read the motion {path}: {getattr(error, 'strerror', None) or error}"
+        ) from None
     header = [name.strip() for name in lines[0]] if lines else []
     if len(header) == 1 and ";" in header[0]:
         raise TrajectoryError(f"{path}: cells are separated by commas, and these by semicolons")
     missing = [name for name in COLUMNS if name not in header]
     if missing:
-        raise TrajectoryError(f"{path} lacks the columns {', '.join(missing)}; it needs {', '.join(COLUMNS)}")
+        raise TrajectoryError(
+            f"{path} lacks the columns {', '.join(missing)}; it needs {', '.join(COLUMNS)}"
+        )
     table = np.empty((len(lines) - 1, len(COLUMNS)))
     for row, line in enumerate(lines[1:]):
         try:
             table[row] = [float(line[header.index(name)]) for name in COLUMNS]
         except (ValueError, IndexError):
-            raise TrajectoryError(f"{path}, row {row + 1}: {','.join(line)!r} are not {len(COLUMNS)} numbers") from None
-    times, poses = table[:, 0], table[:, 1:]
+            raise TrajectoryError(
+                f"{path}, row {row + 1}: {','.join(line)!r} are not {len(COLUMNS)} numbers"
+            ) from None
+    times = table[:, 0]
+    poses = table[:, 1:]
     if len(table) < FEWEST_ROWS:
         raise TrajectoryError(f"{path} has {len(table)} rows; it needs at least {FEWEST_ROWS}")
     if not np.isfinite(table).all():
         row = int(np.argmin(np.isfinite(table).all(axis=1)))
-        raise TrajectoryError(f"{path}, row {row + 1}: {','.join(lines[row + 1])!r} are not all finite numbers")
+        raise TrajectoryError(
+            f"{path}, row {row + 1}: {','.join(lines[row + 1])!r} are not all finite numbers"
+        )
     if times[0] != 0 or not (np.diff(times) > 0).all():
         row = int(np.argmin(np.diff(times, prepend=-1.0) > 0)) if times[0] == 0 else 0
-        raise TrajectoryError(f"{path}, row {row + 1}: t is {times[row]:g}; times must begin at 0 and increase")
+        raise TrajectoryError(
+            f"{path}, row {row + 1}: t is {times[row]:g}; times must begin at 0 and increase"
+        )
     try:
         robot.charted(poses)
     except DynamicsError as error:
@@ -172,20 +213,31 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
 
     def held(order: int) -> Callable[[Array], Array]:
         derivative = spline.derivative(order)
-        return lambda t: derivative(np.clip(t, 0.0, end)) * (1.0 if order == 0 else (np.asarray(t) <= end)[:, None])
+        return lambda t: (
+            derivative(np.clip(t, 0.0, end))
+            * (1.0 if order == 0 else (np.asarray(t) <= end)[:, None])
+        )
 
-    return NamedMotion(path.stem, AlongCoordinates(robot.geometry.chart, (held(0), held(1), held(2))), end)
+    return NamedMotion(
+        path.stem, AlongCoordinates(robot.geometry.chart, (held(0), held(1), held(2))), end
+    )
 
 
 def _check_jumps(path: Path, robot: Robot, times: Array, poses: Array, fastest: float) -> None:
     """What is out of reach is left to who follows the motion: it has no joint coordinates."""
-    steps, unit = np.diff(times), robot.layout.joint_unit
-    speeds = np.nan_to_num(np.abs(np.diff(workspace.measure(robot, poses).theta, axis=0)) / steps[:, None])
+    steps = np.diff(times)
+    unit = robot.layout.joint_unit
+    speeds = np.nan_to_num(
+        np.abs(np.diff(workspace.measure(robot, poses).theta, axis=0)) / steps[:, None]
+    )
     row = int(np.argmax(speeds.max(axis=1) > fastest))
-    joint, jump = int(np.argmax(speeds[row])), np.diff(poses, axis=0)[row]
+    joint = int(np.argmax(speeds[row]))
+    jump = np.diff(poses, axis=0)[row]
     if speeds[row, joint] > fastest:
         raise TrajectoryError(
-            f"{path}, row {row + 2}: the step from the row before, {np.linalg.norm(jump[:3]):.3g} m and "
+            f"{path}, row {row + 2}: the step from the row before, {np.linalg.norm(jump[:3]):.3g} "
+            "m and "
             f"{np.linalg.norm(jump[3:]):.3g} rad in {steps[row]:.3g} s, asks joint {joint + 1} for "
-            f"{speeds[row, joint]:.3g} {unit}/s, limit excitation.max_joint_velocity_{unit}_s = {fastest:g}"
+            f"{speeds[row, joint]:.3g} {unit}/s, limit excitation.max_joint_velocity_{unit}_s = "
+            f"{fastest:g}"
         )

@@ -1,4 +1,6 @@
-"""Laws and models side by side on the same motions: tracking error, effort, and what has which share of the error."""
+"""Laws and models side by side on the same motions: tracking error, effort, and what has which
+share of the error.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +22,13 @@ from identify.estimation.prior import starting_guess
 from identify.excitation.design import design_trajectories
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, Seen, by_images, prepared
 from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import Latencies, drawn_latencies, excitation_run, part_exposures, taught_sensor
+from identify.experiment.run import (
+    Latencies,
+    drawn_latencies,
+    excitation_run,
+    part_exposures,
+    taught_sensor,
+)
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, with_renderer
 from identify.files.run_folder import RunFolder, load_result, rms_figures
 from identify.files.versions import versions
@@ -65,8 +73,9 @@ def track(
     run_folder: Path | None = None,
     own: Path | None = None,
 ) -> dict[str, Any]:
-    """The content of track.json. run_folder: of a whole run, whose estimates are the identified model; None: the robot
-    is identified first, as the scenario says. own: a CSV file with poses to follow instead of the usual motions.
+    """The content of track.json. run_folder: of a whole run, whose estimates are the identified
+    model; None: the robot is identified first, as the scenario says. own: a CSV file with poses to
+    follow instead of the usual motions.
 
     Raises ScenarioError, TrajectoryError, RecordError and what an identification raises.
     """
@@ -74,10 +83,17 @@ def track(
     plant = build_plant(scenario)
     followed = motions(plant.nominal, scenario, seed, own)
     if run_folder and "identified" not in models:
-        raise ScenarioError(f"--run {run_folder} holds the identified model, and only {', '.join(models)} is asked for")
+        raise ScenarioError(
+            f"--run {run_folder} holds the identified model, and only {', '.join(models)} is "
+            "asked for"
+        )
     if set(laws) == {"pid"}:  # which knows no model, so that none is identified
         models = ["initial"]
-    known = {name: known_model(plant, name, run_folder) for name in models if name != "identified" or run_folder}
+    known = {
+        name: known_model(plant, name, run_folder)
+        for name in models
+        if name != "identified" or run_folder
+    }
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
     true = known_model(plant, "true", None)
     for law in laws:  # refused before the sensor is taught
@@ -105,16 +121,20 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
 
     Raises RecordError: no result with estimates in the folder, or a run of another robot.
     """
-    robot, scenario = plant.nominal, plant.scenario
+    robot = plant.nominal
+    scenario = plant.scenario
     if model == "true":
         return KnownModel(plant.parameters, scenario.plant.drive, FITTED)
     if model == "initial":
         law = scenario.model.drive_law
-        return KnownModel(starting_guess(robot, scenario.model.start_parameters, 1.0, drive=law).values, law)
+        return KnownModel(
+            starting_guess(robot, scenario.model.start_parameters, 1.0, drive=law).values, law
+        )
     assert run_folder is not None
-    path, own = run_folder / "result.json", plant.scenario.robot
+    path = run_folder / "result.json"
+    own = plant.scenario.robot
     RunFolder(run_folder).require("scenario.toml", "result.json")
-    other = load_scenario(run_folder / "scenario.toml").robot
+    other = load_scenario(RunFolder(run_folder).whole_scenario).robot
     if other != own:
         raise RecordError(f"{run_folder} holds a run of {other}, not of {own}")
     try:
@@ -131,9 +151,14 @@ def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progre
     """The model from the scenario's excitation."""
     scenario = plant.scenario
     if scenario.identification.scale_anchor == "payload":
-        raise ScenarioError("identification.scale_anchor = payload needs two runs: identify first, and pass --run DIR")
+        raise ScenarioError(
+            "identification.scale_anchor = payload needs two runs: identify first, and pass --run "
+            "DIR"
+        )
     trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
-    with progress.stage("record", scenario.timing.frames(scenario.excitation.duration_s)) as advance:
+    with progress.stage(
+        "record", scenario.timing.frames(scenario.excitation.duration_s)
+    ) as advance:
         record = excitation_run(plant, sensor, trajectories.excitation, seed, advance).record
     return identified_model(plant, record, progress)
 
@@ -145,7 +170,9 @@ def identified_model(plant: Plant, record: xr.Dataset, progress: Progress) -> Kn
 
 
 def _fitted_doubt(misfit: Misfit | None) -> float:
-    """Of a model that was identified: that of a guess where it is not known to explain what was measured."""
+    """Of a model that was identified: that of a guess where it is not known to explain what was
+    measured.
+    """
     return VAGUE if misfit is None or misfit.significant else FITTED
 
 
@@ -159,10 +186,13 @@ def follow_by_images(
     number: int = 0,
     advance: Advance = lambda n=1: None,
 ) -> tuple[Followed, Seen]:
-    """A motion followed under a law with a model, and by what the loop saw; noise and latencies are those of a seed and
-    of the motion's number, the mean latency and how far exposures are apart those of the seed. Raises as `follow`."""
+    """A motion followed under a law with a model, and by what the loop saw; noise and latencies are
+    those of a seed and of the motion's number, the mean latency and how far exposures are apart
+    those of the seed. Raises as `follow`."""
     part_exposures(sensor, plant.scenario, seed)
-    seen = by_images(SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, FIRST_RUN + number), advance))
+    seen = by_images(
+        SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, FIRST_RUN + number), advance)
+    )
     latencies = _latencies(plant, motion, seed, number)
     return follow(plant, law, model, motion, seen, latencies), seen
 
@@ -170,32 +200,51 @@ def follow_by_images(
 def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
     timing = task.plant.scenario.timing
     frames = sum(timing.frames(motion.duration_s) for motion in task.motions)
-    runs = [(law, model) for law in task.laws for model in ([None] if law == SERVO else task.models)]
+    runs = [
+        (law, model) for law in task.laws for model in ([None] if law == SERVO else task.models)
+    ]
     with progress.stage("track", frames * len(runs) * (2 + len(EXACT))) as advance:
-        return [{"law": law, "model": model} | _entry(task, law, model, advance) for law, model in runs]
+        return [
+            {"law": law, "model": model} | _entry(task, law, model, advance) for law, model in runs
+        ]
 
 
 def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dict[str, Any]:
     """One law with one model on all motions; None: that of a law which reads none."""
-    robot, known = task.plant.robot, task.models[model or next(iter(task.models))]
-    errors, rows, effort, normalised, covariances = [], [], [], [], []
+    robot = task.plant.robot
+    known = task.models[model or next(iter(task.models))]
+    errors = []
+    rows = []
+    effort = []
+    normalised = []
+    covariances = []
     frames = saturated = lost = 0
     for number, motion in enumerate(task.motions):
         try:
-            done, seen = follow_by_images(task.plant, task.sensor, law, known, motion, task.seed, number, advance)
+            done, seen = follow_by_images(
+                task.plant, task.sensor, law, known, motion, task.seed, number, advance
+            )
         except DynamicsError as error:
             if isinstance(error, LoopFailure):
-                frames, saturated = frames + error.frame, saturated + error.saturated
-            told = {"failed": f"{motion.name}: {error}", "frames": frames, "saturated_frames": saturated}
+                frames = frames + error.frame
+                saturated = saturated + error.saturated
+            told = {
+                "failed": f"{motion.name}: {error}",
+                "frames": frames,
+                "saturated_frames": saturated,
+            }
             return told | rms_figures(np.full((1, 6), np.nan))
-        frames, saturated = frames + len(done.errors), saturated + done.saturated
+        frames = frames + len(done.errors)
+        saturated = saturated + done.saturated
         errors.append(done.errors)
         lost += int((~done.run.measured_ok).sum())
         effort.append(done.run.torque)
         covariances += [seen.noise(int(frame)) for frame in np.flatnonzero(done.run.measured_ok)]
         found = done.normalised_squared_error(robot)
         normalised += [] if found is None else [found]
-        rows.append({"motion": motion.name, **rms_figures(done.errors), "saturated_frames": done.saturated})
+        rows.append(
+            {"motion": motion.name, **rms_figures(done.errors), "saturated_frames": done.saturated}
+        )
     torque = np.concatenate(effort)
     return {
         **rms_figures(np.concatenate(errors)),
@@ -210,22 +259,33 @@ def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dic
     }
 
 
-def _shares(task: Tracking, law: str, known: KnownModel, covariance: Array, advance: Advance) -> dict[str, Any]:
-    """Shares of the squared error that go when sensor, model or latency is made exact, and the rest, of positions and
-    orientations; by runs whose poses are drawn with the noise that the sensor stated."""
+def _shares(
+    task: Tracking, law: str, known: KnownModel, covariance: Array, advance: Advance
+) -> dict[str, Any]:
+    """Shares of the squared error that go when sensor, model or latency is made exact, and the
+    rest, of positions and orientations; by runs whose poses are drawn with the noise that the
+    sensor stated."""
     base = _drawn(task, law, known, covariance, None, advance)
     shares = {}
     for what in EXACT:
         exact = _drawn(task, law, known, covariance, what, advance)
         with np.errstate(invalid="ignore", divide="ignore"):
-            left = [np.nansum(exact[part]) / np.nansum(base[part]) for part in (slice(0, 3), slice(3, 6))]
+            left = [
+                np.nansum(exact[part]) / np.nansum(base[part])
+                for part in (slice(0, 3), slice(3, 6))
+            ]
         shares[what] = dict(zip(PARTS, (1 - np.array(left)).tolist(), strict=True))
     rest = {part: 1 - sum(share[part] for share in shares.values()) for part in PARTS}
     return shares | {"rest": rest}
 
 
 def _drawn(
-    task: Tracking, law: str, model: KnownModel, covariance: Array, exact: str | None, advance: Advance
+    task: Tracking,
+    law: str,
+    model: KnownModel,
+    covariance: Array,
+    exact: str | None,
+    advance: Advance,
 ) -> Array:
     """Mean squared errors (6,) over all motions, with one thing exact."""
     plant = task.plant
@@ -233,13 +293,16 @@ def _drawn(
         still = dict.fromkeys(("latency_s", "latency_jitter_s", "latency_std_s", "dropout"), 0.0)
         still = {f"timing.{name}": value for name, value in still.items()}
         plant = build_plant(plant.scenario.with_overrides(still), plant.nominal)
-    dropout, squares = plant.scenario.timing.dropout, []
+    dropout = plant.scenario.timing.dropout
+    squares = []
     for number, motion in enumerate(task.motions):
         rng = np.random.default_rng(child(task.seed, TRACKED, number))
         lost = rng.random(plant.scenario.timing.frames(motion.duration_s)) < dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")
         known = known_model(plant, "true", None) if exact == "model" else model
-        latencies = Latencies() if exact == "latency" else _latencies(task.plant, motion, task.seed, number)
+        latencies = (
+            Latencies() if exact == "latency" else _latencies(task.plant, motion, task.seed, number)
+        )
         try:
             done = follow(plant, law, known, motion, seen, latencies)
             squares.append(done.errors**2)
@@ -251,4 +314,6 @@ def _drawn(
 
 def _latencies(plant: Plant, motion: NamedMotion, seed: int, number: int) -> Latencies:
     scenario = plant.scenario
-    return drawn_latencies(scenario, scenario.timing.frames(motion.duration_s), seed, FIRST_RUN + number)
+    return drawn_latencies(
+        scenario, scenario.timing.frames(motion.duration_s), seed, FIRST_RUN + number
+    )

@@ -1,1 +1,3 @@
-"""Judging against the truth: unseen trajectories, estimators side by side, variation of the estimates."""
+"""Judging against the truth: unseen trajectories, estimators side by side, variation of the
+estimates.
+"""

@@ -1,14 +1,15 @@
 """Variation of the estimates from one trajectory to the next (the paper's table 5).
 
-The robot is identified from each of several runs alone. The paper gives its "variation measure" no formula; here it is
-the standard deviation of a parameter's estimates in per cent of their mean. Judged are the parameters that every run
-identifies. Beside it stands what each run's own interval makes one expect. All runs share one weighing of the platform
-and one teaching of the sensor, as in the paper: what is wrong with these does not vary.
+The robot is identified from each of several runs alone. The paper gives its "variation measure" no
+formula; here it is the standard deviation of a parameter's estimates in per cent of their mean.
+Judged are the parameters that every run identifies. Beside it stands what each run's own interval
+makes one expect. All runs share one weighing of the platform and one teaching of the sensor, as in
+the paper: what is wrong with these does not vary.
 
-What varies most are the masses of the links of `rss6`, which accelerations show. By the information of designed runs
-at the true parameters (noise in the servo left out), the worst is known to 4.6, 3.5 and 3.1 % from 20, 40 and 60 s at
-the paper's fundamental of 0.1 Hz, and to 2.4 % from 20 s at 0.3 Hz, which uses the whole velocity limit of 2 rad/s:
-faster is worth more than longer.
+What varies most are the masses of the links of `rss6`, which accelerations show. By the information
+of designed runs at the true parameters (noise in the servo left out), the worst is known to 4.6,
+3.5 and 3.1 % from 20, 40 and 60 s at the paper's fundamental of 0.1 Hz, and to 2.4 % from 20 s at
+0.3 Hz, which uses the whole velocity limit of 2 rad/s: faster is worth more than longer.
 """
 
 import multiprocessing
@@ -45,8 +46,9 @@ FEWEST_RUNS = 3
 
 @dataclass(frozen=True)
 class Variation:
-    """Of each parameter (p,), SI: mean of the estimates, their standard deviation relative to it, the same as expected
-    from the runs' own intervals, and whether every run identifies it; runs: their number."""
+    """Of each parameter (p,), SI: mean of the estimates, their standard deviation relative to it,
+    the same as expected from the runs' own intervals, and whether every run identifies it; runs:
+    their number."""
 
     layout: ParameterLayout
     mean: Array
@@ -62,14 +64,17 @@ class Variation:
 
     def __repr__(self) -> str:
         return (
-            f"<Variation: {np.sum(self.identified)} of {len(self.names)} parameters identified in all {self.runs} runs>"
+            f"<Variation: {np.sum(self.identified)} of {len(self.names)} parameters identified "
+            f"in all {self.runs} runs>"
         )
 
     def to_dataframe(self) -> "pd.DataFrame":
         """One row a parameter: mean, variation, expected, identified."""
         import pandas as pd
 
-        columns = {name: getattr(self, name) for name in ("mean", "variation", "expected", "identified")}
+        columns = {
+            name: getattr(self, name) for name in ("mean", "variation", "expected", "identified")
+        }
         return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
 
     @property
@@ -79,7 +84,9 @@ class Variation:
         Raises EstimationError where no parameter is identified in every run.
         """
         if not self.identified.any():
-            raise EstimationError(f"no parameter is identified in each of the {self.runs} runs: nothing to compare")
+            raise EstimationError(
+                f"no parameter is identified in each of the {self.runs} runs: nothing to compare"
+            )
         index = int(np.argmax(np.where(self.identified, self.variation, -np.inf)))
         return self.names[index], float(self.variation[index])
 
@@ -90,7 +97,8 @@ def variation(results: Sequence[IdentificationResult]) -> Variation:
     Raises EstimationError with fewer than three.
     """
     check_count(len(results))
-    estimates, stds = np.array([r.estimate for r in results]), np.array([r.std for r in results])
+    estimates = np.array([r.estimate for r in results])
+    stds = np.array([r.std for r in results])
     mean = estimates.mean(axis=0)
     size = np.where(mean == 0, np.nan, np.abs(mean))
     return Variation(
@@ -112,7 +120,9 @@ def check_count(runs: int) -> None:
 def identify_each(
     records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario, progress: Progress
 ) -> list[IdentificationResult]:
-    """Identify from each record alone. Raises as `identify` does, and EstimationError with too few records."""
+    """Identify from each record alone. Raises as `identify` does, and EstimationError with too few
+    records.
+    """
     check_count(len(records))
     results = []
     with progress.stage("identify each run", len(records)) as advance:
@@ -125,13 +135,15 @@ def identify_each(
 def designed_runs(
     scenario: Scenario, robot: Robot, seed: int, count: int, workers: int | None, progress: Progress
 ) -> list[Experiment]:
-    """Run the plant with images in the loop on `count` exciting trajectories, each designed from its own random ones.
+    """Run the plant with images in the loop on `count` exciting trajectories, each designed from
+    its own random ones.
 
-    As long as the exciting run, by the scenario's method; workers as in `run_unseen`. Raises as the stages `excite` and
-    `record` do.
+    As long as the exciting run, by the scenario's method; workers as in `run_unseen`. Raises as the
+    stages `excite` and `record` do.
     """
     own = stream_seed(seed, DESIGN)
-    seeds, trajectories = [stream_seed(own, number) for number in range(count)], []
+    seeds = [stream_seed(own, number) for number in range(count)]
+    trajectories = []
     with (
         progress.stage("design the runs", count) as advance,
         ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool,
@@ -145,4 +157,6 @@ def designed_runs(
 
 
 def _designed(scenario: Scenario, seed: int) -> FourierTrajectory:
-    return design_trajectories(load_robot(scenario.robot), scenario, seed, SilentProgress()).excitation
+    return design_trajectories(
+        load_robot(scenario.robot), scenario, seed, SilentProgress()
+    ).excitation

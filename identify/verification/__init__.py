@@ -1,1 +1,3 @@
-"""A robot checked without any sensor (its model against MuJoCo, its workspace), and a sensor without any robot."""
+"""A robot checked without any sensor (its model against MuJoCo, its workspace), and a sensor
+without any robot.
+"""

@@ -1,4 +1,6 @@
-"""The acceptance tests of one sensor, one after the other, and their figures as ``acceptance.json`` holds them."""
+"""The acceptance tests of one sensor, one after the other, and their figures as ``acceptance.json``
+holds them.
+"""
 
 import math
 import time
@@ -41,7 +43,9 @@ BLOCK = 10
 
 @dataclass
 class AcceptanceRun:
-    """What is tested, with the limit of the length error, and what came out, by the name of the test; its seconds."""
+    """What is tested, with the limit of the length error, and what came out, by the name of the
+    test; its seconds.
+    """
 
     under_test: SensorUnderTest
     renderer: str
@@ -54,8 +58,8 @@ class AcceptanceRun:
 
 @dataclass(frozen=True)
 class Standard:
-    """A test: its name in progress bars and in ``acceptance.json``; its steps in a volume, which it refuses where there
-    is no room; the test itself; its figures for ``acceptance.json``."""
+    """A test: its name in progress bars and in ``acceptance.json``; its steps in a volume, which it
+    refuses where there is no room; the test itself; its figures for ``acceptance.json``."""
 
     title: str
     key: str
@@ -65,43 +69,62 @@ class Standard:
 
 
 def prepare(
-    sensor: str | Path, seed: int, renderer: str | None, volume: str | None, standard: str, limit_um: float
+    sensor: str | Path,
+    seed: int,
+    renderer: str | None,
+    volume: str | None,
+    standard: str,
+    limit_um: float,
 ) -> AcceptanceRun:
-    """A run in which nothing is done yet; everything that can be wrong is checked before anything is drawn.
+    """A run in which nothing is done yet; everything that can be wrong is checked before anything
+    is drawn.
 
-    standard: the name of a test or ``all``; volume: its sides, see `parse_volume`, or the largest that is seen.
+    standard: the name of a test or ``all``; volume: its sides, see `parse_volume`, or the largest
+    that is seen.
 
-    Raises CmmError: an unknown sensor, renderer or standard, a limit that is no positive number, or a volume that is
-    not seen, breaks a rule or lacks room for the bar.
+    Raises CmmError: an unknown sensor, renderer or standard, a limit that is no positive number, or
+    a volume that is not seen, breaks a rule or lacks room for the bar.
     """
     if not (math.isfinite(limit_um) and limit_um > 0.0):
-        raise AcceptanceError(f"the limit of the length error must be a positive number of um, got {limit_um:g}")
+        raise AcceptanceError(
+            f"the limit of the length error must be a positive number of um, got {limit_um:g}"
+        )
     if standard != "all" and standard not in STANDARDS:
         raise UnknownOptionError("standard", standard, (*STANDARDS, "all"))
     standards = tuple(STANDARDS) if standard == "all" else (standard,)
     file = read_sensor_file(sensor)
     under_test = SensorUnderTest(file, seed, renderer)
-    found = common_volume(file.rig) if volume is None else volume_of_size(file.rig, parse_volume(volume))
+    found = (
+        common_volume(file.rig)
+        if volume is None
+        else volume_of_size(file.rig, parse_volume(volume))
+    )
     for name in standards:
         STANDARDS[name].steps(found)
     return AcceptanceRun(under_test, under_test.renderer_name(), found, standards, limit_um)
 
 
 def parse_volume(text: str) -> np.ndarray:
-    """Sides (3,) [m] of a volume written ``0.6`` (a cube) or ``0.7x0.6x0.6``. Raises AcceptanceError: anything else."""
+    """Sides (3,) [m] of a volume written ``0.6`` (a cube) or ``0.7x0.6x0.6``. Raises
+    AcceptanceError: anything else.
+    """
     try:
         sides = np.array([float(part) for part in text.lower().split("x")])
     except ValueError:
         sides = np.zeros(0)
     if len(sides) not in (1, 3) or not np.all(np.isfinite(sides)):
-        raise AcceptanceError(f"volume {text!r} is neither one side of a cube nor WIDTHxHEIGHTxDEPTH in m, such as 0.6")
+        raise AcceptanceError(
+            f"volume {text!r} is neither one side of a cube nor WIDTHxHEIGHTxDEPTH in m, such as "
+            "0.6"
+        )
     return np.broadcast_to(sides, 3).copy()
 
 
 def do(run: AcceptanceRun, progress: Progress) -> None:
     """Do the tests of a prepared run."""
     for name in run.standards:
-        standard, start = STANDARDS[name], time.perf_counter()
+        standard = STANDARDS[name]
+        start = time.perf_counter()
         with progress.stage(standard.title, standard.steps(run.volume)) as advance:
             run.found[name] = standard.test(run.under_test, run.volume, advance=advance)
         run.seconds[name] = time.perf_counter() - start
@@ -124,15 +147,22 @@ def acceptance_entry(run: AcceptanceRun) -> dict[str, Any]:
             "depth_from_baseline_mm": [1e3 * depth for depth in volume.depth_range],
             "base_from_volume": volume.base_from_volume,
         },
-        **{STANDARDS[name].key: STANDARDS[name].figures(test, run) for name, test in run.found.items()},
+        **{
+            STANDARDS[name].key: STANDARDS[name].figures(test, run)
+            for name, test in run.found.items()
+        },
         "published": [asdict(figure) for figure in PUBLISHED],
     }
 
 
 def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
-    largest, errors, single = test.largest, 1e6 * test.errors, 1e6 * test.single_errors
+    largest = test.largest
+    errors = 1e6 * test.errors
+    single = 1e6 * test.single_errors
     # the lengths of a line share its first sticker: only the lines are independent
-    line_means = 1e6 * np.array([np.mean([length.error for length in test.of_line(line.name)]) for line in test.lines])
+    line_means = 1e6 * np.array(
+        [np.mean([length.error for length in test.of_line(line.name)]) for line in test.lines]
+    )
     return {
         "limit_um": run.limit_um,
         "met": bool(np.abs(errors).max() <= run.limit_um),
@@ -198,7 +228,9 @@ def _relative_errors(test: BarTest, moving: bool, rng: np.random.Generator) -> d
         "orientation_urad": np.linalg.norm(errors[:, 3:], axis=1),
         "distance_um": np.abs(test.distance_errors(moving)),
     }
-    return {name: asdict(summarise(1e6 * values, rng, BLOCK)) for name, values in magnitudes.items()}
+    return {
+        name: asdict(summarise(1e6 * values, rng, BLOCK)) for name, values in magnitudes.items()
+    }
 
 
 def _rms_norm(errors: np.ndarray) -> float:
@@ -227,8 +259,18 @@ def _circle_steps(volume: MeasuringVolume) -> int:
 
 STANDARDS = {
     "vdi": Standard(
-        "lengths (VDI/VDE 2634-1)", "vdi_2634_1", lambda volume: len(seven_lines(volume)), length_test, _length
+        "lengths (VDI/VDE 2634-1)",
+        "vdi_2634_1",
+        lambda volume: len(seven_lines(volume)),
+        length_test,
+        _length,
     ),
-    "e3064": Standard("moving bar (ASTM E3064)", "astm_e3064", lambda volume: len(bar_paths(volume)), bar_test, _bar),
+    "e3064": Standard(
+        "moving bar (ASTM E3064)",
+        "astm_e3064",
+        lambda volume: len(bar_paths(volume)),
+        bar_test,
+        _bar,
+    ),
     "e3124": Standard("latency (ASTM E3124)", "astm_e3124", _circle_steps, latency_test, _latency),
 }

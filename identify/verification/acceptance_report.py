@@ -1,4 +1,6 @@
-"""``acceptance.md``: tables of acceptance tests, ours beside the published figures, and what may be compared."""
+"""``acceptance.md``: tables of acceptance tests, ours beside the published figures, and what may be
+compared.
+"""
 
 from typing import Any
 
@@ -15,15 +17,18 @@ MAGNITUDES = (
     ("distance_um", "distance of the ends [um]"),
 )
 COMPARABLE = """\
-What is comparable: the NIST figures are of the same kind as our bar test, the relative error of markers at both ends of
-a rigid bar. The length test follows the rules of the guideline, so its errors mean what such a test's errors mean.
+What is comparable: the NIST figures are of the same kind as our bar test, the relative error of
+markers at both ends of a rigid bar. The length test follows the rules of the guideline, so its
+errors mean what such a test's errors mean.
 
-What is not: the published figures belong to real instruments, each in its own volume and test, with warm-up, air, real
-lenses, calibration errors and real targets. Ours are of a simulated sensor whose camera figures were chosen, which
-knows its own calibration exactly, and whose artefacts are certified without error, in the volume stated above. A figure
-published as ± is to be held against our largest error, not against an RMS. The position error of our bar contains the
-orientation error of its first end times the bar's length; its distance error does not. Our latency is what the sensor
-file asks for: the test shows that the reports keep it, and says nothing about how fast an instrument is.
+What is not: the published figures belong to real instruments, each in its own volume and test, with
+warm-up, air, real lenses, calibration errors and real targets. Ours are of a simulated sensor whose
+camera figures were chosen, which knows its own calibration exactly, and whose artefacts are
+certified without error, in the volume stated above. A figure published as ± is to be held against
+our largest error, not against an RMS. The position error of our bar contains the orientation error
+of its first end times the bar's length; its distance error does not. Our latency is what the sensor
+file asks for: the test shows that the reports keep it, and says nothing about how fast an
+instrument is.
 """
 
 
@@ -35,7 +40,8 @@ def acceptance_markdown(entry: dict[str, Any]) -> str:
     parts = [
         f"# Acceptance of {entry['sensor']}",
         f"Renderer {entry['renderer']}, seed {entry['seed']}. Measuring volume {sides} mm "
-        f"({volume['cubic_metres']:.3g} m³, space diagonal {volume['diagonal_mm']:.0f} mm), {near:.0f} to "
+        f"({volume['cubic_metres']:.3g} m³, space diagonal {volume['diagonal_mm']:.0f} mm), "
+        f"{near:.0f} to "
         f"{far:.0f} mm from the middle of the baseline: wholly seen by both cameras.",
         *([f"Of the sensor's figures: {entry['note']}."] if entry.get("note") else []),
     ]
@@ -65,31 +71,44 @@ def length_table(test: dict[str, Any]) -> Table:
         "Lengths in the style of VDI/VDE 2634-1",
         ("line", "lengths [mm]", "longest / diagonal", "errors E [um]", "largest [um]"),
         tuple(rows),
-        f"Largest error {test['largest_error_um']:+.1f} um ({where['line']}, {where['length_mm']:.0f} mm), limit "
-        f"± {test['limit_um']:g} um: {'met' if test['met'] else 'MISSED'}. Mean error {test['mean_error_um']:+.2f} um, "
-        f"95 % interval {low:+.2f} to {high:+.2f} um. A length is the mean of {test['exposures_a_length']} exposures; "
-        f"the RMS error of a single one is {number(test['single_exposure_rms_um'])} um, its mean square "
+        f"Largest error {test['largest_error_um']:+.1f} um ({where['line']}, "
+        f"{where['length_mm']:.0f} mm), limit "
+        f"± {test['limit_um']:g} um: {'met' if test['met'] else 'MISSED'}. Mean error "
+        f"{test['mean_error_um']:+.2f} um, "
+        f"95 % interval {low:+.2f} to {high:+.2f} um. A length is the mean of "
+        f"{test['exposures_a_length']} exposures; "
+        f"the RMS error of a single one is {number(test['single_exposure_rms_um'])} um, its mean "
+        "square "
         f"{number(test['variance_ratio'])} times the stated variance.",
     )
 
 
 def bar_table(test: dict[str, Any]) -> Table:
-    """Statistics of the relative pose error of the bar's ends, standing and moving, with 95 % intervals."""
+    """Statistics of the relative pose error of the bar's ends, standing and moving, with 95 %
+    intervals.
+    """
     rows = []
     for state in ("standing", "moving"):
         for key, name in MAGNITUDES:
             figures = test[state][key]
-            values = [number(figures[k]) + _interval(figures["interval"].get(k)) for k, _ in STATISTICS]
+            values = [
+                number(figures[k]) + _interval(figures["interval"].get(k)) for k, _ in STATISTICS
+            ]
             rows.append((f"{state}, {name}", *values, str(figures["count"])))
     note = (
-        f"A bar with {test['bar_length_mm']:.0f} mm between the clusters at its ends, moved at up to "
-        f"{test['largest_speed_mm_s']:.0f} mm/s with {test['exposure_ms']:g} ms of exposure; in brackets 95 % "
+        f"A bar with {test['bar_length_mm']:.0f} mm between the clusters at its ends, moved at up "
+        "to "
+        f"{test['largest_speed_mm_s']:.0f} mm/s with {test['exposure_ms']:g} ms of exposure; in "
+        "brackets 95 % "
         f"intervals. {test['lost_frames']} of {test['frames']} frames lost. The squared "
         f"errors are {number(test['variance_ratio'])} times the stated variance."
     )
     given_up = [f"{run['name']} ({run['given_up']})" for run in test["runs"] if run["given_up"]]
     if given_up:
-        note += f" Given up after {GIVEN_UP} lost frames in a row, the rest counted as lost: {'; '.join(given_up)}."
+        note += (
+            f" Given up after {GIVEN_UP} lost frames in a row, the rest counted as lost: "
+            f"{'; '.join(given_up)}."
+        )
     return Table(
         "Rigid bar in the style of ASTM E3064-16",
         ("relative pose error", *(name for _, name in STATISTICS), "frames"),
@@ -113,14 +132,16 @@ def latency_table(test: dict[str, Any]) -> Table:
         "Latency in the style of ASTM E3124",
         ("from the middle of the exposure to the report", "[ms]"),
         rows,
-        f"{test['reports']} reports of a body on a circle, {test['lost_frames']} frames lost; in brackets the "
+        f"{test['reports']} reports of a body on a circle, {test['lost_frames']} frames lost; in "
+        "brackets the "
         "95 % interval.",
     )
 
 
 def published_table(entry: dict[str, Any]) -> Table:
     """Our figures above the published ones of the same quantity."""
-    ours, rows = _our_figures(entry), []
+    ours = _our_figures(entry)
+    rows = []
     for quantity in dict.fromkeys(figure["quantity"] for figure in entry["published"]):
         rows += [(quantity, entry["sensor"], value, note) for value, note in ours.get(quantity, ())]
         rows += [
@@ -128,7 +149,9 @@ def published_table(entry: dict[str, Any]) -> Table:
             for f in entry["published"]
             if f["quantity"] == quantity
         ]
-    return Table("Beside published figures", ("quantity", "instrument", "value", "what it is"), tuple(rows))
+    return Table(
+        "Beside published figures", ("quantity", "instrument", "value", "what it is"), tuple(rows)
+    )
 
 
 def _our_figures(entry: dict[str, Any]) -> dict[str, list[tuple[str, str]]]:
@@ -145,7 +168,8 @@ def _our_figures(entry: dict[str, Any]) -> dict[str, list[tuple[str, str]]]:
                 ("distance_um", "position", 1e-3, "mm", f"distance {ends}"),
                 ("orientation_urad", "orientation", URAD_IN_DEG, "deg", f"relative pose {ends}"),
             ):
-                rms, largest = scale * test[state][key]["rms"], scale * test[state][key]["maximum"]
+                rms = scale * test[state][key]["rms"]
+                largest = scale * test[state][key]["maximum"]
                 value = f"{rms:.4f} {unit} RMS, {largest:.4f} {unit} largest"
                 found.setdefault(f"{name}, {word}", []).append((value, what))
     if test := entry.get("astm_e3124"):

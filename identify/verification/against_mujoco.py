@@ -1,11 +1,13 @@
-"""The paper's model validation (section 4.1): this model against MuJoCo in the loop of its figure 7, and its figure 8.
+"""The paper's model validation (section 4.1): this model against MuJoCo in the loop of its figure
+7, and its figure 8.
 
-The same joint PID (eq. 31) on both engines follows the joint coordinates of the same exciting trajectory (eq. 37);
-torques come from each engine's own motion. This model goes through the closed loop of the experiments, driven by
-commands; MuJoCo through `mj_step` on the exported MJCF.
+The same joint PID (eq. 31) on both engines follows the joint coordinates of the same exciting
+trajectory (eq. 37); torques come from each engine's own motion. This model goes through the closed
+loop of the experiments, driven by commands; MuJoCo through `mj_step` on the exported MJCF.
 
-MuJoCo runs with RK4 and with the PID's stiffness and damping inside its integrator, so that its discretisation stays
-far below what is to be seen; only the integral part is held over a step of 0.25 ms, at its value in mid-step.
+MuJoCo runs with RK4 and with the PID's stiffness and damping inside its integrator, so that its
+discretisation stays far below what is to be seen; only the integral part is held over a step of
+0.25 ms, at its value in mid-step.
 """
 
 from collections.abc import Iterator
@@ -27,8 +29,10 @@ from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
 
 PARAMETER_SET = "initial"
-DURATION_S, STEADY_FROM_S = 10.0, 2.0
-COMMAND_RATE_HZ, STEPS_PER_COMMAND = 200.0, 4
+DURATION_S = 10.0
+STEADY_FROM_S = 2.0
+COMMAND_RATE_HZ = 200.0
+STEPS_PER_COMMAND = 4
 SOLVER = MjcfSolver(timestep_s=2.5e-4, integrator="RK4")
 
 # The paper's excitation (section 4.2) in the box of the reference experiment.
@@ -39,15 +43,21 @@ EXCITATION = Excitation(
     orientation_amplitude_rad=0.040,
 )
 
-GOAL_UM, GOAL_URAD = 10.0, 20.0
-PAPER = {"position_max_um": 1250.0, "angle_max_urad": 3250.0, "position_steady_um": 100.0, "angle_steady_urad": 250.0}
+GOAL_UM = 10.0
+GOAL_URAD = 20.0
+PAPER = {
+    "position_max_um": 1250.0,
+    "angle_max_urad": 3250.0,
+    "position_steady_um": 100.0,
+    "angle_steady_urad": 250.0,
+}
 
 
 @dataclass(frozen=True)
 class EngineRuns:
-    """Both engines over time (N,) [s]: poses (N, 6) [m, rad] of this model, of MuJoCo and of the reference;
-    actuator torques or forces (N, n) [N m, N] of this model and of MuJoCo; MuJoCo's closure error (N,) [m] and link
-    spin (N,) [rad/s]."""
+    """Both engines over time (N,) [s]: poses (N, 6) [m, rad] of this model, of MuJoCo and of the
+    reference; actuator torques or forces (N, n) [N m, N] of this model and of MuJoCo; MuJoCo's
+    closure error (N,) [m] and link spin (N,) [rad/s]."""
 
     time: Array
     reference: Array
@@ -71,17 +81,23 @@ def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
     Raises DynamicsError, TrajectoryError: see `compare_engines`.
     """
     values = robot.parameter_sets[PARAMETER_SET].vector.copy()
-    values[robot.layout.coulomb], values[robot.layout.viscous] = 0.0, 0.0
+    values[robot.layout.coulomb] = 0.0
+    values[robot.layout.viscous] = 0.0
     return compare_engines(robot, values, values, DURATION_S, progress)
 
 
 def compare_engines(
-    robot: Robot, model_parameters: Array, mujoco_parameters: Array, duration_s: float, progress: Progress | None = None
+    robot: Robot,
+    model_parameters: Array,
+    mujoco_parameters: Array,
+    duration_s: float,
+    progress: Progress | None = None,
 ) -> EngineRuns:
-    """Both engines on the exciting trajectory, each with its own parameters: the dynamic ones (p,), lp, li, ld.
+    """Both engines on the exciting trajectory, each with its own parameters: the dynamic ones (p,),
+    lp, li, ld.
 
-    Raises DynamicsError: MuJoCo is missing or refuses the model, or the loop is unstable. Raises TrajectoryError: no
-    exciting trajectory of this amplitude stays inside the robot's travel.
+    Raises DynamicsError: MuJoCo is missing or refuses the model, or the loop is unstable. Raises
+    TrajectoryError: no exciting trajectory of this amplitude stays inside the robot's travel.
     """
     import_mujoco()
     progress = progress or SilentProgress()
@@ -97,33 +113,56 @@ def compare_engines(
             closed_loop.FrameTiming(COMMAND_RATE_HZ, hold="linear"),
             steps_per_frame=STEPS_PER_COMMAND,
         )
-        model = closed_loop.simulate(robot, model_parameters, reference, settings, commands=commands)
+        model = closed_loop.simulate_commands(
+            robot, model_parameters, reference, settings, commands
+        )
         advance()
     # Table 1's inertias break the triangle inequality in ways that the motion does not feel
-    chosen, joints = mujoco_parameters[robot.layout.dynamic], robot.layout.joints
+    chosen = mujoco_parameters[robot.layout.dynamic]
+    joints = robot.layout.joints
     mjcf = mjcf_text(robot, chosen, allow_unphysical_inertia=True, solver=SOLVER)
-    engine, rows = MujocoRobot(robot, mjcf), np.empty((len(time), 8 + joints))
+    engine = MujocoRobot(robot, mjcf)
+    rows = np.empty((len(time), 8 + joints))
     with progress.stage("MuJoCo", len(time)) as advance:
-        for frame, row in enumerate(_mujoco_rows(robot, engine, mujoco_parameters, reference, commands)):
+        for frame, row in enumerate(
+            _mujoco_rows(robot, engine, mujoco_parameters, reference, commands)
+        ):
             rows[frame] = row
             advance()
-    pose, torque, closure, spin = rows[:, :6], rows[:, 6:-2], rows[:, -2], rows[:, -1]
+    pose = rows[:, :6]
+    torque = rows[:, 6:-2]
+    closure = rows[:, -2]
+    spin = rows[:, -1]
     return EngineRuns(
-        time, reference.poses, model.pose, pose, model.torque, torque, closure, spin, mujoco_version=engine.version
+        time,
+        reference.poses,
+        model.pose,
+        pose,
+        model.torque,
+        torque,
+        closure,
+        spin,
+        mujoco_version=engine.version,
     )
 
 
 def exciting_trajectory(robot: Robot) -> FourierTrajectory:
-    """The first random trajectory of eq. 37 that stays inside the travel; always the same for a robot."""
+    """The first random trajectory of eq. 37 that stays inside the travel; always the same for a
+    robot.
+    """
     period_s = 1 / EXCITATION.fundamental_hz
     return admissible_trajectories(robot, EXCITATION, period_s, 1, np.random.SeedSequence(0))[0]
 
 
 def _mujoco_rows(
-    robot: Robot, engine: MujocoRobot, parameters: Array, reference: closed_loop.Reference, commands: Array
+    robot: Robot,
+    engine: MujocoRobot,
+    parameters: Array,
+    reference: closed_loop.Reference,
+    commands: Array,
 ) -> Iterator[Array]:
-    """Pose (6,), torques (n,), closure error and link spin at every command, in a row; the command ramps from the one
-    before to the present one, as in the closed loop with linear hold."""
+    """Pose (6,), torques (n,), closure error and link spin at every command, in a row; the command
+    ramps from the one before to the present one, as in the closed loop with linear hold."""
     lp, li, ld = parameters[robot.layout.joint_pid]
     steps = round(1 / (COMMAND_RATE_HZ * engine.timestep))
     dt = 1 / (COMMAND_RATE_HZ * steps)
@@ -145,10 +184,10 @@ def _mujoco_rows(
 
 @dataclass(frozen=True)
 class Verdict:
-    """Largest differences between the engines, of the whole run and from STEADY_FROM_S on: distances of the platform
-    [um], lengths of the vector of Euler angle differences [urad], actuator torque or force [N m, N]; MuJoCo's loop
-    closure error [um] and link spin [rad/s]; how far this model is from its reference [um, urad], which is what the PID
-    leaves to see."""
+    """Largest differences between the engines, of the whole run and from STEADY_FROM_S on:
+    distances of the platform [um], lengths of the vector of Euler angle differences [urad],
+    actuator torque or force [N m, N]; MuJoCo's loop closure error [um] and link spin [rad/s]; how
+    far this model is from its reference [um, urad], which is what the PID leaves to see."""
 
     position_max_um: float
     position_steady_um: float
@@ -191,7 +230,8 @@ def _lengths(difference: Array) -> tuple[Array, Array]:
 
 def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
     """What `verification.json` holds."""
-    verdict, chosen = judge(runs), robot.parameter_sets[PARAMETER_SET]
+    verdict = judge(runs)
+    chosen = robot.parameter_sets[PARAMETER_SET]
     return {
         "robot": robot.name,
         "parameters": f"{PARAMETER_SET}, friction zero",
@@ -201,7 +241,9 @@ def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
         "mujoco": {
             "version": runs.mujoco_version,
             **asdict(SOLVER),
-            "inertias_changed": grouped(physical_inertias(robot.layout, chosen.dynamic, allow_changes=True).changes),
+            "inertias_changed": grouped(
+                physical_inertias(robot.layout, chosen.dynamic, allow_changes=True).changes
+            ),
         },
         "difference": asdict(verdict),
         "torque_unit": robot.layout.unit("joint1.coulomb"),
@@ -215,21 +257,28 @@ def figure_8(runs: EngineRuns) -> Figure:
     """Differences of MuJoCo and this model, and how far MuJoCo's loops are open, over time."""
     figure = Figure(figsize=(9, 9), layout="constrained")
     position, angle, closure = figure.subplots(3, 1, sharex=True)
-    verdict, difference = judge(runs), 1e6 * runs.difference
+    verdict = judge(runs)
+    difference = 1e6 * runs.difference
     for i in range(3):
         position.plot(runs.time, difference[:, i], linewidth=1, label=COMPONENTS[i])
         angle.plot(runs.time, difference[:, 3 + i], linewidth=1, label=COMPONENTS[3 + i])
     closure.plot(runs.time, 1e6 * runs.closure, linewidth=1, color="black")
     position.set_title(
-        f"(a) position: largest {verdict.position_max_um:.2g} um, steady {verdict.position_steady_um:.2g} um "
+        f"(a) position: largest {verdict.position_max_um:.2g} um, steady "
+        f"{verdict.position_steady_um:.2g} um "
         f"(goal {GOAL_UM:g} um; paper 1250 and 100 um)"
     )
     angle.set_title(
-        f"(b) angle: largest {verdict.angle_max_urad:.2g} urad, steady {verdict.angle_steady_urad:.2g} urad "
+        f"(b) angle: largest {verdict.angle_max_urad:.2g} urad, steady "
+        f"{verdict.angle_steady_urad:.2g} urad "
         f"(goal {GOAL_URAD:g} urad; paper 3250 and 250 urad)"
     )
     closure.set_title(f"(c) MuJoCo's loop closure error: largest {verdict.closure_max_um:.2g} um")
-    for axes, label in ((position, "position error [um]"), (angle, "angle error [urad]"), (closure, "gap [um]")):
+    for axes, label in (
+        (position, "position error [um]"),
+        (angle, "angle error [urad]"),
+        (closure, "gap [um]"),
+    ):
         axes.set_ylabel(label)
         axes.axvline(STEADY_FROM_S, color="grey", linewidth=1, linestyle="--")
         axes.grid(alpha=0.3)

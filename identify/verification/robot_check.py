@@ -1,7 +1,9 @@
-"""What a designer wants to know of a robot before it is built or run: each question with its number and its limit.
+"""What a designer wants to know of a robot before it is built or run: each question with its number
+and its limit.
 
-Over the travel: random joint coordinates within the travel limit, and the pose that the robot has with them, followed
-from home. The loop is judged at home, by its linear map from frame to frame, without dry friction.
+Over the travel: random joint coordinates within the travel limit, and the pose that the robot has
+with them, followed from home. The loop is judged at home, by its linear map from frame to frame,
+without dry friction.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,8 +36,8 @@ UNFELT = 1e-9
 
 @dataclass(frozen=True)
 class Finding:
-    """One answer: the check by name, whether it is within its limit (None where there is none), value, limit and unit,
-    the leg 1..n that it concerns (None: no single one), and a sentence."""
+    """One answer: the check by name, whether it is within its limit (None where there is none),
+    value, limit and unit, the leg 1..n that it concerns (None: no single one), and a sentence."""
 
     check: str
     ok: bool
@@ -56,8 +58,8 @@ def check_robot(
     scenario: Scenario,
     progress: Progress | None = None,
 ) -> list[Finding]:
-    """All findings about a robot with all its parameters, in the loop and before the sensor of a scenario, whose
-    `excitation` has the limits of leverage and condition."""
+    """All findings about a robot with all its parameters, in the loop and before the sensor of a
+    scenario, whose `excitation` has the limits of leverage and condition."""
     questions: list[Callable[[], Iterator[Finding]]] = [
         lambda: _freedoms(robot),
         lambda: _travel(robot, scenario.excitation),
@@ -78,14 +80,16 @@ def check_robot(
 
 
 def _freedoms(robot: Robot) -> Iterator[Finding]:
-    names, joints = robot.coordinate_names, robot.layout.joints
+    names = robot.coordinate_names
+    joints = robot.layout.joints
     text = f"{joints} actuators for {len(names)} freedoms of the platform: {', '.join(names)}"
     yield Finding("freedoms", joints == len(names), joints, len(names), "1", None, text)
 
 
 def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
     """At home, then over the travel: what `workspace.check_motion` judges."""
-    unit, limit = robot.layout.joint_unit, robot.travel_limit
+    unit = robot.layout.joint_unit
+    limit = robot.travel_limit
     at_home = workspace.measure(robot, robot.home_pose)
     yield from _extremes("at home", at_home, limits)
     most, leg = _worst(np.abs(at_home.theta), np.argmax)
@@ -93,22 +97,35 @@ def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
     yield Finding("travel at home", most <= limit, most, limit, unit, leg, text)
     travel = workspace.measure_travel(robot, SAMPLES)
     share = len(travel.theta) / SAMPLES
-    text = f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a pose near home"
+    text = (
+        f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a "
+        "pose near home"
+    )
     yield Finding("travel closes", share > 0, share, 0.0, "1", None, text)
     if share > 0:
         yield from _extremes("over the travel", travel, limits)
 
 
-def _extremes(where: str, measures: workspace.WorkspaceMeasures, limits: Excitation) -> Iterator[Finding]:
+def _extremes(
+    where: str, measures: workspace.WorkspaceMeasures, limits: Excitation
+) -> Iterator[Finding]:
     reach, leg = _worst(measures.reach_margin, np.argmin)
-    text = f"least reach margin {where} is {reach:.3g}, of leg {leg}; at 0 it is stretched or folded"
+    text = (
+        f"least reach margin {where} is {reach:.3g}, of leg {leg}; at 0 it is stretched or folded"
+    )
     yield Finding(f"reach {where}", reach > 0, reach, 0.0, "1", leg, text)
     leverage, leg = _worst(measures.leverage, np.argmin)
-    least, most = limits.least_leverage, limits.most_condition
-    text = f"least leverage of an actuator on its leg (J_a1) {where} is {leverage:.3g}, of leg {leg}"
+    least = limits.least_leverage
+    most = limits.most_condition
+    text = (
+        f"least leverage of an actuator on its leg (J_a1) {where} is {leverage:.3g}, of leg {leg}"
+    )
     yield Finding(f"leverage {where}", leverage >= least, leverage, least, "1", leg, text)
     condition = float(np.max(measures.platform_condition))
-    text = f"largest condition of the platform side (J_a2) {where} is {condition:.3g}; at infinity it moves unheld"
+    text = (
+        f"largest condition of the platform side (J_a2) {where} is {condition:.3g}; at "
+        "infinity it moves unheld"
+    )
     yield Finding(f"condition {where}", condition <= most, condition, most, "1", None, text)
 
 
@@ -118,22 +135,35 @@ def _worst(values: Array, pick: Callable[..., np.intp]) -> tuple[float, int]:
 
 
 def _assembly(robot: Robot) -> Iterator[Finding]:
-    modes, home = robot.assembly_modes(), robot.home_pose
-    text = f"{len(modes)} assembly modes found with the joints as at home, no leg folded the other way"
+    modes = robot.assembly_modes()
+    home = robot.home_pose
+    text = (
+        f"{len(modes)} assembly modes found with the joints as at home, no leg folded the other way"
+    )
     if len(modes) > 1:
         turn = Rotation.from_euler("XYZ", home[3:]).inv() * Rotation.from_euler("XYZ", modes[1, 3:])
-        text += f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and {turn.magnitude():.3g} rad from it"
+        text += (
+            f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and "
+            f"{turn.magnitude():.3g} rad from it"
+        )
     yield Finding("assembly modes", len(modes) > 0, len(modes), None, "1", None, text)
 
 
 def _holding(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[Finding]:
     torque = robot.static_torque(robot.home_pose, parameters[robot.layout.dynamic])
-    unit, limit = robot.layout.unit("joint1.coulomb"), of_actuators(robot, scenario.control, "torque_limit")
+    unit = robot.layout.unit("joint1.coulomb")
+    limit = of_actuators(robot, scenario.control, "torque_limit")
     leg = int(np.argmax(np.abs(torque)))
-    most, mean = float(np.abs(torque[leg])), np.abs(torque).mean()
-    text = f"joint {leg + 1} holds the most at home, {torque[leg]:.3g} {unit}; the mean of all is {mean:.3g} {unit}"
+    most = float(np.abs(torque[leg]))
+    mean = np.abs(torque).mean()
+    text = (
+        f"joint {leg + 1} holds the most at home, {torque[leg]:.3g} {unit}; the mean of all is "
+        f"{mean:.3g} {unit}"
+    )
     text += "" if limit is None else f", and the actuators have {limit:.3g} {unit}"
-    yield Finding("holding torque", limit is None or most <= limit, most, limit, unit, leg + 1, text)
+    yield Finding(
+        "holding torque", limit is None or most <= limit, most, limit, unit, leg + 1, text
+    )
 
 
 def _visible(robot: Robot) -> Iterator[Finding]:
@@ -146,46 +176,77 @@ def _visible(robot: Robot) -> Iterator[Finding]:
 def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
     """Inertias that no body has count where the motion feels what would make them possible."""
     inertias = physical_inertias(robot.layout, parameters, allow_changes=True)
-    effects = acceleration_changes(robot, parameters[robot.layout.dynamic], inertias.values) if inertias.changes else {}
+    effects = (
+        acceleration_changes(robot, parameters[robot.layout.dynamic], inertias.values)
+        if inertias.changes
+        else {}
+    )
     largest = max(effects.values(), default=0.0)
     text = "all bodies can exist"
     leg = None
     if inertias.changes:
         worst = robot.layout.bodies.index(max(effects, key=effects.__getitem__))
-        leg = next((leg + 1 for leg, bodies in enumerate(robot.layout.of_leg) if worst in bodies), None)
-        felt = f"accelerations change by up to {100 * largest:.2g} %" if largest > UNFELT else "no motion feels it"
+        leg = next(
+            (leg + 1 for leg, bodies in enumerate(robot.layout.of_leg) if worst in bodies), None
+        )
+        felt = (
+            f"accelerations change by up to {100 * largest:.2g} %"
+            if largest > UNFELT
+            else "no motion feels it"
+        )
         text = f"no rigid body has these, and {felt}: {'; '.join(grouped(inertias.changes))}"
     yield Finding("inertias", largest <= UNFELT, largest, UNFELT, "1", leg, text)
 
 
 def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -> Iterator[Finding]:
-    timing, home = settings.timing, robot.home_pose
+    timing = settings.timing
+    home = robot.home_pose
     arguments = robot, parameters, settings, home
     try:
         radius = stability.spectral_radius(*arguments)
     except DynamicsError as error:  # singular at home, which has been found above
-        yield Finding("loop", False, None, 1.0, "1", None, f"the loop cannot be judged at home: {error}")
+        yield Finding(
+            "loop", False, None, 1.0, "1", None, f"the loop cannot be judged at home: {error}"
+        )
         return
     at = f"at {timing.frame_rate_hz:g} Hz and {1e3 * timing.latency_s:.3g} ms of latency"
-    text = f"largest eigenvalue of the loop from frame to frame {at} is {radius:.6f}; it is stable below 1"
+    text = (
+        f"largest eigenvalue of the loop from frame to frame {at} is {radius:.6f}; it is "
+        "stable below 1"
+    )
     yield Finding("loop", radius < 1, radius, 1.0, "1", None, text)
     factor = stability.gain_margin(*arguments)
     gains = settings.servo
-    text = f"the servo's gains, kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s, "
+    text = (
+        f"the servo's gains, kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = "
+        f"{gains.ki:.4g} 1/s, "
+    )
     text += f"may be {factor:.3g} times as large until the loop is lost"
     if not factor > 0:
         text = "the loop is lost with any gains of the servo"
     elif factor < 1:
-        text = text.replace("may be", "must be").replace(" until the loop is lost", " for the loop to hold")
+        text = text.replace("may be", "must be").replace(
+            " until the loop is lost", " for the loop to hold"
+        )
     yield Finding("gain margin", factor > 1, factor, 1.0, "1", None, text)
     rate = stability.lowest_frame_rate(*arguments)
-    text = f"the loop holds from {rate:.3g} Hz on with this latency" if rate > 0 else "no frame rate makes it stable"
-    yield Finding("frame rate", rate < timing.frame_rate_hz, rate, timing.frame_rate_hz, "Hz", None, text)
+    text = (
+        f"the loop holds from {rate:.3g} Hz on with this latency"
+        if rate > 0
+        else "no frame rate makes it stable"
+    )
+    yield Finding(
+        "frame rate", rate < timing.frame_rate_hz, rate, timing.frame_rate_hz, "Hz", None, text
+    )
 
 
 def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[Finding]:
-    """What the gains of both loops give, and those of the servo for a bandwidth and a damping that are asked for."""
-    settings, home, control = model_settings(robot, scenario), robot.home_pose, scenario.control
+    """What the gains of both loops give, and those of the servo for a bandwidth and a damping that
+    are asked for.
+    """
+    settings = model_settings(robot, scenario)
+    home = robot.home_pose
+    control = scenario.control
     model = Model(robot, parameters, settings.friction)
     try:
         found = servo_figures(model, settings, home)
@@ -193,26 +254,50 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
         torques = torque_figures(model, settings, home, asked)
         limit = largest_bandwidth(model, settings, home, asked)
     except DynamicsError as error:
-        yield Finding("bandwidth", False, None, None, "rad/s", None, f"the loop cannot be judged at home: {error}")
+        yield Finding(
+            "bandwidth",
+            False,
+            None,
+            None,
+            "rad/s",
+            None,
+            f"the loop cannot be judged at home: {error}",
+        )
         return
-    text = f"the servo follows up to {found.bandwidth:.3g} rad/s, with a least damping of {found.damping:.3g}"
+    text = (
+        f"the servo follows up to {found.bandwidth:.3g} rad/s, with a least damping of "
+        f"{found.damping:.3g}"
+    )
     bandwidth: float | None = found.bandwidth
     if found.radius >= 1:
-        bandwidth, text = None, "a loop that is lost has no bandwidth"
+        bandwidth = None
+        text = "a loop that is lost has no bandwidth"
     yield Finding("bandwidth", found.radius < 1, bandwidth, None, "rad/s", None, text)
     wanted = control.servo_bandwidth_rad_s
     if wanted is not None:
         try:
             gains = design_servo(model, settings, home, wanted, control.servo_damping)
             made = servo_figures(model, replace(settings, servo=gains), home)
-            text = f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give a bandwidth of "
-            text += f"{made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, {made.gain_margin:.3g} times "
+            text = (
+                f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give "
+                "a bandwidth of "
+            )
+            text += (
+                f"{made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, "
+                f"{made.gain_margin:.3g} times "
+            )
             text += "these gains lose the loop"
-            yield Finding("servo by design", made.radius < 1, made.gain_margin, 1.0, "1", None, text)
+            yield Finding(
+                "servo by design", made.radius < 1, made.gain_margin, 1.0, "1", None, text
+            )
         except SimulationError as error:
             yield Finding("servo by design", False, None, 1.0, "1", None, str(error))
-    w, nyquist = asked.bandwidth, np.pi * settings.timing.frame_rate_hz
-    text = f"computed_torque at {w:.3g} rad/s, Kp = {w**2:.4g} 1/s^2 and Kd = {2 * asked.damping * w:.4g} 1/s, "
+    w = asked.bandwidth
+    nyquist = np.pi * settings.timing.frame_rate_hz
+    text = (
+        f"computed_torque at {w:.3g} rad/s, Kp = {w**2:.4g} 1/s^2 and Kd = "
+        f"{2 * asked.damping * w:.4g} 1/s, "
+    )
     text += f"has the largest eigenvalue {torques.radius:.4g}, which is stable below 1"
     if torques.radius < 1:
         text += f"; {torques.gain_margin:.3g} times these gains lose it"
@@ -227,10 +312,22 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
 def _seen(robot: Robot, scenario: Scenario) -> Iterator[Finding]:
     """Whether the platform that the scenario's sensor sees is the robot's."""
     outside, away = platform_distances(robot, sensor_file(scenario))
-    leg, limit = int(np.argmax(outside)), OFF_PLATFORM_M
-    text = f"leg {leg + 1} ends {outside[leg]:.3g} m outside of the platform that sensor {scenario.sensor} sees"
+    leg = int(np.argmax(outside))
+    limit = OFF_PLATFORM_M
+    text = (
+        f"leg {leg + 1} ends {outside[leg]:.3g} m outside of the platform that sensor "
+        f"{scenario.sensor} sees"
+    )
     if outside[leg] <= 0:
         text = f"all legs end on the platform that sensor {scenario.sensor} sees"
-    yield Finding("sensor's platform", bool(outside[leg] <= limit), float(outside[leg]), limit, "m", leg + 1, text)
+    yield Finding(
+        "sensor's platform",
+        bool(outside[leg] <= limit),
+        float(outside[leg]),
+        limit,
+        "m",
+        leg + 1,
+        text,
+    )
     text = f"at home that platform is {away:.3g} m from the robot's"
     yield Finding("sensor's home", away <= limit, away, limit, "m", None, text)

@@ -8,7 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from cmmsim.acceptance import BarTest, LatencyTest, LengthTest, MeasuringVolume, bar_paths, seven_lines
+from cmmsim.acceptance import (
+    BarTest,
+    LatencyTest,
+    LengthTest,
+    MeasuringVolume,
+    bar_paths,
+    seven_lines,
+)
 from cmmsim.acceptance.moving_bar import SECONDS
 from cmmsim.acceptance.statistics import published
 from cmmsim.acceptance.volume import CORNERS
@@ -27,7 +34,9 @@ GRID = 25
 
 
 def acceptance_figures(run: AcceptanceRun) -> dict[str, Figure]:
-    """Figures by name: two of the lengths, two of the bar, one of the latency; none of a test that was not done."""
+    """Figures by name: two of the lengths, two of the bar, one of the latency; none of a test that
+    was not done.
+    """
     figures = {}
     if length := run.found.get("vdi"):
         figures["measuring_lines"] = lines_figure(run.volume)
@@ -50,7 +59,9 @@ def paths_figure(volume: MeasuringVolume) -> Figure:
     """The volume with the paths of the bar's middle; axes in mm."""
     to_volume = invert(volume.base_from_volume)
     curves = {
-        path.name: apply(to_volume, np.array([path.pose(time)[:3] for time in np.linspace(0.0, SECONDS, 200)]))
+        path.name: apply(
+            to_volume, np.array([path.pose(time)[:3] for time in np.linspace(0.0, SECONDS, 200)])
+        )
         for path in bar_paths(volume)
     }
     return _in_volume(volume, "Paths of the bar's middle (ASTM E3064)", curves)
@@ -83,7 +94,9 @@ def _as_seen(points: np.ndarray) -> np.ndarray:
 
 
 def length_figure(test: LengthTest, limit_um: float) -> Figure:
-    """Length measurement error against length: single exposures as dots, the mean of each length as a line."""
+    """Length measurement error against length: single exposures as dots, the mean of each length as
+    a line.
+    """
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     axes = figure.subplots()
     for number, line in enumerate(test.lines):
@@ -91,12 +104,20 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
         true = np.array([1e3 * length.true for length in lengths])
         single = 1e6 * np.array([length.measured - length.true for length in lengths])
         shown = axes.plot(true, [1e6 * length.error for length in lengths], "o-", label=line.name)
-        axes.plot(true[:, None] + 1.5 * (number - 3), single, ".", color=shown[0].get_color(), alpha=0.35, markersize=4)
+        axes.plot(
+            true[:, None] + 1.5 * (number - 3),
+            single,
+            ".",
+            color=shown[0].get_color(),
+            alpha=0.35,
+            markersize=4,
+        )
     for sign in (-1.0, 1.0):
         axes.axhline(sign * limit_um, color="black", linestyle="--", linewidth=1)
     axes.set(xlabel="certified length [mm]", ylabel="length measurement error [um]")
     axes.set_title(
-        f"VDI/VDE 2634-1: largest error {1e6 * test.largest.error:+.1f} um, limit ± {limit_um:g} um (dashes)"
+        f"VDI/VDE 2634-1: largest error {1e6 * test.largest.error:+.1f} um, limit ± {limit_um:g} "
+        "um (dashes)"
         "\ndots: single exposures, lines: their mean"
     )
     axes.legend(fontsize="small", ncols=2)
@@ -105,19 +126,27 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
 
 
 def bar_figure(test: BarTest) -> Figure:
-    """Relative pose error of the bar over time, and its distribution beside the published limits."""
+    """Relative pose error of the bar over time, and its distribution beside the published
+    limits."""
     figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(2, 2, width_ratios=(3, 2))
     for (series, spread), name, unit, columns in zip(
         panels, ("position", "orientation"), ("um", "urad"), (slice(0, 3), slice(3, 6)), strict=True
     ):
         for run in test.runs:
-            series.plot(run.time, 1e6 * np.linalg.norm(run.errors[:, columns], axis=1), linewidth=0.7, label=run.name)
+            series.plot(
+                run.time,
+                1e6 * np.linalg.norm(run.errors[:, columns], axis=1),
+                linewidth=0.7,
+                label=run.name,
+            )
         series.set_ylabel(f"{name} error [{unit}]")
         series.axvline(0.0, color="black", linestyle="--", linewidth=1)
         series.grid(alpha=0.3)
         _distribution(spread, test, columns, name, unit)
-    panels[0, 0].set_title("error of the second end relative to the first (dashes: the bar starts to move)")
+    panels[0, 0].set_title(
+        "error of the second end relative to the first (dashes: the bar starts to move)"
+    )
     panels[0, 0].legend(fontsize="x-small", ncols=2)
     panels[1, 0].set_xlabel("time [s]")
     figure.suptitle("Rigid bar in the style of ASTM E3064-16")
@@ -125,15 +154,23 @@ def bar_figure(test: BarTest) -> Figure:
 
 
 def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: str) -> None:
-    """Share of frames below an error, standing and moving, with published figures as vertical lines."""
+    """Share of frames below an error, standing and moving, with published figures as vertical
+    lines.
+    """
     for moving, word in ((False, "standing"), (True, "moving")):
         magnitudes = np.sort(1e6 * np.linalg.norm(test.errors(moving)[:, columns], axis=1))
-        axes.plot(magnitudes, np.arange(1, len(magnitudes) + 1) / len(magnitudes), label=f"this sensor, {word}")
+        axes.plot(
+            magnitudes,
+            np.arange(1, len(magnitudes) + 1) / len(magnitudes),
+            label=f"this sensor, {word}",
+        )
     for number, figure in enumerate([*published(f"{name}, static"), *published(f"{name}, moving")]):
         value = 1e3 * figure.value if figure.unit == "mm" else 1e6 * np.deg2rad(figure.value)
         state = figure.quantity.split(", ")[1]
         style = ":" if state == "static" else "-."
-        axes.axvline(value, color=f"C{number + 2}", linestyle=style, label=f"{figure.instrument}, {state}")
+        axes.axvline(
+            value, color=f"C{number + 2}", linestyle=style, label=f"{figure.instrument}, {state}"
+        )
     axes.set(xscale="log", xlabel=f"{name} error [{unit}]", ylabel="share of frames")
     axes.legend(fontsize="x-small")
     axes.grid(alpha=0.3)
@@ -147,11 +184,19 @@ def latency_figure(test: LatencyTest) -> Figure:
     series.plot(test.reported, 1e3 * found.delays, ".", markersize=4, label="one report")
     low, high = (1e3 * bound for bound in found.interval)
     series.axhspan(low, high, color="tab:orange", alpha=0.4, label="95 % interval of the mean")
-    series.axhline(1e3 * test.stated, color="black", linestyle="--", linewidth=1, label="stated in the sensor file")
+    series.axhline(
+        1e3 * test.stated,
+        color="black",
+        linestyle="--",
+        linewidth=1,
+        label="stated in the sensor file",
+    )
     spread.hist(1e3 * found.delays, bins=30, orientation="horizontal")
     series.set(xlabel="time of the report [s]", ylabel="latency [ms]")
     spread.set_xlabel("reports")
-    series.set_title(f"ASTM E3124: mean {1e3 * found.mean:.4f} ms, standard deviation {1e3 * found.std:.4f} ms")
+    series.set_title(
+        f"ASTM E3124: mean {1e3 * found.mean:.4f} ms, standard deviation {1e3 * found.std:.4f} ms"
+    )
     series.legend(fontsize="small")
     series.grid(alpha=0.3)
     return figure
@@ -161,7 +206,8 @@ def residual_figure(found: Calibration) -> Figure:
     """Residuals, measured minus computed, as arrows where they were seen."""
     figure, panels = _image_panels(found, f"residuals, sigma {found.adjustment.sigma_px:.3g} px")
     for k, axes in enumerate(panels):
-        pixels, residuals = found.sightings[k].pixels, found.adjustment.residuals[k]
+        pixels = found.sightings[k].pixels
+        residuals = found.adjustment.residuals[k]
         three_sigma = 3.0 * max(found.adjustment.sigma_px, 1e-9)
         arrows = axes.quiver(
             *pixels.T,
@@ -173,7 +219,9 @@ def residual_figure(found: Calibration) -> Figure:
         )
         axes.quiverkey(arrows, 0.85, 1.03, three_sigma, f"{three_sigma:.2g} px")
         rms = np.sqrt(np.mean(residuals**2))
-        axes.set_title(f"{SIDES[k]}: {len(residuals)} points, rms {rms:.3g} px", loc="left", fontsize="medium")
+        axes.set_title(
+            f"{SIDES[k]}: {len(residuals)} points, rms {rms:.3g} px", loc="left", fontsize="medium"
+        )
     return figure
 
 
@@ -183,7 +231,9 @@ def coverage_figure(found: Calibration) -> Figure:
     for k, axes in enumerate(panels):
         seen = found.sightings[k]
         axes.scatter(seen.pixels[:, 0], seen.pixels[:, 1], s=3, c=seen.view, cmap="turbo")
-        axes.set_title(f"{SIDES[k]}: {len(np.unique(seen.view))} images", loc="left", fontsize="medium")
+        axes.set_title(
+            f"{SIDES[k]}: {len(np.unique(seen.view))} images", loc="left", fontsize="medium"
+        )
     return figure
 
 
@@ -208,14 +258,20 @@ def _image_panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(12, 5), layout="constrained")
     panels = list(figure.subplots(1, 2).flat)
     for axes in panels:
-        axes.set(xlim=(-0.5, found.rig.left.width - 0.5), ylim=(found.rig.left.height - 0.5, -0.5), aspect="equal")
+        axes.set(
+            xlim=(-0.5, found.rig.left.width - 0.5),
+            ylim=(found.rig.left.height - 0.5, -0.5),
+            aspect="equal",
+        )
         axes.set(xlabel="x [px]", ylabel="y [px]")
     figure.suptitle(title)
     return figure, panels
 
 
 def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
-    """Rms error over noise, logarithmic; one panel for each radius, tilt and point spread, the working point first."""
+    """Rms error over noise, logarithmic; one panel for each radius, tilt and point spread, the
+    working point first.
+    """
     views = list(dict.fromkeys(_view(score.condition) for score in scores))
     figure, panels = panel_grid(len(views), 4.5, 3.2, above=0.8, sharey=True)
     for view, axes in zip(views, panels, strict=True):
@@ -237,12 +293,24 @@ def _view(condition: Condition) -> tuple[float, float, float]:
 def _condition_panel(axes: Axes, scores: Sequence[Score]) -> None:
     noise = sorted({score.condition.noise for score in scores})
     bound = {score.condition.noise: score.bound_px for score in scores}
-    axes.plot(100.0 * np.array(noise), [bound[n] for n in noise], "k--", marker="_", label="Cramer-Rao bound")
+    axes.plot(
+        100.0 * np.array(noise),
+        [bound[n] for n in noise],
+        "k--",
+        marker="_",
+        label="Cramer-Rao bound",
+    )
     for name in dict.fromkeys(score.detector for score in scores):
         mine = sorted((s for s in scores if s.detector == name), key=lambda s: s.condition.noise)
         error = np.array([s.rms_px for s in mine])  # infinite where all was lost: not drawn
         at = [100.0 * s.condition.noise for s in mine]
-        axes.plot(at, np.where(np.isfinite(error), error, np.nan), "o-", markersize=3, label=name.replace("_", " "))
+        axes.plot(
+            at,
+            np.where(np.isfinite(error), error, np.nan),
+            "o-",
+            markersize=3,
+            label=name.replace("_", " "),
+        )
     axes.set(xscale="log", yscale="log", xlabel="noise [% of contrast]", ylabel="rms error [px]")
     axes.set_xticks(100.0 * np.array(noise), [f"{100.0 * n:.2g}" for n in noise])
     axes.xaxis.set_minor_locator(NullLocator())

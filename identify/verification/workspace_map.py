@@ -1,4 +1,6 @@
-"""Maps of a robot's workspace: planes of poses around home, with travel, reach and conditioning; tables and figures."""
+"""Maps of a robot's workspace: planes of poses around home, with travel, reach and conditioning;
+tables and figures.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -28,10 +30,12 @@ AXES = ("x_m", "y_m", "z_m", "alpha_rad", "beta_rad", "gamma_rad")
 
 @dataclass(frozen=True)
 class WorkspacePlane:
-    """One map: two pose components vary (``across``, ``up``: indices 0..5), a third is ``fixed`` at ``value``.
+    """One map: two pose components vary (``across``, ``up``: indices 0..5), a third is ``fixed`` at
+    ``value``.
 
-    ``horizontal`` and ``vertical`` (n,) [m or rad] are the grid lines; ``travel_share`` and ``condition`` (n, n), row
-    by row of ``vertical``, are NaN out of reach; ``reach_margin`` (n, n) is that of the worst leg.
+    ``horizontal`` and ``vertical`` (n,) [m or rad] are the grid lines; ``travel_share`` and
+    ``condition`` (n, n), row by row of ``vertical``, are NaN out of reach; ``reach_margin`` (n, n)
+    is that of the worst leg.
     """
 
     across: int
@@ -52,8 +56,9 @@ class WorkspacePlane:
 
 @dataclass(frozen=True)
 class WorkspaceMap:
-    """Planes, range of each coordinate of the platform alone (m, 2) [m, rad from home], and measures at home and of
-    those of JOINT_SAMPLES random joint vectors within travel that have a pose; unit: of the joints."""
+    """Planes, range of each coordinate of the platform alone (m, 2) [m, rad from home], and
+    measures at home and of those of JOINT_SAMPLES random joint vectors within travel that have a
+    pose; unit: of the joints."""
 
     robot: str
     unit: str
@@ -76,20 +81,25 @@ class WorkspaceMap:
                 "without_pose": JOINT_SAMPLES - len(self.travel.theta),
                 **_extremes(self.travel, self.unit),
             },
-            "range_from_home": {AXES[k]: list(pair) for k, pair in zip(self.axes, self.ranges.tolist(), strict=True)},
+            "range_from_home": {
+                AXES[k]: list(pair) for k, pair in zip(self.axes, self.ranges.tolist(), strict=True)
+            },
             "planes": [_plane_summary(plane) for plane in self.planes],
         }
 
 
-def map_workspace(robot: Robot, progress: Progress | None = None, points: int = POINTS) -> WorkspaceMap:
-    """Maps of x-y at three heights with home's orientation, of a planar platform at three angles, and of alpha-beta at
-    three gamma with home's position, where the platform can do that.
+def map_workspace(
+    robot: Robot, progress: Progress | None = None, points: int = POINTS
+) -> WorkspaceMap:
+    """Maps of x-y at three heights with home's orientation, of a planar platform at three angles,
+    and of alpha-beta at three gamma with home's position, where the platform can do that.
 
-    The sides reach as far from home as the most sensitive joint goes at home's rate within its travel, or 1.3 of that
-    over the characteristic length in rotation.
+    The sides reach as far from home as the most sensitive joint goes at home's rate within its
+    travel, or 1.3 of that over the characteristic length in rotation.
     """
     progress = progress or SilentProgress()
-    length, axes = robot.geometry.characteristic_length, robot.geometry.chart.freedoms
+    length = robot.geometry.characteristic_length
+    axes = robot.geometry.chart.freedoms
     step = robot.travel_limit / float(np.abs(robot.pose_jacobian(robot.home_pose)[:, :3]).max())
     turn = 1.3 * step / length
     layout = [shown for shown in ((0, 1, 2), (0, 1, 5), (3, 4, 5)) if set(shown) <= set(axes)]
@@ -106,11 +116,14 @@ def map_workspace(robot: Robot, progress: Progress | None = None, points: int = 
         advance()
         travel = workspace.measure_travel(robot, JOINT_SAMPLES)
         advance()
-    unit, home = robot.layout.joint_unit, workspace.measure(robot, robot.home_pose)
+    unit = robot.layout.joint_unit
+    home = workspace.measure(robot, robot.home_pose)
     return WorkspaceMap(robot.name, unit, axes, length, tuple(planes), ranges, home, travel)
 
 
-def _plane(robot: Robot, axes: tuple[int, int, int], side: float, offset: float, points: int) -> WorkspacePlane:
+def _plane(
+    robot: Robot, axes: tuple[int, int, int], side: float, offset: float, points: int
+) -> WorkspacePlane:
     across, up, fixed = axes
     steps = np.linspace(-side, side, points)
     poses = np.tile(robot.home_pose, (points, points, 1))
@@ -131,19 +144,27 @@ def _plane(robot: Robot, axes: tuple[int, int, int], side: float, offset: float,
 
 
 def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[float, float]:
-    """How far one pose component alone goes down and up from home before a joint reaches its travel limit."""
+    """How far one pose component alone goes down and up from home before a joint reaches its travel
+    limit.
+    """
     steps = np.linspace(0, 3 * side, points)
     ends = []
     for sign in (-1.0, 1.0):
-        share = workspace.measure(robot, robot.home_pose + sign * steps[:, None] * np.eye(6)[axis]).travel_share
+        share = workspace.measure(
+            robot, robot.home_pose + sign * steps[:, None] * np.eye(6)[axis]
+        ).travel_share
         outside = ~(share <= 1)
-        ends.append(sign * float(steps[max(int(np.argmax(outside)) - 1, 0)] if outside.any() else steps[-1]))
+        ends.append(
+            sign * float(steps[max(int(np.argmax(outside)) - 1, 0)] if outside.any() else steps[-1])
+        )
     return ends[0], ends[1]
 
 
 def _extremes(measures: workspace.WorkspaceMeasures, unit: str) -> dict[str, float]:
     return {
-        f"largest_{'angle_rad' if unit == 'rad' else 'length_m'}": float(np.abs(measures.theta).max()),
+        f"largest_{'angle_rad' if unit == 'rad' else 'length_m'}": float(
+            np.abs(measures.theta).max()
+        ),
         "least_reach_margin": float(measures.reach_margin.min()),
         "least_leverage_J_a1": float(measures.leverage.min()),
         "largest_condition_J_a2": float(measures.platform_condition.max()),
@@ -166,7 +187,10 @@ def _plane_summary(plane: WorkspacePlane) -> dict[str, Any]:
 
 def travel_figure(workspace: WorkspaceMap) -> Figure:
     """Largest joint coordinate as a share of the travel limit."""
-    title = f"{workspace.robot}: travel used, largest |θ| / {workspace.home.travel_limit:.4f} {workspace.unit}"
+    title = (
+        f"{workspace.robot}: travel used, largest |θ| / {workspace.home.travel_limit:.4f} "
+        f"{workspace.unit}"
+    )
     return _maps(workspace, "travel_share", title, "largest |θ| / travel limit", Normalize(0, 1.5))
 
 
@@ -177,7 +201,9 @@ def conditioning_figure(workspace: WorkspaceMap) -> Figure:
     return _maps(workspace, "condition", title, "condition of J_ad", LogNorm(1, 30))
 
 
-def _maps(workspace: WorkspaceMap, quantity: str, title: str, label: str, norm: Normalize) -> Figure:
+def _maps(
+    workspace: WorkspaceMap, quantity: str, title: str, label: str, norm: Normalize
+) -> Figure:
     """One panel a plane: colour is the quantity, lines are the travel limit and the reach."""
     figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(-(-len(workspace.planes) // COLUMNS), COLUMNS, squeeze=False)
@@ -189,12 +215,20 @@ def _maps(workspace: WorkspaceMap, quantity: str, title: str, label: str, norm: 
 
 
 def _panel(axes: Axes, plane: WorkspacePlane, values: np.ndarray, norm: Normalize) -> QuadMesh:
-    across, up = 1e3 * plane.horizontal, 1e3 * plane.vertical
-    shown = axes.pcolormesh(across, up, values, norm=norm, cmap="viridis", shading="nearest", rasterized=True)
-    for field, level, style, colour in ((plane.travel_share, 1.0, "-", "white"), (plane.reach_margin, 0.0, "--", "k")):
+    across = 1e3 * plane.horizontal
+    up = 1e3 * plane.vertical
+    shown = axes.pcolormesh(
+        across, up, values, norm=norm, cmap="viridis", shading="nearest", rasterized=True
+    )
+    for field, level, style, colour in (
+        (plane.travel_share, 1.0, "-", "white"),
+        (plane.reach_margin, 0.0, "--", "k"),
+    ):
         finite = field[np.isfinite(field)]
         if finite.size and finite.min() < level < finite.max():
-            axes.contour(across, up, field, [level], linestyles=style, colors=colour, linewidths=1.5)
+            axes.contour(
+                across, up, field, [level], linestyles=style, colors=colour, linewidths=1.5
+            )
     axes.set(
         xlabel=f"{COMPONENTS[plane.across]} [{_unit(plane.across)}]",
         ylabel=f"{COMPONENTS[plane.up]} [{_unit(plane.up)}]",

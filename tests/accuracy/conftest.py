@@ -1,4 +1,5 @@
-"""What the tests of the plugin share: projects of one file, run by pytest, and four figures of one."""
+"""What the tests of the plugin share: projects of one file, run by pytest, and four figures of
+one."""
 
 import textwrap
 
@@ -9,7 +10,9 @@ import scipy.special  # noqa: F401
 import cmmsim
 import identify.pipeline  # noqa: F401
 
-collect_ignore = ["guide"]  # an outsider's files: test_outside_project.py runs them as an outsider would
+collect_ignore = [
+    "guide"
+]  # an outsider's files: test_outside_project.py runs them as an outsider would
 
 FIGURES = """
 def test_sensor(accuracy):
@@ -21,7 +24,12 @@ def test_pose(accuracy, method):
     accuracy.sample("pose", 10 + np.random.default_rng(len(method)).normal(0, 1, 50), unit="um")
 """
 SAVE, COMPARE = ("--accuracy-save", "before"), ("--accuracy-compare", "before")
-QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each
+QUICK = (
+    "-p",
+    "no:cacheprovider",
+    "-p",
+    "no:hypothesispytest",
+)  # Hypothesis would be imported anew by each
 
 
 def recording(calls):
@@ -31,15 +39,17 @@ def recording(calls):
 
 @pytest.fixture(scope="session", autouse=True)
 def loaded():
-    """What a sensor loads when it measures: pytester forgets what a project was first to import, and neither numba nor
-    OpenGL can be loaded twice."""
+    """What a sensor loads when it measures: pytester forgets what a project was first to import,
+    and neither numba nor OpenGL can be loaded twice."""
     sensor = cmmsim.load_sensor("ctrack780", seed=0)
     sensor.measure(sensor.home)
 
 
 @pytest.fixture
 def project(pytester, monkeypatch):
-    """(body of the tests, *options) -> the outcome of pytest on a file with these tests; as if not in a worker."""
+    """(body of the tests, *options) -> the outcome of pytest on a file with these tests; as if not
+    in a worker.
+    """
     for name in ("PYTEST_XDIST_WORKER", "PYTEST_XDIST_WORKER_COUNT", "PYTEST_XDIST_TESTRUNUID"):
         monkeypatch.delenv(name, raising=False)
 

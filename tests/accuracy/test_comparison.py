@@ -1,4 +1,6 @@
-"""Figures beside saved ones: what got worse, what is held to less than it was or to nothing, and what is gone."""
+"""Figures beside saved ones: what got worse, what is held to less than it was or to nothing, and
+what is gone.
+"""
 
 import json
 import re
@@ -13,7 +15,10 @@ GUARDS = ((), ("--accuracy-fail", "0.1"))
 
 def test_the_table_compares_with_saved_figures_and_tells_of_new_ones_and_of_another_seed(project):
     project(FIGURES, *SAVE)
-    now = FIGURES.replace("0.002", "0.0025") + "\ndef test_new(accuracy): accuracy.record('new', 1.0)\n"
+    now = (
+        FIGURES.replace("0.002", "0.0025")
+        + "\ndef test_new(accuracy): accuracy.record('new', 1.0)\n"
+    )
     again = project(now, *COMPARE, "--accuracy-seed", "7")
     again.assert_outcomes(passed=4)
     cells = {line.split()[0]: line.split()[-2:] for line in again.outlines if line.startswith("  ")}
@@ -52,12 +57,20 @@ def test_the_session_fails_when_a_figure_got_worse_by_more_than_the_ratio(projec
         done.assert_outcomes(passed=len(CHANGES))
         assert done.ret == 1
         done.stdout.fnmatch_lines(["*::test_11: x cannot be compared: unit is 'um', was 'mm'"])
-        told = re.findall(r"^(?:worse by more than .*)?test_mine.py::test_(\d+): x ", str(done.stdout), re.MULTILINE)
-        assert sorted(map(int, told)) == [n for n, ratios in enumerate(worse) if ratio in ratios.split(", ")]
+        told = re.findall(
+            r"^(?:worse by more than .*)?test_mine.py::test_(\d+): x ",
+            str(done.stdout),
+            re.MULTILINE,
+        )
+        assert sorted(map(int, told)) == [
+            n for n, ratios in enumerate(worse) if ratio in ratios.split(", ")
+        ]
 
 
 FEWER = FIGURES.replace('    accuracy.record("seen", 0.98', '    dict(name="seen", value=0.98')
-SKIPPED = FIGURES.replace("accuracy, method):", "accuracy, method):\n    if method == 'planes': pytest.skip('none')")
+SKIPPED = FIGURES.replace(
+    "accuracy, method):", "accuracy, method):\n    if method == 'planes': pytest.skip('none')"
+)
 MODULE = "pytest.skip('no library', allow_module_level=True)\n" + FIGURES
 RENAMED = FIGURES.replace("test_sensor", "test_other")
 TESTS = ("test_pose[planes]: pose", "test_pose[registration]: pose", "test_sensor: bias, seen")
@@ -70,9 +83,16 @@ ALL_SKIPPED = [f"{test} (the test was skipped)" for test in TESTS]
         (SKIPPED, (), ALL_SKIPPED[:1], 1),
         (FEWER, (), ["test_sensor: seen (the test passed without)"], 1),
         (RENAMED, (), ["test_sensor: bias, seen (the test did not run)"], 0),
-        (FIGURES, ("-k", "planes or sensor"), ["test_pose[registration]: pose (the test did not run)"], 0),
+        (
+            FIGURES,
+            ("-k", "planes or sensor"),
+            ["test_pose[registration]: pose (the test did not run)"],
+            0,
+        ),
         (MODULE, (), ALL_SKIPPED, 1),
-        pytest.param(SKIPPED, ("-n", "1", "--dist", "loadgroup"), ALL_SKIPPED[:1], 1, marks=pytest.mark.slow),
+        pytest.param(
+            SKIPPED, ("-n", "1", "--dist", "loadgroup"), ALL_SKIPPED[:1], 1, marks=pytest.mark.slow
+        ),
     ],
     ids=["skipped", "fewer", "renamed", "selected", "module", "in a group of a worker"],
 )
@@ -83,7 +103,11 @@ def test_figures_that_are_missing_are_named(project, pytester, body, options, mi
     project(grouped + FIGURES, *SAVE)
     for guard in GUARDS:
         done = project(grouped + body, *COMPARE, *guard, *options)
-        lines = [line.removeprefix("  test_mine.py::") for line in done.outlines if line.startswith("  test_mine.py::")]
+        lines = [
+            line.removeprefix("  test_mine.py::")
+            for line in done.outlines
+            if line.startswith("  test_mine.py::")
+        ]
         assert lines == missing
         assert (done.ret == 1) == bool(guard and guarded)
         done.stdout.fnmatch_lines(["* of 4 figures saved as before were not measured now:"])
@@ -92,7 +116,11 @@ def test_figures_that_are_missing_are_named(project, pytester, body, options, mi
 NUMBER, SIX = "record('r', 10, limit=20)", "sample('s', [1, 2, 3, 4, 5, 6])"
 WIDE = "sample('r', [1, 50, 2, 60], limit=20)"
 LIMITS = [
-    ("record('b', 1, 'px', 3)", "record('b', 1, 'px', 30)", "the limit of b is ≤ 30 px, was ≤ 3 px"),
+    (
+        "record('b', 1, 'px', 3)",
+        "record('b', 1, 'px', 30)",
+        "the limit of b is ≤ 30 px, was ≤ 3 px",
+    ),
     ("record('b', 1, 'px', 3)", "record('b', 1, 'px')", "the limit of b is none, was ≤ 3 px"),
     ("record('b', 1)", "record('b', 1, '', 3)", "the limit of b is ≤ 3, was none"),
     (NUMBER, NUMBER, ""),
@@ -105,7 +133,9 @@ EVIDENCE = [
 ]
 
 
-@pytest.mark.parametrize(("cases", "fails"), [(LIMITS, False), *(([case], True) for case in EVIDENCE)])
+@pytest.mark.parametrize(
+    ("cases", "fails"), [(LIMITS, False), *(([case], True) for case in EVIDENCE)]
+)
 def test_a_figure_held_to_another_limit_or_resting_on_less_is_told(project, cases, fails):
     """A wide interval overlaps any other, so nothing else would ever say that it got worse."""
     before, now, says = zip(*cases, strict=True)
@@ -121,7 +151,8 @@ def test_a_figure_held_to_another_limit_or_resting_on_less_is_told(project, case
 def test_huge_numbers_are_short_in_the_table_and_saved(project, pytester):
     body = """
     def test_it(accuracy):
-        accuracy.sample("mid", {scale} * np.array([1.0, 1.01, 1.02]), limit={limit}, better="higher")
+        accuracy.sample("mid", {scale} * np.array([1.0, 1.01, 1.02]), limit={limit},
+        better="higher")
     """
     assert project(body.format(scale="1.0", limit=2e-300), *SAVE).ret == 0
     done = project(body.format(scale="1e160", limit=2.0), *COMPARE, "--accuracy-save", "huge")

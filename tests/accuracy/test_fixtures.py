@@ -1,4 +1,6 @@
-"""The fixtures: which figures `accuracy` passes, fails and refuses; seeds, choices and costs of the testbed."""
+"""The fixtures: which figures `accuracy` passes, fails and refuses; seeds, choices and costs of the
+testbed.
+"""
 
 import numpy as np
 import pytest
@@ -9,7 +11,9 @@ from tests.accuracy.conftest import recording
 
 
 def outcomes(project, calls):
-    """Outcome of each call of the fixture in a test of its own: 'passed', or the lines of its failure."""
+    """Outcome of each call of the fixture in a test of its own: 'passed', or the lines of its
+    failure.
+    """
     done = project(recording(calls), "-rA")
     failed = {}
     for line in done.outlines:
@@ -45,14 +49,21 @@ def test_a_value_beyond_its_limit_fails_and_a_sample_only_when_its_whole_interva
 
 
 def test_the_interval_is_students_and_scales_with_the_values():
-    """By powers of two, which change no digit: of squares that vanish and of those that overflow too."""
+    """By powers of two, which change no digit: of squares that vanish and of those that overflow
+    too.
+    """
     for count in (2, 3, 10, 1000):
         values = np.random.default_rng(1).normal(3.0, 2.0, count)
         mean, interval = mean_interval(values)
         assert mean == pytest.approx(values.mean())
-        assert interval == pytest.approx(stats.t.interval(0.95, count - 1, np.mean(values), stats.sem(values)))
+        assert interval == pytest.approx(
+            stats.t.interval(0.95, count - 1, np.mean(values), stats.sem(values))
+        )
         for power in (-1000, -600, 520, 1000):
-            assert mean_interval(np.ldexp(values, power)) == (np.ldexp(mean, power), tuple(np.ldexp(interval, power)))
+            assert mean_interval(np.ldexp(values, power)) == (
+                np.ldexp(mean, power),
+                tuple(np.ldexp(interval, power)),
+            )
 
 
 def test_a_failure_says_everything_and_points_at_the_users_line(project):
@@ -71,7 +82,8 @@ def test_a_failure_says_everything_and_points_at_the_users_line(project):
             "E*centre bias: 0.0042 px is above the limit of 0.003 px",
             "test_mine.py:*: Failed",
             '>*accuracy.sample("hits"*',
-            "E*hits: mean 0.55 % of 2 values, 95% interval [[]-0.0853102, 1.18531[]] %, lies wholly below*2 %",
+            "E*hits: mean 0.55 % of 2 values, 95% interval [[]-0.0853102, 1.18531[]] %, lies "
+            "wholly below*2 %",
             "test_mine.py:*: Failed",
         ]
     )
@@ -89,11 +101,13 @@ BAD = {
     "record('x', 1.0, unit=3)": "the unit of a figure is a line of text, got 3",
     "sample('x', [1.0])": "x: a sample needs at least 2 values, got 1",
     "sample('x', 1.0)": "x: values must be a row of numbers, got an array of shape ()",
-    "sample('x', np.ones((50, 6)))": "x: values must be a row of numbers, got an array of shape (50, 6)",
+    "sample('x', np.ones((50, 6)))": "x: values must be a row of numbers, got an array of shape "
+    "(50, 6)",
     "sample('x', [1.0, 2.0, float('inf')])": "x: values[2] is inf, not a finite number",
     "sample('x', [-1.7e308, 1.7e308])": "x: the interval of the mean is -inf .. inf, not finite",
     "sample('x', ['a', 'b'])": "x: values must be a row of numbers, got ['a', 'b']",
-    "sample('x', [[1], [2, 3]])": "x: values must be a row of numbers, got rows of different lengths",
+    "sample('x', [[1], [2, 3]])": "x: values must be a row of numbers, got rows of different "
+    "lengths",
     "sample('x', [1, 2]), accuracy.record('x', 1)": "x: recorded already in this test",
 }
 
@@ -101,7 +115,9 @@ BAD = {
 def test_what_is_no_figure_is_one_line(project):
     found, done = outcomes(project, BAD)
     assert found == [[f"identify.accuracy.figure.AccuracyError: {says}"] for says in BAD.values()]
-    assert len([line for line in done.outlines if line.startswith("  x ")]) == 1, "nothing of it is a figure"
+    assert len([line for line in done.outlines if line.startswith("  x ")]) == 1, (
+        "nothing of it is a figure"
+    )
 
 
 def test_a_failure_can_be_expected_but_not_swallowed(project):
@@ -160,17 +176,23 @@ def test_plain(cmmsim_scenario, cmmsim_robot):
 
 
 def test_markers_and_options_choose_built_in_names_or_files(project, pytester):
-    """The closest marker holds before those around it, and any marker before the command line; `quick` by default."""
-    (pytester.path / "mine.toml").write_text('name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 40.0\n')
+    """The closest marker holds before those around it, and any marker before the command line;
+    `quick` by default.
+    """
+    (pytester.path / "mine.toml").write_text(
+        'name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 40.0\n'
+    )
     project(CHOOSING.format(name="quick", rate=60.0)).assert_outcomes(passed=3)
     chosen = ("--accuracy-scenario", "paper", "--accuracy-sensor", "mine.toml")
     project(CHOOSING.format(name="paper", rate=40.0), *chosen).assert_outcomes(passed=3)
 
 
 WRONG_MARKERS = {
-    "camera='mine'": "AccuracyError: marker cmmsim: 'camera' unknown; it takes scenario, robot, sensor",
+    "camera='mine'": "AccuracyError: marker cmmsim: 'camera' unknown; it takes scenario, robot, "
+    "sensor",
     "'mine'": "AccuracyError: marker cmmsim: 'mine' unknown; it takes scenario, robot, sensor",
-    "scenario='papper'": "ScenarioError: scenario 'papper' is neither built in (geometry, paper, quick) nor a file",
+    "scenario='papper'": "ScenarioError: scenario 'papper' is neither built in (geometry, paper, "
+    "quick) nor a file",
     "robot='rss7'": "RobotFileError: *rss7*rss6*",
     "sensor=5": "AccuracyError: marker cmmsim: sensor is 5, must be a built-in name or a file",
 }
@@ -178,7 +200,8 @@ WRONG_MARKERS = {
 
 def test_what_does_not_exist_is_one_line_with_the_valid_names(project):
     tests = [
-        f"@pytest.mark.cmmsim({marker})\ndef test_{n}(cmmsim_robot): pass" for n, marker in enumerate(WRONG_MARKERS)
+        f"@pytest.mark.cmmsim({marker})\ndef test_{n}(cmmsim_robot): pass"
+        for n, marker in enumerate(WRONG_MARKERS)
     ]
     done = project("\n".join(tests))
     done.assert_outcomes(errors=len(WRONG_MARKERS))
@@ -187,9 +210,15 @@ def test_what_does_not_exist_is_one_line_with_the_valid_names(project):
 
 def test_options_are_checked_though_no_test_uses_them(project):
     for option, says in (
-        ("--accuracy-scenario", "scenario 'nosuch' is neither built in (geometry, paper, quick) nor a file"),
+        (
+            "--accuracy-scenario",
+            "scenario 'nosuch' is neither built in (geometry, paper, quick) nor a file",
+        ),
         ("--accuracy-robot", "unknown robot `nosuch`; built-in robots: delta3, *rss6, *"),
-        ("--accuracy-sensor", "unknown sensor 'nosuch': neither a built-in name (ctrack780, ctrack780_29hz) nor *"),
+        (
+            "--accuracy-sensor",
+            "unknown sensor 'nosuch': neither a built-in name (ctrack780, ctrack780_29hz) nor *",
+        ),
     ):
         done = project("def test_it(): pass", option, "nosuch")
         assert done.ret == pytest.ExitCode.USAGE_ERROR
@@ -213,4 +242,7 @@ def test_the_sensor_is_taught_once_and_its_noise_is_that_of_the_test(project):
     one, two = (line.split()[1] for line in done.outlines if line.startswith("  x "))
     assert one != two
     again = project(body, "--accuracy-compare", "before")
-    assert len([line for line in again.outlines if line.startswith("  x ") and line.endswith("+0.0%")]) == 2
+    assert (
+        len([line for line in again.outlines if line.startswith("  x ") and line.endswith("+0.0%")])
+        == 2
+    )

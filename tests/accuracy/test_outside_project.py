@@ -1,4 +1,6 @@
-"""The guide in a project outside this one, in an environment of its own where the distribution is a wheel."""
+"""The guide in a project outside this one, in an environment of its own where the distribution is a
+wheel.
+"""
 
 import json
 import os
@@ -52,28 +54,45 @@ def test_pose(accuracy, cmmsim_sensor, cmmsim_seed, method):
 
 def run(*command, cwd):
     """Outcome of a command that knows nothing of this checkout."""
-    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTEST_ADDOPTS")}
+    environment = {
+        key: value
+        for key, value in os.environ.items()
+        if key not in ("PYTHONPATH", "PYTEST_ADDOPTS")
+    }
     return subprocess.run(
-        list(map(str, command)), cwd=cwd, capture_output=True, text=True, env=environment, check=False
+        list(map(str, command)),
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
     )
 
 
 @pytest.fixture(scope="module")
 def outside(tmp_path_factory):
-    """A folder with an environment `venv`: the wheel, built from a copy of the sources, and beside it the packages of
-    this interpreter, on which it depends."""
+    """A folder with an environment `venv`: the wheel, built from a copy of the sources, and beside
+    it the packages of this interpreter, on which it depends."""
     folder, source = tmp_path_factory.mktemp("outside"), tmp_path_factory.mktemp("source")
     for name in PACKAGES:
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    pip, python = (sys.executable, "-m", "pip", "--disable-pip-version-check"), folder / "venv" / "bin" / "python"
+    pip, python = (
+        (sys.executable, "-m", "pip", "--disable-pip-version-check"),
+        folder / "venv" / "bin" / "python",
+    )
     built = run(*pip, "wheel", "--no-deps", "--wheel-dir", folder, source, cwd=folder)
     if "Could not find a version that satisfies the requirement setuptools" in built.stderr:
         pytest.skip("no package index to take the build's setuptools from")
     assert built.returncode == 0, built.stderr
-    assert run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder).returncode == 0
-    installed = run(*pip, "--python", python, "install", "--no-deps", next(folder.glob("*.whl")), cwd=folder)
+    assert (
+        run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder).returncode
+        == 0
+    )
+    installed = run(
+        *pip, "--python", python, "install", "--no-deps", next(folder.glob("*.whl")), cwd=folder
+    )
     assert installed.returncode == 0, installed.stderr
     (packages(folder) / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
     (folder / "mine.toml").write_text('name = "mine"\n')
@@ -88,7 +107,10 @@ def packages(folder):
 def test_the_guide_names_every_option_and_every_file_and_no_other(pytestconfig):
     named = set(re.findall(r"--accuracy-[a-z]+", TEXT))
     known = {name for name in dir(pytestconfig.option) if name.startswith("accuracy_")}
-    assert {name[2:].replace("-", "_") for name in named} | {"accuracy_robot", "accuracy_scenario"} == known
+    assert {name[2:].replace("-", "_") for name in named} | {
+        "accuracy_robot",
+        "accuracy_scenario",
+    } == known
     assert "likewise for `robot` and `scenario`" in TEXT
     assert set(re.findall(r"\]\(([^)]+)\)", TEXT)) == {path.name for path in FILES}
 
@@ -96,7 +118,9 @@ def test_the_guide_names_every_option_and_every_file_and_no_other(pytestconfig):
 @pytest.mark.slow
 def test_the_wheel_holds_every_file_of_the_packages(outside):
     files = [path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()]
-    wanted = [path.relative_to(ROOT) for path in files if path.suffix not in (".pyc", ".nbc", ".nbi")]
+    wanted = [
+        path.relative_to(ROOT) for path in files if path.suffix not in (".pyc", ".nbc", ".nbi")
+    ]
     assert len(wanted) > 200
     assert [path for path in wanted if not (packages(outside) / path).exists()] == []
 
@@ -109,17 +133,31 @@ def test_the_guides_example_and_its_complete_files_run_where_the_wheel_is_instal
     (outside / "test_example.py").write_text(re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)[0])
     for file in FILES:
         shutil.copy(file, outside)
-    pytest_ = ("venv/bin/python", "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:hypothesispytest")
+    pytest_ = (
+        "venv/bin/python",
+        "-m",
+        "pytest",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:hypothesispytest",
+    )
     done = run(*pytest_, "--strict-markers", "--accuracy-save", "mine", cwd=outside)
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"{3 + len(FILES)} passed" in done.stdout
     saved = json.loads((outside / ".accuracy" / "mine.json").read_text())["figures"]
     assert len(saved) == 1 + 2 + 4 * len(FILES)
     for file in FILES:
-        held = [f for f in saved if f["test"].startswith(f"{file.name}::") and f["limit"] is not None]
+        held = [
+            f for f in saved if f["test"].startswith(f"{file.name}::") and f["limit"] is not None
+        ]
         assert [figure["unit"] for figure in held] == ["um", "urad"]
-        assert all(figure["limit"] / 10 < figure["value"] < figure["limit"] for figure in held), held
-    table = run("venv/bin/python", "-m", "identify.accuracy", ".accuracy/mine.json", cwd=outside).stdout.splitlines()
+        assert all(figure["limit"] / 10 < figure["value"] < figure["limit"] for figure in held), (
+            held
+        )
+    table = run(
+        "venv/bin/python", "-m", "identify.accuracy", ".accuracy/mine.json", cwd=outside
+    ).stdout.splitlines()
     assert table[0] == "| figure | value | 95% interval | unit | limit | margin |"
     assert len(table) == 2 + len(saved)
 
@@ -137,11 +175,17 @@ def test_a_second_version_is_held_to_the_first(outside):
     by_planes, by_registration = (figure["value"] for figure in figures)
     assert 0 < by_registration < by_planes < 50  # um; plane by plane, a pose is less exact
     error = "1e6 * np.linalg"
-    worse = SENSOR.replace("limit=50)", "limit=500)").replace(error, f"(10 if method == 'planes' else 1) * {error}")
+    worse = SENSOR.replace("limit=50)", "limit=500)").replace(
+        error, f"(10 if method == 'planes' else 1) * {error}"
+    )
     test.write_text(worse)
-    again = run(*pytest_, "-n", "2", "--accuracy-compare", "first", "--accuracy-fail", "0.2", cwd=outside)
+    again = run(
+        *pytest_, "-n", "2", "--accuracy-compare", "first", "--accuracy-fail", "0.2", cwd=outside
+    )
     assert again.returncode == 1, again.stdout + again.stderr
     assert again.stdout.count("+0.0%") == 1
-    assert [line.partition(" is ")[0] for line in again.stdout.splitlines() if line.startswith("worse by")] == [
-        "worse by more than 20%: test_pose.py::test_pose[planes]: position error"
-    ]
+    assert [
+        line.partition(" is ")[0]
+        for line in again.stdout.splitlines()
+        if line.startswith("worse by")
+    ] == ["worse by more than 20%: test_pose.py::test_pose[planes]: position error"]

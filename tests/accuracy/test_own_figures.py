@@ -1,7 +1,8 @@
-"""This project's own figures of accuracy, recorded through its own plugin, with the goals of its design as limits.
+"""This project's own figures of accuracy, recorded through its own plugin, with the goals of its
+design as limits.
 
-`sh .ci/thorough` keeps them, and `python -m identify.accuracy .readme/accuracy.json` prints them as a table. What makes
-them so is proved in the tests of each package.
+`sh .ci/thorough` keeps them, and `python -m identify.accuracy .readme/accuracy.json` prints them as
+a table. What makes them so is proved in the tests of each package.
 """
 
 import numpy as np
@@ -21,7 +22,10 @@ pytestmark = [pytest.mark.thorough, pytest.mark.rendering]
 TRAVEL = np.array([0.009, 0.009, 0.009, 0.03, 0.03, 0.03])  # m and rad around home
 STATES = 200
 DETECTOR_GOAL = 1.3  # rms over the Cramér-Rao bound
-PLANES_GOAL = (25, 100)  # um and urad: what stickers seen that well make of it, by test_plane_intersection.py
+PLANES_GOAL = (
+    25,
+    100,
+)  # um and urad: what stickers seen that well make of it, by test_plane_intersection.py
 
 
 def random_poses(sensor, count, seed):
@@ -31,10 +35,14 @@ def random_poses(sensor, count, seed):
 def sticker_centres(sensor, pose):
     """True centres (2, n, 2) of the stickers in both images, px."""
     camera_from_platform = sensor.true_cameras.camera_from_base @ pose_to_transform(pose)
-    return sensor.rig.project(apply(camera_from_platform, sensor.true_cameras.scene[0].sticker_places))[0]
+    return sensor.rig.project(
+        apply(camera_from_platform, sensor.true_cameras.scene[0].sticker_places)
+    )[0]
 
 
-def test_sticker_centres_without_noise(accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_sensor, cmmsim_seed):
+def test_sticker_centres_without_noise(
+    accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_sensor, cmmsim_seed
+):
     """What images, detection and their pixel convention leave when the camera makes no noise."""
     silent = cmmsim_scenario.with_overrides({"sensor_changes.camera.noise": False})
     sensor = make_sensor(silent, cmmsim_robot, cmmsim_seed, cmmsim_sensor.taught)
@@ -44,22 +52,40 @@ def test_sticker_centres_without_noise(accuracy, cmmsim_scenario, cmmsim_robot, 
         assert len(seen.target_ids) == true.shape[1]
         errors += [seen.left_pixels - true[0], seen.right_pixels - true[1]]
     found = np.concatenate(errors)
-    accuracy.record("sticker centre without noise, rms per axis", np.sqrt(np.mean(found**2)), unit="px", limit=0.002)
-    accuracy.record("sticker centre without noise, mean", np.abs(found.mean(axis=0)).max(), unit="px", limit=0.0005)
+    accuracy.record(
+        "sticker centre without noise, rms per axis",
+        np.sqrt(np.mean(found**2)),
+        unit="px",
+        limit=0.002,
+    )
+    accuracy.record(
+        "sticker centre without noise, mean",
+        np.abs(found.mean(axis=0)).max(),
+        unit="px",
+        limit=0.0005,
+    )
 
 
 @pytest.mark.parametrize("method", ["registration", "planes"])
 def test_poses(accuracy, cmmsim_sensor, cmmsim_seed, method):
-    """The design's goals for the method that is taken unless told otherwise; plane intersection against theory."""
+    """The design's goals for the method that is taken unless told otherwise; plane intersection
+    against theory.
+    """
     cmmsim_sensor.method = method
     goals = {"registration": (20, 100), "planes": PLANES_GOAL}[method]
     poses = random_poses(cmmsim_sensor, 50, cmmsim_seed)
     errors = 1e6 * np.array([cmmsim_sensor.measure(pose).pose - pose for pose in poses])
     rms = np.sqrt(np.mean(errors**2, axis=0))
-    accuracy.record("measured position, rms of the worst axis", rms[:3].max(), unit="um", limit=goals[0])
-    accuracy.record("measured orientation, rms of the worst axis", rms[3:].max(), unit="urad", limit=goals[1])
+    accuracy.record(
+        "measured position, rms of the worst axis", rms[:3].max(), unit="um", limit=goals[0]
+    )
+    accuracy.record(
+        "measured orientation, rms of the worst axis", rms[3:].max(), unit="urad", limit=goals[1]
+    )
     accuracy.sample("measured position, distance", np.linalg.norm(errors[:, :3], axis=1), unit="um")
-    accuracy.sample("measured orientation, angle", np.linalg.norm(errors[:, 3:], axis=1), unit="urad")
+    accuracy.sample(
+        "measured orientation, angle", np.linalg.norm(errors[:, 3:], axis=1), unit="urad"
+    )
 
 
 def test_detector_against_the_cramer_rao_bound(accuracy, cmmsim_seed):
@@ -67,26 +93,44 @@ def test_detector_against_the_cramer_rao_bound(accuracy, cmmsim_seed):
     file, detectors = read_sensor_file("ctrack780"), [find_detector(DEFAULT_DETECTOR)]
     rng = np.random.default_rng(cmmsim_seed)
     scores = compete(scene_of(file), 16 * [working_point(file)], 100, rng, detectors)
-    accuracy.sample("detector's rms over the Cramér-Rao bound", [score.ratio for score in scores], limit=DETECTOR_GOAL)
+    accuracy.sample(
+        "detector's rms over the Cramér-Rao bound",
+        [score.ratio for score in scores],
+        limit=DETECTOR_GOAL,
+    )
 
 
 def test_dynamics_against_pinocchio(accuracy, cmmsim_robot, cmmsim_seed):
-    """Both ways through Pinocchio's closed chain of 13 bodies with 18 constraints; largest of 200 random states."""
+    """Both ways through Pinocchio's closed chain of 13 bodies with 18 constraints; largest of 200
+    random states.
+    """
     pytest.importorskip("pinocchio")
     from tests.closed_chain import ClosedChain
 
     values = cmmsim_robot.parameter_sets["initial"].dynamic  # the paper's Table 1 has no friction
-    states, chain = random_states(cmmsim_robot, STATES, cmmsim_seed), ClosedChain(cmmsim_robot, values)
-    torques = 5 * np.random.default_rng(cmmsim_seed).standard_normal((STATES, cmmsim_robot.layout.joints))
+    states, chain = (
+        random_states(cmmsim_robot, STATES, cmmsim_seed),
+        ClosedChain(cmmsim_robot, values),
+    )
+    torques = 5 * np.random.default_rng(cmmsim_seed).standard_normal(
+        (STATES, cmmsim_robot.layout.joints)
+    )
 
     def largest_difference(ours, torques):
         theirs = np.array(
-            [chain.twist_dot(chain.state(*row)) for row in zip(states.pose, states.twist, torques, strict=True)]
+            [
+                chain.twist_dot(chain.state(*row))
+                for row in zip(states.pose, states.twist, torques, strict=True)
+            ]
         )
         return (np.abs(ours - theirs).max(axis=1) / np.abs(theirs).max(axis=1)).max()
 
     forward = cmmsim_robot.forward_dynamics(states.pose, states.twist, torques, values)
-    accuracy.record("forward dynamics against Pinocchio, relative", largest_difference(forward, torques), limit=1e-9)
+    accuracy.record(
+        "forward dynamics against Pinocchio, relative",
+        largest_difference(forward, torques),
+        limit=1e-9,
+    )
     inverse = cmmsim_robot.inverse_dynamics(states.pose, states.twist, states.twist_dot, values)
     error = largest_difference(states.twist_dot, inverse)
     accuracy.record("inverse dynamics against Pinocchio, relative", error, limit=1e-9)
@@ -97,11 +141,17 @@ def test_papers_loop_against_mujoco(accuracy, cmmsim_robot):
     from identify.verification.against_mujoco import judge, verify
 
     verdict = judge(verify(cmmsim_robot))
-    accuracy.record("the paper's loop against MuJoCo, position", verdict.position_steady_um, unit="um", limit=10)
-    accuracy.record("the paper's loop against MuJoCo, angle", verdict.angle_steady_urad, unit="urad", limit=20)
+    accuracy.record(
+        "the paper's loop against MuJoCo, position", verdict.position_steady_um, unit="um", limit=10
+    )
+    accuracy.record(
+        "the paper's loop against MuJoCo, angle", verdict.angle_steady_urad, unit="urad", limit=20
+    )
 
 
-def test_identified_model_on_unseen_trajectories(accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_seed):
+def test_identified_model_on_unseen_trajectories(
+    accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_seed
+):
     """Scenario `quick`: RMS of the worst component and run, model against the true plant."""
     record = identify.run_experiment(cmmsim_scenario, seed=cmmsim_seed)
     result = identify.identify(record, cmmsim_robot, cmmsim_scenario)
@@ -111,5 +161,12 @@ def test_identified_model_on_unseen_trajectories(accuracy, cmmsim_scenario, cmms
     ):
         errors = identify.unseen_errors(parameters, cmmsim_robot, cmmsim_scenario, seed=cmmsim_seed)
         worst = 1e6 * np.sqrt(np.mean(errors**2, axis=1)).max(axis=0)
-        accuracy.record(f"{model} model on unseen motion, position", worst[:3].max(), unit="um", limit=goals[0])
-        accuracy.record(f"{model} model on unseen motion, orientation", worst[3:].max(), unit="urad", limit=goals[1])
+        accuracy.record(
+            f"{model} model on unseen motion, position", worst[:3].max(), unit="um", limit=goals[0]
+        )
+        accuracy.record(
+            f"{model} model on unseen motion, orientation",
+            worst[3:].max(),
+            unit="urad",
+            limit=goals[1],
+        )

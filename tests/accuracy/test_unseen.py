@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 import identify
-from dynamics.closed_loop import LoopFailure, simulate
+from dynamics.closed_loop import (
+    LoopFailure,
+    simulate_servo,
+)
 from dynamics.errors import DynamicsError
 from identify.excitation.design import design_trajectories
 from identify.loop_parameters import model_settings
@@ -20,13 +23,18 @@ def unseen_errors(parameters, seed=0):
 def simulated(parameters, run, seed=0):
     """Poses of the loop with these parameters on an unseen trajectory."""
     path = design_trajectories(rss6(), SCENARIO, seed).validation[run]
-    return simulate(
-        rss6(), parameters, path.reference(SCENARIO.timing.frame_times(1.0)), model_settings(rss6(), SCENARIO)
+    return simulate_servo(
+        rss6(),
+        parameters,
+        path.reference(SCENARIO.timing.frame_times(1.0)),
+        model_settings(rss6(), SCENARIO),
     ).pose
 
 
 def test_the_true_parameters_leave_nothing_but_the_models_steps():
-    """Plant and model integrate the same law with other steps: below a hundredth of a micrometre and microradian."""
+    """Plant and model integrate the same law with other steps: below a hundredth of a micrometre
+    and microradian.
+    """
     errors = unseen_errors(truth())
     assert errors.shape == (2, 60, 6)
     assert 0 < np.abs(errors).max() < 1e-8
@@ -38,7 +46,9 @@ def test_wrong_parameters_err_as_two_runs_of_the_loop_differ():
     wrong[52:58] = 0.0
     errors = unseen_errors(wrong, seed=3)
     assert np.abs(errors[1]).max() > 1e-5
-    np.testing.assert_allclose(errors[1], simulated(wrong, 1, seed=3) - simulated(truth(), 1, seed=3), atol=1e-8)
+    np.testing.assert_allclose(
+        errors[1], simulated(wrong, 1, seed=3) - simulated(truth(), 1, seed=3), atol=1e-8
+    )
     assert np.abs(unseen_errors(wrong, seed=4) - errors).max() > 1e-5
 
 
@@ -49,5 +59,7 @@ def test_an_unstable_model_has_no_error_and_what_are_no_parameters_is_refused():
         simulated(unstable, 0)
     assert np.isnan(unseen_errors(unstable)).all()
     for parameters in (np.zeros(64), np.full(67, np.nan)):
-        with pytest.raises(DynamicsError, match=r"must have shape \(67,\), got \(64,\)|platform.mass = nan kg"):
+        with pytest.raises(
+            DynamicsError, match=r"must have shape \(67,\), got \(64,\)|platform.mass = nan kg"
+        ):
             unseen_errors(parameters)

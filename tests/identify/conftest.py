@@ -50,13 +50,27 @@ def make_result():
             "expected_noise_ratio": 1.1,
             "noise_ratio_std": 0.04,
             "whiteness": {"p_value": 0.3},
-            "conditioning": {"with_guess": 1e9, "poses_alone": 2e11, "directions": 39, "unshown": 3},
-            "strongest_correlations": [{"first": "joint1.coulomb", "second": "joint_pid.lp", "correlation": 0.98765}],
+            "conditioning": {
+                "with_guess": 1e9,
+                "poses_alone": 2e11,
+                "directions": 39,
+                "unshown": 3,
+            },
+            "strongest_correlations": [
+                {"first": "joint1.coulomb", "second": "joint_pid.lp", "correlation": 0.98765}
+            ],
         },
         "before": {"position_rms_um": [None] * 3, "orientation_rms_urad": [None] * 3},
-        "after": {"position_rms_um": [20.0, 21.0, 22.0], "orientation_rms_urad": [80.0, 81.0, 82.0]},
+        "after": {
+            "position_rms_um": [20.0, 21.0, 22.0],
+            "orientation_rms_urad": [80.0, 81.0, 82.0],
+        },
         "validation": [
-            {"true": model_error, "measured": rms_figures(10 * np.array([six])), "predicted": predicted}
+            {
+                "true": model_error,
+                "measured": rms_figures(10 * np.array([six])),
+                "predicted": predicted,
+            }
             for _ in range(2)
         ],
     }
@@ -75,7 +89,9 @@ def robot():
 
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory):
-    """A run up to the report, not to be changed; the starting model diverges on the first unseen trajectory."""
+    """A run up to the report, not to be changed; the starting model diverges on the first unseen
+    trajectory.
+    """
     run = recorded_run_folder(tmp_path_factory.mktemp("finished"))
     record, plant = short_run()
     identified, initial = plant.pose + 1e-6, plant.pose + 1e-4

@@ -16,7 +16,9 @@ from identify.scenario import load_scenario
 
 POSE_STD = np.repeat([3e-6, 11e-6], 3)
 """Of one frame, as ctrack780 states it at home."""
-FRAMES = FrameKnowledge(np.diag(np.repeat([0.4e-6, 0.7e-6], 3) ** 2), np.diag(np.repeat([0.3e-6, 1.1e-6], 3) ** 2))
+FRAMES = FrameKnowledge(
+    np.diag(np.repeat([0.4e-6, 0.7e-6], 3) ** 2), np.diag(np.repeat([0.3e-6, 1.1e-6], 3) ** 2)
+)
 """As its teaching says."""
 TOLERANCE = Tolerance(1e-3, 1e-2)
 
@@ -36,9 +38,15 @@ def designer(robot, criterion="prediction", frames_per_pose=20):
     known, settings = known_robot(robot), scenario().excitation
     margin = settings.travel_margin_m if known.layout.prismatic else settings.travel_margin_rad
     limits = Limits(
-        known, known.travel_limit - margin, settings.least_leverage, settings.most_condition, sight_lines("ctrack780")
+        known,
+        known.travel_limit - margin,
+        settings.least_leverage,
+        settings.most_condition,
+        sight_lines("ctrack780"),
     )
-    std = np.full(known.layout.joints, encoders_of(known, scenario().geometry).mean_std(frames_per_pose))
+    std = np.full(
+        known.layout.joints, encoders_of(known, scenario().geometry).mean_std(frames_per_pose)
+    )
     model = PoseModel(known, TOLERANCE.of(known), FRAMES)
     return Designer(model, limits, np.diag(POSE_STD**2) / frames_per_pose, std, criterion)
 
@@ -61,7 +69,9 @@ class Drawn:
 
 
 def drawn(robot, seed, chosen, frames_per_pose=20):
-    """A calibration of a robot off by 0.1 mm and 1 mrad, at poses, with what encoders and sensor say drawn."""
+    """A calibration of a robot off by 0.1 mm and 1 mrad, at poses, with what encoders and sensor
+    say drawn.
+    """
     known, rng = known_robot(robot), np.random.default_rng([1515, seed])
     plant = scenario().plant.model_copy(update={"geometry_seed": seed})
     encoders = encoders_of(known, scenario().geometry)
@@ -69,15 +79,21 @@ def drawn(robot, seed, chosen, frames_per_pose=20):
     off = misplaced(known, plant).geometry.shifted(-offsets).deviations_from(known.geometry)
     joints = chosen.joints + 1e-3 * known.travel_limit * rng.uniform(-1, 1, chosen.joints.shape)
     covariance = np.diag(POSE_STD**2) / frames_per_pose
-    seen = seen_between(true_poses(known, off, joints, chosen.poses), FRAMES.root @ rng.standard_normal(12))
+    seen = seen_between(
+        true_poses(known, off, joints, chosen.poses), FRAMES.root @ rng.standard_normal(12)
+    )
     seen += rng.multivariate_normal(np.zeros(6), covariance, len(joints))
     std = np.full(known.layout.joints, encoders.mean_std(frames_per_pose))
     read = encoders.read(joints, frames_per_pose, rng)
-    return Drawn(StaticPoses(read, std, seen, np.tile(covariance, (len(joints), 1, 1)), FRAMES), off)
+    return Drawn(
+        StaticPoses(read, std, seen, np.tile(covariance, (len(joints), 1, 1)), FRAMES), off
+    )
 
 
 def unseen_errors(robot, found, deviations, count=200):
     """Errors (count, 6) of poses that were not measured, m and rad."""
     known, unseen = known_robot(robot), poses_of(robot, count, 99)
     predicted = designer(robot).model.closure.poses(unseen.joints, found.deviations, unseen.poses)
-    return seen_between(predicted, found.frames) - true_poses(known, deviations, unseen.joints, unseen.poses)
+    return seen_between(predicted, found.frames) - true_poses(
+        known, deviations, unseen.joints, unseen.poses
+    )

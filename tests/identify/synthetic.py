@@ -1,4 +1,6 @@
-"""Records of the reference robot with drawn measurement noise instead of images: fast, and with known statistics."""
+"""Records of the reference robot with drawn measurement noise instead of images: fast, and with
+known statistics.
+"""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -67,16 +69,20 @@ def run_plant(
     geometry=None,
     **stated,
 ):
-    """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured.
+    """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not
+    measured.
 
-    size: of the motion, as a share of the usual box; robot: another than the reference robot; bias: of the sensor in a
-    frame at a pose (6,); latency_s: the true one, where it is not the scenario's; geometry: the known robot with its
-    covariance, and the true robot; stated: what `build_record` is given in place of what was.
+    size: of the motion, as a share of the usual box; robot: another than the reference robot; bias:
+    of the sensor in a frame at a pose (6,); latency_s: the true one, where it is not the
+    scenario's; geometry: the known robot with its covariance, and the true robot; stated: what
+    `build_record` is given in place of what was.
     """
     rng, robot = np.random.default_rng(seed), robot or rss6()
     plant = build_plant(scenario, robot)
     plant = plant if parameters is None else replace(plant, parameters=parameters)
-    plant = plant if geometry is None else replace(plant, nominal=geometry[0].robot, robot=geometry[1])
+    plant = (
+        plant if geometry is None else replace(plant, nominal=geometry[0].robot, robot=geometry[1])
+    )
     times = scenario.timing.frame_times(duration_s)
     reference = trajectory(trajectory_seed, size, robot).reference(times)
 
@@ -84,7 +90,9 @@ def run_plant(
         noise = sigma * rng.standard_normal(6)
         return None if frame in lost else pose + bias(frame, pose) + noise
 
-    run = plant.run(reference, sensor, None if latency_s is None else np.full(len(times), latency_s))
+    run = plant.run(
+        reference, sensor, None if latency_s is None else np.full(len(times), latency_s)
+    )
     covariance = np.broadcast_to(np.diag(np.maximum(sigma, 1e-9) ** 2), (len(times), 6, 6)).copy()
     covariance[~run.measured_ok] = np.nan
     made = {
@@ -124,14 +132,19 @@ def evidence(seed, noise=1.0, instruments=None, scenario=None):
     scenario = scenario or quick()
     record, run = run_plant(scenario, seed, sigma=noise * SIGMA)
     rng = np.random.default_rng([seed, 1])
-    channels = measure_joints(record, truth_of(run), scenario.timing, instruments or JointInstruments(), rng)
+    channels = measure_joints(
+        record, truth_of(run), scenario.timing, instruments or JointInstruments(), rng
+    )
     problem = output_error_problem([record], rss6(), scenario)
     return Evidence(problem, scenario, joint_channels(channels, record), truth()[64:])
 
 
 def unseen(seeds=(7, 8)):
-    """(record, truth) of noise-free runs of the plant on trajectories that no estimator has seen."""
-    runs = [run_plant(quick(), 0, np.zeros(6), trajectory_seed=seed, duration_s=5.0) for seed in seeds]
+    """(record, truth) of noise-free runs of the plant on trajectories that no estimator has
+    seen."""
+    runs = [
+        run_plant(quick(), 0, np.zeros(6), trajectory_seed=seed, duration_s=5.0) for seed in seeds
+    ]
     return [(record, truth_of(run)) for record, run in runs]
 
 
@@ -173,12 +186,16 @@ def short_run():
 
 
 def recorded_run_folder(path, scenario=SHORT, made=None, chosen=None):
-    """A folder as `cmmsim record` leaves it, of a scenario and (record, run of the plant), by default a short one.
+    """A folder as `cmmsim record` leaves it, of a scenario and (record, run of the plant), by
+    default a short one.
 
     chosen: another exciting trajectory than that of the record.
     """
     folder, (record, run) = RunFolder(path), made or short_run()
     folder.scenario.write_text(scenario.to_toml(), encoding="utf-8")
-    save_trajectories(folder.trajectories, TrajectorySet(0, chosen or trajectory(0), (trajectory(5),), 1.0, 1.0, 1.0))
+    save_trajectories(
+        folder.trajectories,
+        TrajectorySet(0, chosen or trajectory(0), (trajectory(5),), 1.0, 1.0, 1.0),
+    )
     write(folder.experiment, record, build_plant(scenario, rss6()).truth(run))
     return folder

@@ -15,13 +15,20 @@ from tests.identify.commands import command
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(0.5, marks=pytest.mark.slow), pytest.param(SECONDS, marks=pytest.mark.thorough)],
+    params=[
+        pytest.param(0.5, marks=pytest.mark.slow),
+        pytest.param(SECONDS, marks=pytest.mark.thorough),
+    ],
 )
 def accepted(request, tmp_path_factory):
-    """Exit status and folder of all tests with a limit that no sensor keeps; the bar moves for so many seconds."""
+    """Exit status and folder of all tests with a limit that no sensor keeps; the bar moves for so
+    many seconds.
+    """
     out, bar = tmp_path_factory.mktemp("acceptance") / "out", STANDARDS["e3064"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(STANDARDS, "e3064", replace(bar, test=partial(bar.test, seconds=request.param)))
+        patch.setitem(
+            STANDARDS, "e3064", replace(bar, test=partial(bar.test, seconds=request.param))
+        )
         arguments = ("--renderer", "analytic", "--limit-um", "0.01", "--out", out, "--quiet")
         return command("acceptance", *arguments), out
 
@@ -40,9 +47,17 @@ def test_missed_limit_is_the_exit_status_and_all_is_written(accepted):
     assert abs(test["largest_error_um"]) == max(map(abs, errors))
     for line in test["lines"]:
         for length in line["lengths"]:
-            assert 1e3 * (length["measured_mm"] - length["certified_mm"]) == pytest.approx(length["error_um"], abs=1e-6)
+            assert 1e3 * (length["measured_mm"] - length["certified_mm"]) == pytest.approx(
+                length["error_um"], abs=1e-6
+            )
     assert "MISSED" in (out / "acceptance.md").read_text(encoding="utf-8")
-    names = ["bar_errors.png", "bar_paths.png", "latency.png", "length_errors.png", "measuring_lines.png"]
+    names = [
+        "bar_errors.png",
+        "bar_paths.png",
+        "latency.png",
+        "length_errors.png",
+        "measuring_lines.png",
+    ]
     assert sorted(path.name for path in (out / "figures").iterdir()) == names
 
 
@@ -58,7 +73,11 @@ def test_statistics_are_consistent_and_tables_stand_beside_the_published_figures
             assert figures["mean"] < figures["rms"] < figures["p95"] < figures["maximum"]
             assert figures["interval"]["rms"][0] < figures["rms"] < figures["interval"]["rms"][1]
     latency = entry["astm_e3124"]
-    assert latency["mean_interval_ms"][0] <= latency["sensor_file_ms"] <= latency["mean_interval_ms"][1]
+    assert (
+        latency["mean_interval_ms"][0]
+        <= latency["sensor_file_ms"]
+        <= latency["mean_interval_ms"][1]
+    )
     assert text == acceptance_markdown(entry)
     for row in (
         "| position, static | Creaform C-Track 780 | 0.05 mm |",

@@ -1,5 +1,5 @@
-"""What is proved of the reference robot holds for robots with other joints, sizes and freedoms, and for one that no
-code knows, of which there is only a file."""
+"""What is proved of the reference robot holds for robots with other joints, sizes and freedoms, and
+for one that no code knows, of which there is only a file."""
 
 import casadi as ca
 import numpy as np
@@ -7,7 +7,11 @@ import pytest
 from scipy.stats import chi2
 
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import LoopFailure, equilibrium, simulate
+from dynamics.closed_loop import (
+    LoopFailure,
+    differentiate_servo,
+    equilibrium,
+)
 from dynamics.closed_loop.drives import joint_law
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.chart import Chart
@@ -42,14 +46,20 @@ FORBIDDEN = {"delta3": (3, 4, 5), "rrr3": (2, 3, 4)}
 
 @pytest.fixture(
     scope="module",
-    params=["delta3", "rrr3", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ups6", "mixed"))],
+    params=[
+        "delta3",
+        "rrr3",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("ups6", "mixed")),
+    ],
 )
 def robot(request, tmp_path_factory) -> Robot:
     if request.param != "mixed":
         return load_robot(request.param)
     mixed = mixed_robot(tmp_path_factory.mktemp("mixed"))
     initial, rng = mixed.parameter_sets["initial"], np.random.default_rng(0)
-    own = ParameterSet(initial.dynamic * rng.uniform(0.95, 1.05, len(initial.dynamic)), 1.03 * initial.joint_pid)
+    own = ParameterSet(
+        initial.dynamic * rng.uniform(0.95, 1.05, len(initial.dynamic)), 1.03 * initial.joint_pid
+    )
     mixed.parameter_sets = {"initial": initial, "identified": own}
     return mixed
 
@@ -68,7 +78,9 @@ def small_motion(robot, **excitation):
     return scenario, free, free.of(moved), moved
 
 
-def test_a_trajectory_fills_the_box_in_what_the_platform_can_do_and_survives_its_file(robot, tmp_path):
+def test_a_trajectory_fills_the_box_in_what_the_platform_can_do_and_survives_its_file(
+    robot, tmp_path
+):
     moved, t = trajectory(3, robot=robot), np.linspace(0, 10, 20001)
     away, free = moved.pose(t) - robot.home_pose, list(robot.geometry.chart.freedoms)
     forbidden = list(FORBIDDEN.get(robot.name, ()))
@@ -92,7 +104,9 @@ def test_groups_span_what_the_singular_vectors_do_and_what_they_leave_free_chang
     t = rng.uniform(0, 10, 50)
     pose, rate = moved.pose(t), moved.pose_rate(t)
     motion = pose, robot.twist(pose, rate), robot.twist_dot(pose, rate, moved.pose_acceleration(t))
-    hidden = parameters + 0.3 * parameters.min() * kernel.T @ rng.uniform(-1, 1, len(kernel)) / np.sqrt(len(kernel))
+    hidden = parameters + 0.3 * parameters.min() * kernel.T @ rng.uniform(
+        -1, 1, len(kernel)
+    ) / np.sqrt(len(kernel))
     torque = robot.inverse_dynamics(*motion, parameters)
     shift = robot.inverse_dynamics(*motion, np.maximum(hidden, 0)) - torque
     assert np.abs(shift).max() < 1e-9 * np.abs(torque).max()
@@ -104,7 +118,9 @@ def test_index_is_the_geometric_mean_of_the_singular_values_that_are_not_zero(ro
     free = unknowns(robot.geometry.chart, scenario.excitation)
     t = np.arange(0.05, 10.0, 0.1)
     pose, rate = moved.pose(t), moved.pose_rate(t)
-    rows = robot.regressor(pose, robot.twist(pose, rate), robot.twist_dot(pose, rate, moved.pose_acceleration(t)))
+    rows = robot.regressor(
+        pose, robot.twist(pose, rate), robot.twist_dot(pose, rate, moved.pose_acceleration(t))
+    )
     rows = rows[:, list(robot.geometry.chart.freedoms)]
     singular = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)
     rank = base_parameters(structural_regressor(robot), robot.layout).rank
@@ -115,18 +131,20 @@ def test_index_is_the_geometric_mean_of_the_singular_values_that_are_not_zero(ro
 
 @pytest.mark.slow
 def test_the_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
-    """Small motion, no dry friction, 600 frames a second: the second period against the spectrum, to what the rate of
-    commands, a difference of two frames in the loop, makes of ld."""
+    """Small motion, no dry friction, 600 frames a second: the second period against the spectrum,
+    to what the rate of commands, a difference of two frames in the loop, makes of ld."""
     rates = {"timing__frame_rate_hz": 600.0, "excitation__duration_s": 20.0}
     scenario, free, z, moved = small_motion(robot, **rates)
     parameters = truth_of(robot)
     parameters[robot.layout.coulomb] = 0.0
     reference = moved.reference(scenario.timing.frame_times(20.0))
-    run = simulate(robot, parameters, reference, model_settings(robot, scenario), sensitivities=True)
+    run = differentiate_servo(robot, parameters, reference, model_settings(robot, scenario))
     s, t, m = harmonics(free), run.time[6000:], len(robot.coordinate_names)
     unknown = ca.MX.sym("z", z.size)
     spectrum = sensitivity_spectrum(robot, free, scenario, parameters, unknown)
-    parts = np.array(ca.Function("spectrum", [unknown], [spectrum])(z)).reshape(len(parameters), len(s), 2, m)
+    parts = np.array(ca.Function("spectrum", [unknown], [spectrum])(z)).reshape(
+        len(parameters), len(s), 2, m
+    )
     waves = np.exp(np.outer(s, t))
     expected = np.einsum("pkj,kt->tjp", parts[:, :, 0] + 1j * parts[:, :, 1], waves).real
     for name in ("platform.mass", "joint3.viscous", *robot.layout.joint_pid_names):
@@ -146,26 +164,34 @@ def test_the_warm_starts_equation_holds_for_the_true_parameters(robot):
     columns, pid = columns[slipping], layout.joint_pid
     start = equilibrium(robot, parameters, run.pose[0], build_plant(scenario, robot).settings.servo)
     balance = columns @ np.concatenate([parameters, start.joint_integral * parameters[pid][1]])
-    assert np.sqrt(np.mean(balance**2)) < 5e-3 * np.sqrt(np.mean((columns[:, pid] @ parameters[pid]) ** 2))
+    assert np.sqrt(np.mean(balance**2)) < 5e-3 * np.sqrt(
+        np.mean((columns[:, pid] @ parameters[pid]) ** 2)
+    )
 
 
 def test_segments_from_the_true_states_make_up_the_run(robot):
     scenario, chart = quick(**{"plant.steps_per_frame": 4}), robot.geometry.chart
     record, run = run_plant(scenario, seed=1, duration_s=3.0, robot=robot)
     problem = output_error_problem([record], robot, scenario).driven_by_commands()
-    true = np.hstack([chart.coordinates(run.pose), chart.coordinates(run.pose_rate), run.joint_integral])
+    true = np.hstack(
+        [chart.coordinates(run.pose), chart.coordinates(run.pose_rate), run.joint_integral]
+    )
     chain = segments(problem.runs[0])
     assert true.shape[1] == 2 * len(robot.coordinate_names) + robot.layout.joints
     for part in chain:
         one = part.simulate(truth_of(robot), true[part.first])
         assert np.allclose(one.pose, run.pose[part.first : part.last + 1], rtol=0, atol=1e-12)
         assert np.allclose(end_state(one, chart), true[part.last], rtol=0, atol=1e-9)
-    error = np.abs(measured_states(chain, truth_of(robot), scenario) - true[[part.first for part in chain]])[1:]
+    error = np.abs(
+        measured_states(chain, truth_of(robot), scenario) - true[[part.first for part in chain]]
+    )[1:]
     assert np.all(error[:, : len(chart.freedoms)] < 5 * chart.coordinates(SIGMA))
 
 
 def test_friction_and_gains_are_identified_with_intervals_and_unseen_motion_is_predicted(robot):
-    """From poses with drawn noise, among them what the platform cannot change; chi-square of what is estimated."""
+    """From poses with drawn noise, among them what the platform cannot change; chi-square of what
+    is estimated.
+    """
     scenario, truth = quick(), truth_of(robot)
     record, _ = run_plant(scenario, seed=1, robot=robot)
     run = output_error_problem([record], robot, scenario).runs[0]
@@ -180,7 +206,9 @@ def test_friction_and_gains_are_identified_with_intervals_and_unseen_motion_is_p
     assert result.identifiable[known].all()
     shares = ((result.estimate - truth) / result.std)[known]
     assert np.abs(shares).max() < 4.5, dict(zip(layout.names[known], shares, strict=True))
-    assert result.noise_ratio == pytest.approx(result.expected_noise_ratio, abs=5 * result.noise_ratio_std)
+    assert result.noise_ratio == pytest.approx(
+        result.expected_noise_ratio, abs=5 * result.noise_ratio_std
+    )
     assert chi2.sf(np.sum(shares**2), len(shares)) > 1e-6
     errors = unseen_errors(result.estimate, robot, scenario.with_overrides({"validation.count": 1}))
     rms = np.sqrt(np.mean(errors**2, axis=(0, 1)))
@@ -189,9 +217,14 @@ def test_friction_and_gains_are_identified_with_intervals_and_unseen_motion_is_p
 
 
 @pytest.mark.parametrize("size", [3, 6])
-def test_the_smooth_condition_number_is_never_below_that_of_the_2_norm_and_three_per_cent_above_at_most(size):
+def test_the_smooth_condition_number_is_never_below_that_of_the_2_norm_and_three_per_cent_above_at_most(
+    size,
+):
     matrix = ca.SX.sym("matrix", size, size)
-    function, rng = ca.Function("condition", [matrix], [condition_number(matrix)]), np.random.default_rng(size)
+    function, rng = (
+        ca.Function("condition", [matrix], [condition_number(matrix)]),
+        np.random.default_rng(size),
+    )
     for drawn in [np.eye(size), *(rng.standard_normal((100, size, size)))]:
         assert 1 - 1e-9 <= float(function(drawn)) / np.linalg.cond(drawn) < 1.03
 
@@ -199,7 +232,11 @@ def test_the_smooth_condition_number_is_never_below_that_of_the_2_norm_and_three
 def test_limits_are_judged_at_home_first_and_in_the_norm_of_the_workspace():
     robot = load_robot("delta3")
     for key, value, says in (
-        ("most_condition", 1.5, r"delta3 may not even be at home: condition of J_a2 of delta3 is 2\.\d+.* limit 1\.5"),
+        (
+            "most_condition",
+            1.5,
+            r"delta3 may not even be at home: condition of J_a2 of delta3 is 2\.\d+.* limit 1\.5",
+        ),
         (
             "least_leverage",
             0.99,
@@ -228,7 +265,9 @@ def test_settings_of_another_kind_of_actuators_are_refused_with_the_key_to_set()
         with pytest.raises(ScenarioError, match=says):
             MotionConstraints(robot, quick(**{f"excitation.{key}": 0.2}))
     smoothed = {"plant.friction": "smoothed", "plant.smoothing_velocity_rad_s": 1e-3}
-    with pytest.raises(ScenarioError, match=r"plant.smoothing_velocity_rad_s = 0.001 .* set smoothing_velocity_m_s"):
+    with pytest.raises(
+        ScenarioError, match=r"plant.smoothing_velocity_rad_s = 0.001 .* set smoothing_velocity_m_s"
+    ):
         build_plant(quick(**smoothed), sliding)
     elastic = {"plant.joint_stiffness_N_m": 1e6, "plant.motor_mass_kg": 0.1}
     springs = build_plant(quick(**elastic), sliding).settings.elasticity
@@ -241,7 +280,10 @@ def test_what_is_known_beforehand_is_named_as_the_scenarios_own_robot_names_it()
         {"robot": "ups6", "identification.prior": {"cylinder1.mass": known}}
     )
     assert scenario.identification.prior["cylinder1.mass"].value == 2.0
-    with pytest.raises(ScenarioError, match=r"no parameter 'crank1.mass'; valid: .* cylinder1 to cylinder6 or rod1 to"):
+    with pytest.raises(
+        ScenarioError,
+        match=r"no parameter 'crank1.mass'; valid: .* cylinder1 to cylinder6 or rod1 to",
+    ):
         scenario.with_overrides({"identification.prior": {"crank1.mass": known}})
     with pytest.raises(ScenarioError, match="robot: unknown robot `nosuch`"):
         scenario.with_overrides({"robot": "nosuch"})
@@ -253,7 +295,9 @@ def test_friction_of_a_robot_that_lies_flat_has_the_size_of_what_accelerates_it(
     initial = robot.parameter_sets["initial"].dynamic
     assert np.abs(robot.static_torque(robot.home_pose, initial)).max() < 1e-9
     rest, found = np.zeros((2, 6)), holding_torque(robot, initial)
-    torques = robot.inverse_dynamics(np.tile(robot.home_pose, (2, 1)), rest, 9.81 * np.eye(6)[:2], initial)
+    torques = robot.inverse_dynamics(
+        np.tile(robot.home_pose, (2, 1)), rest, 9.81 * np.eye(6)[:2], initial
+    )
     assert found == pytest.approx(np.abs(torques).mean(), rel=1e-12)
 
 
@@ -261,15 +305,21 @@ def test_a_robot_that_is_not_the_one_whose_platform_the_sensor_sees_is_refused_w
     """Twice as large in all lengths, its legs would end in mid-air."""
     small = load_robot("rss6")
     legs = [
-        leg.model_copy(update={name: 2 * getattr(leg, name) for name in ("base_joint", "platform_joint")})
+        leg.model_copy(
+            update={name: 2 * getattr(leg, name) for name in ("base_joint", "platform_joint")}
+        )
         for leg in small.geometry.legs
     ]
-    legs = [leg.model_copy(update={"crank_length": 0.12, "link_length": 2 * leg.link_length}) for leg in legs]
+    legs = [
+        leg.model_copy(update={"crank_length": 0.12, "link_length": 2 * leg.link_length})
+        for leg in legs
+    ]
     chart = Chart("free", tuple(2 * small.home_pose))
     geometry = RobotGeometry(tuple(legs), chart, small.travel_limit, small.geometry.gravity)
     large = Robot(RobotDescription("large", geometry, small.parameter_sets))
     with pytest.raises(
-        ScenarioError, match=r"platform joint \d of large is 0.2\d* m outside .* ctrack780 .*limit 0.05"
+        ScenarioError,
+        match=r"platform joint \d of large is 0.2\d* m outside .* ctrack780 .*limit 0.05",
     ):
         make_sensor(quick(), large, 0)
     raised = quick(**{"sensor_changes.platform.home": [0, 0, 0.3, 0, 0, 0]})
@@ -280,5 +330,8 @@ def test_a_robot_that_is_not_the_one_whose_platform_the_sensor_sees_is_refused_w
 def test_a_loop_that_is_lost_says_its_eigenvalue_and_the_frame_rate_that_would_hold_it():
     plant = build_plant(quick(**{"servo.kp": 12.0}))
     reference = trajectory(0).reference(np.arange(600) / 60)
-    with pytest.raises(LoopFailure, match=r"eigenvalue .* is 1\.\d+, and must be below 1: from \d+ Hz on it is, at 60"):
+    with pytest.raises(
+        LoopFailure,
+        match=r"eigenvalue .* is 1\.\d+, and must be below 1: from \d+ Hz on it is, at 60",
+    ):
         plant.run(reference)

@@ -1,6 +1,8 @@
-"""Bounded least squares: the search against scipy's solvers, among bodies that can exist, and the intervals that hold.
+"""Bounded least squares: the search against scipy's solvers, among bodies that can exist, and the
+intervals that hold.
 
-The linear problems have known statistics: the estimate without bounds is that of `numpy.linalg.lstsq`.
+The linear problems have known statistics: the estimate without bounds is that of
+`numpy.linalg.lstsq`.
 """
 
 import numpy as np
@@ -19,7 +21,16 @@ from identify.estimation.bounds import (
 )
 from identify.estimation.identification import identify
 from identify.scenario import load_scenario
-from tests.identify.synthetic import LAYOUT, NAMES, guess_of, index_of, quick, rss6, run_plant, truth
+from tests.identify.synthetic import (
+    LAYOUT,
+    NAMES,
+    guess_of,
+    index_of,
+    quick,
+    rss6,
+    run_plant,
+    truth,
+)
 
 CRITERIA = StopCriteria(cost_tolerance=1e-12, parameter_tolerance=1e-9, max_iterations=200)
 DRAWS = 500
@@ -67,21 +78,27 @@ def linear(matrix, data, **where):
     ids=["free", "bound", "from a bound"],
 )
 def test_it_finds_the_minimum_that_scipy_finds_within_the_bounds(start, lower):
-    """The model cannot run below its bounds, and a step along a bound may end below it by rounding."""
+    """The model cannot run below its bounds, and a step along a bound may end below it by
+    rounding."""
     problem = exponential(allowed=not_below_zero)
     mine = minimise(problem, np.array(start), np.array(lower), np.array([0.3, 0.7]), CRITERIA)
-    scipys = least_squares(problem.residual, [0.5, 4.0], bounds=(lower, np.inf), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    scipys = least_squares(
+        problem.residual, [0.5, 4.0], bounds=(lower, np.inf), xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
     assert mine.parameters[1] >= lower[1]
     assert np.allclose(mine.parameters, scipys.x, rtol=1e-5 if lower[1] else 1e-6)
     assert np.all(np.diff(mine.costs) < 0) or lower[1] > 0.0
 
 
 def test_parameters_held_at_their_bound_stay_there_exactly():
-    """The unconstrained minimum has a negative entry: it ends at zero, and the others still move."""
+    """The unconstrained minimum has a negative entry: it ends at zero, and the others still
+    move."""
     matrix = np.random.default_rng(2).standard_normal((30, 5))
     target = matrix @ np.array([1.0, -2.0, 0.5, 3.0, -0.1])
     problem = linear(matrix, target, allowed=not_below_zero)
-    found = minimise(problem, np.array([1.0, 0.0, 1.0, 1.0, 0.0]), np.zeros(5), np.full(5, 0.37), CRITERIA)
+    found = minimise(
+        problem, np.array([1.0, 0.0, 1.0, 1.0, 0.0]), np.zeros(5), np.full(5, 0.37), CRITERIA
+    )
     assert np.allclose(found.parameters, nnls(matrix, target)[0], atol=1e-9)
     assert np.all(found.parameters >= 0)
 
@@ -100,7 +117,9 @@ def test_a_region_where_the_model_cannot_run_is_stepped_around():
 def test_the_stop_reason_names_the_criterion():
     reasons = {(1e-3, 1e-12, 50): "tol1 = 0.001 (eq. 35)", (1e-15, 1e-15, 2): "max_iterations = 2"}
     for criteria, says in (reasons | {(0.0, 0.0, 200): "no step lowers the cost"}).items():
-        found = minimise(exponential(), np.array([0.5, 4.0]), np.zeros(2), np.ones(2), StopCriteria(*criteria))
+        found = minimise(
+            exponential(), np.array([0.5, 4.0]), np.zeros(2), np.ones(2), StopCriteria(*criteria)
+        )
         assert says in found.stop_reason
         assert found.iterations <= criteria[2]
 
@@ -110,10 +129,14 @@ INERTIAS = slice(1, 4)
 
 def fitted(matrix, data, bounds, start) -> BoundedEstimate:
     problem = InCoordinates(linear(matrix, data), bounds)
-    found = minimise(problem, bounds.coordinates(start), bounds.lower, np.ones(len(start)), CRITERIA)
+    found = minimise(
+        problem, bounds.coordinates(start), bounds.lower, np.ones(len(start)), CRITERIA
+    )
     estimate, information = bounds.parameters(found.parameters), matrix.T @ matrix
     gradient = matrix.T @ (matrix @ estimate - data)
-    return bounded_estimate(estimate, found.at_bound, gradient, information, np.linalg.inv(information), bounds)
+    return bounded_estimate(
+        estimate, found.at_bound, gradient, information, np.linalg.inv(information), bounds
+    )
 
 
 def one_bounds(physical):
@@ -122,15 +145,18 @@ def one_bounds(physical):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_constrained_optimum_is_the_one_that_scipy_finds(seed):
-    """SLSQP with the inequalities in the moments themselves, of a platform that breaks one of them, the others held
-    near one by their own rows; where no inequality is in the way both searches agree."""
+    """SLSQP with the inequalities in the moments themselves, of a platform that breaks one of them,
+    the others held near one by their own rows; where no inequality is in the way both searches
+    agree."""
     rng = np.random.default_rng(seed)
     matrix = rng.standard_normal((9, 4))
     whole = block_diag(matrix, np.eye(63))
 
     def platform(target, physical):
         bounds = one_bounds(physical)
-        return fitted(whole, whole @ np.append(target, np.ones(63)), bounds, bounds.nearest(np.ones(67)))
+        return fitted(
+            whole, whole @ np.append(target, np.ones(63)), bounds, bounds.nearest(np.ones(67))
+        )
 
     target = np.array([2.0, *rng.permutation([0.4, 0.7, 1.9])])
     found, free = (platform(target, physical) for physical in (True, False))
@@ -154,7 +180,9 @@ def test_the_constrained_optimum_is_the_one_that_scipy_finds(seed):
 
 
 def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
-    """The paper's starting values break the triangle inequality; the motion does not feel what is changed."""
+    """The paper's starting values break the triangle inequality; the motion does not feel what is
+    changed.
+    """
     initial = rss6().parameter_sets["initial"].vector
     bounds = parameter_bounds(guess_of(initial, initial), physical=True)
     near = bounds.nearest(initial)
@@ -172,13 +200,17 @@ def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (2, 3))])
+@pytest.mark.parametrize(
+    "seed", [1, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (2, 3))]
+)
 def test_bodies_that_exist_are_identified_as_such(seed):
-    """With noise the plain search finds bodies that cannot exist; the other does not, and fits as well. Its intervals
-    hold what those without bounds hold, which a linearisation predicts to a fifth of a standard deviation."""
+    """With noise the plain search finds bodies that cannot exist; the other does not, and fits as
+    well. Its intervals hold what those without bounds hold, which a linearisation predicts to a
+    fifth of a standard deviation."""
     flat = truth()
     flat[LAYOUT.rigid] = physical_inertias(LAYOUT, flat, allow_changes=True).values.ravel()
-    flat[NAMES.index("platform.Izz")] = 0.999 * flat[1:3].sum()  # just below Ixx + Iyy, as of a plate
+    # just below Ixx + Iyy, as of a plate
+    flat[NAMES.index("platform.Izz")] = 0.999 * flat[1:3].sum()
     scenario = quick(**{"identification.method": "command_driven"})
     consistent = scenario.with_overrides({"identification.physical_consistency": True})
     record, _ = run_plant(scenario, seed=seed, parameters=flat)
@@ -204,7 +236,8 @@ def not_negative(size):
 
 
 def coverage(estimates, truth, rows, intervals):
-    """Share (n,) of the estimates whose intervals of rows (n, p) @ parameters hold the true values."""
+    """Share (n,) of the estimates whose intervals of rows (n, p) @ parameters hold the true
+    values."""
     ends = np.array([intervals(one, rows) for one in estimates])
     true = rows @ truth
     return np.mean((ends[:, :, 0] <= true) & (true <= ends[:, :, 1]), axis=0)
@@ -212,26 +245,35 @@ def coverage(estimates, truth, rows, intervals):
 
 @pytest.mark.parametrize("distance", [0.0, 0.5, 1.5])
 def test_correlated_parameters_near_their_bounds_are_covered(distance):
-    """Five unknowns that the data tie together, three of them within some of their standard deviations of zero."""
+    """Five unknowns that the data tie together, three of them within some of their standard
+    deviations of zero.
+    """
     rng = np.random.default_rng(0)
     matrix = rng.standard_normal((12, 5)) + 1.5
     std = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
     truth = std * np.array([distance, distance, distance, 5.0, 20.0])
     rows = np.vstack([np.eye(5), np.ones(5), rng.uniform(0, 1, 5), [1, -1, 0, 0, 0]])
     bounds = not_negative(5)
-    estimates = [fitted(matrix, matrix @ truth + rng.standard_normal(12), bounds, truth) for _ in range(DRAWS)]
+    estimates = [
+        fitted(matrix, matrix @ truth + rng.standard_normal(12), bounds, truth)
+        for _ in range(DRAWS)
+    ]
     assert 0.05 < np.mean([one.at_bound[0] for one in estimates]) < 0.95
     found = coverage(estimates, truth, rows, BoundedEstimate.intervals)
     assert np.all(found >= LOWEST), found
 
 
 def test_a_sum_of_many_at_their_bounds_is_covered_where_the_cut_interval_of_the_estimate_is_not():
-    """Thirty independent unknowns that are zero: what is drawn below is raised, and so their sum is far too high."""
+    """Thirty independent unknowns that are zero: what is drawn below is raised, and so their sum is
+    far too high.
+    """
     rng = np.random.default_rng(1)
     size, bounds, rows = 30, not_negative(30), np.ones((1, 30))
     data = rng.standard_normal((DRAWS, size))
     one = np.eye(size)
-    estimates = [bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, bounds) for y in data]
+    estimates = [
+        bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, bounds) for y in data
+    ]
 
     def cut(found, rows):
         half, value = 1.96 * np.sqrt(size), rows @ found.estimate
@@ -249,12 +291,16 @@ def body_fit(physical):
     matrix = np.vstack([rng.standard_normal((70, 67)), 3 * np.eye(67)])
     data = matrix @ truth + 0.3 * rng.standard_normal(len(matrix))
     bounds = one_bounds(physical)
-    return fitted(matrix, data, bounds, bounds.nearest(np.ones(67))), np.linalg.lstsq(matrix, data)[0]
+    return fitted(matrix, data, bounds, bounds.nearest(np.ones(67))), np.linalg.lstsq(matrix, data)[
+        0
+    ]
 
 
 def test_intervals_end_at_the_bounds_and_hold_the_estimate_and_how_far_a_bound_moved_it_is_a_warning():
     found, unbounded = body_fit(physical=True)
-    wide = BoundedEstimate(found.estimate, found.at_bound, found.unheld, 100 * found.covariance, found.bounds)
+    wide = BoundedEstimate(
+        found.estimate, found.at_bound, found.unheld, 100 * found.covariance, found.bounds
+    )
     for one in (found, wide):
         intervals = one.intervals(np.eye(67))
         assert np.all(intervals[:, 0] >= 0)
@@ -276,5 +322,7 @@ def test_intervals_end_at_the_bounds_and_hold_the_estimate_and_how_far_a_bound_m
     assert np.allclose(found.unheld, unbounded, atol=1e-8)
     row = np.random.default_rng(0).standard_normal((1, 67))
     std = np.sqrt(row @ found.covariance @ row.T)[0, 0]
-    assert found.intervals(row)[0] == pytest.approx((row @ found.estimate)[0] + 1.959964 * std * np.array([-1, 1]))
+    assert found.intervals(row)[0] == pytest.approx(
+        (row @ found.estimate)[0] + 1.959964 * std * np.array([-1, 1])
+    )
     assert found.warnings() == ()

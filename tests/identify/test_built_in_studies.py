@@ -1,9 +1,11 @@
-"""The built-in studies: they can be run, their rows follow the laws that they state, and geometry says the same.
+"""The built-in studies: they can be run, their rows follow the laws that they state, and geometry
+says the same.
 
-What the study of the distance should measure is told from geometry and the Cramér-Rao bound alone: no picture is made
-and no detector runs. A blurred edge of length dl with normal n tells where it is along n, with an information that is
-the same for every px of it; so the information of a sticker's centre is the integral of n n^T dl along its rim as each
-camera sees it. Its inverse goes through the triangulation of both cameras' pixels.
+What the study of the distance should measure is told from geometry and the Cramér-Rao bound alone:
+no picture is made and no detector runs. A blurred edge of length dl with normal n tells where it is
+along n, with an information that is the same for every px of it; so the information of a sticker's
+centre is the integral of n n^T dl along its rim as each camera sees it. Its inverse goes through
+the triangulation of both cameras' pixels.
 """
 
 import json
@@ -23,10 +25,16 @@ from identify.studies.table import tidy_table
 from identify.studies.theory import CONFIDENCE, check_laws, scale_regression
 
 IDENTIFYING = {"parameter_noise": 1, "parameter_periods": 1}
-REPEATS = dict.fromkeys(("pixel_noise", "sticker_size", "sticker_count", "baseline", "distance"), 6) | IDENTIFYING
+REPEATS = (
+    dict.fromkeys(("pixel_noise", "sticker_size", "sticker_count", "baseline", "distance"), 6)
+    | IDENTIFYING
+)
 REPEATS |= {"frame_rate": 2, "hold_time": 2, "pose_method": 4}
 """Rows at each point of the studies that the README names, where they are few."""
-SLOW = [pytest.param(name, marks=pytest.mark.slow if name in IDENTIFYING else ()) for name in sorted(REPEATS)]
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow if name in IDENTIFYING else ())
+    for name in sorted(REPEATS)
+]
 
 POSES, RIM_POINTS, STEP_M = 6, 60, 1e-4
 DEPTH, DISPARITY = "point_depth_rms_um", "disparity_rms_px"
@@ -38,10 +46,19 @@ def rows_of(name, repeats=None):
     study = load_study(name)
     study = study.model_copy(update={"repeats": repeats or study.repeats})
     design = Design(study)
-    return study, tidy_table(study, compute(prepare(study), [design.case(number) for number in range(len(design))]))
+    return study, tidy_table(
+        study, compute(prepare(study), [design.case(number) for number in range(len(design))])
+    )
 
 
-ANSWERS = {"control_laws", "control_value", "estimators", "excitation_methods", "friction_timing", "inexact"}
+ANSWERS = {
+    "control_laws",
+    "control_value",
+    "estimators",
+    "excitation_methods",
+    "friction_timing",
+    "inexact",
+}
 ANSWERS |= {"interval_coverage", "parameter_groups", "control_robots", "model_off", "observer"}
 """Studies that ask what no law says; what came out is in the documentation."""
 
@@ -62,14 +79,20 @@ LARGEST_SHARE = {"feedforward": 25.0, "computed_torque": 12.5}
 
 def kept_points(name):
     """Law and figures of each point of a kept answer, whose 95 % bands are of their means."""
-    content = json.loads((Path(__file__).parents[2] / ".readme" / "answers" / f"{name}.json").read_text())
+    content = json.loads(
+        (Path(__file__).parents[2] / ".readme" / "answers" / f"{name}.json").read_text()
+    )
     assert not content["rows"]["failed"]
     return [(point["factors"]["options.law"], point["figures"]) for point in content["points"]]
 
 
 @pytest.mark.parametrize("timing", ["", "_29hz"], ids=["60 Hz", "29 Hz"])
-def test_kept_answers_say_that_identified_models_follow_nearly_as_true_ones_and_better_than_starting_ones(timing):
-    """By the bands of twenty seeds: the share of pid's error, the ratio to the true model, and the difference."""
+def test_kept_answers_say_that_identified_models_follow_nearly_as_true_ones_and_better_than_starting_ones(
+    timing,
+):
+    """By the bands of twenty seeds: the share of pid's error, the ratio to the true model, and the
+    difference.
+    """
     for law, figures in kept_points(f"control_laws{timing}"):
         for what, unit in (("position", "um"), ("orientation", "urad")):
             assert figures[f"{what}_share_percent"]["rows"] >= 20
@@ -89,16 +112,24 @@ def test_kept_answers_say_the_same_of_other_robots(timing):
                 assert figures[f"starting_{what}_excess_{unit}"]["mean"] > 0
 
 
-TOO_SMALL = "errors of a tenth of the sensor's noise: innovations cannot tell, and joints that turn back count"
+TOO_SMALL = (
+    "errors of a tenth of the sensor's noise: innovations cannot tell, and joints that "
+    "turn back count"
+)
 
 
 @pytest.mark.parametrize(
-    "law", [pytest.param("feedforward", marks=pytest.mark.xfail(reason=TOO_SMALL)), "computed_torque"]
+    "law",
+    [pytest.param("feedforward", marks=pytest.mark.xfail(reason=TOO_SMALL)), "computed_torque"],
 )
 @pytest.mark.parametrize("timing", ["", "_29hz"], ids=["60 Hz", "29 Hz"])
 def test_kept_answers_say_that_the_observer_knows_how_well_it_predicts(timing, law):
     """By the means of twenty seeds, of each robot."""
-    found = [figures["observer_normalised_error"] for of, figures in kept_points(f"observer{timing}") if of == law]
+    found = [
+        figures["observer_normalised_error"]
+        for of, figures in kept_points(f"observer{timing}")
+        if of == law
+    ]
     assert len(found) == 3
     assert all(figure["rows"] >= 20 and 0.9 <= figure["mean"] <= 1.1 for figure in found)
 
@@ -138,13 +169,19 @@ def rim_information(rim):
     """Integrals (..., 2, 2) of n n^T dl along closed image curves (..., n, 2), px."""
     along = 0.5 * (np.roll(rim, -1, axis=-2) - np.roll(rim, 1, axis=-2))
     normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    return np.einsum("...ni,...nj,...n->...ij", normal, normal, 1.0 / np.linalg.norm(along, axis=-1))
+    return np.einsum(
+        "...ni,...nj,...n->...ij", normal, normal, 1.0 / np.linalg.norm(along, axis=-1)
+    )
 
 
 def sticker_bounds(eye, radius, pose):
-    """Of every sticker at a pose: distance, variances of the error along the sight and of the disparity, to a scale."""
+    """Of every sticker at a pose: distance, variances of the error along the sight and of the
+    disparity, to a scale.
+    """
     rig, places = eye.sensor.estimator.rig, eye.truth.platform_places
-    centres = apply(invert(eye.truth.base_from_camera), apply(cmmsim.pose_to_transform(pose), places))
+    centres = apply(
+        invert(eye.truth.base_from_camera), apply(cmmsim.pose_to_transform(pose), places)
+    )
     angles = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
     circle = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     planes = np.array([name[0] for name in eye.sensor.estimator.platform.sticker_ids])
@@ -159,22 +196,40 @@ def sticker_bounds(eye, radius, pose):
             point = np.linalg.inv(np.einsum("cia,cij,cjb->ab", slopes, information, slopes))
             sight = centre - middle
             distance = np.linalg.norm(sight)
-            yield distance, sight @ point @ sight / distance**2, np.linalg.inv(information)[:, 0, 0].sum()
+            yield (
+                distance,
+                sight @ point @ sight / distance**2,
+                np.linalg.inv(information)[:, 0, 0].sum(),
+            )
 
 
 @pytest.fixture(scope="module")
 def expected():
-    """Exponents of the depth error, and of its ratio to the disparity's, in the distance; and the study."""
+    """Exponents of the depth error, and of its ratio to the disparity's, in the distance; and the
+    study.
+    """
     study = load_study("distance")
     setup, design, points = prepare(study), Design(study), []
     for point in range(study.points):
         scenario = setup.row_scenario(design.case(point))
         eye, rng = row_sensor(scenario, "exact", 0), np.random.default_rng(0)
-        box = np.repeat((scenario.excitation.position_amplitude_m, scenario.excitation.orientation_amplitude_rad), 3)
+        box = np.repeat(
+            (
+                scenario.excitation.position_amplitude_m,
+                scenario.excitation.orientation_amplitude_rad,
+            ),
+            3,
+        )
         poses = eye.sensor.home + box * rng.uniform(-1.0, 1.0, (POSES, 6))
         radius = study.changes["sensor.stickers.radius"]
-        distance, depth, disparity = np.array([one for pose in poses for one in sticker_bounds(eye, radius, pose)]).T
-        points.append(np.log([distance.mean(), np.sqrt(depth.mean()), np.sqrt(depth.mean() / disparity.mean())]))
+        distance, depth, disparity = np.array(
+            [one for pose in poses for one in sticker_bounds(eye, radius, pose)]
+        ).T
+        points.append(
+            np.log(
+                [distance.mean(), np.sqrt(depth.mean()), np.sqrt(depth.mean() / disparity.mean())]
+            )
+        )
     logs = np.array(points)
     return (*(float(np.polyfit(logs[:, 0], logs[:, k], 1)[0]) for k in (1, 2)), study)
 
@@ -183,7 +238,9 @@ def test_tolerances_of_the_laws_are_what_geometry_takes_from_them(expected):
     depth, ratio, study = expected
     stated = {law.per: law for law in study.theory if law.figure == DEPTH}
     assert stated[None].exponent - depth == pytest.approx(stated[None].tolerance, abs=0.006)
-    assert stated[DISPARITY].exponent - ratio == pytest.approx(stated[DISPARITY].tolerance, abs=0.003)
+    assert stated[DISPARITY].exponent - ratio == pytest.approx(
+        stated[DISPARITY].tolerance, abs=0.003
+    )
 
 
 @pytest.mark.parametrize("repeats", [6, pytest.param(None, marks=pytest.mark.thorough)])

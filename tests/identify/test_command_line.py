@@ -1,4 +1,6 @@
-"""The command `cmmsim`: what its stages, replaced by notes, pass on and say; what a terminal shows; what all refuse."""
+"""The command `cmmsim`: what its stages, replaced by notes, pass on and say; what a terminal shows;
+what all refuse.
+"""
 
 import io
 import shlex
@@ -33,7 +35,11 @@ def calls(monkeypatch):
         save_result(RunFolder(folder).result, warned(make_result()))
 
     noted = {name: lambda *arguments, name=name: made.append((name, *arguments)) for name in STAGES}
-    monkeypatch.setattr(command_line, "_pipeline", lambda: SimpleNamespace(run=run, **noted))
+    monkeypatch.setattr(
+        command_line,
+        "_pipeline",
+        lambda: SimpleNamespace(run=run, is_begun=lambda *_: False, **noted),
+    )
     return made
 
 
@@ -48,7 +54,9 @@ def warned(result):
     return result
 
 
-def test_identify_says_whether_the_model_explains_the_record_and_warns_even_where_it_is_quiet(calls, run_folder, capfd):
+def test_identify_says_whether_the_model_explains_the_record_and_warns_even_where_it_is_quiet(
+    calls, run_folder, capfd
+):
     assert command("identify", "--out", run_folder.path) == 0
     out, err = capfd.readouterr()
     assert err == ""
@@ -58,7 +66,8 @@ def test_identify_says_whether_the_model_explains_the_record_and_warns_even_wher
         "identified: 4 of 5 parameters and 1 of 1 sums of them that motion shows",
         "residuals of the model: 1.356 × noise: mean square of",
         "noise alone leaves 1.100 ± 0.040",
-        "the model does NOT explain the record: it is wrong, or the cameras err by more than they state",
+        "the model does NOT explain the record: it is wrong, or the cameras err by more than they "
+        "state",
         str(run_folder.result),
     )
     for quiet in (True, False):
@@ -73,12 +82,19 @@ def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_
 ):
     monkeypatch.chdir(tmp_path)
     settings = ("--set", "timing.latency_s=0.01", "--set", "pose_method=planes")
-    assert command("run", "quick", "--out", "mine", "--seed", 7, "--workers", 2, "--quiet", *settings) == 0
+    assert (
+        command("run", "quick", "--out", "mine", "--seed", 7, "--workers", 2, "--quiet", *settings)
+        == 0
+    )
     assert capfd.readouterr() == ("", "warning: not white\nwarning: a b\n")
     assert command("run", "--seed", 3) == 0
     (name, scenario, seed, folder, _, workers), default = calls
     assert (name, seed, folder.as_posix(), workers) == ("run", 7, "mine", 2)
-    assert (scenario.name, scenario.timing.latency_s, scenario.pose_method) == ("quick", 0.01, "planes")
+    assert (scenario.name, scenario.timing.latency_s, scenario.pose_method) == (
+        "quick",
+        0.01,
+        "planes",
+    )
     assert default[3].as_posix() == "runs/paper-3"
     out, err = capfd.readouterr()
     assert err == "warning: not white\nwarning: a b\n"
@@ -87,12 +103,20 @@ def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_
     assert "missed: residuals of the model: mean square of measured minus identified pose" in out
 
 
-def test_stages_read_the_folder_that_the_one_before_wrote_and_identify_takes_settings(calls, run_folder, capfd):
+def test_stages_read_the_folder_that_the_one_before_wrote_and_identify_takes_settings(
+    calls, run_folder, capfd
+):
     for stage in STAGES:
         assert command(stage, "--out", run_folder.path, "--quiet") == 0
     assert [call[:2] for call in calls] == [(stage, run_folder.path) for stage in STAGES]
-    method, prior = "identification.method=command_driven", 'identification.prior={"link1.mass"={value=1, std=0.1}}'
-    assert command("identify", "--out", run_folder.path, "--quiet", "--set", method, "--set", prior) == 0
+    method, prior = (
+        "identification.method=command_driven",
+        'identification.prior={"link1.mass"={value=1, std=0.1}}',
+    )
+    assert (
+        command("identify", "--out", run_folder.path, "--quiet", "--set", method, "--set", prior)
+        == 0
+    )
     assert calls[-1][3] == {
         "identification.method": "command_driven",
         "identification.prior": {"link1.mass": {"value": 1, "std": 0.1}},
@@ -102,17 +126,23 @@ def test_stages_read_the_folder_that_the_one_before_wrote_and_identify_takes_set
     assert "cmmsim record --out" in one_line(capfd.readouterr().err)
 
 
-def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_report_is(calls, run_folder, capsys):
+def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_report_is(
+    calls, run_folder, capsys
+):
     result = load_result(run_folder.result)
     result["identification"]["parameters"]["joint1.viscous"]["estimate"] = 0.3
     save_result(run_folder.result, result)
     assert command("report", "--out", run_folder.path) == 0
     shown = capsys.readouterr().out
     missed = (
-        "missed: friction and gains far off: of 3: estimates off the truth by more than 5 % and more than 3 standard"
+        "missed: friction and gains far off: of 3: estimates off the truth by more than 5 % "
+        "and more than 3 standard"
     )
     assert f"{missed} deviations, joint1.viscous\n" in shown
-    assert all(text in shown for text in ("unseen motion, position", "µrad", "stereo frames", str(run_folder.report)))
+    assert all(
+        text in shown
+        for text in ("unseen motion, position", "µrad", "stereo frames", str(run_folder.report))
+    )
 
 
 @pytest.mark.parametrize(
@@ -124,56 +154,100 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         ("record --out nowhere", "no run folder nowhere"),
         ("run quick --out mine", "mine is not empty"),
         ("run quick --out mine/text", "mine/text is a file"),
-        ("run quick --out /proc/none/here", "/proc/none/here cannot be made: /proc is not a folder"),
+        (
+            "run quick --out /proc/none/here",
+            "cannot write /proc/none/here: No such file or directory",
+        ),
         ("acceptance ctrak", "unknown sensor 'ctrak'"),
         ("acceptance --renderer oil", "unknown renderer 'oil': valid are analytic"),
         ("acceptance --standard iso", "unknown standard 'iso': valid are all, e3064, e3124, vdi"),
         ("acceptance --limit-um nan", "positive number of um, got nan"),
         ("acceptance --volume 1x2", "volume '1x2' is neither"),
         ("acceptance --volume nan", "volume 'nan' is neither"),
-        ("acceptance --volume 3", "measuring volume 3000 x 3000 x 3000 mm is not wholly visible to both cameras"),
+        (
+            "acceptance --volume 3",
+            "measuring volume 3000 x 3000 x 3000 mm is not wholly visible to both cameras",
+        ),
         ("acceptance --volume 0.3 --standard e3124", "the body on its circle needs"),
         ("acceptance --renderer analytic --out mine", "mine is not empty"),
         ("detectors --tilt 85", "tilt 85 degrees"),
-        ("calibrate mine --out new", "missing RIGHT, --board FILE; cmmsim calibrate --help shows examples"),
+        (
+            "calibrate mine --out new",
+            "missing RIGHT, --board FILE; cmmsim calibrate --help shows examples",
+        ),
         ("calibrate none mine --board mine/board.toml", "no folder none"),
-        ("calibrate mine mine --board b --distortion fisheye", "'fisheye': valid are brown5, none, radial2"),
+        (
+            "calibrate mine mine --board b --distortion fisheye",
+            "'fisheye': valid are brown5, none, radial2",
+        ),
         ("calibrate mine mine --board b --sensor ctrack", "unknown sensor 'ctrack'"),
-        ("calibrate mine mine --board b --seed 0", "no random numbers without --render or --halves: leave out --seed"),
+        (
+            "calibrate mine mine --board b --seed 0",
+            "no random numbers without --render or --halves: leave out --seed",
+        ),
         ("calibrate mine mine --render 3", "leave out LEFT and RIGHT"),
-        ("calibrate --render 1 --min-images 7 --fix-aspect", "nothing: leave out --fix-aspect and --min-images"),
+        (
+            "calibrate --render 1 --min-images 7 --fix-aspect",
+            "nothing: leave out --fix-aspect and --min-images",
+        ),
         ("workspace --out mine", "mine is not empty"),
-        ("workspace --out mine/text/here", "mine/text/here cannot be made"),
-        ("verify-model --out /proc/impossible", "cannot be made"),
+        ("workspace --out mine/text/here", "cannot write mine/text/here: Not a directory"),
+        ("verify-model --out /proc/impossible", "cannot write /proc/impossible"),
         ("verify-model --out new", "pip install '.[mujoco]'"),
         ("verify-model nope", "unknown robot `nope`"),
-        ("export mjcf rss6", "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + "),
-        ("export mjcf rss6 --parameters ''", "'' is neither a parameter set of robot rss6 (identified, in"),
+        (
+            "export mjcf rss6",
+            "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + ",
+        ),
+        (
+            "export mjcf rss6 --parameters ''",
+            "'' is neither a parameter set of robot rss6 (identified, in",
+        ),
         ("export mjcf rss6 --allow-unphysical-inertia --out .", "cannot write ."),
         ("study no_such_study", "pixel_noise"),
     ],
 )
-def test_bad_input_is_one_line_before_any_work_and_leaves_nothing(calls, capfd, tmp_path, monkeypatch, words, evidence):
+def test_bad_input_is_one_line_before_any_work_and_leaves_nothing(
+    calls, capfd, tmp_path, monkeypatch, words, evidence
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    work = ("identify.verification.acceptance.do", "identify.verification.workspace_map.map_workspace")
-    for name in (*work, "cmmsim.detector_leaderboard.compete", "cmmsim.calibration.sightings.find_board"):
+    work = (
+        "identify.verification.acceptance.do",
+        "identify.verification.workspace_map.map_workspace",
+    )
+    for name in (
+        *work,
+        "cmmsim.detector_leaderboard.compete",
+        "cmmsim.calibration.sightings.find_board",
+    ):
         monkeypatch.setattr(name, lambda *_, **__: pytest.fail("has begun"))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "text").touch()
-    (tmp_path / "mine" / "board.toml").write_text('kind = "chessboard"\ncolumns = 7\nrows = 6\nspacing = 0.07\n')
+    (tmp_path / "mine" / "board.toml").write_text(
+        'kind = "chessboard"\ncolumns = 7\nrows = 6\nspacing = 0.07\n'
+    )
     assert command(*shlex.split(words), "--quiet") == 1
     assert evidence in one_line(capfd.readouterr().err)
     assert calls == []
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["board.toml", "mine", "text"]
 
 
-def test_known_errors_of_every_package_are_one_line_and_others_keep_their_traceback(capfd, monkeypatch, tmp_path):
+def test_known_errors_of_every_package_are_one_line_and_others_keep_their_traceback(
+    capfd, monkeypatch, tmp_path
+):
     def fail(*_):
         raise errors.pop(0)
 
-    errors = [RecordError("a\nb"), RobotFileError("a\nb"), OpenGLMissingError(ImportError("a\nb")), ZeroDivisionError()]
-    monkeypatch.setattr(command_line, "_pipeline", lambda: SimpleNamespace(run=fail))
+    errors = [
+        RecordError("a\nb"),
+        RobotFileError("a\nb"),
+        OpenGLMissingError(ImportError("a\nb")),
+        ZeroDivisionError(),
+    ]
+    monkeypatch.setattr(
+        command_line, "_pipeline", lambda: SimpleNamespace(run=fail, is_begun=lambda *_: False)
+    )
     words = ("run", "quick", "--out", tmp_path / "new", "--quiet")
     for _ in errors[:3]:
         assert command(*words) == 1
@@ -218,7 +292,10 @@ def test_a_terminal_shows_a_bar_and_a_file_one_plain_line_a_stage_that_did_not_f
     assert line.count("\n") == 1
     assert "\x1b" not in line
     assert shown(terminal=False, fail=True) == ""
-    assert [" rows/s" in shown(terminal, rate="rows/s") for terminal in (True, False)] == [True, True]
+    assert [" rows/s" in shown(terminal, rate="rows/s") for terminal in (True, False)] == [
+        True,
+        True,
+    ]
     assert "/s" not in bar + line
 
 
@@ -230,14 +307,23 @@ def test_a_long_stage_says_now_and_then_where_it_is_also_in_a_file(monkeypatch, 
 
 
 def test_words_stand_left_numbers_right_brackets_stay_and_the_first_column_is_never_broken(capsys):
-    rows = [("joint1.coulomb", "0.12", "fixed"), ("lp [a]", "-1234.5", "from the [red]prior[/red] :smile:")]
-    print_table(("parameter", "std [um]", "remark"), rows, ("parameter", "remark"), "of [x]", "std of [y]")
-    title, header, rule, first, second, note = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    rows = [
+        ("joint1.coulomb", "0.12", "fixed"),
+        ("lp [a]", "-1234.5", "from the [red]prior[/red] :smile:"),
+    ]
+    print_table(
+        ("parameter", "std [um]", "remark"), rows, ("parameter", "remark"), "of [x]", "std of [y]"
+    )
+    title, header, rule, first, second, note = [
+        line.rstrip() for line in capsys.readouterr().out.splitlines()
+    ]
     assert (title.strip(), note.strip(), set(rule)) == ("of [x]", "std of [y]", {"─"})
     assert header == "parameter      std [um] remark"
     assert first == "joint1.coulomb     0.12 fixed"
     assert second == "lp [a]          -1234.5 from the [red]prior[/red] :smile:"
-    print_table(("study", "what it asks"), [("n" * 30, "how long " * 20)], ("study", "what it asks"))
+    print_table(
+        ("study", "what it asks"), [("n" * 30, "how long " * 20)], ("study", "what it asks")
+    )
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].startswith("n" * 30 + " how long")
     assert max(map(len, lines)) <= 80

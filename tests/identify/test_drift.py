@@ -1,4 +1,6 @@
-"""Cameras that drift during an experiment: what the run's watch says reaches record, result and warnings."""
+"""Cameras that drift during an experiment: what the run's watch says reaches record, result and
+warnings.
+"""
 
 import pytest
 
@@ -46,7 +48,7 @@ def test_an_identification_begins_its_warnings_with_the_cameras():
     ("drift", "words"),
     [
         ({"right.centre": 0.1}, "a rig has no parameter 'right.centre'"),
-        ({"left.cy_px": 1e4}, "a drift of left.cy_px by 10000 takes sticker"),
+        ({"left.cy_px": 1e3}, "a drift of left.cy_px by 1000 takes sticker"),
     ],
 )
 def test_a_drift_that_no_run_can_have_is_refused_before_anything_is_taught(drift, words):

@@ -1,4 +1,6 @@
-"""Identification under drives of other laws than the paper's, and the choice between laws by a record's evidence."""
+"""Identification under drives of other laws than the paper's, and the choice between laws by a
+record's evidence.
+"""
 
 import os
 from concurrent.futures import ProcessPoolExecutor
@@ -44,7 +46,10 @@ def test_the_gains_of_a_named_law_are_within_their_intervals(law):
     result, true = identify(record, rss6(), scenario), build_plant(scenario, rss6()).parameters
     deviation = ((result.estimate - true) / result.std)[FRICTION_AND_PID]
     assert np.abs(deviation).max() < 3
-    said, absent = result.to_dict()["drive"], {"pd": ["joint_pid.li"], "pi": ["joint_pid.ld"]}.get(law, [])
+    said, absent = (
+        result.to_dict()["drive"],
+        {"pd": ["joint_pid.li"], "pi": ["joint_pid.ld"]}.get(law, []),
+    )
     assert (said["law"], said["decided_by"], said["fixed_at_zero"]) == (law, "scenario", absent)
     gains = LAYOUT.joint_pid
     assert result.identifiable[gains].tolist() == [name not in absent for name in NAMES[gains]]
@@ -57,7 +62,8 @@ def test_the_gains_of_a_named_law_are_within_their_intervals(law):
 
 @pytest.mark.slow
 def test_a_torque_limit_that_is_met_does_not_bias():
-    """Of plant and model: the run without it is another, and the gains are within their intervals."""
+    """Of plant and model: the run without it is another, and the gains are within their
+    intervals."""
     scenario = under("pid", **{"control.torque_limit_N_m": 3.38})
     record, run = run_plant(scenario, seed=1, duration_s=5.0)
     assert 0.005 < (np.abs(run.torque) == 3.38).mean() < 0.5
@@ -71,8 +77,14 @@ def test_a_torque_limit_that_is_met_does_not_bias():
 
 @pytest.mark.thorough
 def test_a_filter_is_seen_and_the_gains_beside_it_are_within_their_intervals():
-    """Among all laws, where its time constant is stated; without a filter in the plant none is seen."""
-    asked = {"model.drive": "auto", "model.derivative_filter_s": 0.01, "excitation.duration_s": 10.0}
+    """Among all laws, where its time constant is stated; without a filter in the plant none is
+    seen.
+    """
+    asked = {
+        "model.drive": "auto",
+        "model.derivative_filter_s": 0.01,
+        "excitation.duration_s": 10.0,
+    }
     scenario = quick(**asked, **{"plant.drive": "pid_filtered", "plant.derivative_filter_s": 0.01})
     record, _ = run_plant(scenario, seed=1)
     result, true = identify(record, rss6(), scenario), build_plant(scenario, rss6()).parameters
@@ -84,14 +96,22 @@ def test_a_filter_is_seen_and_the_gains_beside_it_are_within_their_intervals():
 
 
 def case(number):
-    """(law, choice) of a seeded case: law by turns, gains some 20 % about the usual ones, trajectory and noise."""
+    """(law, choice) of a seeded case: law by turns, gains some 20 % about the usual ones,
+    trajectory and noise.
+    """
     rng, law = np.random.default_rng([number, 17]), LAWS[number % len(LAWS)]
     usual = CASCADE if law == "cascade" else GAINS
     while True:
-        gains = {name: float(value * np.exp(0.2 * rng.standard_normal())) for name, value in usual.items()}
+        gains = {
+            name: float(value * np.exp(0.2 * rng.standard_normal()))
+            for name, value in usual.items()
+        }
         scenario = under(law, gains=gains, model="auto")
         plant = build_plant(scenario, rss6())
-        if stability.spectral_radius(rss6(), plant.parameters, plant.settings, rss6().home_pose) < 1:
+        if (
+            stability.spectral_radius(rss6(), plant.parameters, plant.settings, rss6().home_pose)
+            < 1
+        ):
             break
     record, _ = run_plant(scenario, seed=number, duration_s=5.0, trajectory_seed=100 + number)
 
@@ -113,7 +133,9 @@ def test_the_record_tells_the_law_of_the_drives():
 
 @pytest.mark.thorough
 def test_the_law_is_right_in_95_of_100_cases_or_said_to_be_unknown(record_property):
-    """And where it is sure it is as sure as it should be: the expected number of wrong ones is that of the figure."""
+    """And where it is sure it is as sure as it should be: the expected number of wrong ones is that
+    of the figure.
+    """
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         cases = list(pool.map(case, range(100)))
     wrong = [(law, choice) for law, choice in cases if choice.sure and choice.law != law]
@@ -127,8 +149,14 @@ def test_the_law_is_right_in_95_of_100_cases_or_said_to_be_unknown(record_proper
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"model.drive": "pdi"}, "model.drive = 'pdi'.*'pid', 'pd', 'pi', 'cascade', 'pid_filtered' or 'auto'"),
-        ({"plant.drive": "pid_filtered"}, "derivative_filter_s = None: the law pid_filtered needs it"),
+        (
+            {"model.drive": "pdi"},
+            "model.drive = 'pdi'.*'pid', 'pd', 'pi', 'cascade', 'pid_filtered' or 'auto'",
+        ),
+        (
+            {"plant.drive": "pid_filtered"},
+            "derivative_filter_s = None: the law pid_filtered needs it",
+        ),
         ({"model.derivative_filter_s": 0.01}, "drive = 'pid' with derivative_filter_s = 0.01"),
         (
             {"plant.drive": "pd", "plant.drive_gains": {"li": 3.0}},
@@ -154,16 +182,30 @@ def test_scenarios_know_the_laws_and_gains_that_the_drives_have():
 
 
 def test_the_report_says_how_the_law_is_known():
-    usual = {"law": "pid", "decided_by": "scenario", "sure": True, "probabilities": {"pid": 1.0}, "fixed_at_zero": []}
+    usual = {
+        "law": "pid",
+        "decided_by": "scenario",
+        "sure": True,
+        "probabilities": {"pid": 1.0},
+        "fixed_at_zero": [],
+    }
     assert drive_sentence({"drive": usual}) == drive_sentence({}) == ""
-    told = {"law": "pd", "decided_by": "record", "sure": False, "probabilities": {"pid": 0.3, "pd": 0.7, "pi": 0.0}}
+    told = {
+        "law": "pd",
+        "decided_by": "record",
+        "sure": False,
+        "probabilities": {"pid": 0.3, "pd": 0.7, "pi": 0.0},
+    }
     said = drive_sentence({"drive": usual | told})
     assert said == (
-        "The law of the drives is a PD: no integral; the record cannot tell: this is the most probable (probability "
+        "The law of the drives is a PD: no integral; the record cannot tell: this is the most "
+        "probable (probability "
         "70 %; pid 30 %)."
     )
     left = {"joint_pid.li": {"identifiable": False}, "joint_pid.lp": {"identifiable": True}}
-    reasons = unidentified({"parameters": left, "drive": told | {"fixed_at_zero": ["joint_pid.li"]}})
+    reasons = unidentified(
+        {"parameters": left, "drive": told | {"fixed_at_zero": ["joint_pid.li"]}}
+    )
     assert reasons == [("the law of the drives has no such gain", ["joint_pid.li"])]
 
 
@@ -171,5 +213,8 @@ def test_a_record_of_which_no_law_gives_a_model_is_refused_with_the_reasons():
     def problem_of(named):
         raise EstimationError(f"nothing under {named.model.drive}")
 
-    with pytest.raises(EstimationError, match="no law of the drives gives a model that runs: pid: nothing under pid; "):
+    with pytest.raises(
+        EstimationError,
+        match="no law of the drives gives a model that runs: pid: nothing under pid; ",
+    ):
         choose_drive(problem_of, quick(**{"model.drive": "auto"}), SilentProgress())

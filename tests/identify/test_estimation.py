@@ -1,11 +1,17 @@
-"""The estimator against known truth, on records with drawn noise (images are in test_experiment)."""
+"""The estimator against known truth, on records with drawn noise (images are in
+test_experiment)."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dynamics.closed_loop import LoopFailure, equilibrium, simulate
+from dynamics.closed_loop import (
+    LoopFailure,
+    differentiate_servo,
+    equilibrium,
+    simulate_servo,
+)
 from dynamics.closed_loop.drives import joint_law
 from dynamics.errors import ParameterError
 from identify.errors import EstimationError
@@ -17,9 +23,9 @@ from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import joint_balance
 from identify.experiment.plant import build_plant, drawn_load
 from identify.loop_parameters import choose_parameters, model_settings
+from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
 from identify.record.payload import store_payload
-from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import prediction_entry
 from identify.scenario import load_scenario
 from identify.validation.unseen import PosePrediction, predict_poses, predicted_runs
@@ -41,8 +47,8 @@ def record(scenario):
 
 @pytest.fixture(scope="module")
 def ensemble():
-    """Results of eight experiments that differ by noise, weighing and starting guess, which errs by as much as it says,
-    30 % of each parameter; the last loses frames."""
+    """Results of eight experiments that differ by noise, weighing and starting guess, which errs by
+    as much as it says, 30 % of each parameter; the last loses frames."""
     found = []
     for seed in range(8):
         rng = np.random.default_rng([seed, 1])
@@ -59,7 +65,9 @@ def ensemble():
 def assert_near_the_truth(result, limit):
     """Friction and gains are within so many standard deviations of theirs; returns these shares."""
     deviation = ((result.estimate - truth()) / result.std)[FRICTION_AND_PID]
-    assert np.all(np.abs(deviation) < limit), dict(zip(np.array(NAMES)[FRICTION_AND_PID], deviation, strict=True))
+    assert np.all(np.abs(deviation) < limit), dict(
+        zip(np.array(NAMES)[FRICTION_AND_PID], deviation, strict=True)
+    )
     return deviation
 
 
@@ -73,27 +81,38 @@ def unseen_error(scenario, parameters, seed=7):
 @pytest.mark.parametrize("jitter", [False, True])
 @pytest.mark.parametrize("hold", ["zero", "linear"])
 def test_warm_start_equation_holds_for_the_true_parameters(scenario, hold, jitter):
-    """Without dry friction the regression times the truth vanishes against the torques in it, also where each command
-    has a latency of its own."""
-    parameters, scenario = truth(), scenario.with_overrides({"timing.hold": hold, "timing.latency_s": 1 / 60})
+    """Without dry friction the regression times the truth vanishes against the torques in it, also
+    where each command has a latency of its own."""
+    parameters, scenario = (
+        truth(),
+        scenario.with_overrides({"timing.hold": hold, "timing.latency_s": 1 / 60}),
+    )
     parameters[52:58] = 0
     latencies = np.random.default_rng(1).uniform(0.0, 2.0, 600) / 60 if jitter else None
     _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters, latency_s=latencies)
     law = joint_law("pid", parameters[64:])
     columns, slipping = joint_balance(rss6(), run.pose, run.command, scenario, law, latencies)
     columns = columns[slipping]
-    start = equilibrium(rss6(), parameters, run.pose[0], build_plant(scenario, rss6()).settings.servo)
+    start = equilibrium(
+        rss6(), parameters, run.pose[0], build_plant(scenario, rss6()).settings.servo
+    )
     unknowns = np.concatenate([parameters, start.joint_integral * parameters[65]])
     balance = columns @ unknowns
     limit = 3e-3 if jitter else 1e-3
-    assert np.sqrt(np.mean(balance**2)) < limit * np.sqrt(np.mean((columns[:, 64:67] @ parameters[64:]) ** 2))
+    assert np.sqrt(np.mean(balance**2)) < limit * np.sqrt(
+        np.mean((columns[:, 64:67] @ parameters[64:]) ** 2)
+    )
 
 
 @pytest.mark.slow
-def test_intervals_cover_as_often_as_they_say_and_friction_and_gains_are_found_without_bias(ensemble):
-    """Each within what its standard deviation says, and their mean over all experiments within that of a mean.
+def test_intervals_cover_as_often_as_they_say_and_friction_and_gains_are_found_without_bias(
+    ensemble,
+):
+    """Each within what its standard deviation says, and their mean over all experiments within that
+    of a mean.
 
-    Residuals are the sensor's noise, and what the servo made of it: as the repeated experiments predict.
+    Residuals are the sensor's noise, and what the servo made of it: as the repeated experiments
+    predict.
     """
     check_coverage([row_of(number, result, truth()) for number, result in enumerate(ensemble)])
     errors = [assert_near_the_truth(result, 4) for result in ensemble]
@@ -108,27 +127,35 @@ def test_intervals_cover_as_often_as_they_say_and_friction_and_gains_are_found_w
 
 @pytest.mark.slow
 def test_the_error_on_unseen_motions_is_the_one_predicted(scenario, ensemble):
-    """To micrometres, also where frames were lost; its square in units of what was predicted is one on average. With
-    exactly known parameters the plant strays by what the servo lets through of the noise alone."""
+    """To micrometres, also where frames were lost; its square in units of what was predicted is one
+    on average. With exactly known parameters the plant strays by what the servo lets through of the
+    noise alone."""
     ratios, exact = [], []
     for unseen in range(12):
         result, rng = ensemble[unseen // 2], np.random.default_rng(unseen)
-        record, plant = run_plant(scenario, seed=100 + unseen, trajectory_seed=50 + unseen, duration_s=5.0)
-        run = recorded_run(record, rss6(), scenario)
-        for found, model in ((ratios, (result.estimate, result.covariance)), (exact, (truth(), np.zeros((67, 67))))):
+        record, plant = run_plant(
+            scenario, seed=100 + unseen, trajectory_seed=50 + unseen, duration_s=5.0
+        )
+        run = identified_model(record, rss6(), scenario)
+        for found, model in (
+            (ratios, (result.estimate, result.covariance)),
+            (exact, (truth(), np.zeros((67, 67)))),
+        ):
             found.append(predict_poses(run, *model, rng).normalised_squared_error(plant.pose))
     assert 0.8 < np.mean(ratios) < 1.2, ratios
     assert np.mean(exact) == pytest.approx(1.0, abs=0.1), exact
     for experiment, limits in ((1, [3e-6, 15e-6]), (7, [5e-6, 25e-6])):
-        assert np.all(unseen_error(scenario, ensemble[experiment].estimate) < np.repeat(limits, 3)), experiment
+        assert np.all(
+            unseen_error(scenario, ensemble[experiment].estimate) < np.repeat(limits, 3)
+        ), experiment
 
 
 def test_a_prediction_keeps_the_models_slopes_where_no_frame_was_lost(scenario):
     """Found by the parameters that stand for all, they are those by all."""
     record, _ = run_plant(scenario, seed=3, trajectory_seed=4, duration_s=3.0)
-    run, rng = recorded_run(record, rss6(), scenario), np.random.default_rng(0)
+    run, rng = identified_model(record, rss6(), scenario), np.random.default_rng(0)
     whole, few = (np.arange(len(run.ok)) != lost for lost in (-1, 20))
-    alone = simulate(rss6(), truth(), run.reference, run.settings, sensitivities=True)
+    alone = differentiate_servo(rss6(), truth(), run.reference, run.settings)
     for groups in (None, structure(rss6()).rigid_groups):
         one = replace(run, ok=whole, groups=groups)
         found = predict_poses(one, truth(), np.zeros((67, 67)), rng)
@@ -139,9 +166,12 @@ def test_a_prediction_keeps_the_models_slopes_where_no_frame_was_lost(scenario):
 
 
 @pytest.mark.slow
-def test_groups_are_known_where_their_members_are_not_and_the_common_factor_ties_gains_together(ensemble):
-    """The intervals of the identified groups hold the truth, and there are more of them than of lone parameters. Crank
-    Ixx, Iyy and link Izz do no work (design of the robot), so no record can tell them."""
+def test_groups_are_known_where_their_members_are_not_and_the_common_factor_ties_gains_together(
+    ensemble,
+):
+    """The intervals of the identified groups hold the truth, and there are more of them than of
+    lone parameters. Crank Ixx, Iyy and link Izz do no work (design of the robot), so no record can
+    tell them."""
     result = ensemble[1]
     groups = result.groups
     true, known = groups.combinations @ truth()[:64], groups.identifiable
@@ -153,19 +183,39 @@ def test_groups_are_known_where_their_members_are_not_and_the_common_factor_ties
     for index in map(NAMES.index, ("crank1.Ixx", "crank4.Iyy", "link2.Izz")):
         assert not result.identifiable[index]
         assert result.estimate[index] == pytest.approx(result.initial[index], rel=1e-6)
-    # What a weighed platform leaves of the common factor is larger than what is left of the ratio of two gains.
-    assert correlation_matrix(result.covariance)[NAMES.index("joint_pid.lp"), NAMES.index("joint_pid.li")] > 0.99
+    # What a weighed platform leaves of the common factor is larger than what is left of the ratio
+    # of two gains.
+    assert (
+        correlation_matrix(result.covariance)[
+            NAMES.index("joint_pid.lp"), NAMES.index("joint_pid.li")
+        ]
+        > 0.99
+    )
 
 
 @pytest.mark.slow
 def test_a_result_shows_itself_in_a_line_as_a_table_and_as_a_file_of_parameters(ensemble, tmp_path):
     result = ensemble[1]
-    assert repr(result).startswith(f"<IdentificationResult: {result.identifiable.sum()} of 67 parameters and ")
+    assert repr(result).startswith(
+        f"<IdentificationResult: {result.identifiable.sum()} of 67 parameters and "
+    )
     assert repr(result).endswith(", 0 warnings>")
     frame = result.to_dataframe()
-    assert list(frame.columns) == ["unit", "initial", "estimate", "std", "low", "high", "identifiable"]
+    assert list(frame.columns) == [
+        "unit",
+        "initial",
+        "estimate",
+        "std",
+        "low",
+        "high",
+        "identifiable",
+    ]
     assert (len(frame), frame.index.name) == (67, "parameter")
-    assert frame.loc["joint_pid.lp", "low"] < frame.loc["joint_pid.lp", "estimate"] < frame.loc["joint_pid.lp", "high"]
+    assert (
+        frame.loc["joint_pid.lp", "low"]
+        < frame.loc["joint_pid.lp", "estimate"]
+        < frame.loc["joint_pid.lp", "high"]
+    )
     result.save(tmp_path / "mine.json")
     read = choose_parameters(rss6(), str(tmp_path / "mine.json"))
     np.testing.assert_array_equal(read.values, result.estimate[:64])
@@ -173,7 +223,9 @@ def test_a_result_shows_itself_in_a_line_as_a_table_and_as_a_file_of_parameters(
 
 @pytest.mark.slow
 def test_a_record_that_hardly_moves_is_called_poorly_conditioned(scenario, ensemble):
-    """A motion of 1 mm and 4 mrad leaves too little beside the sensor's noise; the scenario's motion does not warn."""
+    """A motion of 1 mm and 4 mrad leaves too little beside the sensor's noise; the scenario's
+    motion does not warn.
+    """
     plain = ensemble[0]
     assert plain.conditioning.poses_alone < POOR
     few = scenario.with_overrides({"identification.max_iterations": 5})
@@ -186,7 +238,9 @@ def test_a_record_that_hardly_moves_is_called_poorly_conditioned(scenario, ensem
 
 @pytest.fixture(scope="module")
 def driven(record):
-    """The scenario with a search by the logged commands, which is quicker, and what it finds in the record."""
+    """The scenario with a search by the logged commands, which is quicker, and what it finds in the
+    record.
+    """
     scenario = quick(**{"identification.method": "command_driven"})
     return scenario, identify(record, rss6(), scenario)
 
@@ -196,7 +250,8 @@ def test_the_command_driven_model_explains_the_noise_fully_and_scales_with_the_a
     record, driven
 ):
     """It follows what the servo made of the noise. Poses leave a common factor free: an anchor 10 %
-    higher gives all friction and gains 10 % higher. Truth may not leak: another plant changes nothing."""
+    higher gives all friction and gains 10 % higher. Truth may not leak: another plant changes
+    nothing."""
     scenario, one = driven
     assert abs(one.noise_ratio - 1) < 5 * np.sqrt(2 / (6 * 600))
     assert_near_the_truth(one, 3.5)
@@ -209,7 +264,9 @@ def test_the_command_driven_model_explains_the_noise_fully_and_scales_with_the_a
 
 @pytest.mark.slow
 def test_two_records_tell_more_than_one(record, driven):
-    """Another run of the same length adds its information: halved variance where both show a parameter equally."""
+    """Another run of the same length adds its information: halved variance where both show a
+    parameter equally.
+    """
     scenario, one = driven
     both = identify([record, run_plant(scenario, seed=2, trajectory_seed=2)[0]], rss6(), scenario)
     viscous = [i for i, name in enumerate(NAMES) if name.endswith(".viscous")]
@@ -231,8 +288,8 @@ def test_the_model_is_the_closed_loop_itself_and_the_gradient_of_the_whole_cost_
     scenario, record
 ):
     """Of poses, starting guess and anchor together, off the optimum."""
-    run = recorded_run(record, rss6(), scenario)
-    loop = simulate(rss6(), truth(), run.reference, model_settings(rss6(), scenario))
+    run = identified_model(record, rss6(), scenario)
+    loop = simulate_servo(rss6(), truth(), run.reference, model_settings(rss6(), scenario))
     assert np.array_equal(run.model_poses(truth()), loop.pose)
     whole = output_error_problem([record], rss6(), scenario)
     at = 1.01 * truth()
@@ -247,13 +304,22 @@ def test_the_model_is_the_closed_loop_itself_and_the_gradient_of_the_whole_cost_
 
 def test_a_long_loss_is_flagged(scenario):
     record, _ = run_plant(scenario, seed=1, lost=range(200, 245))
-    assert "45 frames in a row were lost from t = 3.33 s" in recorded_run(record, rss6(), scenario).warnings()[0]
-    assert recorded_run(run_plant(scenario, seed=1, lost=[7, 9])[0], rss6(), scenario).warnings() == ()
+    assert (
+        "45 frames in a row were lost from t = 3.33 s"
+        in identified_model(record, rss6(), scenario).warnings()[0]
+    )
+    assert (
+        identified_model(run_plant(scenario, seed=1, lost=[7, 9])[0], rss6(), scenario).warnings()
+        == ()
+    )
 
 
 def loaded(scenario, seed):
     """A record of the bare robot, and one with the scenario's known load on the platform."""
-    load, duration = drawn_load(LAYOUT, scenario, np.random.default_rng(0)).stated, scenario.excitation.duration_s
+    load, duration = (
+        drawn_load(LAYOUT, scenario, np.random.default_rng(0)).stated,
+        scenario.excitation.duration_s,
+    )
     bare, _ = run_plant(scenario, seed=seed, duration_s=duration)
     heavy, _ = run_plant(scenario, seed=seed + 1000, parameters=truth() + load, duration_s=duration)
     for record in (bare, heavy):
@@ -273,7 +339,8 @@ def test_a_known_payload_shows_the_scale(scenario):
 
 @pytest.mark.thorough
 def test_the_payload_recovers_the_scale_of_the_papers_experiment():
-    """The common factor of all parameters, exactly known load: within 0.5 % (design: to <= 0.5 %)."""
+    """The common factor of all parameters, exactly known load: within 0.5 % (design: to <=
+    0.5 %)."""
     paper = load_scenario("paper").with_overrides({"identification.scale_anchor": "payload"})
     scales = []
     for seed in (1, 2):
@@ -296,22 +363,29 @@ def test_normalised_squared_error_is_one_for_errors_of_the_stated_covariance():
     errors = rng.normal(size=(4000, 6)) @ root.T
     chart, covariance = rss6().geometry.chart, np.broadcast_to(root @ root.T, (4000, 6, 6))
     prediction = PosePrediction(chart, np.zeros((4000, 6)), covariance)
-    assert prediction.normalised_squared_error(errors) == pytest.approx(1.0, abs=5 * np.sqrt(2 / 24000))
+    assert prediction.normalised_squared_error(errors) == pytest.approx(
+        1.0, abs=5 * np.sqrt(2 / 24000)
+    )
     assert prediction.normalised_squared_error(2 * errors) == pytest.approx(4.0, rel=0.05)
     np.testing.assert_allclose(prediction.std[7], np.sqrt(np.diag(root @ root.T)))
 
 
 def test_where_nothing_can_be_predicted_nothing_is_said():
-    """Too many frames lost to know the sensor's noise; and a model whose loop is unstable: the starting guess, which
-    has no friction, at 29 Hz with a frame of latency."""
+    """Too many frames lost to know the sensor's noise; and a model whose loop is unstable: the
+    starting guess, which has no friction, at 29 Hz with a frame of latency."""
     slow = quick(sensor="ctrack780_29hz")
     unstable, known = rss6().parameter_sets["initial"].vector, np.zeros((67, 67))
     dark, plant = run_plant(quick(), 0, duration_s=2.0, lost=range(80))
     good, plant_29hz = run_plant(slow, 0, duration_s=8.0)
     with pytest.raises(LoopFailure, match="the loop is unstable"):
-        recorded_run(good, rss6(), slow).model_poses(unstable)
-    for scenario, record, parameters, true in ((quick(), dark, truth(), plant), (slow, good, unstable, plant_29hz)):
-        (prediction,) = predicted_runs(rss6(), scenario, [record], parameters, known, 0, SilentProgress())
+        identified_model(good, rss6(), slow).model_poses(unstable)
+    for scenario, record, parameters, true in (
+        (quick(), dark, truth(), plant),
+        (slow, good, unstable, plant_29hz),
+    ):
+        (prediction,) = predicted_runs(
+            rss6(), scenario, [record], parameters, known, 0, SilentProgress()
+        )
         assert prediction.std.shape == (record.sizes["time"], 6)
         assert np.isnan(prediction.std).all()
         figures = prediction_entry(prediction, truth_of(true))["predicted"]
@@ -319,12 +393,14 @@ def test_where_nothing_can_be_predicted_nothing_is_said():
 
 
 def test_a_motion_too_short_to_identify_from_can_be_predicted_and_what_cannot_be_asked_is_an_error():
-    """With exactly known parameters what remains is what the servo lets through of the sensor's noise. Another servo or
-    parameters of no model are errors, as everywhere else."""
+    """With exactly known parameters what remains is what the servo lets through of the sensor's
+    noise. Another servo or parameters of no model are errors, as everywhere else."""
     record, plant = run_plant(quick(), 0, duration_s=0.5)
 
     def predicted(record, parameters, **scenario):
-        return predicted_runs(rss6(), quick(**scenario), [record], parameters, np.zeros((67, 67)), 0, SilentProgress())
+        return predicted_runs(
+            rss6(), quick(**scenario), [record], parameters, np.zeros((67, 67)), 0, SilentProgress()
+        )
 
     (prediction,) = predicted(record, truth())
     np.testing.assert_allclose(prediction.poses[0], plant.pose[0])

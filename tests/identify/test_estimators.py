@@ -1,5 +1,5 @@
-"""Estimators of torque and angle against known truth and closed forms; the comparison of all of them: its examination,
-the table's rows, who wins, and the command `cmmsim estimators`."""
+"""Estimators of torque and angle against known truth and closed forms; the comparison of all of
+them: its examination, the table's rows, who wins, and the command `cmmsim estimators`."""
 
 import json
 from dataclasses import replace
@@ -9,8 +9,19 @@ import pytest
 from scipy.optimize import nnls
 
 from identify.errors import EstimationError, RecordError, ScenarioError
-from identify.estimators.errors_in_variables import instrumental_variables, iv_fit, total_least_squares, truncated_tls
-from identify.estimators.estimator import Estimate, Estimator, Evidence, find_estimators, joint_channels
+from identify.estimators.errors_in_variables import (
+    instrumental_variables,
+    iv_fit,
+    total_least_squares,
+    truncated_tls,
+)
+from identify.estimators.estimator import (
+    Estimate,
+    Estimator,
+    Evidence,
+    find_estimators,
+    joint_channels,
+)
 from identify.estimators.least_squares import (
     TorqueEquations,
     encoder_route,
@@ -21,11 +32,16 @@ from identify.estimators.least_squares import (
     weighted_least_squares,
 )
 from identify.estimators.output_error import known_pid
-from identify.experiment.joint_instruments import JointInstruments, frame_mean, measure_joints, read_channels
+from identify.experiment.joint_instruments import (
+    JointInstruments,
+    frame_mean,
+    measure_joints,
+    read_channels,
+)
 from identify.files.dataset import write_groups
+from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
 from identify.record import recording
-from identify.record.recorded_run import recorded_run
 from identify.validation.estimator_comparison import START, compare, estimators_figure, examination
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import (
@@ -60,8 +76,8 @@ def score(seen, asked, parameters):
 
 
 def test_distances_are_relative_and_of_what_the_record_shows(seen, asked):
-    """3 % on everything is 3 % of every combination, and what no motion shows does not count. Plant and model integrate
-    with other steps: that is all that the true parameters leave."""
+    """3 % on everything is 3 % of every combination, and what no motion shows does not count. Plant
+    and model integrate with other steps: that is all that the true parameters leave."""
     exact = score(seen, asked, truth())
     assert exact.group_distance == exact.gain_distance == 0
     assert exact.position_um < 0.05
@@ -90,7 +106,9 @@ def test_an_estimator_that_fails_has_its_reason_in_the_table(seen, asked):
 
 
 def test_a_model_that_does_not_run_and_parameters_of_none_have_no_pose_distance(seen, asked):
-    """A regression may end at a gain of zero, where it is bounded: its row stands without this distance."""
+    """A regression may end at a gain of zero, where it is bounded: its row stands without this
+    distance.
+    """
     wild, stopped = truth().copy(), truth().copy()
     wild[64:] *= 1e4
     stopped[65] = 0.0
@@ -109,8 +127,12 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_command_prints_and_writes_its_table_with_an_estimator_of_ones_own(folder, capsys, tmp_path, monkeypatch):
-    """A function of the evidence in a module of the user's, given by its name alone, has a row beside the others."""
+def test_the_command_prints_and_writes_its_table_with_an_estimator_of_ones_own(
+    folder, capsys, tmp_path, monkeypatch
+):
+    """A function of the evidence in a module of the user's, given by its name alone, has a row
+    beside the others.
+    """
     (tmp_path / "mine.py").write_text(
         "from identify.estimators.estimator import Estimate\n"
         "def believer(evidence):\n"
@@ -126,18 +148,39 @@ def test_the_command_prints_and_writes_its_table_with_an_estimator_of_ones_own(f
     assert "mine:believer: as I said" in shown
     rows = json.loads((folder / "estimators.json").read_text(encoding="utf-8"))["estimators"]
     assert list(rows) == ["starting guess", "warm_start", "encoders", "mine:believer"]
-    assert rows["encoders"]["parameters"]["joint_pid.lp"]["estimate"] == pytest.approx(truth()[64], rel=0.05)
+    assert rows["encoders"]["parameters"]["joint_pid.lp"]["estimate"] == pytest.approx(
+        truth()[64], rel=0.05
+    )
     assert 0 < rows["encoders"]["position_um"] < rows["mine:believer"]["position_um"]
     assert rows["mine:believer"]["position_um"] == rows["starting guess"]["position_um"]
     assert (folder / "figures" / "estimators.png").read_bytes()[:4] == b"\x89PNG"
     channels = read_channels(folder / "instruments.nc")
     assert channels.attrs["torque_noise_N_m"] == 0.1
-    assert command("estimators", "--out", folder, *chosen[:2], "--quiet", "--seed", 6, "--torque-noise", 0.1) == 0
-    assert not read_channels(folder / "instruments.nc").equals(channels), "another seed, other instruments"
+    assert (
+        command(
+            "estimators",
+            "--out",
+            folder,
+            *chosen[:2],
+            "--quiet",
+            "--seed",
+            6,
+            "--torque-noise",
+            0.1,
+        )
+        == 0
+    )
+    assert not read_channels(folder / "instruments.nc").equals(channels), (
+        "another seed, other instruments"
+    )
 
 
-def test_what_is_missing_or_unknown_is_said_before_anything_is_written(folder, seen, tmp_path, capsys):
-    with pytest.raises(ScenarioError, match="unknown estimator 'best'; valid: closed_loop, command_driven"):
+def test_what_is_missing_or_unknown_is_said_before_anything_is_written(
+    folder, seen, tmp_path, capsys
+):
+    with pytest.raises(
+        ScenarioError, match="unknown estimator 'best'; valid: closed_loop, command_driven"
+    ):
         find_estimators(["warm_start", "best"])
     assert list(find_estimators(["torque_ls", "closed_loop"])) == ["closed_loop", "torque_ls"]
     with pytest.raises(EstimationError, match="no unseen trajectory"):
@@ -147,7 +190,7 @@ def test_what_is_missing_or_unknown_is_said_before_anything_is_written(folder, s
     for arguments, says in (
         (("--out", tmp_path / "none"), "no run folder"),
         (("--out", tmp_path), "cmmsim validate"),
-        (("--out", folder, "--add", "magic:wand"), "'magic:wand' is no importable module:function"),
+        (("--out", folder, "--add", "magic:wand"), "'magic:wand' is no importable module:name"),
     ):
         assert command("estimators", *arguments) == 1
         assert says in one_line(capsys.readouterr().err)
@@ -164,18 +207,28 @@ def test_known_gains_stay_and_anchor_the_rest(seen):
 
 @pytest.mark.slow
 def test_output_error_beats_the_linear_estimators_on_unseen_poses(seen, asked):
-    """All nine on one record: what is fitted in the loop's own output predicts it best, at the price of time."""
+    """All nine on one record: what is fitted in the loop's own output predicts it best, at the
+    price of time.
+    """
     rows = {row.name: row for row in compare(seen, asked, find_estimators(), SilentProgress())}
-    assert all(np.isfinite(row.position_um) for row in rows.values()), {n: row.note for n, row in rows.items()}
+    assert all(np.isfinite(row.position_um) for row in rows.values()), {
+        n: row.note for n, row in rows.items()
+    }
     best = rows["command_driven"]
-    linear = [name for name in find_estimators() if name not in ("closed_loop", "command_driven", "known_pid")]
+    linear = [
+        name
+        for name in find_estimators()
+        if name not in ("closed_loop", "command_driven", "known_pid")
+    ]
     assert len(linear) == 6
     for name in linear:
         assert best.position_um < rows[name].position_um / 2, name
         assert best.orientation_urad < rows[name].orientation_urad / 2, name
         assert best.group_distance < rows[name].group_distance * 1.2, name
     assert best.evaluations > rows["torque_iv"].evaluations > rows["torque_wls"].evaluations == 0
-    assert all(row.position_um < rows[START].position_um / 5 for name, row in rows.items() if name != START)
+    assert all(
+        row.position_um < rows[START].position_um / 5 for name, row in rows.items() if name != START
+    )
 
 
 LD = NAMES.index("joint_pid.ld")
@@ -186,7 +239,9 @@ def short():
     record, run = run_plant(quick(), 0, duration_s=2.0)
 
     def measured(instruments, seed=0):
-        return measure_joints(record, truth_of(run), quick().timing, instruments, np.random.default_rng(seed))
+        return measure_joints(
+            record, truth_of(run), quick().timing, instruments, np.random.default_rng(seed)
+        )
 
     return record, run, measured
 
@@ -197,16 +252,27 @@ def short():
     ids=["paper", "one frame late", "quarter frame late", "ramped"],
 )
 def test_the_mean_torque_of_a_frame_is_that_of_the_motion(timing):
-    """The true parameters explain the mean torque of the smooth motion; single samples sit on the sawtooth's tooth."""
+    """The true parameters explain the mean torque of the smooth motion; single samples sit on the
+    sawtooth's tooth.
+    """
     scenario = quick(**timing)
     record, run = run_plant(scenario, 0, np.zeros(6), duration_s=5.0)
-    problem = recorded_run(record, rss6(), scenario)
+    problem = identified_model(record, rss6(), scenario)
     latencies = np.full(len(run.torque), scenario.timing.latency_s)
-    mean = frame_mean(run.torque, run.command, run.start.commands[-1], truth()[[64, 66]], scenario.timing, latencies)
+    mean = frame_mean(
+        run.torque,
+        run.command,
+        run.start.commands[-1],
+        truth()[[64, 66]],
+        scenario.timing,
+        latencies,
+    )
 
     def left(torque):
         equations = torque_equations(problem, run.pose, torque, scenario)
-        return np.sqrt(np.mean(equations.residual(np.append(truth(), np.zeros(6)))[equations.kind < 6] ** 2))
+        return np.sqrt(
+            np.mean(equations.residual(np.append(truth(), np.zeros(6)))[equations.kind < 6] ** 2)
+        )
 
     assert left(mean) < 1.5e-3
     assert left(run.torque) > 3 * left(mean) or timing.get("timing.hold") == "linear"
@@ -227,13 +293,15 @@ def test_jumps_are_averaged_whenever_they_come():
     samples = np.array([torque(k) for k in range(50)])[:, None] * np.ones((1, 6))
     fine = (np.arange(2000) + 0.5) / 2000 - 0.5
     mean = np.array([np.mean([torque(k + s) for s in fine]) for k in range(2, 48)])
-    found = frame_mean(samples, command, np.zeros(6), np.array([2.0, 0.0]), quick().timing, latencies)
+    found = frame_mean(
+        samples, command, np.zeros(6), np.array([2.0, 0.0]), quick().timing, latencies
+    )
     assert np.abs(found[2:48, 0] - mean).max() < 5e-3
 
 
 def test_instruments_remove_the_attenuation_of_errors_in_variables():
-    """Equations W x = tau whose columns have errors beside a signal of 1. Closed form: least squares shrinks every
-    unknown by 1 / (1 + error^2); its instruments bring it back."""
+    """Equations W x = tau whose columns have errors beside a signal of 1. Closed form: least
+    squares shrinks every unknown by 1 / (1 + error^2); its instruments bring it back."""
     rng, n, error = np.random.default_rng(0), 1500, 0.5
     unknowns = np.concatenate([np.linspace(1, 2, len(NAMES)), np.zeros(6)])
     clean = np.zeros((2 * n, len(unknowns)))
@@ -252,7 +320,8 @@ def test_instruments_remove_the_attenuation_of_errors_in_variables():
 
 
 def test_truncated_tls_is_the_textbooks_where_all_errors_are_alike_and_leaves_a_direction_that_nothing_shows():
-    """Equal, independent errors of all columns: the last right singular vector of (matrix | right)."""
+    """Equal, independent errors of all columns: the last right singular vector of (matrix |
+    right)."""
     rng = np.random.default_rng(1)
     clean = 50 * rng.standard_normal((400, 4))
     truth_ = np.array([1.0, -2.0, 0.5, 3.0])
@@ -292,12 +361,21 @@ def test_the_nearest_admissible_unknowns_have_no_negative_parameter():
 
 
 def test_total_least_squares_and_the_encoder_route_agree_with_least_squares_where_noise_is_small():
-    """On a clean record all routes of the inverse dynamics tell the same gains, within 1 %, and Coulomb friction; no
-    anchor is told: the torque carries the scale. Angles that no pose has tell none."""
+    """On a clean record all routes of the inverse dynamics tell the same gains, within 1 %, and
+    Coulomb friction; no anchor is told: the torque carries the scale. Angles that no pose has tell
+    none."""
     seen = evidence(1, noise=0.05, instruments=JointInstruments(1e-3, 0.0, 0.0))
-    for route in (weighted_least_squares, total_least_squares, instrumental_variables, encoder_route):
+    for route in (
+        weighted_least_squares,
+        total_least_squares,
+        instrumental_variables,
+        encoder_route,
+    ):
         estimate = route(seen)
-        assert np.allclose(estimate.parameters[64:], truth()[64:], rtol=0.01), (route, estimate.parameters[64:])
+        assert np.allclose(estimate.parameters[64:], truth()[64:], rtol=0.01), (
+            route,
+            estimate.parameters[64:],
+        )
         assert np.all(estimate.std > 0)
     coulomb = weighted_least_squares(seen).parameters[52:58]
     assert np.allclose(coulomb, truth()[52:58], rtol=0.02), coulomb
@@ -308,7 +386,7 @@ def test_total_least_squares_and_the_encoder_route_agree_with_least_squares_wher
 
 def test_encoders_give_the_true_poses_but_for_rounding_and_the_channels_are_seeded(short):
     record, run, measured = short
-    reference = recorded_run(record, rss6(), quick()).reference.poses
+    reference = identified_model(record, rss6(), quick()).reference.poses
     poses = rss6().forward_kinematics(measured(PERFECT)["joint_angle"].values, reference)
     assert np.abs(poses - run.pose).max() < 1e-10
     one, same, other = (measured(JointInstruments(0.05, 1e-4, 1e-3), seed) for seed in (1, 1, 2))
@@ -342,11 +420,17 @@ def test_channels_survive_the_file_and_bad_ones_are_named(short, tmp_path):
 
 @pytest.mark.slow
 def test_the_bias_of_least_squares_over_repeated_experiments():
-    """Mean of eight records at 40 um: what the inertia and ld lose by least squares is many standard errors of the
-    mean, and several times what the instrumental variables lose, whose stated deviations of the gains hold."""
+    """Mean of eight records at 40 um: what the inertia and ld lose by least squares is many
+    standard errors of the mean, and several times what the instrumental variables lose, whose
+    stated deviations of the gains hold."""
     runs = [evidence(seed, 8.0, JointInstruments(torque_noise=0.005)) for seed in range(8)]
-    found = {estimate: [estimate(seen) for seen in runs] for estimate in (least_squares, instrumental_variables)}
-    values = {estimate: np.array([one.parameters for one in all_]) for estimate, all_ in found.items()}
+    found = {
+        estimate: [estimate(seen) for seen in runs]
+        for estimate in (least_squares, instrumental_variables)
+    }
+    values = {
+        estimate: np.array([one.parameters for one in all_]) for estimate, all_ in found.items()
+    }
     for index in (LD, NAMES.index("platform.Izz")):
         bias = {name: x[:, index].mean() / truth()[index] - 1 for name, x in values.items()}
         error = values[least_squares][:, index].std(ddof=1) / np.sqrt(8) / truth()[index]

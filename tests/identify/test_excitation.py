@@ -1,5 +1,8 @@
-"""The trajectories of a run: what they are, what is chosen, and what it has to keep by robot and sensor themselves."""
+"""The trajectories of a run: what they are, what is chosen, and what it has to keep by robot and
+sensor themselves.
+"""
 
+import json
 import re
 from dataclasses import replace
 from functools import cache
@@ -12,12 +15,28 @@ from scipy.integrate import cumulative_simpson
 
 from cmmsim.visibility import sight_lines
 from dynamics.workspace import measure
-from identify.errors import ScenarioError, TrajectoryError
-from identify.excitation.constraints import MotionConstraints, check_periods, required_stickers, within_sight
-from identify.excitation.design import design_trajectories, motion_check, random_candidates, unseen_trajectories
+from identify.errors import RecordError, ScenarioError, TrajectoryError
+from identify.excitation.constraints import (
+    MotionConstraints,
+    check_periods,
+    required_stickers,
+    within_sight,
+)
+from identify.excitation.design import (
+    design_trajectories,
+    motion_check,
+    random_candidates,
+    unseen_trajectories,
+)
 from identify.excitation.motion import unknowns
 from identify.scenario import load_scenario, scenario_from_toml
-from identify.trajectory import FourierTrajectory, check_travel, load_trajectories, random_trajectory, save_trajectories
+from identify.trajectory import (
+    FourierTrajectory,
+    check_travel,
+    load_trajectories,
+    random_trajectory,
+    save_trajectories,
+)
 from tests.identify.commands import refusal
 from tests.identify.synthetic import Stages, rss6
 
@@ -26,7 +45,9 @@ HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 
 
 def random_one(seed, harmonics=5, fundamental_hz=0.1):
-    return random_trajectory(np.random.default_rng(seed), rss6().geometry.chart, fundamental_hz, harmonics, 0.01, 0.04)
+    return random_trajectory(
+        np.random.default_rng(seed), rss6().geometry.chart, fundamental_hz, harmonics, 0.01, 0.04
+    )
 
 
 def test_single_harmonic_is_equation_37_written_out():
@@ -50,8 +71,12 @@ def test_rates_and_accelerations_integrate_to_the_pose(seed):
     np.testing.assert_allclose(trajectory.pose(t), pose, atol=1e-9)
 
 
-@given(seed=st.integers(0, 2**32 - 1), harmonics=st.integers(2, 8), fundamental_hz=st.floats(0.02, 2.0))
-def test_start_is_at_home_at_rest_and_without_acceleration_and_amplitude_fills_the_box(seed, harmonics, fundamental_hz):
+@given(
+    seed=st.integers(0, 2**32 - 1), harmonics=st.integers(2, 8), fundamental_hz=st.floats(0.02, 2.0)
+)
+def test_start_is_at_home_at_rest_and_without_acceleration_and_amplitude_fills_the_box(
+    seed, harmonics, fundamental_hz
+):
     trajectory = random_one(seed, harmonics, fundamental_hz)
     fastest = 2 * np.pi * fundamental_hz * harmonics
     np.testing.assert_allclose(trajectory.pose(0.0), HOME, atol=1e-12)
@@ -65,7 +90,10 @@ def test_start_is_at_home_at_rest_and_without_acceleration_and_amplitude_fills_t
 def test_a_trajectory_has_its_fundamentals_period_and_frozen_coefficients_and_wrong_ones_are_refused():
     trajectory, t = random_one(4), np.linspace(0, 10, 50)
     np.testing.assert_allclose(trajectory.pose(t + 10), trajectory.pose(t), atol=1e-12)
-    assert (trajectory.pose(0.3).shape, trajectory.pose_acceleration(np.zeros(7)).shape) == ((6,), (7, 6))
+    assert (trajectory.pose(0.3).shape, trajectory.pose_acceleration(np.zeros(7)).shape) == (
+        (6,),
+        (7, 6),
+    )
     with pytest.raises(ValueError, match="read-only"):
         trajectory.sine[0, 0] = 1.0
     with pytest.raises(TrajectoryError, match=r"\(5, 2\)"):
@@ -77,7 +105,9 @@ def test_a_trajectory_has_its_fundamentals_period_and_frozen_coefficients_and_wr
 
 
 def test_travel_is_the_largest_angle_and_refused_with_time_leg_angle_and_limit_or_what_is_out_of_reach():
-    """One harmonic of 1 Hz that is at t = 0.25 s where the second crank alone is turned by 0.3 rad; and 1 m in x."""
+    """One harmonic of 1 Hz that is at t = 0.25 s where the second crank alone is turned by 0.3 rad;
+    and 1 m in x.
+    """
     robot, times = rss6(), np.arange(5) / 16
     turned = robot.forward_kinematics(np.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])) - HOME
     one_crank, far = (
@@ -85,7 +115,10 @@ def test_travel_is_the_largest_angle_and_refused_with_time_leg_angle_and_limit_o
         for way in (turned, [1.0, 0, 0, 0, 0, 0])
     )
     assert check_travel(robot, one_crank, times) == pytest.approx(0.3, abs=1e-9)
-    with pytest.raises(TrajectoryError, match=r"theta\| in rad of leg 2 of rss6 is 0\.3 at t = 0\.25 s, limit 0\.2948"):
+    with pytest.raises(
+        TrajectoryError,
+        match=r"theta\| in rad of leg 2 of rss6 is 0\.3 at t = 0\.25 s, limit 0\.2948",
+    ):
         check_travel(robot, one_crank, times, margin=0.7)
     with pytest.raises(TrajectoryError, match=r"reach margin of leg \d of rss6 is -.* must be > 0"):
         check_travel(robot, far, times)
@@ -100,14 +133,19 @@ def quick(**overrides):
 
 @cache
 def designed(seed=3, **overrides):
-    """What is designed for `quick` with four candidates; a smaller number draws the first of them."""
+    """What is designed for `quick` with four candidates; a smaller number draws the first of
+    them."""
     return design_trajectories(rss6(), quick(**overrides), seed)
 
 
 def test_a_run_too_short_to_show_every_parameter_has_no_index():
     """Six poses give 36 equations for the 37 base parameters, seven give enough."""
     chosen, alone = designed(), designed(candidates=1)
-    assert alone.observability_index == alone.first_index == pytest.approx(chosen.first_index, rel=1e-9)
+    assert (
+        alone.observability_index
+        == alone.first_index
+        == pytest.approx(chosen.first_index, rel=1e-9)
+    )
     assert chosen.observability_index > max(alone.observability_index, chosen.median_index)
     assert designed(duration_s=0.6).observability_index == 0.0
     assert designed(duration_s=0.7).observability_index > 0.0
@@ -119,7 +157,11 @@ def test_seed_decides_everything_and_unseen_trajectories_depend_on_nothing_else(
     assert not np.allclose(a.excitation.sine, c.excitation.sine)
     assert len(a.validation) == 2
     assert not any(np.allclose(a.excitation.sine, v.sine) for v in a.validation)
-    for others in (b.validation, designed(candidates=1).validation, unseen_trajectories(robot, QUICK, 3)):
+    for others in (
+        b.validation,
+        designed(candidates=1).validation,
+        unseen_trajectories(robot, QUICK, 3),
+    ):
         for one, other in zip(designed().validation, others, strict=True):
             np.testing.assert_array_equal(one.sine, other.sine)
             np.testing.assert_array_equal(one.cosine, other.cosine)
@@ -134,7 +176,12 @@ def test_file_reads_back_equal_and_a_damaged_one_is_named(tmp_path):
     assert (again.seed, again.observability_index) == (3, chosen.observability_index)
     assert [p.name for p in tmp_path.iterdir()] == ["trajectories.json"]
     whole = path.read_text()
-    for damaged in (whole[: len(whole) // 2], whole.replace("offset", "offfset"), "[]"):
+    changed = whole.replace("offset", "offfset")
+    path.write_text(changed)
+    with pytest.raises(RecordError, match=r"trajectories\.json is damaged: .* digest"):
+        load_trajectories(path)
+    without_digest = {key: value for key, value in json.loads(changed).items() if key != "sha256"}
+    for damaged in (whole[: len(whole) // 2], json.dumps(without_digest), "[]"):
         path.write_text(damaged)
         with pytest.raises(TrajectoryError, match=r"trajectories\.json"):
             load_trajectories(path)
@@ -155,7 +202,9 @@ def test_worst_is_what_the_robot_says(robot, seed):
     worst = {w.name: w for w in MotionConstraints(robot, QUICK).worst(trajectory, t)}
     seen = measure(robot, trajectory.pose(t))
     fine = 1e-4
-    rates = robot.inverse_kinematics(trajectory.pose(t + fine)) - robot.inverse_kinematics(trajectory.pose(t - fine))
+    rates = robot.inverse_kinematics(trajectory.pose(t + fine)) - robot.inverse_kinematics(
+        trajectory.pose(t - fine)
+    )
     assert worst["travel"].value == pytest.approx(np.abs(seen.theta).max(), rel=1e-9)
     assert worst["travel"].limit == pytest.approx(robot.travel_limit - 0.1)
     assert worst["leverage"].value == pytest.approx(seen.leverage.min(), rel=1e-9)
@@ -165,29 +214,52 @@ def test_worst_is_what_the_robot_says(robot, seed):
     assert (worst["travel"].who, worst["travel"].time_s) == (f"leg {leg + 1}", t[row])
 
 
-def test_broken_limits_no_feasible_start_and_a_run_that_cannot_end_at_rest_are_named_with_their_numbers(robot):
+def test_broken_limits_no_feasible_start_and_a_run_that_cannot_end_at_rest_are_named_with_their_numbers(
+    robot,
+):
     for key, value, message in (
-        ("travel_margin_rad", 0.8, r"travel of leg \d is 0\.\d+ rad at t = \d+\.\d+ s, limit 0\.1948 rad"),
-        ("max_joint_velocity_rad_s", 0.1, r"velocity of leg \d is 0\.\d+ rad/s at t = \d+\.\d+ s, limit 0\.1 rad/s"),
-        ("position_amplitude_m", 0.005, r"box of [xyz] is 0\.01 m at t = \d+\.\d+ s, limit 0\.005 m"),
+        (
+            "travel_margin_rad",
+            0.8,
+            r"travel of leg \d is 0\.\d+ rad at t = \d+\.\d+ s, limit 0\.1948 rad",
+        ),
+        (
+            "max_joint_velocity_rad_s",
+            0.1,
+            r"velocity of leg \d is 0\.\d+ rad/s at t = \d+\.\d+ s, limit 0\.1 rad/s",
+        ),
+        (
+            "position_amplitude_m",
+            0.005,
+            r"box of [xyz] is 0\.01 m at t = \d+\.\d+ s, limit 0\.005 m",
+        ),
     ):
         with pytest.raises(TrajectoryError, match=message):
-            MotionConstraints(robot, quick(**{key: value})).check(random_one(0), np.arange(400) / 40, 1e-3)
+            MotionConstraints(robot, quick(**{key: value})).check(
+                random_one(0), np.arange(400) / 40, 1e-3
+            )
     for overrides, reason in (
         ({"max_joint_velocity_rad_s": 0.01}, r"only 0 of 50 .*velocity of leg \d"),
         ({"position_amplitude_m": 0.06}, r"only 0 of 50 .*±0\.06 m.*leg \d"),
         ({"travel_margin_rad": 0.99, "method": "gradient"}, r"leg \d .*limit 0\.0048"),
-        ({"travel_margin_rad": 1.0}, r"travel_margin_rad = 1 rad leaves nothing of the travel limit 0\.9948"),
+        (
+            {"travel_margin_rad": 1.0},
+            r"travel_margin_rad = 1 rad leaves nothing of the travel limit 0\.9948",
+        ),
     ):
         scenario = quick(candidates=1, **overrides)
         assert re.search(reason, refusal(TrajectoryError, design_trajectories, robot, scenario, 0))
     for duration_s, periods in ((5.0, 0.5), (13.0, 1.3)):
-        with pytest.raises(TrajectoryError, match=rf"end at rest: excitation\.duration_s = .* is {periods} per"):
+        with pytest.raises(
+            TrajectoryError, match=rf"end at rest: excitation\.duration_s = .* is {periods} per"
+        ):
             check_periods(quick(duration_s=duration_s, method="gradient"))
 
 
 def test_the_best_candidate_is_chosen_by_a_criterion_of_ones_own(tmp_path, monkeypatch, robot):
-    """Of all candidates the smallest is chosen by a function of the user's that is named nowhere else."""
+    """Of all candidates the smallest is chosen by a function of the user's that is named nowhere
+    else.
+    """
     (tmp_path / "own_criterion.py").write_text(
         "import casadi as ca\n"
         "from identify.excitation.criteria import Criterion\n"
@@ -198,6 +270,7 @@ def test_the_best_candidate_is_chosen_by_a_criterion_of_ones_own(tmp_path, monke
         encoding="utf-8",
     )
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("CMMSIM_PLUGINS", "own_criterion")
     scenario = quick(criterion="own_criterion:smallness")
     free = unknowns(robot.geometry.chart, scenario.excitation)
     progress = Stages()
@@ -207,9 +280,14 @@ def test_the_best_candidate_is_chosen_by_a_criterion_of_ones_own(tmp_path, monke
     sizes = [np.linalg.norm(free.of(trajectory)) for trajectory in drawn]
     assert np.linalg.norm(free.of(chosen)) == pytest.approx(min(sizes))
     assert scenario_from_toml(scenario.to_toml()) == scenario
-    with pytest.raises(ScenarioError, match="criterion 'own_criterion:beauty' is no importable module:function"):
+    with pytest.raises(
+        ScenarioError, match="criterion 'own_criterion:beauty' is no importable module:name"
+    ):
         design_trajectories(robot, quick(criterion="own_criterion:beauty"), 3)
-    with pytest.raises(ScenarioError, match="unknown criterion 'beauty'; valid: observability, information, or module"):
+    with pytest.raises(
+        ScenarioError,
+        match="unknown criterion 'beauty'; valid: observability, information, or module",
+    ):
         quick(criterion="beauty")
 
 
@@ -220,7 +298,8 @@ def test_box_that_is_said_to_be_in_sight_is_and_sight_counts_where_that_is_not_p
     assert within_sight(sight, chosen, robot.home_pose, box)
     for signs in np.random.default_rng(0).choice([-1.0, 1.0], (40, 6)):
         assert sight.visible(robot.home_pose + signs * box)[chosen].all()
-    # A narrow image: the shares that are within one are those of stickers that the cameras can look for.
+    # A narrow image: the shares that are within one are those of stickers that the cameras can look
+    # for.
     sight = narrowed(1.5)
     constraints = MotionConstraints(robot, quick(position_amplitude_m=0.1), sight)
     assert not constraints.always_in_sight
@@ -229,8 +308,12 @@ def test_box_that_is_said_to_be_in_sight_is_and_sight_counts_where_that_is_not_p
     for offset in rng.uniform(-1, 1, (100, 6)) * np.repeat([0.1, 0.5], 3):
         pose = robot.home_pose + offset
         shares = np.array(function(pose, np.zeros(6))).reshape(len(chosen), -1)
-        np.testing.assert_array_equal((np.abs(shares) <= 1).all(axis=1), sight.visible(pose)[chosen])
+        np.testing.assert_array_equal(
+            (np.abs(shares) <= 1).all(axis=1), sight.visible(pose)[chosen]
+        )
         lost += not sight.visible(pose)[chosen].all()
     assert 10 < lost < 90
-    with pytest.raises(TrajectoryError, match=r"visibility: both cameras can look for \d stickers of plane [ABC]"):
+    with pytest.raises(
+        TrajectoryError, match=r"visibility: both cameras can look for \d stickers of plane [ABC]"
+    ):
         MotionConstraints(robot, QUICK, narrowed(12.0))

@@ -1,5 +1,5 @@
-"""Criteria as functions of a trajectory's unknowns, against numpy, finite differences and the simulated loop; searches:
-what they find is admissible, repeatable, and better than chance."""
+"""Criteria as functions of a trajectory's unknowns, against numpy, finite differences and the
+simulated loop; searches: what they find is admissible, repeatable, and better than chance."""
 
 import json
 import os
@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from dynamics.closed_loop import simulate
+from dynamics.closed_loop import (
+    differentiate_servo,
+)
 from identify.errors import TrajectoryError
 from identify.excitation.comparison import compare_methods
 from identify.excitation.constraints import MotionConstraints
@@ -36,7 +38,12 @@ from tests.identify.synthetic import NAMES, index_of, rss6
 
 QUICK = load_scenario("quick")
 SMALL = QUICK.with_overrides(
-    {"excitation.harmonics": 3, "excitation.candidates": 6, "excitation.generations": 8, "validation.count": 1}
+    {
+        "excitation.harmonics": 3,
+        "excitation.candidates": 6,
+        "excitation.generations": 8,
+        "validation.count": 1,
+    }
 )
 
 
@@ -51,26 +58,39 @@ def known(robot):
 def a_motion(robot, seed, scenario=QUICK):
     """Unknowns, and the z of a random trajectory."""
     of = scenario.excitation
-    free, size = unknowns(robot.geometry.chart, of), (of.position_amplitude_m, of.orientation_amplitude_rad)
+    free, size = (
+        unknowns(robot.geometry.chart, of),
+        (of.position_amplitude_m, of.orientation_amplitude_rad),
+    )
     rng = np.random.default_rng(seed)
-    trajectory = random_trajectory(rng, robot.geometry.chart, of.fundamental_hz, of.harmonics, *size)
+    trajectory = random_trajectory(
+        rng, robot.geometry.chart, of.fundamental_hz, of.harmonics, *size
+    )
     return free, free.of(trajectory), trajectory
 
 
 def simulated(robot, parameters, trajectory, scenario):
     """Run of the whole scenario's duration, with sensitivities."""
     reference = trajectory.reference(scenario.timing.frame_times(scenario.excitation.duration_s))
-    return simulate(robot, parameters, reference, model_settings(rss6(), scenario), sensitivities=True)
+    return differentiate_servo(robot, parameters, reference, model_settings(rss6(), scenario))
 
 
 @pytest.mark.parametrize("harmonics_", [2, 5])
-def test_unknowns_and_trajectories_are_the_same_thing_and_any_start_and_end_at_home_and_at_rest(robot, harmonics_):
-    free, z, trajectory = a_motion(robot, 1, QUICK.with_overrides({"excitation.harmonics": harmonics_}))
+def test_unknowns_and_trajectories_are_the_same_thing_and_any_start_and_end_at_home_and_at_rest(
+    robot, harmonics_
+):
+    free, z, trajectory = a_motion(
+        robot, 1, QUICK.with_overrides({"excitation.harmonics": harmonics_})
+    )
     assert z.shape == (12 * (harmonics_ - 1),)
     t = np.linspace(0, 10, 50)
     np.testing.assert_allclose(free.trajectory(z).pose(t), trajectory.pose(t), atol=1e-15)
-    for basis, derivative in zip(free.basis(t), ("pose", "pose_rate", "pose_acceleration"), strict=True):
-        moved = (z.reshape(6, -1) @ basis.T).T * free.box + (robot.home_pose if derivative == "pose" else 0)
+    for basis, derivative in zip(
+        free.basis(t), ("pose", "pose_rate", "pose_acceleration"), strict=True
+    ):
+        moved = (z.reshape(6, -1) @ basis.T).T * free.box + (
+            robot.home_pose if derivative == "pose" else 0
+        )
         np.testing.assert_allclose(moved, getattr(trajectory, derivative)(t), atol=1e-14)
     trajectory = free.trajectory(np.random.default_rng(3).standard_normal(z.size))
     for t in (0.0, 10.0, 20.0):
@@ -81,19 +101,29 @@ def test_unknowns_and_trajectories_are_the_same_thing_and_any_start_and_end_at_h
 
 @pytest.mark.parametrize("duration_s", [20.0, 13.0, 4.0])
 def test_index_is_the_geometric_mean_of_the_singular_values_that_are_not_zero(robot, duration_s):
-    """Equation 39 by a singular value decomposition of all 64 columns of the robot's own regressor, over what is
-    played; of whole periods one is sampled, which is the same. No judgement hangs on what counts as zero: between the
-    two kinds lie more than six decades. Nor does it depend on the trajectory that sets the scale."""
+    """Equation 39 by a singular value decomposition of all 64 columns of the robot's own regressor,
+    over what is played; of whole periods one is sampled, which is the same. No judgement hangs on
+    what counts as zero: between the two kinds lie more than six decades. Nor does it depend on the
+    trajectory that sets the scale."""
     free, z, trajectory = a_motion(robot, 4)
     t = np.arange(0.05, duration_s, 0.1)
-    pose, rate, acceleration = trajectory.pose(t), trajectory.pose_rate(t), trajectory.pose_acceleration(t)
-    stacked = robot.regressor(pose, robot.twist(pose, rate), robot.twist_dot(pose, rate, acceleration))
+    pose, rate, acceleration = (
+        trajectory.pose(t),
+        trajectory.pose_rate(t),
+        trajectory.pose_acceleration(t),
+    )
+    stacked = robot.regressor(
+        pose, robot.twist(pose, rate), robot.twist_dot(pose, rate, acceleration)
+    )
     singular = np.linalg.svd(stacked.reshape(-1, 64), compute_uv=False)
     seen = singular[singular > 1e-9 * singular[0]]
     assert len(seen) == 37
     assert singular[36] / singular[37] > 1e6
     expected = np.exp(np.mean(np.log(seen))) / np.sqrt(len(t))
-    found, scaled = (float(log_observability(robot, free, duration_s, of)(z)) for of in (z, a_motion(robot, 6)[1]))
+    found, scaled = (
+        float(log_observability(robot, free, duration_s, of)(z))
+        for of in (z, a_motion(robot, 6)[1])
+    )
     assert np.exp(found) == pytest.approx(expected, rel=1e-7)
     assert scaled == pytest.approx(found, abs=1e-8)
 
@@ -106,17 +136,24 @@ def test_gradients_are_those_of_finite_differences(robot, known, criterion):
     else:
         value = log_linear_information(robot, free, QUICK, known, SMOOTHING_RAD_S)
     unknown = ca.MX.sym("z", z.size)
-    gradient = np.array(ca.Function("gradient", [unknown], [ca.gradient(value(unknown), unknown)])(z)).ravel()
+    gradient = np.array(
+        ca.Function("gradient", [unknown], [ca.gradient(value(unknown), unknown)])(z)
+    ).ravel()
     rng, step = np.random.default_rng(0), 1e-5
     for direction in rng.standard_normal((3, z.size)):
-        quotient = (float(value(z + step * direction)) - float(value(z - step * direction))) / (2 * step)
+        quotient = (float(value(z + step * direction)) - float(value(z - step * direction))) / (
+            2 * step
+        )
         assert gradient @ direction == pytest.approx(quotient, rel=1e-5, abs=1e-7)
 
 
 @pytest.mark.slow
 def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
-    """Small motion, no dry friction, 600 frames a second: the second period against the spectrum."""
-    scenario = QUICK.with_overrides({**TINY, "timing.frame_rate_hz": 600.0, "excitation.duration_s": 20.0})
+    """Small motion, no dry friction, 600 frames a second: the second period against the
+    spectrum."""
+    scenario = QUICK.with_overrides(
+        {**TINY, "timing.frame_rate_hz": 600.0, "excitation.duration_s": 20.0}
+    )
     free, z, trajectory = a_motion(robot, 8, scenario)
     parameters = robot.parameter_sets["initial"].vector.copy()
     parameters[robot.layout.viscous] = 0.5  # without friction the loop rings longer than a period
@@ -135,7 +172,9 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
         assert np.linalg.norm(seen - linear) < 0.02 * np.linalg.norm(seen), name
 
 
-@pytest.mark.parametrize("prior", [{}, {"link4.mass": (1.2, 0.01)}], ids=["guess alone", "a link weighed"])
+@pytest.mark.parametrize(
+    "prior", [{}, {"link4.mass": (1.2, 0.01)}], ids=["guess alone", "a link weighed"]
+)
 def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
     """By the singular values of whitened sensitivities over prior rows, with another whitening."""
     _, _, trajectory = a_motion(robot, 9)
@@ -149,7 +188,9 @@ def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
     anchor[0, NAMES.index("platform.mass")] = std[NAMES.index("platform.mass")] / 0.005
     singular = np.linalg.svd(np.vstack([rows, np.eye(67), anchor]), compute_uv=False)
     expected = np.mean(np.log(singular))
-    entries = {name: {"value": value, "std": deviation} for name, (value, deviation) in prior.items()}
+    entries = {
+        name: {"value": value, "std": deviation} for name, (value, deviation) in prior.items()
+    }
     scenario = QUICK.with_overrides({"identification.prior": entries})
     found = log_information(robot, scenario, knowledge(robot, scenario), trajectory)
     assert found == pytest.approx(expected, rel=1e-6)
@@ -161,7 +202,9 @@ def test_longer_runs_inform_more_and_an_unstable_starting_model_is_named(robot, 
     once, twice = (log_information(robot, s, known, trajectory) for s in (QUICK, longer))
     assert 0.0 < twice - once < np.log(2) / 2 + 0.05
     late = QUICK.with_overrides({"timing.frame_rate_hz": 30.0, "timing.latency_s": 0.05})
-    with pytest.raises(TrajectoryError, match=r"no D-criterion: .*model\.start_parameters = 'initial' is unstable"):
+    with pytest.raises(
+        TrajectoryError, match=r"no D-criterion: .*model\.start_parameters = 'initial' is unstable"
+    ):
         log_information(robot, late, known, trajectory)
 
 
@@ -189,19 +232,28 @@ def climbed(problem):
     return climb(problem, np.random.SeedSequence(0), SilentProgress())
 
 
-@pytest.mark.parametrize("method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.slow)]
+)
 def test_limits_hold_between_the_instants_of_the_search(one_start, method):
-    """Ten times as many instants; a velocity limit that random trajectories keep and an optimum runs into."""
+    """Ten times as many instants; a velocity limit that random trajectories keep and an optimum
+    runs into.
+    """
     scenario = small(method=method, max_joint_velocity_rad_s=0.45)
     found = design_trajectories(rss6(), scenario, 0).excitation
-    worst = {w.name: w for w in MotionConstraints(rss6(), scenario).check(found, sample_times(0.1, 3, 10))}
+    worst = {
+        w.name: w
+        for w in MotionConstraints(rss6(), scenario).check(found, sample_times(0.1, 3, 10))
+    }
     if method == "gradient":
         assert worst["velocity"].share > 0.99
 
 
 @pytest.mark.slow
 def test_searches_beat_the_random_trajectories_they_begin_with(one_start):
-    random, evolved, climbed = (designed(method) for method in ("random", "evolutionary", "gradient"))
+    random, evolved, climbed = (
+        designed(method) for method in ("random", "evolutionary", "gradient")
+    )
     assert evolved.first_index == climbed.first_index == pytest.approx(random.first_index, rel=1e-8)
     assert evolved.observability_index >= random.observability_index * (1 - 1e-8)
     assert climbed.observability_index > 1.5 * random.observability_index
@@ -209,12 +261,17 @@ def test_searches_beat_the_random_trajectories_they_begin_with(one_start):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    "method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.thorough)]
+)
 def test_seed_decides_what_is_found(method):
     a, b, c = (designed.__wrapped__(method, seed, generations=3) for seed in (0, 0, 1))
     np.testing.assert_array_equal(a.excitation.sine, b.excitation.sine)
     assert not np.allclose(a.excitation.sine, c.excitation.sine)
-    with pytest.raises(TrajectoryError, match=r"excitation\.candidates = 3: the evolutionary method needs at least 5"):
+    with pytest.raises(
+        TrajectoryError,
+        match=r"excitation\.candidates = 3: the evolutionary method needs at least 5",
+    ):
         design_trajectories(rss6(), small(method="evolutionary", candidates=3), 0)
 
 
@@ -229,7 +286,11 @@ def test_command_compares_and_leaves_its_files_and_none_where_it_is_interrupted(
     assert sorted(path.name for path in out.iterdir()) == ["comparison.json", "comparison.png"]
     compared = json.loads((out / "comparison.json").read_text())
     random, _, gradient = compared["entries"]
-    assert [entry["method"] for entry in compared["entries"]] == ["random", "evolutionary", "gradient"]
+    assert [entry["method"] for entry in compared["entries"]] == [
+        "random",
+        "evolutionary",
+        "gradient",
+    ]
     assert gradient["value"] > random["value"]
     assert gradient["information"] > random["information"]
     assert all(entry["worst"][0]["name"] == "box" for entry in compared["entries"])
@@ -253,14 +314,18 @@ def test_threads_of_linear_algebra_do_not_change_what_is_found():
     found = []
     for threads in (1, 2):
         with threadpool_limits(limits=threads, user_api="blas"):
-            assert {pool["num_threads"] for pool in threadpool_info() if "casadi" in pool["filepath"]} == {threads}
+            assert {
+                pool["num_threads"] for pool in threadpool_info() if "casadi" in pool["filepath"]
+            } == {threads}
             found.append(climbed(problem).z)
     np.testing.assert_array_equal(*found)
 
 
 @pytest.mark.parametrize("seconds", [0.3, 1.0])
 def test_interrupt_stops_the_search(seconds, monkeypatch):
-    """Ctrl-C while IPOPT runs, which swallows it, or while limits are checked, where CasADi may make a SystemError."""
+    """Ctrl-C while IPOPT runs, which swallows it, or while limits are checked, where CasADi may
+    make a SystemError.
+    """
     monkeypatch.setattr("identify.excitation.search.STARTS", 20)
     scenario = QUICK.with_overrides({"excitation.method": "gradient"})
     problem = search_problem(rss6(), scenario, drawn(2) * 10)
@@ -271,7 +336,9 @@ def test_interrupt_stops_the_search(seconds, monkeypatch):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("criterion", "generations"), [("observability", 324), ("information", 150)])
+@pytest.mark.parametrize(
+    ("criterion", "generations"), [("observability", 324), ("information", 150)]
+)
 def test_gradient_method_wins_in_value(criterion, generations):
     """The paper's settings, and for its own criterion its number of generations, in one run."""
     overrides = {"excitation.criterion": criterion, "excitation.generations": generations}

@@ -1,5 +1,5 @@
-"""The experiment with images in the loop: what is recorded, lost and refused, and the sensor's timing in it.
-That images decide the pose is proved in tests/cmmsim/test_measuring.py."""
+"""The experiment with images in the loop: what is recorded, lost and refused, and the sensor's
+timing in it. That images decide the pose is proved in tests/cmmsim/test_measuring.py."""
 
 import json
 
@@ -8,9 +8,11 @@ import pytest
 import xarray as xr
 
 import cmmsim
-from cmmsim.imaging.scene import PlacedBodies
-from cmmsim.pose_estimation.estimator import lost_measurement
-from dynamics.closed_loop import simulate
+from cmmsim.imaging.scene_bodies import PlacedBodies
+from cmmsim.measuring.measurement import lost_measurement
+from dynamics.closed_loop import (
+    simulate_servo,
+)
 from dynamics.errors import SimulationError
 from identify.errors import RecordError, TrajectoryError
 from identify.estimation.explanation import SUSPICIOUS
@@ -34,7 +36,9 @@ SHORT = {"excitation.duration_s": 1.0, "excitation.candidates": 2}
 
 
 class Told:
-    """A sensor that keeps what it is told, and answers as another does; in some frames a shutter is closed."""
+    """A sensor that keeps what it is told, and answers as another does; in some frames a shutter is
+    closed.
+    """
 
     def __init__(self, sensor, closed=()):
         self.sensor, self.closed, self.seeds, self.poses, self.rates = sensor, closed, [], [], []
@@ -47,7 +51,9 @@ class Told:
         self.poses.append(pose)
         self.rates.append(pose_rate)
         measured = self.sensor.measure(pose, obstacles, pose_rate)
-        return lost_measurement("shutter closed") if len(self.rates) - 1 in self.closed else measured
+        return (
+            lost_measurement("shutter closed") if len(self.rates) - 1 in self.closed else measured
+        )
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +62,19 @@ def sensor():
 
 
 def test_rods_join_the_robots_joints():
-    """Every crank starts at its base joint and ends where its link starts; every link ends at its platform joint."""
+    """Every crank starts at its base joint and ends where its link starts; every link ends at its
+    platform joint.
+    """
     robot = rss6()
     pose = robot.home_pose + np.array([0.004, -0.006, 0.005, 0.02, -0.01, 0.03])
     transforms = robot_transforms(robot, pose)
     platform = cmmsim.pose_to_transform(pose)
     for leg in range(6):
-        crank, link, own = transforms[f"crank{leg + 1}"], transforms[f"link{leg + 1}"], robot.geometry.legs[leg]
+        crank, link, own = (
+            transforms[f"crank{leg + 1}"],
+            transforms[f"link{leg + 1}"],
+            robot.geometry.legs[leg],
+        )
         tip = crank[:3, 3] + own.crank_length * crank[:3, 2]
         end = link[:3, 3] + own.link_length * link[:3, 2]
         joint = platform[:3, :3] @ robot.geometry.platform_joints[leg] + platform[:3, 3]
@@ -72,7 +84,9 @@ def test_rods_join_the_robots_joints():
 
 
 def test_legs_that_are_placed_together_are_those_placed_one_by_one(sensor):
-    """Also in another order, and where one of them is missing; what is no place is refused by its name."""
+    """Also in another order, and where one of them is missing; what is no place is refused by its
+    name.
+    """
     robot = rss6()
     pose = robot.home_pose + np.array([0.004, -0.006, 0.005, 0.02, -0.01, 0.03])
     together, found = robot_transforms(robot, pose), []
@@ -93,7 +107,9 @@ def test_legs_that_are_placed_together_are_those_placed_one_by_one(sensor):
 
 
 def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(sensor):
-    """Nothing is seen for five frames, then the platform is found again; the sensor is told how fast it moves."""
+    """Nothing is seen for five frames, then the platform is found again; the sensor is told how
+    fast it moves.
+    """
     told = Told(sensor, closed=range(10, 15))
     experiment = run_plant(build_plant(quick(**SHORT), rss6()), told, trajectory(3), 0.5, 7, 0)
     record = experiment.record
@@ -140,13 +156,22 @@ def test_the_sensor_gets_the_scenarios_timing_and_latencies_jitter_as_it_says(se
 
     def true(seed, jitter_s):
         eye = DrawnSensor(np.diag(SIGMA**2))
-        return true_poses(run_plant(build_plant(late(jitter_s), rss6()), eye, trajectory(3), 0.5, seed, 0).truth)
+        return true_poses(
+            run_plant(build_plant(late(jitter_s), rss6()), eye, trajectory(3), 0.5, seed, 0).truth
+        )
 
     scenario = late(0.0, **{"timing.exposure_s": 0.004, "timing.dropout": 0.25})
     timing = make_sensor(scenario, rss6(), 0, sensor.taught).timing
-    assert (timing.frame_rate, timing.exposure, timing.dropout, timing.latency) == (60.0, 0.004, 0.25, 0.01)
+    assert (timing.frame_rate, timing.exposure, timing.dropout, timing.latency) == (
+        60.0,
+        0.004,
+        0.25,
+        0.01,
+    )
     assert scenario.timing.drawn_latencies(400, np.random.default_rng(0)) is None
-    assert late(0.002).timing.drawn_latencies(400, np.random.default_rng(0)).std() == pytest.approx(0.002, rel=0.15)
+    assert late(0.002).timing.drawn_latencies(400, np.random.default_rng(0)).std() == pytest.approx(
+        0.002, rel=0.15
+    )
     assert model_settings(rss6(), late(0.002)).timing.latency_s == 0.01
     jittered = true(0, 0.005)
     assert np.array_equal(jittered, true(0, 0.005))
@@ -154,12 +179,17 @@ def test_the_sensor_gets_the_scenarios_timing_and_latencies_jitter_as_it_says(se
     assert not np.array_equal(jittered, true(1, 0.005))
 
 
-# Plants that no model of the estimator can be: what the switches do, and that the residuals tell. The dynamics of these
-# plants are proved in tests/dynamics/test_elastic_joints.py and test_closed_loop.py.
+# Plants that no model of the estimator can be: what the switches do, and that the residuals tell.
+# The dynamics of these plants are proved in tests/dynamics/test_elastic_joints.py and
+# test_closed_loop.py.
 
 ELASTIC = {"plant.joint_stiffness_N_m_rad": 1000.0}
 MISPLACED = {"plant.geometry_error_m": 1e-4}
-STRIBECK = {"plant.friction": "stribeck", "plant.static_ratio": 1.3, "plant.stribeck_velocity_rad_s": 0.05}
+STRIBECK = {
+    "plant.friction": "stribeck",
+    "plant.static_ratio": 1.3,
+    "plant.stribeck_velocity_rad_s": 0.05,
+}
 
 
 def test_the_model_knows_of_no_switch_and_without_one_the_plant_is_the_nominal_robot_bit_by_bit():
@@ -168,21 +198,31 @@ def test_the_model_knows_of_no_switch_and_without_one_the_plant_is_the_nominal_r
     assert build_plant(switched).settings.elasticity.stiffness == 1000.0
     text = switched.to_toml()
     assert scenario_from_toml(text) == switched
-    for line in ("joint_stiffness_N_m_rad = 1000.0", "[N m/rad]", "geometry_error_m = 0.0001", "motor_inertia_kg_m2"):
+    for line in (
+        "joint_stiffness_N_m_rad = 1000.0",
+        "[N m/rad]",
+        "geometry_error_m = 0.0001",
+        "motor_inertia_kg_m2",
+    ):
         assert line in text
     assert "joint_stiffness" not in quick().to_toml()
     with pytest.raises(SimulationError, match="of crank2 about its axis"):
         build_plant(quick(**ELASTIC, **{"plant.motor_inertia_kg_m2": 1e-3}), rss6()).check()
-    plant, reference = build_plant(plain, rss6()), trajectory(0).reference(plain.timing.frame_times(0.5))
+    plant, reference = (
+        build_plant(plain, rss6()),
+        trajectory(0).reference(plain.timing.frame_times(0.5)),
+    )
     assert plant.robot is rss6()
-    ours, nominal = plant.run(reference), simulate(rss6(), truth(), reference, plant.settings)
+    ours, nominal = plant.run(reference), simulate_servo(rss6(), truth(), reference, plant.settings)
     assert {"base_joint_error", "motor_angle"}.isdisjoint(plant.truth(ours))
     np.testing.assert_array_equal(ours.pose, nominal.pose)
     np.testing.assert_array_equal(ours.command, nominal.command)
 
 
 def test_the_truth_holds_true_poses_motors_joint_errors_and_switches_and_the_encoders_read_the_motors():
-    """Crank angles are those of the poses that the sensor was shown; motors are ahead by torque over stiffness."""
+    """Crank angles are those of the poses that the sensor was shown; motors are ahead by torque
+    over stiffness.
+    """
     scenario = quick(**ELASTIC, **MISPLACED)
     told, plant = Told(DrawnSensor(1e-24 * np.eye(6))), build_plant(scenario, rss6())
     run, robot = run_plant(plant, told, trajectory(3), 0.5, 0, 0), plant.robot
@@ -195,17 +235,26 @@ def test_the_truth_holds_true_poses_motors_joint_errors_and_switches_and_the_enc
     errors = robot.geometry.base_joints - rss6().geometry.base_joints
     np.testing.assert_array_equal(run.truth["base_joint_error"].values, errors)
     assert 0.5e-4 < errors.std() < 2e-4
-    assert build_plant(quick(**MISPLACED, **{"plant.geometry_seed": 1})).robot.geometry != robot.geometry
-    channels = measure_joints(run.record, run.truth, scenario.timing, PERFECT, np.random.default_rng(0))
+    assert (
+        build_plant(quick(**MISPLACED, **{"plant.geometry_seed": 1})).robot.geometry
+        != robot.geometry
+    )
+    channels = measure_joints(
+        run.record, run.truth, scenario.timing, PERFECT, np.random.default_rng(0)
+    )
     np.testing.assert_array_equal(channels["joint_angle"].values, motors)
     with pytest.raises(RecordError, match="motor_angle are not finite"):
         check_truth(run.truth.assign(motor_angle=run.truth["motor_angle"] * np.nan), "broken truth")
 
 
 def test_unseen_trajectories_are_run_by_the_elastic_plant():
-    """With the true parameters a rigid model misses it, and not the rigid plant with the same friction law."""
+    """With the true parameters a rigid model misses it, and not the rigid plant with the same
+    friction law.
+    """
     short = {"validation.duration_s": 1.0, "validation.count": 1, "excitation.candidates": 2}
-    rigid, elastic = (unseen_errors(truth(), rss6(), quick(**short, **switch)) for switch in ({}, ELASTIC))
+    rigid, elastic = (
+        unseen_errors(truth(), rss6(), quick(**short, **switch)) for switch in ({}, ELASTIC)
+    )
     assert np.abs(rigid).max() < 1e-8
     assert np.abs(elastic).max() > 1e-6
 
@@ -221,7 +270,9 @@ def _identified(**switch):
     [
         pytest.param(ELASTIC, id="elastic joints", marks=pytest.mark.slow),
         pytest.param(MISPLACED, id="joints off by 0.1 mm", marks=pytest.mark.slow),
-        pytest.param(MISPLACED | {"plant.geometry_seed": 1}, id="another robot", marks=pytest.mark.thorough),
+        pytest.param(
+            MISPLACED | {"plant.geometry_seed": 1}, id="another robot", marks=pytest.mark.thorough
+        ),
     ],
 )
 def test_the_residuals_say_that_the_model_is_wrong(switch):
@@ -233,7 +284,9 @@ def test_the_residuals_say_that_the_model_is_wrong(switch):
 
 @pytest.mark.slow
 def test_the_residuals_of_elastic_joints_that_the_closed_loop_hides_are_those_of_the_logged_commands():
-    """The closed loop explains the record, with wrong parameters; the model driven by the commands does not."""
+    """The closed loop explains the record, with wrong parameters; the model driven by the commands
+    does not.
+    """
     hidden = _identified(**ELASTIC, **{"identification.method": "closed_loop"})
     assert hidden.noise_ratio < 1.2
     assert not hidden.identifiable.any()
@@ -242,7 +295,9 @@ def test_the_residuals_of_elastic_joints_that_the_closed_loop_hides_are_those_of
 
 @pytest.mark.thorough
 def test_intervals_hold_though_joints_are_off_by_a_third_of_a_millimetre():
-    """The misfit is as large as the noise; intervals of white noise would miss by 4.5 standard deviations."""
+    """The misfit is as large as the noise; intervals of white noise would miss by 4.5 standard
+    deviations.
+    """
     result = _identified(**MISPLACED | {"plant.geometry_error_m": 3e-4})
     assert 1.5 < result.noise_ratio < 3
     known = result.identifiable

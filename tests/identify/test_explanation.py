@@ -1,4 +1,6 @@
-"""Whether the model explains its record: misfits told from chance and brought into the intervals, and whiteness."""
+"""Whether the model explains its record: misfits told from chance and brought into the intervals,
+and whiteness.
+"""
 
 import warnings
 from types import SimpleNamespace
@@ -9,14 +11,21 @@ from scipy.stats import kstest
 
 from identify.errors import EstimationError
 from identify.estimation.covariance import estimate_uncertainty
-from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white, whiteness
+from identify.estimation.explanation import (
+    Misfit,
+    coloured_score_covariance,
+    misfit_of_white,
+    whiteness,
+)
 from identify.estimation.identification import identify
 from identify.record.common_errors import NONE
 from tests.identify.synthetic import quick, rss6, run_plant
 
 
 def noise(rng, frames=600, memory=0.0):
-    """Six residuals of variance one that follow each other with the correlation `memory` (an AR(1) process)."""
+    """Six residuals of variance one that follow each other with the correlation `memory` (an AR(1)
+    process).
+    """
     rows = np.empty((frames, 6))
     rows[0] = rng.standard_normal(6)
     for k in range(1, frames):
@@ -36,11 +45,15 @@ def test_it_is_the_double_sum_over_the_frames_with_gaps_left_out():
             first, second = max(i - j, 0), max(j - i, 0)
             pairs = rows[first : 41 - second].T @ rows[second : 41 - first] / ok.sum()
             total += max(1 - abs(i - j) / (0.2 * 41), 0) * slopes[i].T @ pairs @ slopes[j]
-    np.testing.assert_allclose(coloured_score_covariance(residuals, jacobian, ok), total, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        coloured_score_covariance(residuals, jacobian, ok), total, rtol=1e-9, atol=1e-9
+    )
 
 
 def test_scores_of_lasting_residuals_spread_as_it_says_and_four_times_as_far_as_white_ones():
-    """The spread of drawn scores is the oracle. Fading correlations lack a part that grows with their length."""
+    """The spread of drawn scores is the oracle. Fading correlations lack a part that grows with
+    their length.
+    """
     rng, frames = np.random.default_rng(1), 600
     ok = np.ones(frames, dtype=bool)
     wave = np.sin(2 * np.pi * np.arange(frames) / 200)[:, None, None] * rng.standard_normal((6, 1))
@@ -53,7 +66,9 @@ def test_scores_of_lasting_residuals_spread_as_it_says_and_four_times_as_far_as_
 
 
 def test_of_chance_nothing_is_the_models_a_large_misfit_decides_and_a_small_one_blames_the_covariance():
-    """One in a thousand of right models is above the limit; what is above belongs to the model only from there on."""
+    """One in a thousand of right models is above the limit; what is above belongs to the model only
+    from there on.
+    """
     inside, outside = Misfit(1.1, 1.0, 0.0325), Misfit(1.1, 1.0, 0.0320)
     assert (inside.significant, inside.share_of_model, inside.warnings()) == (False, 0.0, ())
     assert outside.share_of_model == pytest.approx(1 / 11)
@@ -68,12 +83,18 @@ def test_of_chance_nothing_is_the_models_a_large_misfit_decides_and_a_small_one_
 
 
 def test_of_information_that_no_computer_inverts_the_variances_are_right_and_positive_whatever_the_misfit():
-    """A linear problem J = U diag(s) V^T whose guess is known to one in each direction; its information spans 20 orders
-    of magnitude. A direction that only the guess shows is known as well as that says; no residual takes from that."""
+    """A linear problem J = U diag(s) V^T whose guess is known to one in each direction; its
+    information spans 20 orders of magnitude. A direction that only the guess shows is known as well
+    as that says; no residual takes from that."""
     rng, frames, size = np.random.default_rng(0), 40, 12
     singular = np.logspace(10, -2, size)
-    left, right = (np.linalg.qr(rng.standard_normal((rows, size)))[0] for rows in (6 * frames, size))
-    jacobian, noise = (left * singular @ right.T).reshape(frames, 6, size), rng.standard_normal((frames, 6))
+    left, right = (
+        np.linalg.qr(rng.standard_normal((rows, size)))[0] for rows in (6 * frames, size)
+    )
+    jacobian, noise = (
+        (left * singular @ right.T).reshape(frames, 6, size),
+        rng.standard_normal((frames, 6)),
+    )
 
     def found(scale):
         run = SimpleNamespace(
@@ -86,14 +107,18 @@ def test_of_information_that_no_computer_inverts_the_variances_are_right_and_pos
             payload_std=np.zeros(size),
         )
         guess = SimpleNamespace(rows=np.eye(size))
-        problem = SimpleNamespace(runs=(run,), known=lambda parameters: (np.zeros(size), np.eye(size)), guess=guess)
+        problem = SimpleNamespace(
+            runs=(run,), known=lambda parameters: (np.zeros(size), np.eye(size)), guess=guess
+        )
         with warnings.catch_warnings(action="error"):
             return estimate_uncertainty(problem, np.zeros(size), np.random.default_rng(0))
 
     right_model, wrong_model = found(0.9), found(1e3)
     assert not right_model.misfit.significant
     assert np.linalg.cond(right_model.information + np.eye(size)) > 1e15
-    np.testing.assert_allclose(right_model.covariance, right / (1 + singular**2) @ right.T, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(
+        right_model.covariance, right / (1 + singular**2) @ right.T, rtol=1e-5, atol=1e-7
+    )
     assert wrong_model.misfit.decides
     eigenvalues, unseen = np.linalg.eigvalsh(wrong_model.covariance), right[:, singular < 0.1]
     assert eigenvalues[0] > -1e-9 * eigenvalues[-1]
@@ -102,7 +127,9 @@ def test_of_information_that_no_computer_inverts_the_variances_are_right_and_pos
 
 
 def test_frames_marked_as_lost_afterwards_leave_nothing_identified():
-    """The servo had them, the model's has not: 20 frames are enough to miss the record by far more than the noise."""
+    """The servo had them, the model's has not: 20 frames are enough to miss the record by far more
+    than the noise.
+    """
     record = run_plant(quick(), seed=0, duration_s=3.0)[0]
     record["measured_ok"][90:110] = 0
     result = identify(record, rss6(), quick(**{"identification.max_iterations": 5}))
@@ -126,8 +153,13 @@ def test_the_probability_of_white_noise_is_uniform(lost):
 def test_a_little_memory_is_seen_and_too_few_frames_are_refused():
     """A correlation of 0.2 from frame to frame, in 600 frames of six components."""
     ok = np.ones(600, dtype=bool)
-    assert all(whiteness(noise(np.random.default_rng(seed), memory=0.2), ok).suspicious for seed in range(20))
-    found = whiteness(noise(np.random.default_rng(3), 20_000, 0.5), np.ones(20_000, dtype=bool)).autocorrelations
+    assert all(
+        whiteness(noise(np.random.default_rng(seed), memory=0.2), ok).suspicious
+        for seed in range(20)
+    )
+    found = whiteness(
+        noise(np.random.default_rng(3), 20_000, 0.5), np.ones(20_000, dtype=bool)
+    ).autocorrelations
     assert np.allclose(found[:, :3], 0.5 ** np.arange(1, 4), atol=0.04)
     with pytest.raises(EstimationError, match=r"40 good frames are too few to test 10 lags, 100"):
         whiteness(np.zeros((40, 6)), np.ones(40, dtype=bool))

@@ -1,4 +1,6 @@
-"""Every robot from its file alone: the whole experiment with images in the loop, from the camera to unseen motion."""
+"""Every robot from its file alone: the whole experiment with images in the loop, from the camera to
+unseen motion.
+"""
 
 import json
 import subprocess
@@ -20,7 +22,8 @@ MOST_UM, MOST_URAD = 5.0, 25.0
 def check_unseen(result) -> tuple[float, float]:
     runs = [run["true"] for run in result["validation"]]
     position, orientation = (
-        max(max(run[f"{what}"]) for run in runs) for what in ("position_rms_um", "orientation_rms_urad")
+        max(max(run[f"{what}"]) for run in runs)
+        for what in ("position_rms_um", "orientation_rms_urad")
     )
     assert position <= MOST_UM
     assert orientation <= MOST_URAD
@@ -29,13 +32,20 @@ def check_unseen(result) -> tuple[float, float]:
 
 @pytest.mark.thorough
 def test_a_robot_that_no_code_knows_runs_from_its_file_alone(tmp_path):
-    """Sliders with links of two lengths on universal joints and on balls, and cylinders: ten seconds of images, and
-    three of unseen motion."""
+    """Sliders with links of two lengths on universal joints and on balls, and cylinders: ten
+    seconds of images, and three of unseen motion."""
     robot = mixed_robot(tmp_path)
-    changes = {"robot": str(tmp_path / "mixed.toml"), "plant.parameters": "initial", "renderer": "analytic"}
+    changes = {
+        "robot": str(tmp_path / "mixed.toml"),
+        "plant.parameters": "initial",
+        "renderer": "analytic",
+    }
     changes |= {"excitation.candidates": 2, "validation.count": 1, "validation.duration_s": 3.0}
     scenario, folder = load_scenario("quick").with_overrides(changes), tmp_path / "run"
-    for stage in (lambda: pipeline.excite(scenario, 0, folder, SilentProgress()), *_later_stages(folder)):
+    for stage in (
+        lambda: pipeline.excite(scenario, 0, folder, SilentProgress()),
+        *_later_stages(folder),
+    ):
         stage()
     result = load_result(folder / "result.json")
     assert tuple(result["identification"]["parameters"]) == robot.layout.names
@@ -55,9 +65,20 @@ def _later_stages(folder):
 def test_a_quick_run_of_every_robot_predicts_unseen_motion_and_names_what_poses_cannot_show(
     robot, tmp_path, record_property
 ):
-    """Within three minutes on two cores, compiling included; robots that do not turn by positions."""
+    """Within three minutes on two cores, compiling included; robots that do not turn by
+    positions."""
     done = subprocess.run(
-        [sys.executable, "-m", "identify", "run", "quick", "--robot", robot, "--out", tmp_path / "run"],
+        [
+            sys.executable,
+            "-m",
+            "identify",
+            "run",
+            "quick",
+            "--robot",
+            robot,
+            "--out",
+            tmp_path / "run",
+        ],
         capture_output=True,
         text=True,
         check=False,
@@ -69,6 +90,10 @@ def test_a_quick_run_of_every_robot_predicts_unseen_motion_and_names_what_poses_
     record_property(f"seconds_{robot}", result["seconds"]["total"])
     assert result["seconds"]["total"] < 180
     report = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    groups = [g["expression"] for g in result["identification"]["groups"].values() if len(g["coefficients"]) > 1]
+    groups = [
+        g["expression"]
+        for g in result["identification"]["groups"].values()
+        if len(g["coefficients"]) > 1
+    ]
     assert len(groups) > 0  # which poses cannot separate
     assert all(expression in report for expression in groups)

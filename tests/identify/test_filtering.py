@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 
 from identify.errors import FilterError
-from identify.filtering import filtered_derivatives, padding_samples, spline_derivatives, zero_phase_filter
+from identify.filtering import (
+    filtered_derivatives,
+    padding_samples,
+    spline_derivatives,
+    zero_phase_filter,
+)
 
 RATE = 60.0
 T = np.arange(1200) / RATE
@@ -13,7 +18,9 @@ def sine(frequency, phase=0.3):
     return np.sin(2 * np.pi * frequency * T + phase)
 
 
-@pytest.mark.parametrize(("frequency", "within"), [(0.5, 1e-6), (10.0, 2e-3), (12.0, 2e-3), (15.0, 2e-3)])
+@pytest.mark.parametrize(
+    ("frequency", "within"), [(0.5, 1e-6), (10.0, 2e-3), (12.0, 2e-3), (15.0, 2e-3)]
+)
 def test_gain_is_that_of_a_digital_butterworth_squared_without_a_shift(frequency, within):
     """One in the passband, one half at the cutoff."""
     gain = 1 / (1 + (np.tan(np.pi * frequency / RATE) / np.tan(np.pi * 10.0 / RATE)) ** 16)
@@ -22,7 +29,9 @@ def test_gain_is_that_of_a_digital_butterworth_squared_without_a_shift(frequency
 
 
 def test_constant_passes_unchanged_to_the_ends_and_columns_are_filtered_alike():
-    np.testing.assert_allclose(zero_phase_filter(np.full((200, 6), 0.2), RATE, 10.0), 0.2, atol=1e-12)
+    np.testing.assert_allclose(
+        zero_phase_filter(np.full((200, 6), 0.2), RATE, 10.0), 0.2, atol=1e-12
+    )
     both = zero_phase_filter(np.stack([sine(1.0), sine(3.0)], axis=1), RATE, 10.0)
     np.testing.assert_allclose(both[:, 1], zero_phase_filter(sine(3.0), RATE, 10.0), atol=1e-12)
 

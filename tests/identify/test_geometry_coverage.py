@@ -1,4 +1,6 @@
-"""Kinematic calibration at full count: 200 experiments a robot with drawn noise, and through images."""
+"""Kinematic calibration at full count: 200 experiments a robot with drawn noise, and through
+images.
+"""
 
 import json
 
@@ -16,7 +18,9 @@ EXPERIMENTS, POSES = 200, 60
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("robot", built_in_robots())
-def test_intervals_of_what_is_told_cover_95_percent_and_unseen_poses_are_met(robot, record_property):
+def test_intervals_of_what_is_told_cover_95_percent_and_unseen_poses_are_met(
+    robot, record_property
+):
     among = poses_of(robot, 400)
     design = designer(robot)
     chosen = design.moved(design.greedy(among, POSES), among)
@@ -44,16 +48,24 @@ def test_intervals_of_what_is_told_cover_95_percent_and_unseen_poses_are_met(rob
 
 
 def through_images(folder, robot, *settings):
-    """The entry of a calibration through images; the errors of what is told, in standard deviations; and the mean
-    square of these in units of their covariance, which is one where that is right."""
+    """The entry of a calibration through images; the errors of what is told, in standard
+    deviations; and the mean square of these in units of their covariance, which is one where that
+    is right."""
     assert command("geometry", "--robot", robot, "--out", folder, "--quiet", *settings) == 0
     entry = json.loads((folder / "geometry.json").read_text())
     names, covariance = read_covariance(folder / "covariance.nc")
     told = [k for k, name in enumerate(names) if entry["parameters"][name]["observable"]]
     rows = [entry["parameters"][names[k]] for k in told]
-    errors, std = (np.array([one["estimate"] - one["true"] for one in rows]), np.array([one["std"] for one in rows]))
+    errors, std = (
+        np.array([one["estimate"] - one["true"] for one in rows]),
+        np.array([one["std"] for one in rows]),
+    )
     scaled = covariance[np.ix_(told, told)] / np.outer(std, std)
-    return entry, errors / std, float(errors / std @ np.linalg.solve(scaled, errors / std)) / len(told)
+    return (
+        entry,
+        errors / std,
+        float(errors / std @ np.linalg.solve(scaled, errors / std)) / len(told),
+    )
 
 
 def judge(entry, errors, normalised):
@@ -63,13 +75,17 @@ def judge(entry, errors, normalised):
     assert abs(normalised - 1) < 4 * np.sqrt(2 / len(errors))
     assert max(entry["unseen"]["position_rms_um"]) < 5
     assert max(entry["unseen"]["orientation_rms_urad"]) < 20
-    assert max(entry["uncalibrated"]["position_rms_um"]) > 10 * max(entry["unseen"]["position_rms_um"])
+    assert max(entry["uncalibrated"]["position_rms_um"]) > 10 * max(
+        entry["unseen"]["position_rms_um"]
+    )
 
 
 @pytest.mark.slow
 def test_a_geometry_is_found_through_images(tmp_path):
     settings = {"poses": 15, "frames_per_pose": 3, "candidates": 60, "unseen": 30}
-    chosen = [word for name, value in settings.items() for word in ("--set", f"geometry.{name}={value}")]
+    chosen = [
+        word for name, value in settings.items() for word in ("--set", f"geometry.{name}={value}")
+    ]
     judge(*through_images(tmp_path / "out", "rss6", *chosen, "--set", "renderer=analytic"))
 
 

@@ -1,4 +1,6 @@
-"""What a stranger reads first: the help of every command, what a shell completes, and figures for scripts."""
+"""What a stranger reads first: the help of every command, what a shell completes, and figures for
+scripts.
+"""
 
 import json
 import os
@@ -39,7 +41,9 @@ def help_of(words, monkeypatch, capsys):
     return shown
 
 
-def test_the_first_help_lists_every_command_in_a_group_before_anything_else_in_whole_sentences(monkeypatch, capsys):
+def test_the_first_help_lists_every_command_in_a_group_before_anything_else_in_whole_sentences(
+    monkeypatch, capsys
+):
     shown = help_of((), monkeypatch, capsys)
     assert "..." not in shown.replace("[ARGS]...", "")
     listed, _, rest = shown.partition("\nExamples:\n")
@@ -62,7 +66,11 @@ def test_each_help_says_what_is_read_and_written_shows_an_example_and_names_the_
     assert re.search(r"\b[wW]rites\b", shown)
     examples = shown.partition("Example")[2]
     assert f"  cmmsim {' '.join(words)}" in examples
-    assert re.findall(r"^  (\d+)  ", examples.partition("Exit status:")[2], re.MULTILINE)[:3] == ["0", "1", "2"]
+    assert re.findall(r"^  (\d+)  ", examples.partition("Exit status:")[2], re.MULTILINE)[:3] == [
+        "0",
+        "1",
+        "2",
+    ]
 
 
 def test_a_limit_that_is_missed_and_a_command_that_cannot_be_done_have_statuses_of_their_own(
@@ -87,7 +95,9 @@ class Finding:
 
 @pytest.mark.parametrize("quiet", [False, True])
 @pytest.mark.slow
-def test_json_goes_to_a_file_beside_the_table_or_to_standard_output_in_its_place(quiet, tmp_path, capfd):
+def test_json_goes_to_a_file_beside_the_table_or_to_standard_output_in_its_place(
+    quiet, tmp_path, capfd
+):
     more = ["--quiet"] * quiet
     assert command("base-parameters", "rrr3", "--json", tmp_path / "a.json", *more) == 0
     assert ("base parameters" in capfd.readouterr().out) != quiet
@@ -100,7 +110,9 @@ def test_json_goes_to_a_file_beside_the_table_or_to_standard_output_in_its_place
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_completion_knows_the_names_that_the_readers_know_and_the_files_beside_them(tmp_path, monkeypatch):
+def test_completion_knows_the_names_that_the_readers_know_and_the_files_beside_them(
+    tmp_path, monkeypatch
+):
     known = {"robot": built_in_robots(), "sensor": sensor_names(), "scenario": scenario_names()}
     known["study"] = STUDIES.names()
     assert {kind: built_in_names(kind) for kind in BUILT_IN} == known
@@ -120,7 +132,17 @@ def test_completion_knows_the_names_that_the_readers_know_and_the_files_beside_t
 )
 @pytest.mark.slow
 def test_a_shell_is_offered_names(words, offered):
-    given = {"_CMMSIM_COMPLETE": "complete_bash", "COMP_WORDS": f"cmmsim {words}", "COMP_CWORD": "2"}
-    start = [sys.executable, "-c", "from cmmsim.__main__ import main; import sys; sys.argv = ['cmmsim']; main()"]
-    made = subprocess.run(start, env=os.environ | given, capture_output=True, text=True, check=False)
+    given = {
+        "_CMMSIM_COMPLETE": "complete_bash",
+        "COMP_WORDS": f"cmmsim {words}",
+        "COMP_CWORD": "2",
+    }
+    start = [
+        sys.executable,
+        "-c",
+        "from cmmsim.__main__ import main; import sys; sys.argv = ['cmmsim']; main()",
+    ]
+    made = subprocess.run(
+        start, env=os.environ | given, capture_output=True, text=True, check=False
+    )
     assert made.stdout.split() == offered, made.stderr

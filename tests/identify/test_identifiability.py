@@ -1,5 +1,6 @@
-"""What is known beside the poses (guess, parameters that a scenario states, scale anchor), what counts as identified,
-what rests on the guess, and conditioning: worked out by hand, and named for the robot."""
+"""What is known beside the poses (guess, parameters that a scenario states, scale anchor), what
+counts as identified, what rests on the guess, and conditioning: worked out by hand, and named for
+the robot."""
 
 import json
 from dataclasses import replace
@@ -55,7 +56,8 @@ def base():
 
 
 def test_the_base_parameters_alone_decide_the_torque(base):
-    """Parameters with equal base parameters have equal torques; a moved base parameter moves them."""
+    """Parameters with equal base parameters have equal torques; a moved base parameter moves
+    them."""
     robot, rng = rss6(), np.random.default_rng(3)
     pose = robot.home_pose + rng.uniform(-1, 1, (20, 6)) * np.repeat([0.008, 0.03], 3)
     motion = pose, rng.normal(size=(20, 6)) * np.repeat([0.1, 0.5], 3), rng.normal(size=(20, 6))
@@ -71,7 +73,9 @@ def test_the_base_parameters_alone_decide_the_torque(base):
         assert np.abs(robot.regressor(*motion) @ (row / (row @ row))).max() > 1e-3
 
 
-def test_rank_and_space_are_those_of_the_singular_values_and_the_papers_threshold_depends_on_the_units(base):
+def test_rank_and_space_are_those_of_the_singular_values_and_the_papers_threshold_depends_on_the_units(
+    base,
+):
     matrix = structural_regressor(rss6())
     lengths = np.linalg.norm(matrix, axis=0)
     scale = np.where(lengths > 0, lengths, 1.0)
@@ -86,14 +90,18 @@ def test_rank_and_space_are_those_of_the_singular_values_and_the_papers_threshol
 
 
 def test_the_angle_to_the_singular_vectors_is_that_by_which_a_group_is_wrong():
-    """Columns of length 3 and 4, and one that no motion shows: a group turned towards it by 0.1 rad."""
+    """Columns of length 3 and 4, and one that no motion shows: a group turned towards it by 0.1
+    rad.
+    """
     first, second, unseen = (index_of(f"crank{leg}.Izz") for leg in (1, 2, 3))
     matrix, tilt = np.zeros((2, 64)), np.zeros((2, 64))
     matrix[0, first], matrix[1, second], tilt[0, unseen] = 3.0, 4.0, np.tan(0.1) / 3.0
     right = base_parameters(matrix, LAYOUT)
     assert angle_to_singular_vectors(matrix, right) < 1e-12
     turned = right.combinations + tilt
-    assert angle_to_singular_vectors(matrix, replace(right, combinations=turned)) == pytest.approx(0.1, rel=1e-9)
+    assert angle_to_singular_vectors(matrix, replace(right, combinations=turned)) == pytest.approx(
+        0.1, rel=1e-9
+    )
     one_less = replace(right, combinations=right.combinations[:1])
     assert angle_to_singular_vectors(matrix, one_less) == pytest.approx(np.pi / 2)
 
@@ -102,7 +110,9 @@ def test_the_angle_to_the_singular_vectors_is_that_by_which_a_group_is_wrong():
 def test_gravity_across_the_crank_axes_separates_mass_from_inertia(base, tmp_path):
     """On a slope a crank's weight turns it, so its mass is no longer tied to its inertia."""
     level, leaning = "gravity = [0.0, 0.0, -9.81]", "gravity = [4.0, 0.0, -8.9575]"
-    matrix = structural_regressor(load_robot(changed_robot_file(tmp_path / "leaning.toml", level, leaning)))
+    matrix = structural_regressor(
+        load_robot(changed_robot_file(tmp_path / "leaning.toml", level, leaning))
+    )
     sloped = base_parameters(matrix, LAYOUT)
     assert sloped.rank == rank_by_singular_values(matrix) > base.rank
     row = sloped.combinations[sloped.pivots.index(LAYOUT.dynamic_names.index("crank2.Izz"))]
@@ -110,13 +120,16 @@ def test_gravity_across_the_crank_axes_separates_mass_from_inertia(base, tmp_pat
 
 
 def test_groups_do_not_depend_on_the_motions_and_a_crank_turns_about_its_joint(base):
-    """A crank about a vertical axis shows its inertia about that axis: Izz + m (r / 2)², r = 60 mm."""
+    """A crank about a vertical axis shows its inertia about that axis: Izz + m (r / 2)², r =
+    60 mm."""
     again = base_parameters(structural_regressor(rss6(), motions=333, seed=11), LAYOUT)
     assert again.pivots == base.pivots
     assert np.allclose(again.combinations, base.combinations, atol=1e-9)
     row = base.combinations[base.pivots.index(LAYOUT.dynamic_names.index("crank2.Izz"))]
     assert row[LAYOUT.dynamic_names.index("crank2.mass")] == pytest.approx(0.03**2, rel=1e-9)
-    assert all(f"crank{k}.Ixx" in base.unseen and f"link{k}.Izz" in base.unseen for k in range(1, 7))
+    assert all(
+        f"crank{k}.Ixx" in base.unseen and f"link{k}.Izz" in base.unseen for k in range(1, 7)
+    )
 
 
 def test_the_command_prints_and_writes_the_groups(tmp_path, capsys):
@@ -141,8 +154,8 @@ def judged(guess, name, std):
 
 
 def test_the_record_must_halve_the_guess_and_leave_less_than_half_of_the_size():
-    """The guess of the platform's mass is 24 kg ± 100 %, then ± 10 %, then ± 1,000,000 %: from that, 0.146 ± 2.73 kg m2
-    is a large step and no knowledge."""
+    """The guess of the platform's mass is 24 kg ± 100 %, then ± 10 %, then ± 1,000,000 %: from
+    that, 0.146 ± 2.73 kg m2 is a large step and no knowledge."""
     for start_std, limit in ((1.0, 12.0), (0.1, 1.2), (1e4, 12.0)):
         guess = starting_guess(rss6(), "initial", start_std)
         assert judged(guess, "platform.mass", 0.999 * limit), start_std
@@ -159,7 +172,9 @@ def test_the_record_must_halve_the_guess_and_leave_less_than_half_of_the_size():
 
 
 def test_a_difference_of_masses_is_as_large_as_they_are():
-    """Of 3 kg and 4 kg the size is 5 kg: known to 2.4 kg it is identified, whatever is left of it; to 2.6 kg not."""
+    """Of 3 kg and 4 kg the size is 5 kg: known to 2.4 kg it is identified, whatever is left of it;
+    to 2.6 kg not.
+    """
     criterion = Identifiability(std=np.array([30.0, 40.0]), sizes=np.array([3.0, 4.0]))
     row = np.array([[1.0, -1.0]])
     assert criterion.judge(row, np.diag([2.4**2, 0.0]))[0]
@@ -168,7 +183,9 @@ def test_a_difference_of_masses_is_as_large_as_they_are():
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 100.0])
 def test_the_estimate_does_not_decide(base, factor):
-    """Groups with members known to 20 % are identified however small, or large, chance makes their estimates."""
+    """Groups with members known to 20 % are identified however small, or large, chance makes their
+    estimates.
+    """
     guess = starting_guess(rss6(), "initial", 1.0)
     criterion = identifiability(guess, rss6())
     covariance = np.diag((0.2 * criterion.sizes) ** 2)
@@ -185,21 +202,30 @@ def record():
 
 def driven(**known):
     """A scenario with (value, std) of parameters by name, an underscore for its last dot."""
-    prior = {".".join(name.rsplit("_", 1)): {"value": value, "std": std} for name, (value, std) in known.items()}
+    prior = {
+        ".".join(name.rsplit("_", 1)): {"value": value, "std": std}
+        for name, (value, std) in known.items()
+    }
     return quick(**{"identification.method": "command_driven", "identification.prior": prior})
 
 
 def test_the_share_of_the_guess_is_what_another_guess_makes_of_the_estimate(record):
-    """Another guess of all parameters moves the estimate by W^-1 P d, W^-1 the covariance of white residuals, and the
-    share is the variance of that for guesses that err as they say."""
+    """Another guess of all parameters moves the estimate by W^-1 P d, W^-1 the covariance of white
+    residuals, and the share is the variance of that for guesses that err as they say."""
     first = identify(record, rss6(), driven())
     guess = starting_guess(rss6(), "initial", quick().identification.start_std)
-    moved = 0.02 * guess.std * np.random.default_rng(0).uniform(0.2, 2.0, len(NAMES))  # friction is never negative
-    known = {name.replace(".", "_"): (guess.values[k] + moved[k], guess.std[k]) for k, name in enumerate(NAMES)}
+    # friction is never negative
+    moved = 0.02 * guess.std * np.random.default_rng(0).uniform(0.2, 2.0, len(NAMES))
+    known = {
+        name.replace(".", "_"): (guess.values[k] + moved[k], guess.std[k])
+        for k, name in enumerate(NAMES)
+    }
     second = identify(record, rss6(), driven(**known))
     gain = first.covariance / guess.std**2
     off = second.estimate - first.estimate - gain @ moved
-    assert np.sqrt(np.mean((off / first.std) ** 2)) < 0.02 * np.sqrt(np.mean((gain @ moved / first.std) ** 2))
+    assert np.sqrt(np.mean((off / first.std) ** 2)) < 0.02 * np.sqrt(
+        np.mean((gain @ moved / first.std) ** 2)
+    )
     expected = np.sum((gain * guess.std) ** 2, axis=1) / first.std**2
     np.testing.assert_allclose(first.prior_share, expected, rtol=1e-6)
 
@@ -217,8 +243,13 @@ def test_a_result_names_what_rests_on_the_guess_among_what_is_identified(record)
 
 @pytest.mark.slow
 def test_weighing_a_platform_that_sliders_carry_does_not_fix_the_scale_and_a_known_gain_does():
-    """Poses show the platform's mass only in a sum with those of the six sliders; a warning says what to do."""
-    sliders, scenario = load_robot("pss6"), quick(robot="pss6", **{"identification.method": "command_driven"})
+    """Poses show the platform's mass only in a sum with those of the six sliders; a warning says
+    what to do.
+    """
+    sliders, scenario = (
+        load_robot("pss6"),
+        quick(robot="pss6", **{"identification.method": "command_driven"}),
+    )
     record = run_plant(scenario, seed=1, duration_s=5.0, robot=sliders)[0]
     place = sliders.layout.names.index("joint_pid.lp")
     gain = sliders.parameter_sets["identified"].vector[place]
@@ -242,13 +273,17 @@ def with_anchor(record, anchor):
 
 
 def three_unknowns(poses, groups=((1.0, 0.0), (0.0, 1.0))):
-    """Conditioning of two dynamic parameters in groups and one gain, all of size one with a guess of 1 ± 1."""
+    """Conditioning of two dynamic parameters in groups and one gain, all of size one with a guess
+    of 1 ± 1.
+    """
     base = BaseParameters(("a", "b"), np.array(groups), tuple(range(len(groups))), (), (0.0, 1.0))
     return conditioning(poses, np.eye(3), base, guess_of(np.ones(3), np.ones(3)), np.ones(3))
 
 
 def test_condition_numbers_are_those_worked_out_by_hand_and_a_poor_one_is_a_warning():
-    """Poses that show a - b with weight 8 and a + b - 2 gain with weight 0.5, and nothing of the common factor."""
+    """Poses that show a - b with weight 8 and a + b - 2 gain with weight 0.5, and nothing of the
+    common factor.
+    """
     first, second = np.array([1.0, -1.0, 0.0]) / np.sqrt(2), np.array([1.0, 1.0, -2.0]) / np.sqrt(6)
     found = three_unknowns(8 * np.outer(first, first) + 0.5 * np.outer(second, second))
     assert found.with_guess == pytest.approx(9.0)
@@ -257,9 +292,12 @@ def test_condition_numbers_are_those_worked_out_by_hand_and_a_poor_one_is_a_warn
     assert found.warnings() == ()
     found = three_unknowns(2 * np.outer(first, first) + 0.1 / POOR * np.outer(second, second))
     assert found.poor
-    assert "of 2 independent combinations of parameters and gains, 1 are known from" in found.warnings()[0]
-    # Two parameters that only act as a + 2 b: the pair's information has rank one, that of the group is full. Poses are
-    # blind to a common factor of (a, b, gain) = (1, 1, 1).
+    assert (
+        "of 2 independent combinations of parameters and gains, 1 are known from"
+        in found.warnings()[0]
+    )
+    # Two parameters that only act as a + 2 b: the pair's information has rank one, that of the
+    # group is full. Poses are blind to a common factor of (a, b, gain) = (1, 1, 1).
     only = np.array([1.0, 2.0, -3.0])
     found = three_unknowns(3.0 * np.outer(only, only), groups=[[1.0, 2.0]])
     assert found.directions == 1
@@ -278,15 +316,23 @@ def test_correlations_and_the_strongest_pairs():
 def anchored(record, anchor):
     """The record with another anchor."""
     bare = record.copy()
-    bare.attrs = {name: value for name, value in record.attrs.items() if not name.startswith("scale_anchor")}
+    bare.attrs = {
+        name: value for name, value in record.attrs.items() if not name.startswith("scale_anchor")
+    }
     store_anchor(bare, anchor)
     return bare
 
 
-def test_a_known_gain_fixes_the_scale_as_its_anchor_does_and_of_what_no_motion_shows_only_the_prior_is_known(record):
-    """Two routes to the same knowledge; the anchor stands beside the starting guess, the prior in its place."""
+def test_a_known_gain_fixes_the_scale_as_its_anchor_does_and_of_what_no_motion_shows_only_the_prior_is_known(
+    record,
+):
+    """Two routes to the same knowledge; the anchor stands beside the starting guess, the prior in
+    its place.
+    """
     by_anchor = identify(anchored(record, ScaleAnchor("joint_gain", 11.0, 0.02)), rss6(), driven())
-    by_prior = identify(anchored(record, ScaleAnchor("prior")), rss6(), driven(joint_pid_lp=(11.0, 0.02)))
+    by_prior = identify(
+        anchored(record, ScaleAnchor("prior")), rss6(), driven(joint_pid_lp=(11.0, 0.02))
+    )
     assert by_prior.estimate[index_of("joint_pid.lp")] == pytest.approx(11.0, abs=0.04)
     assert np.all(np.abs(by_prior.estimate - by_anchor.estimate) < 0.05 * by_anchor.std)
     assert np.allclose(by_prior.std, by_anchor.std, rtol=1e-3)
@@ -296,7 +342,9 @@ def test_a_known_gain_fixes_the_scale_as_its_anchor_does_and_of_what_no_motion_s
     assert not result.identifiable[k]
 
 
-def test_the_anchor_that_is_stored_is_read_and_a_weighing_is_one_equation_in_standard_deviations(record):
+def test_the_anchor_that_is_stored_is_read_and_a_weighing_is_one_equation_in_standard_deviations(
+    record,
+):
     for anchor in (ScaleAnchor("joint_gain", 10.5, 0.01), ScaleAnchor("payload")):
         assert read_anchor(anchored(record, anchor), LAYOUT) == anchor
     row, right = ScaleAnchor("platform_mass", 23.5, 0.005).row(LAYOUT)
@@ -310,21 +358,35 @@ def test_the_anchor_that_is_stored_is_read_and_a_weighing_is_one_equation_in_sta
 @pytest.mark.parametrize("attribute", ["scale_anchor_value", "scale_anchor_std"])
 def test_an_impossible_anchor_is_refused_with_its_value_limit_and_unit(record, attribute, bad):
     shown = f"{float(bad)}" if isinstance(bad, float) else repr(bad)
-    with pytest.raises(RecordError, match=rf"{attribute} is {shown}, must be a finite number > 0 in kg: .*form.mass"):
+    with pytest.raises(
+        RecordError,
+        match=rf"{attribute} is {shown}, must be a finite number > 0 in kg: .*form.mass",
+    ):
         read_anchor(record.assign_attrs({attribute: bad}), LAYOUT)
 
 
 def test_what_no_model_has_an_anchor_that_is_unknown_or_incomplete_and_what_is_no_robot_or_scenario_are_refused(
     record,
 ):
-    with pytest.raises(ScenarioError, match=r"set 'initial', known beforehand: joint_pid.li\): joint_pid.li is 0.0"):
+    with pytest.raises(
+        ScenarioError, match=r"set 'initial', known beforehand: joint_pid.li\): joint_pid.li is 0.0"
+    ):
         identify(record, rss6(), driven(joint_pid_li=(0.0, 1.0)))
-    with pytest.raises(ScenarioError, match=r"known beforehand: platform.mass\): platform.mass = 0 kg is not"):
+    with pytest.raises(
+        ScenarioError, match=r"known beforehand: platform.mass\): platform.mass = 0 kg is not"
+    ):
         identify(record, rss6(), driven(platform_mass=(0.0, 1.0)))
-    with pytest.raises(RecordError, match=r"no scale anchor .*found 'guess'; valid anchors: platform_mass"):
+    with pytest.raises(
+        RecordError, match=r"no scale anchor .*found 'guess'; valid anchors: platform_mass"
+    ):
         identify(record.assign_attrs(scale_anchor="guess"), rss6(), quick())
-    half = anchored(record, ScaleAnchor("payload")).assign_attrs(scale_anchor="joint_gain", scale_anchor_value=1.0)
-    with pytest.raises(RecordError, match=r"_std is None, must be .* in N m/rad: .*joint_gain measures joint_pid.lp"):
+    half = anchored(record, ScaleAnchor("payload")).assign_attrs(
+        scale_anchor="joint_gain", scale_anchor_value=1.0
+    )
+    with pytest.raises(
+        RecordError,
+        match=r"_std is None, must be .* in N m/rad: .*joint_gain measures joint_pid.lp",
+    ):
         read_anchor(half, LAYOUT)
     with pytest.raises(EstimationError, match="None is no Robot: dynamics"):
         identify(record, None, quick())

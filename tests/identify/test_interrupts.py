@@ -61,7 +61,9 @@ def test_noted_ctrl_c_is_raised_again_where_it_was_swallowed_and_an_inner_blocks
         raise ImportError("no library")
 
 
-def test_ctrl_c_in_a_row_is_no_error_of_it_whatever_became_of_it_and_one_that_was_swallowed_begins_no_row(tmp_path):
+def test_ctrl_c_in_a_row_is_no_error_of_it_whatever_became_of_it_and_one_that_was_swallowed_begins_no_row(
+    tmp_path,
+):
     def workers():
         raise AssertionError("workers are started")
 
@@ -76,14 +78,19 @@ def test_ctrl_c_in_a_row_is_no_error_of_it_whatever_became_of_it_and_one_that_wa
             run_study(chosen, tmp_path / "b", SilentProgress(), workers)
 
 
-def test_ctrl_c_in_a_command_is_one_line_whatever_became_of_it_and_other_errors_stay_what_they_are(monkeypatch, capsys):
+def test_ctrl_c_in_a_command_is_one_line_whatever_became_of_it_and_other_errors_stay_what_they_are(
+    monkeypatch, capsys
+):
     study = "studies.study_file.load_study"
     scenario = ("scenario.scenario.load_scenario", "commands.options.load_scenario")
     for happens in (ctrl_c, broken_import):
         for name in (study, *scenario):
             monkeypatch.setattr(f"identify.{name}", lambda _, happens=happens: happens())
         for words, line in (
-            (("study", "pixel_noise"), "stopped: what is done is kept; the same command goes on from there\n"),
+            (
+                ("study", "pixel_noise"),
+                "stopped: what is done is kept; the same command goes on from there\n",
+            ),
             (("excite", "quick"), "aborted\n"),
         ):
             assert command(*words) == 130

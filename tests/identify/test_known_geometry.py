@@ -1,7 +1,8 @@
-"""Identification on a geometry that is calibrated and not exact: its covariance costs precision and no truth.
+"""Identification on a geometry that is calibrated and not exact: its covariance costs precision and
+no truth.
 
-The plant has a geometry of its own; servo and estimator know what a calibration by static poses, with drawn noise, left
-of the drawing.
+The plant has a geometry of its own; servo and estimator know what a calibration by static poses,
+with drawn noise, left of the drawing.
 """
 
 import json
@@ -17,7 +18,8 @@ from dynamics.robot_text import robot_text
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify, output_error_problem
 from identify.experiment.plant import build_plant
-from identify.files.dataset import write_covariance_of
+from identify.files.atomic import write_bytes
+from identify.files.dataset import covariance_netcdf
 from identify.record.geometry_errors import read_geometry_covariance, store_geometry_covariance
 from identify.record.known_geometry import KnownGeometry, known_geometry
 from identify.record.recording import write
@@ -33,10 +35,14 @@ SENSOR = np.repeat([3e-6, 11e-6], 3)
 
 @cache
 def calibrated(seed, poses=14, frames=1):
-    """What a calibration of rss6 knows, and the true robot. So few poses leave errors that a motion shows."""
+    """What a calibration of rss6 knows, and the true robot. So few poses leave errors that a motion
+    shows.
+    """
     made = drawn("rss6", seed, poses_of("rss6", poses), frames)
     found, nominal = made.calibrated("rss6"), known_robot("rss6")
-    return KnownGeometry(nominal.moved(found.deviations), found.covariance), nominal.moved(made.deviations)
+    return KnownGeometry(nominal.moved(found.deviations), found.covariance), nominal.moved(
+        made.deviations
+    )
 
 
 def record_of(known, true, scenario, seed, robot=None):
@@ -64,7 +70,10 @@ def test_modes_of_the_geometry_are_how_the_poses_of_a_model_change_with_it(metho
     drawn_numbers = np.linalg.solve(geometry.factor, errors)
     moved = run.simulate(values, robot=robot.moved(errors)).pose - run.simulate(values).pose
     free = list(robot.geometry.chart.freedoms)
-    sizes = [np.sqrt(np.mean(rows[:, free] ** 2, axis=0)) for rows in (modes @ drawn_numbers - moved, moved)]
+    sizes = [
+        np.sqrt(np.mean(rows[:, free] ** 2, axis=0))
+        for rows in (modes @ drawn_numbers - moved, moved)
+    ]
     assert (sizes[0] < 0.1 * sizes[1]).all()  # what sticks as it starts has no derivative
     assert np.abs(moved).max() > 1e-7  # m or rad
     assert run.common.all_names == tuple(f"geometry.{name}" for name in robot.geometry.number_names)
@@ -88,7 +97,9 @@ def test_parameters_are_found_in_spite_of_a_poor_calibration_and_the_geometry_wi
     assert found.names == tuple(f"geometry.{name}" for name in known.robot.geometry.number_names)
     assert (np.abs(found.estimate - off) < 4.5 * found.std).all()
     assert (found.std <= found.prior_std * (1 + 1e-6)).all()
-    silent = identify(record, known.robot, scenario.with_overrides({"identification.nuisances": []}))
+    silent = identify(
+        record, known.robot, scenario.with_overrides({"identification.nuisances": []})
+    )
     assert any("does not explain" in warning for warning in silent.warnings)
     assert silent.noise_ratio > 1.3 * result.noise_ratio
 
@@ -97,14 +108,20 @@ def test_parameters_are_found_in_spite_of_a_poor_calibration_and_the_geometry_wi
 @pytest.mark.parametrize("method", ["command_driven", "closed_loop"])
 @pytest.mark.parametrize(("poses", "frames"), [(60, 20), (14, 1)])
 def test_intervals_hold_on_a_calibrated_geometry(method, poses, frames, record_property):
-    """Each experiment has its own true robot, calibration and noise; beside it the same without a word of the geometry,
-    and with the true geometry known. Unseen motions are foretold as well as with that."""
+    """Each experiment has its own true robot, calibration and noise; beside it the same without a
+    word of the geometry, and with the true geometry known. Unseen motions are foretold as well as
+    with that."""
     told = quick(**{"identification.method": method})
     silent = told.with_overrides({"identification.nuisances": []})
-    hits, squares, normalised = ({name: [] for name in ("told", "silent", "exact")} for _ in range(3))
+    hits, squares, normalised = (
+        {name: [] for name in ("told", "silent", "exact")} for _ in range(3)
+    )
     for seed in range(20):
         known, true = calibrated(seed, poses, frames)
-        record, exact = record_of(known, true, told, seed), run_plant(told, seed, SENSOR, duration_s=5.0, robot=true)[0]
+        record, exact = (
+            record_of(known, true, told, seed),
+            run_plant(told, seed, SENSOR, duration_s=5.0, robot=true)[0],
+        )
         for name, seen, model, robot in (
             ("told", record, told, known.robot),
             ("silent", record, silent, known.robot),
@@ -114,13 +131,19 @@ def test_intervals_hold_on_a_calibrated_geometry(method, poses, frames, record_p
             low, high = result.intervals[result.identifiable].T
             actual = truth()[result.identifiable]
             hits[name].append((low <= actual) & (actual <= high))
-            normalised[name].append(((result.estimate - truth()) / result.std)[result.identifiable] ** 2)
-            squares[name].append(np.mean(unseen_errors(robot, true, model, result.estimate) ** 2, axis=0))
+            normalised[name].append(
+                ((result.estimate - truth()) / result.std)[result.identifiable] ** 2
+            )
+            squares[name].append(
+                np.mean(unseen_errors(robot, true, model, result.estimate) ** 2, axis=0)
+            )
     for name in hits:
         record_property(f"covered_{name}", float(np.concatenate(hits[name]).mean()))
         record_property(f"mean_square_{name}", float(np.concatenate(normalised[name]).mean()))
         record_property(f"identified_{name}", float(np.mean([len(row) for row in hits[name]])))
-        record_property(f"unseen_um_{name}", float(1e6 * np.sqrt(np.mean(np.array(squares[name])[:, :3]))))
+        record_property(
+            f"unseen_um_{name}", float(1e6 * np.sqrt(np.mean(np.array(squares[name])[:, :3])))
+        )
     covered = {name: np.concatenate(rows).mean() for name, rows in hits.items()}
     assert covered["told"] >= 0.93, covered
     rms = {name: np.sqrt(np.mean(np.array(rows)[:, :3])) for name, rows in squares.items()}
@@ -129,8 +152,13 @@ def test_intervals_hold_on_a_calibrated_geometry(method, poses, frames, record_p
 
 
 def unseen_errors(known, true, scenario, parameters):
-    """Errors (N, 6) of a model on motions that it never saw, of the plant in its servo without noise."""
-    plant, errors = replace(build_plant(scenario, known_robot("rss6")), nominal=known, robot=true), []
+    """Errors (N, 6) of a model on motions that it never saw, of the plant in its servo without
+    noise.
+    """
+    plant, errors = (
+        replace(build_plant(scenario, known_robot("rss6")), nominal=known, robot=true),
+        [],
+    )
     for seed in (7, 8, 9):
         reference = trajectory(seed).reference(scenario.timing.frame_times(5.0))
         errors.append(model_run(known, scenario, parameters, reference) - plant.run(reference).pose)
@@ -141,10 +169,12 @@ def written(folder, known):
     """A calibration as `cmmsim geometry` writes it; returns the robot file."""
     robot, names = known.robot, known.robot.geometry
     folder.mkdir(exist_ok=True)
-    text = robot_text(RobotDescription(robot.name, robot.geometry, robot.parameter_sets), ["calibrated"])
+    text = robot_text(
+        RobotDescription(robot.name, robot.geometry, robot.parameter_sets), ["calibrated"]
+    )
     (folder / "robot.toml").write_text(text, encoding="utf-8")
     units = dict(zip(names.number_names, names.number_units, strict=True))
-    write_covariance_of(folder / "covariance.nc", units, known.covariance)
+    write_bytes(folder / "covariance.nc", covariance_netcdf(units, known.covariance))
     return folder / "robot.toml"
 
 
@@ -173,7 +203,9 @@ def test_what_is_no_calibration_of_this_robot_is_refused_in_one_line(tmp_path):
     def said(**overrides):
         return refusal(ScenarioError, known_geometry, scenario.with_overrides(overrides))
 
-    assert "is neither exact, calibrated, nor a robot.toml" in said(**{"geometry.known": str(tmp_path / "none.toml")})
+    assert "is neither exact, calibrated, nor a robot.toml" in said(
+        **{"geometry.known": str(tmp_path / "none.toml")}
+    )
     assert "rrr3 has other legs than delta3" in said(robot="delta3")
     adrift = {"geometry.known": "calibrated", "geometry.frames": "unknown"}
     assert "up to where the robot stands" in refusal(ScenarioError, scenario.with_overrides, adrift)
@@ -196,7 +228,9 @@ def test_a_record_with_a_covariance_that_is_none_is_refused():
     np.testing.assert_array_equal(read_geometry_covariance(record, known.robot), known.covariance)
     store_geometry_covariance(record, known.robot, -known.covariance)
     assert "not > 0" in refusal(RecordError, read_geometry_covariance, record, known.robot)
-    assert "not of the 33" in refusal(RecordError, read_geometry_covariance, record, load_robot("delta3"))
+    assert "not of the 33" in refusal(
+        RecordError, read_geometry_covariance, record, load_robot("delta3")
+    )
 
 
 @pytest.mark.slow
@@ -214,7 +248,12 @@ def test_a_run_calibrates_its_robot_first_and_the_truth_stays_where_no_estimator
         "excitation.candidates": 4,
     }
     changes = [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
-    assert command("excite", "quick", "--robot", "rrr3", "--out", tmp_path / "run", "--quiet", *changes) == 0
+    assert (
+        command(
+            "excite", "quick", "--robot", "rrr3", "--out", tmp_path / "run", "--quiet", *changes
+        )
+        == 0
+    )
     folder = tmp_path / "run" / "geometry"
     entry = json.loads((folder / "geometry.json").read_text())
     for name in ("geometry.json", "geometry.md", "poses.json"):
@@ -227,7 +266,9 @@ def test_a_run_calibrates_its_robot_first_and_the_truth_stays_where_no_estimator
     assert 0.3 < errors < 2.5  # three standard deviations of 21 numbers
     parameters = entry["parameters"].values()
     true = [one["true"] - one["nominal"] for one in parameters]
-    np.testing.assert_allclose(plant.robot.geometry.deviations_from(load_robot("rrr3").geometry), true, atol=1e-12)
+    np.testing.assert_allclose(
+        plant.robot.geometry.deviations_from(load_robot("rrr3").geometry), true, atol=1e-12
+    )
     assert np.abs(true).max() > 1e-4
 
 
@@ -236,10 +277,17 @@ def test_a_record_of_ones_own_is_told_how_well_its_geometry_is_known_by_its_scen
     known, errors = off_by("rrr3", 4e-6)
     known = replace(known, robot=known.robot.moved(10 * errors))
     path = str(written(tmp_path, known))
-    scenario = quick(robot="rrr3", **{"geometry.known": path, "identification.method": "command_driven"})
+    scenario = quick(
+        robot="rrr3", **{"geometry.known": path, "identification.method": "command_driven"}
+    )
     record = record_of(known, known.robot.moved(errors), scenario, 0, load_robot("rrr3"))
     write(tmp_path / "mine.nc", record.drop_dims(["geometric_number", "geometric_number_2"]))
-    assert command("identify", "--record", tmp_path / "mine.nc", "--out", tmp_path / "out", "--quiet") == 0
+    assert (
+        command("identify", "--record", tmp_path / "mine.nc", "--out", tmp_path / "out", "--quiet")
+        == 0
+    )
     found = json.loads((tmp_path / "out" / "result.json").read_text())["identification"]
-    assert list(found["nuisances"]) == [f"geometry.{name}" for name in known.robot.geometry.number_names]
+    assert list(found["nuisances"]) == [
+        f"geometry.{name}" for name in known.robot.geometry.number_names
+    ]
     assert found["noise_ratio"] < 1.15

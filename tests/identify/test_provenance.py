@@ -1,4 +1,6 @@
-"""What a result was made of: files that are others are refused by each stage that reads both, before any work."""
+"""What a result was made of: files that are others are refused by each stage that reads both,
+before any work.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,15 @@ from identify.files.dataset import write_covariance
 from identify.files.run_folder import load_result, save_result
 from identify.progress import SilentProgress
 from identify.record.provenance import ENTRY, RunFiles, array_digest, digest
-from identify.record.recording import EXCITATION, read, read_model_runs, read_runs, write, write_model_runs, write_runs
+from identify.record.recording import (
+    EXCITATION,
+    read,
+    read_model_runs,
+    read_runs,
+    write,
+    write_model_runs,
+    write_runs,
+)
 from identify.reporting.report import write_report
 from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector
@@ -35,16 +45,27 @@ def test_arrays_are_told_apart_by_name_shape_and_number_alone():
         assert array_digest(others) != known
 
 
-def test_a_record_is_the_same_wherever_it_was_written_and_another_by_whatever_an_identification_reads(tmp_path):
+def test_a_record_is_the_same_wherever_it_was_written_and_another_by_whatever_an_identification_reads(
+    tmp_path,
+):
     """Nor does it matter which estimator its scenario named: the record was made without."""
     record, _ = short_run()
     driven, stiffer = ({"identification.method": "command_driven"}, {"servo.kp": 0.31})
     scenarios = [SHORT.with_overrides(settings).to_toml() for settings in (driven, stiffer)]
-    later = record.assign_attrs(created="later", record_seconds=3.0, title="mine", scenario=scenarios[0])
+    later = record.assign_attrs(
+        created="later", record_seconds=3.0, title="mine", scenario=scenarios[0]
+    )
     write(tmp_path / "one.nc", record)
     write(tmp_path / "two.nc", later)
-    (known,) = {digest(one) for one in (record, later, read(tmp_path / "one.nc"), read(tmp_path / "two.nc"))}
-    others = [{"scale_anchor_value": 23.6}, {"payload_mass": 8.0}, {"seed": 2}, {"scenario": scenarios[1]}]
+    (known,) = {
+        digest(one) for one in (record, later, read(tmp_path / "one.nc"), read(tmp_path / "two.nc"))
+    }
+    others = [
+        {"scale_anchor_value": 23.6},
+        {"payload_mass": 8.0},
+        {"seed": 2},
+        {"scenario": scenarios[1]},
+    ]
     changed = [record.assign_attrs(attributes) for attributes in others]
     for another in (*changed, moved(record), record.assign(command=record["command"] + 1e-9)):
         assert digest(another) != known
@@ -70,9 +91,13 @@ def other_model(run):
 
 
 @pytest.mark.slow
-def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate_outside_its_interval(run_folder):
+def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate_outside_its_interval(
+    run_folder,
+):
     bare = load_result(run_folder.result)
-    made_of = RunFiles(run_folder).digests("experiment.nc", "covariance.nc", "validation.nc", "model.nc")
+    made_of = RunFiles(run_folder).digests(
+        "experiment.nc", "covariance.nc", "validation.nc", "model.nc"
+    )
     save_result(run_folder.result, bare | {ENTRY: made_of})
     assert len(read_run(run_folder).validation) == 2
     for replace, file, says, stage in (
@@ -83,7 +108,9 @@ def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate
     ):
         replace(run_folder)
         save_result(run_folder.result, bare | {ENTRY: {file: made_of[file]}})
-        with pytest.raises(RecordError, match=f"json is {says}: run `cmmsim {stage} --out {run_folder.path}` again"):
+        with pytest.raises(
+            RecordError, match=f"json is {says}: run `cmmsim {stage} --out {run_folder.path}` again"
+        ):
             write_report(run_folder.path)
         assert not run_folder.report.exists()
     save_result(run_folder.result, bare | {ENTRY: {"payload.nc": "of a second run"}})
@@ -93,7 +120,9 @@ def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate
     read_run(run_folder)  # a result that states no digest asks nothing
     bare["identification"]["parameters"]["joint1.coulomb"]["estimate"] = -5
     save_result(run_folder.result, bare)
-    with pytest.raises(RecordError, match=r"json: the estimate -5 of joint1.coulomb is outside its interval 0.103"):
+    with pytest.raises(
+        RecordError, match=r"json: the estimate -5 of joint1.coulomb is outside its interval 0.103"
+    ):
         write_report(run_folder.path)
 
 
@@ -106,12 +135,20 @@ def test_identification_states_what_it_read_and_wrote(recorded_folder):
 
 def entries(**changes):
     """The true parameters as an identification has them, but for some; None: it lacks this one."""
-    values = dict(zip(NAMES, truth(), strict=True)) | {name.replace("__", "."): one for name, one in changes.items()}
-    return {"parameters": {name: {"initial": value, "estimate": value} for name, value in values.items()}}
+    values = dict(zip(NAMES, truth(), strict=True)) | {
+        name.replace("__", "."): one for name, one in changes.items()
+    }
+    return {
+        "parameters": {
+            name: {"initial": value, "estimate": value} for name, value in values.items()
+        }
+    }
 
 
 @pytest.mark.slow
-def test_what_reads_a_run_anew_refuses_in_one_line_files_of_another_and_a_result_that_is_none(recorded_folder, capsys):
+def test_what_reads_a_run_anew_refuses_in_one_line_files_of_another_and_a_result_that_is_none(
+    recorded_folder, capsys
+):
     """And writes nothing."""
     run = recorded_folder
     write_covariance(run.covariance, LAYOUT, np.eye(len(NAMES)))
@@ -125,9 +162,20 @@ def test_what_reads_a_run_anew_refuses_in_one_line_files_of_another_and_a_result
         ("variation", "validation.nc", "validate"),
     )
     for reader, result, says in (
-        *((reader, whole | {ENTRY: {of: ""}}, f"{of}: run `cmmsim {stage} --out") for reader, of, stage in made_of),
-        ("validate", whole | {"identification": entries(link3__mass=None)}, "there is no initial of link3.mass"),
-        ("validate", {}, "lacks identification, before, after, seconds; write it with: cmmsim identify"),
+        *(
+            (reader, whole | {ENTRY: {of: ""}}, f"{of}: run `cmmsim {stage} --out")
+            for reader, of, stage in made_of
+        ),
+        (
+            "validate",
+            whole | {"identification": entries(link3__mass=None)},
+            "there is no initial of link3.mass",
+        ),
+        (
+            "validate",
+            {},
+            "lacks identification, before, after, seconds; write it with: cmmsim identify",
+        ),
         ("validate", whole | {ENTRY: 7}, "made_of must be digests"),
     ):
         save_result(run.result, result)
@@ -144,11 +192,17 @@ def test_parameters_of_a_result_that_no_model_has_are_named():
     for identification, says in (
         (entries(link3__mass="1 kg"), 'estimate of link3.mass is "1 kg", must be a finite number'),
         (entries(link3__mass=True), "estimate of link3.mass is true, must be a finite number"),
-        (entries(link3__mass=float("nan")), "estimate of link3.mass is NaN, must be a finite number"),
+        (
+            entries(link3__mass=float("nan")),
+            "estimate of link3.mass is NaN, must be a finite number",
+        ),
         (entries(link3__mass=10**400), "estimate of link3.mass is 10{59}, must be"),
         (entries(platform__mass=-5), "estimate: platform.mass = -5 kg is not allowed"),
         (entries(joint_pid__li=0), "estimate: joint_pid.li"),
-        ({"parameters": {}}, "no estimate of platform.mass, platform.Ixx, platform.Iyy and 64 more"),
+        (
+            {"parameters": {}},
+            "no estimate of platform.mass, platform.Ixx, platform.Iyy and 64 more",
+        ),
         ({"parameters": []}, r"no identification\.parameters"),
     ):
         with pytest.raises(RecordError, match=says):

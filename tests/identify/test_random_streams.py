@@ -7,7 +7,17 @@ from identify import random_streams
 from identify.random_streams import child, mixed_generator, stream_seed
 
 CHILDREN = (
-    *("EXCITATION", "UNSEEN", "SEARCH", "ANCHOR", "NOISE", "LATENCY", "PREDICTION", "DESIGN", "LOAD"),
+    *(
+        "EXCITATION",
+        "UNSEEN",
+        "SEARCH",
+        "ANCHOR",
+        "NOISE",
+        "LATENCY",
+        "PREDICTION",
+        "DESIGN",
+        "LOAD",
+    ),
     *("CALIBRATION", "MEAN_LATENCY", "EXPOSURES"),
     *("STATIC_POSES", "UNSEEN_POSES", "ENCODER_OFFSETS", "ENCODERS", "STATIC_NOISE"),
 )
@@ -25,13 +35,21 @@ def test_children_are_those_that_numpy_spawns_and_leave_a_rows_sequence_as_it_is
 
 @pytest.mark.parametrize("seed", [0, 1, 12345])
 def test_no_two_streams_draw_the_same(seed):
-    """Nor do streams of the same number: a seed that a child generates, and one that is mixed, begin others."""
-    generators = {name: np.random.default_rng(child(seed, getattr(random_streams, name))) for name in CHILDREN}
+    """Nor do streams of the same number: a seed that a child generates, and one that is mixed,
+    begin others.
+    """
+    generators = {
+        name: np.random.default_rng(child(seed, getattr(random_streams, name))) for name in CHILDREN
+    }
     generators["TEACHING"] = np.random.default_rng(stream_seed(seed, random_streams.TEACHING))
-    generators |= {f"NOISE {run}": np.random.default_rng(child(seed, random_streams.NOISE, run)) for run in (0, 1)}
+    generators |= {
+        f"NOISE {run}": np.random.default_rng(child(seed, random_streams.NOISE, run))
+        for run in (0, 1)
+    }
     generators |= {name: mixed_generator(getattr(random_streams, name), seed) for name in MIXED}
     generators |= {
-        name: mixed_generator(getattr(random_streams, name)) for name in ("ROUTES_UNCERTAINTY", "DISTURBED_COPIES")
+        name: mixed_generator(getattr(random_streams, name))
+        for name in ("ROUTES_UNCERTAINTY", "DISTURBED_COPIES")
     }
     drawn = {name: generator.integers(2**63) for name, generator in generators.items()}
     assert len(set(drawn.values())) == len(drawn), drawn

@@ -1,4 +1,5 @@
-"""The page that replays a run, in a browser: what its scene shows is what the files of the run say."""
+"""The page that replays a run, in a browser: what its scene shows is what the files of the run
+say."""
 
 import shutil
 import time
@@ -15,8 +16,7 @@ from identify.files.dataset import read_group, write_groups
 from identify.files.run_folder import RunFolder, save_result
 from identify.record.provenance import store_robot
 from identify.record.recording import build_model_run, write, write_model_runs
-from identify.scene import page as replay_page
-from identify.scene import workcell
+from identify.scene import replay, workcell
 from tests.identify.commands import command
 from tests.identify.conftest import make_result
 from tests.identify.synthetic import quick, rss6, run_plant
@@ -41,7 +41,9 @@ def replayed(tmp_path_factory):
 
 
 def replayed_run(robot, folder, seconds=1.0, images=4):
-    """A run with a lost frame and a starting model that diverges, and its page with so many images a camera."""
+    """A run with a lost frame and a starting model that diverges, and its page with so many images
+    a camera.
+    """
     scenario = quick(robot=robot.name)
     record, run = run_plant(scenario, 3, duration_s=seconds, robot=robot, lost=(LOST,))
     store_robot(record, robot)
@@ -53,7 +55,7 @@ def replayed_run(robot, folder, seconds=1.0, images=4):
     write_model_runs(folder.model, build_model_run(run.time, starting, identified))
     save_result(folder.result, make_result())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(replay_page, "KEY_FRAMES", images)
+        patch.setattr(replay, "KEY_FRAMES", images)
         assert command("replay", folder.path, "--quiet") == 0
     return folder
 
@@ -73,7 +75,10 @@ def opened(page, folder, size=SMALL, dark=False):
 
 def sought(page, frame):
     """What the page shows after its slider has been set to a frame."""
-    script = "const s = document.getElementById('time'); s.value = arguments[0]; s.dispatchEvent(new Event('input'));"
+    script = (
+        "const s = document.getElementById('time'); s.value = arguments[0]; "
+        "s.dispatchEvent(new Event('input'));"
+    )
     page.run(script, frame)
     return page.run("return window.replay.shown()")
 
@@ -104,7 +109,9 @@ def test_the_slider_shows_the_poses_of_the_files(robot, replayed, browser):
 
 def test_legs_rays_and_enlarged_differences_stand_where_they_should(replayed, browser):
     page = opened(browser(), replayed())
-    truth, measured = (stored(replayed(), "experiment.nc", *place) for place in (("truth", ""), ("", "measured_")))
+    truth, measured = (
+        stored(replayed(), "experiment.nc", *place) for place in (("truth", ""), ("", "measured_"))
+    )
     cell = workcell(rss6(), read_sensor_file("ctrack780"))
     sought(page, 20)
     place = "return window.replay.scene.{}.matrix.elements.slice(12, 15)"
@@ -113,7 +120,9 @@ def test_legs_rays_and_enlarged_differences_stand_where_they_should(replayed, br
     starts = [page.run(place.format(f"parts[{k}]")) for k in range(len(cell.parts))]
     np.testing.assert_allclose(starts, cell.rods(truth[20])[:, 0], atol=1e-6)
     sought(page, 0)  # of which there are images
-    rays = page.run("return Array.from(window.replay.scene.rays.geometry.attributes.position.array)")
+    rays = page.run(
+        "return Array.from(window.replay.scene.rays.geometry.attributes.position.array)"
+    )
     found = page.run("return window.replay.data.looks[0].found.platform")
     for k, camera in enumerate(cell.cameras):
         ends = np.reshape(rays, (-1, 2, 2, 3))[:, k]  # stickers, cameras, ends
@@ -133,9 +142,15 @@ def test_play_moves_on_and_switches_work(replayed, browser):
     assert page.run("return Number(document.getElementById('time').value)") == at
     page.run("document.querySelector('[data-layer=starting]').click()")
     page.run("document.getElementById('difference').value = 'residual'; "
-             "document.getElementById('difference').dispatchEvent(new Event('change'))")  # fmt: skip
-    assert page.run("return document.querySelectorAll('#differences path').length") == 12  # two models, six components
-    page.run("const e = document.getElementById('enlarged'); e.value = '10000'; e.dispatchEvent(new Event('change'))")
+             "document.getElementById('difference').dispatchEvent(new "
+             "Event('change'))")  # fmt: skip
+    assert (
+        page.run("return document.querySelectorAll('#differences path').length") == 12
+    )  # two models, six components
+    page.run(
+        "const e = document.getElementById('enlarged'); e.value = '10000'; e.dispatchEvent(new "
+        "Event('change'))"
+    )
     assert "1 µm" in page.run("return document.getElementById('scale').textContent")
     assert "× 10,000" in page.run("return document.getElementById('legend').textContent")
     assert page.console() == []
@@ -144,7 +159,9 @@ def test_play_moves_on_and_switches_work(replayed, browser):
 def test_without_webgl_the_page_says_so_and_shows_stills(replayed, browser):
     page = opened(browser(webgl=False), replayed())
     assert "WebGL" in page.run("return document.getElementById('without-webgl').innerText")
-    widths = page.run("return [...document.images].filter((i) => i.offsetWidth > 50).map((i) => i.naturalWidth)")
+    widths = page.run(
+        "return [...document.images].filter((i) => i.offsetWidth > 50).map((i) => i.naturalWidth)"
+    )
     assert len(widths) == 3  # the scene and both images
     assert min(widths) > 500
     before = page.run("return document.querySelector('.image img').src")
@@ -158,8 +175,12 @@ def test_without_webgl_the_page_says_so_and_shows_stills(replayed, browser):
 def test_the_page_fits_a_phone_and_is_readable_in_the_dark(replayed, browser, size, dark):
     page = opened(browser(), replayed(), size, dark)
     assert page.run("return document.documentElement.scrollWidth") <= size[0]
-    colours = page.run("const s = getComputedStyle(document.body); return [s.color, s.backgroundColor]")
-    ink, paper = ([int(part) / 255 for part in colour.strip("rgb()").split(",")] for colour in colours)
+    colours = page.run(
+        "const s = getComputedStyle(document.body); return [s.color, s.backgroundColor]"
+    )
+    ink, paper = (
+        [int(part) / 255 for part in colour.strip("rgb()").split(",")] for colour in colours
+    )
     light, shade = sorted((luminance(ink), luminance(paper)), reverse=True)
     assert (light + 0.05) / (shade + 0.05) > 7  # WCAG's AAA
     assert (luminance(paper) < 0.1) == dark
@@ -182,7 +203,9 @@ def test_a_record_without_truth_and_models_is_shown_with_what_it_has(replayed, b
     assert "not validated yet" in said
     measured = stored(folder, "experiment.nc", "", "measured_")
     np.testing.assert_allclose(sought(page, 20)["drawn"], measured[20], rtol=0, atol=1e-12)
-    shown = page.run("return [...document.querySelectorAll('[data-layer]')].map((box) => box.dataset.layer)")
+    shown = page.run(
+        "return [...document.querySelectorAll('[data-layer]')].map((box) => box.dataset.layer)"
+    )
     assert set(shown) == {"measured", "legs", "cameras", "ellipsoid"}
     assert page.console() == []
 
@@ -194,17 +217,24 @@ def test_a_scene_without_a_run_opens_too(browser, tmp_path, monkeypatch):
         assert command("show", name, "--quiet") == 0
         page.open(tmp_path / f"{name}.html", SMALL)
         page.wait(READY)
-        np.testing.assert_allclose(page.run("return window.replay.shown().drawn")[2], 0.2, atol=1e-12)
+        np.testing.assert_allclose(
+            page.run("return window.replay.shown().drawn")[2], 0.2, atol=1e-12
+        )
         assert page.console() == []
         assert page.requests() == []
 
 
 @pytest.mark.thorough
-def test_a_replay_of_quick_is_small_is_soon_written_and_opens_soon(tmp_path, browser, record_property):
-    folder = replayed_run(rss6(), RunFolder(tmp_path), seconds=10.0, images=replay_page.KEY_FRAMES)
+def test_a_replay_of_quick_is_small_is_soon_written_and_opens_soon(
+    tmp_path, browser, record_property
+):
+    folder = replayed_run(rss6(), RunFolder(tmp_path), seconds=10.0, images=replay.KEY_FRAMES)
     began = time.perf_counter()
     assert command("replay", folder.path, "--quiet") == 0
-    figures = {"written_s": time.perf_counter() - began, "megabytes": 1e-6 * (tmp_path / "replay.html").stat().st_size}
+    figures = {
+        "written_s": time.perf_counter() - began,
+        "megabytes": 1e-6 * (tmp_path / "replay.html").stat().st_size,
+    }
     opened(browser(), folder)  # the browser itself has started
     began = time.perf_counter()
     opened(browser(), folder, (1280, 900))

@@ -1,4 +1,6 @@
-"""Result file, goals, tables, figures and report of a run: worked out by hand; the report opens offline."""
+"""Result file, goals, tables, figures and report of a run: worked out by hand; the report opens
+offline.
+"""
 
 import json
 import math
@@ -16,21 +18,29 @@ from identify.errors import OutputFolderError, RecordError
 from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
 from identify.record.recording import build_model_run, read, write, write_model_runs
 from identify.reporting import paper, parameter_tables, tables
-from identify.reporting.figures import fit, motion, parameters, style
+from identify.reporting.figures import estimates, fit, paths, style
 from identify.reporting.figures.fit import Fit
 from identify.reporting.goals import check_goals, within_tolerance
-from identify.reporting.numbers import interval, number, rounded, spelled, with_deviation
-from identify.reporting.page import render
+from identify.reporting.number_format import interval, number, rounded, spelled, with_deviation
 from identify.reporting.pictures import pictures
-from identify.reporting.report import write_report
+from identify.reporting.report import render, write_report
+from identify.reporting.report_sections import SECTIONS
 from identify.reporting.run_data import read_run
-from identify.reporting.sections import SECTIONS
 from identify.reporting.verdict import cameras_acquitted, key_numbers, verdict
 from identify.scenario import load_scenario
 from identify.trajectory import TrajectorySet, random_trajectory
 from tests.identify.synthetic import short_run, truth_of
 
-FIGURES = {"scene", "errors", "stereo_frame", "ellipses", "excitation", "path", "fit_excitation", "fit_validation"}
+FIGURES = {
+    "scene",
+    "errors",
+    "stereo_frame",
+    "ellipses",
+    "excitation",
+    "path",
+    "fit_excitation",
+    "fit_validation",
+}
 FIGURES |= {"validation_errors", "parameters", "correlation"}
 TIME, ZERO = np.arange(50) / 60, np.zeros((50, 6))
 NOISE = np.random.default_rng(0).normal(size=(50, 6))
@@ -49,7 +59,9 @@ def no_images(monkeypatch):
 
 
 def without_truth(run_folder):
-    """The folder as that of a record of a real robot: nothing but record, result and covariance, and no truth."""
+    """The folder as that of a record of a real robot: nothing but record, result and covariance,
+    and no truth.
+    """
     write(run_folder.experiment, read(run_folder.experiment))
     for path in (run_folder.validation, run_folder.trajectories):
         path.unlink()
@@ -63,8 +75,12 @@ def without_truth(run_folder):
 
 
 @pytest.mark.slow
-def test_report_is_one_page_that_people_can_read_on_any_screen_and_figures_for_print(run_folder, browser):
-    """Without a console message and without a request; text differs from what is behind it by 4.5 to 1 at least."""
+def test_report_is_one_page_that_people_can_read_on_any_screen_and_figures_for_print(
+    run_folder, browser
+):
+    """Without a console message and without a request; text differs from what is behind it by 4.5
+    to 1 at least.
+    """
     path, page = write_report(run_folder.path), browser()
     assert path.stat().st_size < 3e6
     for size in ((1280, 900), (390, 844)):
@@ -72,17 +88,21 @@ def test_report_is_one_page_that_people_can_read_on_any_screen_and_figures_for_p
             page.open(path, size=size, dark=dark)
             page.run("document.querySelectorAll('details').forEach(one => { one.open = true })")
             assert (page.console(), page.requests()) == ([], [])
-            assert page.run("return document.documentElement.scrollWidth") <= size[0], "the page scrolls sideways"
+            assert page.run("return document.documentElement.scrollWidth") <= size[0], (
+                "the page scrolls sideways"
+            )
             drawn = page.run(SIZES)
             assert len(drawn) == len(FIGURES)
             assert min(min(one) for one in drawn) > 100
             worst, text = page.run(CONTRAST)
             assert worst >= 4.5, f"{text!r} has a contrast of {worst:.2f}, dark: {dark}"
     page.open(path, size=(690, 970), dark=True, media="print")
-    assert page.run("return getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-    assert page.run("return [...document.querySelectorAll('details.printed')].map(one => one.offsetHeight < 40)") == [
-        False for _ in page.run("return [...document.querySelectorAll('details.printed')]")
-    ]
+    assert (
+        page.run("return getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    )
+    assert page.run(
+        "return [...document.querySelectorAll('details.printed')].map(one => one.offsetHeight < 40)"
+    ) == [False for _ in page.run("return [...document.querySelectorAll('details.printed')]")]
     text = path.read_text(encoding="utf-8")
     assert len(re.findall(r"<section id", text)) == len(SECTIONS)
     assert "<script" not in text
@@ -101,8 +121,8 @@ return [...document.querySelectorAll('figure')].map(one => {
 
 CONTRAST = """
 const colour = text => text.match(/[\\d.]+/g).map(Number);
-const light = c => c.slice(0, 3).map(v => v / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
-  .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
+const light = c => c.slice(0, 3).map(v => v / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055)
+  / 1.055) ** 2.4) .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
 const behind = node => {
   for (; node; node = node.parentElement) {
     const c = colour(getComputedStyle(node).backgroundColor);
@@ -127,9 +147,16 @@ return worst;
 @pytest.mark.usefixtures("no_images")
 def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finished_run, result):
     data = read_run(finished_run)
-    path = random_trajectory(np.random.default_rng(0), Chart("free", (0.0,) * 6), 0.1, 5, 0.01, 0.04)
-    text = page_of(replace(data, trajectories=TrajectorySet(0, path, (path,), 0.5293, 0.4606, 0.4603)))
-    chosen = "0.461 for the first random candidate, 0.46 for the middle one, and 0.529 for the trajectory that was used"
+    path = random_trajectory(
+        np.random.default_rng(0), Chart("free", (0.0,) * 6), 0.1, 5, 0.01, 0.04
+    )
+    text = page_of(
+        replace(data, trajectories=TrajectorySet(0, path, (path,), 0.5293, 0.4606, 0.4603))
+    )
+    chosen = (
+        "0.461 for the first random candidate, 0.46 for the middle one, and 0.529 for the "
+        "trajectory that was used"
+    )
     shown = (
         "joint1.coulomb, joint_pid.lp",
         "+0.9877",
@@ -138,7 +165,12 @@ def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finish
         "diverged",
         paper.DOI,
     )
-    said = ("8 of 8 goals are met", "whole run", "Not identified, 1 of 5: no motion", "it ended because tolerance")
+    said = (
+        "8 of 8 goals are met",
+        "whole run",
+        "Not identified, 1 of 5: no motion",
+        "it ended because tolerance",
+    )
     assert [one for one in (chosen, *shown, *said) if one not in text] == []
     result["sensor"]["lost_frames"] = 2
     result["identification"]["stop_reason"] = "<b>cost & step</b>"
@@ -153,7 +185,11 @@ def test_the_papers_figures_stand_only_beside_its_own_robot_and_settings(finishe
     data = read_run(finished_run)
     assert "1411" not in page_of(data)
     own = load_scenario("paper")
-    for overrides, shown in (({}, True), ({"renderer": "analytic"}, True), ({"robot": "ups6"}, False)):
+    for overrides, shown in (
+        ({}, True),
+        ({"renderer": "analytic"}, True),
+        ({"robot": "ups6"}, False),
+    ):
         scenario = own.with_overrides(overrides).to_toml()
         text = page_of(replace(data, experiment=data.experiment.assign_attrs(scenario=scenario)))
         assert [one in text for one in ("1411", "2520", "1.345")] == 3 * [shown], overrides
@@ -163,17 +199,24 @@ def test_every_axis_has_a_unit_and_every_panel_its_letter(result):
     drawn = fit.fit_figure(Fit(TIME, NOISE, NOISE, NOISE))
     poses, covariances = 1e-3 * np.cumsum(NOISE, axis=0), np.tile(1e-10 * np.eye(6), (50, 1, 1))
     others = (
-        motion.excitation_figure(TIME, NOISE),
-        motion.ellipse_figure(poses, covariances, list(range(6)), 1e-6 * NOISE),
+        paths.excitation_figure(TIME, NOISE),
+        paths.ellipse_figure(poses, covariances, list(range(6)), 1e-6 * NOISE),
         fit.validation_figure(result["validation"]),
         fit.error_figure(Fit(TIME, NOISE, ZERO + NOISE, NOISE, truth=ZERO)),
     )
     for figure in (drawn, *others):
         for axes in figure.axes:
             assert re.search(r"\[(mm|mrad|µm|µrad)\]", axes.get_ylabel()), axes.get_ylabel()
-    assert [axes.get_title(loc="left")[:3] or axes.get_title()[:3] for axes in drawn.axes[:3]] == ["(a)", "(b)", "(c)"]
-    for axes in motion.path_figure(TIME, poses).axes:
-        assert [getattr(axes, f"get_{axis}label")()[-5:].strip(" [") for axis in "xyz"] in (3 * ["mm]"], 3 * ["mrad]"])
+    assert [axes.get_title(loc="left")[:3] or axes.get_title()[:3] for axes in drawn.axes[:3]] == [
+        "(a)",
+        "(b)",
+        "(c)",
+    ]
+    for axes in paths.path_figure(TIME, poses).axes:
+        assert [getattr(axes, f"get_{axis}label")()[-5:].strip(" [") for axis in "xyz"] in (
+            3 * ["mm]"],
+            3 * ["mrad]"],
+        )
 
 
 def test_no_two_curves_of_a_panel_differ_by_their_colour_alone(result):
@@ -181,7 +224,7 @@ def test_no_two_curves_of_a_panel_differ_by_their_colour_alone(result):
     figures = (
         fit.fit_figure(Fit(TIME, NOISE, NOISE, NOISE, truth=ZERO, std=ZERO + 1)),
         fit.error_figure(Fit(TIME, NOISE, NOISE, NOISE + 1, truth=ZERO)),
-        motion.excitation_figure(TIME, NOISE),
+        paths.excitation_figure(TIME, NOISE),
     )
     for axes in (axes for figure in figures for axes in figure.axes):
         named = [line for line in axes.lines if not line.get_label().startswith("_")]
@@ -190,7 +233,9 @@ def test_no_two_curves_of_a_panel_differ_by_their_colour_alone(result):
         assert len(set(looks)) == len(looks), [line.get_label() for line in named]
     bars = fit.validation_figure(result["validation"]).axes[0].containers
     assert len({(bar.patches[0].get_hatch(), bar.patches[0].get_facecolor()) for bar in bars}) == 3
-    assert len(set(style.PALETTE.values())) == len(style.PALETTE), "the page tells them apart by their code"
+    assert len(set(style.PALETTE.values())) == len(style.PALETTE), (
+        "the page tells them apart by their code"
+    )
 
 
 def test_what_does_not_move_is_not_drawn():
@@ -199,17 +244,24 @@ def test_what_does_not_move_is_not_drawn():
         poses = np.zeros((50, 6))
         poses[:, moves] = 1e-3 * np.cumsum(NOISE, axis=0)[:, moves]
         assert style.moving(poses) == moves
-        assert sum(axes.get_visible() for axes in fit.fit_figure(Fit(TIME, poses, poses)).axes) == panels
+        assert (
+            sum(axes.get_visible() for axes in fit.fit_figure(Fit(TIME, poses, poses)).axes)
+            == panels
+        )
         covariances = np.tile(1e-10 * np.eye(6), (50, 1, 1))
-        seen = [axes for axes in motion.ellipse_figure(poses, covariances, moves).axes if axes.get_visible()]
+        seen = [
+            axes
+            for axes in paths.ellipse_figure(poses, covariances, moves).axes
+            if axes.get_visible()
+        ]
         assert len(seen) == ellipses
-    assert len(motion.path_figure(TIME, poses).axes) == 2
+    assert len(paths.path_figure(TIME, poses).axes) == 2
 
 
 def test_ellipses_hold_95_percent_of_drawn_errors():
     """Of 4000 draws of a covariance, by the outline that is drawn."""
     covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
-    outline = motion.ellipse_outline(covariance)
+    outline = paths.ellipse_outline(covariance)
     reach = np.einsum("ni,ij,nj->n", outline, np.linalg.inv(covariance), outline)
     draws = np.random.default_rng(1).multivariate_normal(np.zeros(2), covariance, 4000)
     inside = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(covariance), draws) < reach.mean()
@@ -218,13 +270,18 @@ def test_ellipses_hold_95_percent_of_drawn_errors():
 
 
 def test_fit_figure_draws_what_it_is_given_and_predicted_deviations_as_a_band_of_two_about_zero():
-    """Error panel of z: measured minus identified is 3 µm everywhere, true minus identified 1 µm."""
+    """Error panel of z: measured minus identified is 3 µm everywhere, true minus identified
+    1 µm."""
     path = 1e-3 * NOISE
     figure = fit.fit_figure(Fit(TIME, path + 3e-6, path, initial=path + 1e-3, truth=path + 1e-6))
     panel = figure.axes[5]
     np.testing.assert_allclose([line.get_ydata()[0] for line in panel.lines], [3.0, 1.0])
     assert "997 → 3 µm" in panel.get_title()
-    assert [line.get_color() for line in figure.axes[2].lines] == [style.INK, style.GREEN, style.BLUE]
+    assert [line.get_color() for line in figure.axes[2].lines] == [
+        style.INK,
+        style.GREEN,
+        style.BLUE,
+    ]
     panel = fit.fit_figure(Fit(TIME, path, path, truth=path, std=ZERO + 2e-6)).axes[5]
     assert [line.get_ydata()[0] for line in panel.lines[2:]] == pytest.approx([-4.0, 4.0])
     position, orientation = fit.error_figure(Fit(TIME, path, path + 3e-6, truth=path)).axes
@@ -245,42 +302,52 @@ def test_an_unstable_model_and_lost_frames_do_not_hide_the_rest():
 
 def test_correlation_figure_names_every_parameter_or_says_that_none_is_identified():
     correlations = np.array([[1.0, -0.5], [-0.5, 1.0]])
-    axes = parameters.correlation_figure(correlations, ["a", "b"]).axes[0]
+    axes = estimates.correlation_figure(correlations, ["a", "b"]).axes[0]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["a", "b"]
     negative = axes.collections[1]
-    assert (tuple(negative.get_offsets()[0]), negative.get_sizes()[0]) == ((0.0, 1.0), 0.5 * parameters.LARGEST)
+    assert (tuple(negative.get_offsets()[0]), negative.get_sizes()[0]) == (
+        (0.0, 1.0),
+        0.5 * estimates.LARGEST,
+    )
     with warnings.catch_warnings(action="error"):
-        axes = parameters.correlation_figure(np.zeros((0, 0)), []).axes[0]
+        axes = estimates.correlation_figure(np.zeros((0, 0)), []).axes[0]
     assert axes.get_title() == "No parameter is identified: no correlations"
     assert not axes.collections
 
 
 def test_group_figure_shows_the_share_of_each_member_and_what_is_subtracted():
-    """Of 3 m1 - 1 m2 with m1 = m2 = 2 the shares are 3/4 and 1/4; a sum of one parameter is none."""
+    """Of 3 m1 - 1 m2 with m1 = m2 = 2 the shares are 3/4 and 1/4; a sum of one parameter is
+    none."""
     sums = {
         "m1 +": {"coefficients": {"m1": 3.0, "m2": -1.0}, "identifiable": True},
         "m3": {"coefficients": {"m3": 1.0}, "identifiable": True},
     }
-    axes = parameters.group_figure(sums, {name: {"initial": 2.0} for name in ("m1", "m2", "m3")}).axes[0]
+    axes = estimates.group_figure(
+        sums, {name: {"initial": 2.0} for name in ("m1", "m2", "m3")}
+    ).axes[0]
     added, subtracted = axes.collections[:2]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["m1", "m2"]
     assert [text.get_text() for text in axes.get_yticklabels()] == ["m1 + … *"]
-    np.testing.assert_allclose(added.get_sizes(), [0.75 * parameters.LARGEST])
-    np.testing.assert_allclose(subtracted.get_sizes(), [0.25 * parameters.LARGEST])
+    np.testing.assert_allclose(added.get_sizes(), [0.75 * estimates.LARGEST])
+    np.testing.assert_allclose(subtracted.get_sizes(), [0.25 * estimates.LARGEST])
     assert subtracted.get_facecolor()[0][:3] == pytest.approx((1.0, 1.0, 1.0))
 
 
 def test_parameter_figure_shows_what_is_identifiable_with_its_interval(result):
     """One that a bound cuts off reaches less far down than up."""
-    figure = parameters.parameter_figure(result["identification"]["parameters"])
+    figure = estimates.parameter_figure(result["identification"]["parameters"])
     labels = [text.get_text() for axes in figure.axes for text in axes.get_yticklabels()]
     assert labels == ["joint1.coulomb", "joint1.viscous", "joint_pid.lp", "platform.mass"]
     entry = {"true": 2.0, "estimate": 1.0, "std": 3.0, "interval": [0.5, 6.0], "identifiable": True}
-    figure = parameters.parameter_figure({"link1.mass": entry})
+    figure = estimates.parameter_figure({"link1.mass": entry})
     segments = [line.get_segments()[0] for line in figure.axes[1].collections]
-    np.testing.assert_allclose([segment[:, 0] for segment in segments], [[100 * -1.5 / 2, 100 * 4.0 / 2]])
-    assert parameters.relative_errors({"a": entry | {"interval": None}})[1:] == (-50.0, 0.0, 0.0)
-    assert parameters.relative_errors({"a": entry | {"true": None}})[1:] == (0.0, 50.0, 500.0), "of the estimate"
+    np.testing.assert_allclose(
+        [segment[:, 0] for segment in segments], [[100 * -1.5 / 2, 100 * 4.0 / 2]]
+    )
+    assert estimates.relative_errors({"a": entry | {"interval": None}})[1:] == (-50.0, 0.0, 0.0)
+    assert estimates.relative_errors({"a": entry | {"true": None}})[1:] == (0.0, 50.0, 500.0), (
+        "of the estimate"
+    )
 
 
 def test_model_of_another_run_an_incomplete_result_and_a_missing_stage_are_refused(run_folder):
@@ -290,10 +357,14 @@ def test_model_of_another_run_an_incomplete_result_and_a_missing_stage_are_refus
     with pytest.raises(RecordError, match="excitation differs"):
         write_report(run_folder.path)
     save_result(run_folder.result, {"scenario": "quick"})
-    with pytest.raises(RecordError, match=r"lacks .*before, after, seconds, sensor, .*; write .*cmmsim identify"):
+    with pytest.raises(
+        RecordError, match=r"lacks .*before, after, seconds, sensor, .*; write .*cmmsim identify"
+    ):
         write_report(run_folder.path)
     run_folder.validation.unlink()
-    with pytest.raises(OutputFolderError, match=r"no validation\.nc; write it with: cmmsim validate --out"):
+    with pytest.raises(
+        OutputFolderError, match=r"no validation\.nc; write it with: cmmsim validate --out"
+    ):
         write_report(run_folder.path)
     assert not run_folder.report.exists()
 
@@ -308,8 +379,12 @@ def test_a_record_without_truth_has_a_report_that_says_what_nobody_can_tell(run_
     assert ">truth<" not in text
     shown = pictures(data)
     assert {"fit_validation", "validation_errors", "stereo_frame"} & shown.keys() == set()
-    assert [len(figure.axes) > 0 for figure in (shown["errors"].draw(), shown["ellipses"].draw())] == [True, True]
-    assert data.excitation_fit.noise == pytest.approx(np.sqrt(np.diag(data.experiment["measured_covariance"][0])))
+    assert [
+        len(figure.axes) > 0 for figure in (shown["errors"].draw(), shown["ellipses"].draw())
+    ] == [True, True]
+    assert data.excitation_fit.noise == pytest.approx(
+        np.sqrt(np.diag(data.experiment["measured_covariance"][0]))
+    )
     assert list(identify.run_figures(run_folder.path)) == list(shown)
 
 
@@ -345,8 +420,12 @@ def test_cameras_are_acquitted_when_they_err_by_white_noise_of_the_size_that_the
     bold = record.assign(measured_covariance=record["measured_covariance"] / 4)
     assert cameras_acquitted(bold, truth) is False, "they state half of their noise"
     lasting = record["measured_position"] + 5e-6 * np.sin(6 * record["time"])
-    assert cameras_acquitted(record.assign(measured_position=lasting), truth) is False, "an error that lasts"
-    assert cameras_acquitted(record.isel(time=slice(20)), truth.isel(time=slice(20))) is None, "too short to say"
+    assert cameras_acquitted(record.assign(measured_position=lasting), truth) is False, (
+        "an error that lasts"
+    )
+    assert cameras_acquitted(record.isel(time=slice(20)), truth.isel(time=slice(20))) is None, (
+        "too short to say"
+    )
 
 
 def test_the_first_look_has_three_numbers_with_and_without_truth(result):
@@ -367,12 +446,18 @@ def test_numbers_have_the_digits_that_they_deserve_and_what_is_rounding_is_zero(
     assert interval(-0.0131, 0.344) == "−0.01 to 0.34"
     assert rounded(-6.688e-15, 1.3) == 0.0
     assert rounded(-6.688e-15, 1e-14) == -6.688e-15
-    assert spelled("cost changed by 3.35e-07 <= tol1 = 1e-06") == "cost changed by 3.35 × 10⁻⁷ ≤ tol1 = 1 × 10⁻⁶"
+    assert (
+        spelled("cost changed by 3.35e-07 <= tol1 = 1e-06")
+        == "cost changed by 3.35 × 10⁻⁷ ≤ tol1 = 1 × 10⁻⁶"
+    )
 
 
 def test_the_report_says_what_fixes_the_scale_or_that_its_anchor_does_not(result):
     found = result["identification"]
-    assert parameter_tables.scale_sentence(found) == "The overall scale is fixed by the weighed mass of the platform."
+    assert (
+        parameter_tables.scale_sentence(found)
+        == "The overall scale is fixed by the weighed mass of the platform."
+    )
     found["parameters"]["joint_pid.lp"]["prior_share"] = 0.61
     assert "but is not: 61 % of the variance" in parameter_tables.scale_sentence(found)
     found["scale_anchor"] = "prior"
@@ -380,11 +465,17 @@ def test_the_report_says_what_fixes_the_scale_or_that_its_anchor_does_not(result
 
 
 def test_what_is_not_identified_has_its_reason():
-    """One that is shown only in a sum, one that this record shows too badly, and one that moves nothing."""
+    """One that is shown only in a sum, one that this record shows too badly, and one that moves
+    nothing.
+    """
     entries = {
-        name: {"identifiable": name == "known"} for name in ("known", "summed", "weak", "unseen", "joint_pid.li")
+        name: {"identifiable": name == "known"}
+        for name in ("known", "summed", "weak", "unseen", "joint_pid.li")
     }
-    groups = {"known +": {"coefficients": {"known": 1.0, "summed": 2.0}}, "weak": {"coefficients": {"weak": 1.0}}}
+    groups = {
+        "known +": {"coefficients": {"known": 1.0, "summed": 2.0}},
+        "weak": {"coefficients": {"weak": 1.0}},
+    }
     reasons = parameter_tables.unidentified({"parameters": entries, "groups": groups})
     assert [names for _, names in reasons] == [["summed"], ["weak", "joint_pid.li"], ["unseen"]]
     for entry in entries.values():
@@ -404,19 +495,34 @@ def goals(result):
 
 def test_rms_figures_are_in_um_and_urad_and_a_model_that_diverged_has_none_however_well_it_began():
     errors = np.array([[3e-6, 0, 0, 1e-3, 0, 0], [np.nan] * 6, [-4e-6, 0, 0, 1e-3, 0, 0]])
-    assert rms_row(rms_figures(errors, [True, False, True])) == pytest.approx([math.sqrt(12.5), 0, 0, 1000, 0, 0])
+    assert rms_row(rms_figures(errors, [True, False, True])) == pytest.approx(
+        [math.sqrt(12.5), 0, 0, 1000, 0, 0]
+    )
     errors = np.zeros((10, 6))
     errors[9] = np.inf
     assert all(math.isnan(v) for v in rms_row(rms_figures(errors)))
     assert all(math.isnan(v) for v in rms_row(rms_figures(errors, np.zeros(10, dtype=bool))))
 
 
-def test_result_file_is_standard_json_with_null_for_what_is_not_finite_and_a_damaged_one_is_named(tmp_path):
+def test_result_file_is_standard_json_with_null_for_what_is_not_finite_and_a_damaged_one_is_named(
+    tmp_path,
+):
     path = tmp_path / "result.json"
-    save_result(path, {"a": np.float64(1.5), "b": [math.inf, np.nan], "c": np.arange(2), "d": {"e": np.bool_(True)}})
+    save_result(
+        path,
+        {
+            "a": np.float64(1.5),
+            "b": [math.inf, np.nan],
+            "c": np.arange(2),
+            "d": {"e": np.bool_(True)},
+        },
+    )
     plain = {"a": 1.5, "b": [None, None], "c": [0, 1], "d": {"e": True}}
-    assert json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no standard JSON")) == plain
-    assert load_result(path)["a"] == 1.5
+    held = json.loads(
+        path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no standard JSON")
+    )
+    assert held | plain == held
+    assert load_result(path) == plain
     for text in ('{"a": ', "[1]", ""):
         path.write_text(text)
         with pytest.raises(RecordError, match=r"result\.json"):
@@ -428,16 +534,27 @@ def test_good_result_meets_every_goal_and_one_without_validation_those_that_can_
     assert all(goal.passed for goal in goals(result).values())
     assert goals(result)["unseen motion, position"].value == pytest.approx(1.8)
     assert goals(result)["cameras, orientation"].value == 50.0
-    assert goals(result)["residuals of the model"].limit == pytest.approx(1.1 + 3.0902 * 0.04, abs=1e-5)
+    assert goals(result)["residuals of the model"].limit == pytest.approx(
+        1.1 + 3.0902 * 0.04, abs=1e-5
+    )
     assert check_goals({"scenario": "quick"}) == []
 
 
 @pytest.mark.parametrize(
     ("change", "missed"),
     [
-        (lambda r: r["validation"][1]["true"].update(position_rms_um=[1, 2.1, 1]), "unseen motion, position"),
-        (lambda r: r["validation"][1]["true"].update(orientation_rms_urad=[1, 1, 10.1]), "unseen motion, orientation"),
-        (lambda r: r["validation"][0]["true"].update(position_rms_um=[None, 1, 1]), "unseen motion, position"),
+        (
+            lambda r: r["validation"][1]["true"].update(position_rms_um=[1, 2.1, 1]),
+            "unseen motion, position",
+        ),
+        (
+            lambda r: r["validation"][1]["true"].update(orientation_rms_urad=[1, 1, 10.1]),
+            "unseen motion, orientation",
+        ),
+        (
+            lambda r: r["validation"][0]["true"].update(position_rms_um=[None, 1, 1]),
+            "unseen motion, position",
+        ),
         (lambda r: r["sensor"].update(position_rms_um=[20.1, 1, 1]), "cameras, position"),
         (lambda r: r["sensor"].update(orientation_rms_urad=[1, 100.1, 1]), "cameras, orientation"),
         (lambda r: r["sensor"].update(lost_frames=1), "lost frames"),
@@ -446,10 +563,19 @@ def test_good_result_meets_every_goal_and_one_without_validation_those_that_can_
             "friction and gains far off",
         ),
         (lambda r: r["identification"].update(noise_ratio=1.31), "residuals of the model"),
-        (lambda r: r["identification"].update(noise_ratio=1.1 + 3.1 * 0.04), "residuals of the model"),
+        (
+            lambda r: r["identification"].update(noise_ratio=1.1 + 3.1 * 0.04),
+            "residuals of the model",
+        ),
         (lambda r: r["identification"].update(noise_ratio=None), "residuals of the model"),
-        (lambda r: r["identification"]["whiteness"].update(p_value=9e-5), "chance of such residuals"),
-        (lambda r: r["identification"]["whiteness"].update(p_value=None), "chance of such residuals"),
+        (
+            lambda r: r["identification"]["whiteness"].update(p_value=9e-5),
+            "chance of such residuals",
+        ),
+        (
+            lambda r: r["identification"]["whiteness"].update(p_value=None),
+            "chance of such residuals",
+        ),
     ],
 )
 def test_each_goal_is_missed_alone(result, change, missed):
@@ -459,7 +585,12 @@ def test_each_goal_is_missed_alone(result, change, missed):
 
 def test_speed_stands_beside_the_goals_and_no_machine_misses_one(result):
     result["sensor"]["stereo_frames_per_second"] = 0.5
-    result["seconds"] = {"record": 3000.0, "identify": 20.0, "identify.search": 15.0, "validate": None}
+    result["seconds"] = {
+        "record": 3000.0,
+        "identify": 20.0,
+        "identify.search": 15.0,
+        "validate": None,
+    }
     frames, whole = tables.goals_table(result).rows[-2:]
     assert frames[:4] == ("stereo frames", "0.5 1/s", "", "")
     assert whole[:4] == ("whole run", "3020 s", "", ""), "parts of a stage are not counted twice"
@@ -484,7 +615,9 @@ def test_papers_figures_are_those_of_its_text():
     assert np.all(np.array(paper.AFTER) < paper.BEFORE)
 
 
-def test_tables_show_our_numbers_beside_the_papers_and_none_of_a_parameter_that_is_not_identifiable(result):
+def test_tables_show_our_numbers_beside_the_papers_and_none_of_a_parameter_that_is_not_identifiable(
+    result,
+):
     table = tables.excitation_error_table(result, beside_paper=True)
     assert table.rows[0] == ("x [µm]", "diverged", "20", "1260", "408")
     assert table.rows[5] == ("gamma [µrad]", "diverged", "82", "2800", "725")
@@ -495,26 +628,48 @@ def test_tables_show_our_numbers_beside_the_papers_and_none_of_a_parameter_that_
     assert len(validation.rows) == 2 * 2 + 10
     assert len(tables.validation_table(result).rows) == 2 * 2
     assert tables.sensor_table(result).rows[0][:4] == ("120", "0", "70", "5")
-    result["validation"][0]["initial_true"] = {"position_rms_um": [None] * 3, "orientation_rms_urad": [None] * 3}
+    result["validation"][0]["initial_true"] = {
+        "position_rms_um": [None] * 3,
+        "orientation_rms_urad": [None] * 3,
+    }
     assert tables.validation_table(result).rows[2] == ("1: starting, true", *["diverged"] * 6)
     lines = tables.goals_table(result).markdown().splitlines()
     assert {line.count("|") for line in lines} == {6}, "a cell for each column"
     assert tables.goals_table(result).words == (True, False, False, True, True)
     rows = {row[0]: row for row in parameter_tables.parameter_table(result).rows}
     assert "link1.Ixx" not in rows
-    assert rows["joint1.coulomb"][1:] == ("N m", "0", "0.104", "0.1050 ± 0.0010", "0.1030 to 0.1070", "+0.96")
+    assert rows["joint1.coulomb"][1:] == (
+        "N m",
+        "0",
+        "0.104",
+        "0.1050 ± 0.0010",
+        "0.1030 to 0.1070",
+        "+0.96",
+    )
 
 
 def test_a_sum_that_vanishes_but_for_rounding_starts_at_zero(result):
-    """And its error is told in standard deviations: in per cent of almost nothing it says nothing."""
+    """And its error is told in standard deviations: in per cent of almost nothing it says
+    nothing."""
     link = {"initial": 1.31, "identifiable": True, "unit": "kg"}
     result["identification"]["parameters"] = {"link1.mass": link, "link2.mass": link}
-    entry = {"initial": -6.688e-15, "true": 0.071, "estimate": 0.163, "std": 0.088, "interval": [-0.01, 0.34]}
-    group = {"coefficients": {"link1.mass": 1.0, "link2.mass": -1.0}, "expression": "link1.mass - link2.mass"}
+    entry = {
+        "initial": -6.688e-15,
+        "true": 0.071,
+        "estimate": 0.163,
+        "std": 0.088,
+        "interval": [-0.01, 0.34],
+    }
+    group = {
+        "coefficients": {"link1.mass": 1.0, "link2.mass": -1.0},
+        "expression": "link1.mass - link2.mass",
+    }
     result["identification"]["groups"] = {
         "link1.mass +": entry | group | {"identifiable": True, "rests_on_prior": True}
     }
     (row,) = parameter_tables.group_table(result).rows
     assert row == (
-        "link1.mass − link2.mass", "0", "0.071", "0.163 ± 0.088", "−0.01 to 0.34", "+1.0", parameter_tables.ON_GUESS,
+        "link1.mass − link2.mass", "0", "0.071", "0.163 ± 0.088", "−0.01 to "
+                                                                  "0.34", "+1.0",
+                                                                  parameter_tables.ON_GUESS,
     )  # fmt: skip

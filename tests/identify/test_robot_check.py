@@ -1,4 +1,6 @@
-"""`cmmsim check`: what is found of a sound robot, and of one spoilt in several ways, with number, limit and leg."""
+"""`cmmsim check`: what is found of a sound robot, and of one spoilt in several ways, with number,
+limit and leg.
+"""
 
 import json
 from importlib import resources
@@ -13,18 +15,26 @@ from tests.identify.commands import command, one_line
 
 def _found(path):
     content = json.loads(path.read_text(encoding="utf-8"))
-    assert all(set(entry) == {"check", "ok", "value", "limit", "unit", "leg", "text"} for entry in content["findings"])
+    assert all(
+        set(entry) == {"check", "ok", "value", "limit", "unit", "leg", "text"}
+        for entry in content["findings"]
+    )
     assert content["ok"] == all(entry["ok"] for entry in content["findings"])
     return {entry["check"]: entry for entry in content["findings"]}
 
 
-def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_methods(tmp_path, capfd):
+def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_methods(
+    tmp_path, capfd
+):
     assert command("check", "ups6", "--json", tmp_path / "found.json") == 0
     found, robot = _found(tmp_path / "found.json"), load_robot("ups6")
     assert all(entry["ok"] for entry in found.values())
     held = robot.static_torque(robot.home_pose, robot.parameter_sets["identified"].dynamic)
     assert found["holding torque"]["value"] == pytest.approx(np.abs(held).max())
-    assert (found["holding torque"]["unit"], found["holding torque"]["leg"]) == ("N", np.abs(held).argmax() + 1)
+    assert (found["holding torque"]["unit"], found["holding torque"]["leg"]) == (
+        "N",
+        np.abs(held).argmax() + 1,
+    )
     assert found["leverage over the travel"]["value"] == 1.0  # a cylinder pushes along its leg
     assert found["loop"]["value"] < 1 < found["gain margin"]["value"]
     assert found["frame rate"]["value"] < 60
@@ -34,7 +44,13 @@ def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_met
 
 @pytest.mark.slow
 def test_gains_are_designed_for_the_bandwidth_and_damping_that_are_asked_for(tmp_path, capfd):
-    asked = ["--set", "control.servo_bandwidth_rad_s=3.5", "--set", "control.servo_damping=0.3", "--quiet"]
+    asked = [
+        "--set",
+        "control.servo_bandwidth_rad_s=3.5",
+        "--set",
+        "control.servo_damping=0.3",
+        "--quiet",
+    ]
     assert command("check", "delta3", *asked, "--json", tmp_path / "found.json") == 0
     found = _found(tmp_path / "found.json")
     assert "give a bandwidth of 3.5 rad/s with a damping of 0.3" in found["servo by design"]["text"]
@@ -43,13 +59,27 @@ def test_gains_are_designed_for_the_bandwidth_and_damping_that_are_asked_for(tmp
     assert 3 < found["bandwidth"]["value"] < 5
     beyond = ["--set", "control.servo_bandwidth_rad_s=60.0", "--quiet"]
     assert command("check", "delta3", *beyond, "--json", tmp_path / "found.json") == BEYOND_LIMIT
-    assert "no gains of the servo give delta3 a bandwidth of 60 rad/s" in one_line(capfd.readouterr().err)
+    assert "no gains of the servo give delta3 a bandwidth of 60 rad/s" in one_line(
+        capfd.readouterr().err
+    )
 
 
-@pytest.mark.parametrize(("observer", "most"), [("true", np.pi * 60), ("false", pytest.approx(69.503, rel=1e-4))])
-def test_a_bandwidth_that_frames_cannot_show_or_that_is_unstable_fails_with_the_largest_one(observer, most, tmp_path):
-    """Without observer the linear loop of vision alone: its largest bandwidth was found by bisection of its radius."""
-    asked = ["--set", "control.bandwidth_rad_s=400.0", "--set", f"control.observer={observer}", "--quiet"]
+@pytest.mark.parametrize(
+    ("observer", "most"), [("true", np.pi * 60), ("false", pytest.approx(69.503, rel=1e-4))]
+)
+def test_a_bandwidth_that_frames_cannot_show_or_that_is_unstable_fails_with_the_largest_one(
+    observer, most, tmp_path
+):
+    """Without observer the linear loop of vision alone: its largest bandwidth was found by
+    bisection of its radius.
+    """
+    asked = [
+        "--set",
+        "control.bandwidth_rad_s=400.0",
+        "--set",
+        f"control.observer={observer}",
+        "--quiet",
+    ]
     assert command("check", "ups6", *asked, "--json", tmp_path / "found.json") == BEYOND_LIMIT
     found = _found(tmp_path / "found.json")
     fast = found["torque bandwidth"]
@@ -59,7 +89,9 @@ def test_a_bandwidth_that_frames_cannot_show_or_that_is_unstable_fails_with_the_
 
 @pytest.mark.slow
 def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
-    """A cylinder that no body is, a travel beyond what the legs can reach, and gains that no frame rate holds."""
+    """A cylinder that no body is, a travel beyond what the legs can reach, and gains that no frame
+    rate holds.
+    """
     text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
     for old, new in (
         ("Ixx = [0.00672, 0.00607, 0.00703", "Ixx = [0.00672, 0.00607, 0.0203"),
@@ -70,21 +102,33 @@ def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
         assert old in text
         text = text.replace(old, new)
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
-    assert command("check", tmp_path / "mine.toml", "--json", tmp_path / "found.json", "--quiet") == BEYOND_LIMIT
+    assert (
+        command("check", tmp_path / "mine.toml", "--json", tmp_path / "found.json", "--quiet")
+        == BEYOND_LIMIT
+    )
     found = _found(tmp_path / "found.json")
     failed = {name for name, entry in found.items() if not entry["ok"]}
     assert {"inertias", "loop", "gain margin", "frame rate"} <= failed
     assert found["inertias"]["leg"] == 3
     assert found["loop"]["value"] > 1 == found["loop"]["limit"]
-    assert f"{len(failed)} of {len(found)} findings about ups6 fail" in one_line(capfd.readouterr().err)
+    assert f"{len(failed)} of {len(found)} findings about ups6 fail" in one_line(
+        capfd.readouterr().err
+    )
 
 
 def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read(capfd):
     """Beside the inertias of ten bodies, of which the table has the whole list."""
-    assert command("check", "rss6", "--set", "control.torque_limit_N_m=3.0", "--quiet") == BEYOND_LIMIT
+    assert (
+        command("check", "rss6", "--set", "control.torque_limit_N_m=3.0", "--quiet") == BEYOND_LIMIT
+    )
     said = one_line(capfd.readouterr().err)
-    assert "2 of 21 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
-    assert "and the actuators have 3 N m; inertias: no rigid body has these, and accelerations change by up to" in said
+    assert (
+        "2 of 21 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
+    )
+    assert (
+        "and the actuators have 3 N m; inertias: no rigid body has these, and accelerations "
+        "change by up to" in said
+    )
     assert len(said) < 400
 
 

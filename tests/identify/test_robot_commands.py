@@ -1,4 +1,6 @@
-"""Commands about a robot alone: the paper's figure-7 loop on both engines, ``export``, and maps of the workspace."""
+"""Commands about a robot alone: the paper's figure-7 loop on both engines, ``export``, and maps of
+the workspace.
+"""
 
 import json
 from dataclasses import replace
@@ -15,7 +17,13 @@ from identify.files.run_folder import load_result, save_result
 from identify.loop_parameters import choose_parameters
 from identify.trajectory import check_travel
 from identify.verification import against_mujoco, workspace_map
-from identify.verification.against_mujoco import EngineRuns, compare_engines, exciting_trajectory, figure_8, judge
+from identify.verification.against_mujoco import (
+    EngineRuns,
+    compare_engines,
+    exciting_trajectory,
+    figure_8,
+    judge,
+)
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import LAYOUT
 
@@ -29,10 +37,14 @@ def made_runs():
     other[:2, 0], other[2:, 1], other[2:, 4] = 3e-6, 2e-6, -3e-6
     other[:2, 2] = 4e-6
     reference = np.full((9, 6), [1e-3, 0, 0, 0, 0, 2e-3])
-    return EngineRuns(time, reference, poses, other, torques, torques - 0.5, time * 1e-9, time * 1e-3, "4.0.0")
+    return EngineRuns(
+        time, reference, poses, other, torques, torques - 0.5, time * 1e-9, time * 1e-3, "4.0.0"
+    )
 
 
-def test_verdict_and_figure_take_lengths_before_and_after_settling_and_one_beyond_its_goal_misses(made_runs):
+def test_verdict_and_figure_take_lengths_before_and_after_settling_and_one_beyond_its_goal_misses(
+    made_runs,
+):
     verdict = judge(made_runs)
     assert verdict.position_max_um == pytest.approx(5)
     assert verdict.position_steady_um == pytest.approx(2)
@@ -40,22 +52,33 @@ def test_verdict_and_figure_take_lengths_before_and_after_settling_and_one_beyon
     assert verdict.torque_max == pytest.approx(0.5)
     assert verdict.closure_max_um == pytest.approx(4e-3)
     assert verdict.spin_max_rad_s == pytest.approx(4e-3)
-    assert (verdict.tracking_max_um, verdict.tracking_max_urad) == (pytest.approx(1e3), pytest.approx(2e3))
+    assert (verdict.tracking_max_um, verdict.tracking_max_urad) == (
+        pytest.approx(1e3),
+        pytest.approx(2e3),
+    )
     assert verdict.met
     for column in (0, 5):
         beyond = made_runs.mujoco_pose.copy()
         beyond[-1, column] = 21e-6
         assert not judge(replace(made_runs, mujoco_pose=beyond)).met
     figure = figure_8(made_runs)
-    assert [axes.get_ylabel() for axes in figure.axes] == ["position error [um]", "angle error [urad]", "gap [um]"]
+    assert [axes.get_ylabel() for axes in figure.axes] == [
+        "position error [um]",
+        "angle error [urad]",
+        "gap [um]",
+    ]
     assert "steady 2 um (goal 10 um" in figure.axes[0].get_title()
-    np.testing.assert_allclose(figure.axes[0].lines[1].get_ydata(), 1e6 * made_runs.difference[:, 1])
+    np.testing.assert_allclose(
+        figure.axes[0].lines[1].get_ydata(), 1e6 * made_runs.difference[:, 1]
+    )
     assert "time [s]" in figure.axes[2].get_xlabel()
 
 
-def test_verify_model_finds_the_engines_agreeing_to_nanometres_under_the_papers_pid(monkeypatch, capfd, tmp_path):
-    """Ten thousand times below the goals, while the soft PID leaves both a millimetre from the reference; over two
-    seconds. The whole ten are one of our figures, see tests/accuracy."""
+def test_verify_model_finds_the_engines_agreeing_to_nanometres_under_the_papers_pid(
+    monkeypatch, capfd, tmp_path
+):
+    """Ten thousand times below the goals, while the soft PID leaves both a millimetre from the
+    reference; over two seconds. The whole ten are one of our figures, see tests/accuracy."""
     pytest.importorskip("mujoco")
     monkeypatch.setattr(against_mujoco, "DURATION_S", 2.1)
     assert command("verify-model", "--out", tmp_path / "new") == 0
@@ -81,7 +104,9 @@ def test_a_wrong_parameter_in_one_engine_is_seen(robot):
     for name, factor in (("platform.mass", 1.01), ("link1.mass", 1.01), ("platform.Ixx", 1.05)):
         other = initial.copy()
         other[LAYOUT.dynamic_names.index(name)] *= factor
-        assert judge(compare_engines(robot, initial, other, 2.1)).angle_max_urad > max(1, 500 * right.angle_max_urad)
+        assert judge(compare_engines(robot, initial, other, 2.1)).angle_max_urad > max(
+            1, 500 * right.angle_max_urad
+        )
 
 
 def test_exciting_trajectory_starts_at_home_at_rest_and_stays_inside_the_travel(robot, monkeypatch):
@@ -104,9 +129,13 @@ def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch
     assert json.loads((tmp_path / "new" / "verification.json").read_text())["met"] is False
 
 
-def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(robot, monkeypatch, capfd, tmp_path):
+def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(
+    robot, monkeypatch, capfd, tmp_path
+):
     mujoco = pytest.importorskip("mujoco")
-    values = dict(zip(LAYOUT.dynamic_names, robot.parameter_sets["identified"].dynamic.tolist(), strict=True))
+    values = dict(
+        zip(LAYOUT.dynamic_names, robot.parameter_sets["identified"].dynamic.tolist(), strict=True)
+    )
     values["platform.mass"] = 23.456
     save_result(tmp_path / "result.json", made_result(values))
     out = tmp_path / "model.xml"
@@ -128,14 +157,25 @@ def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(robot, mo
 
 
 def made_result(values):
-    return {"identification": {"parameters": {name: {"estimate": value} for name, value in values.items()}}}
+    return {
+        "identification": {
+            "parameters": {name: {"estimate": value} for name, value in values.items()}
+        }
+    }
 
 
-def test_parameters_are_the_nominal_set_where_none_is_named_and_no_others_than_a_model_can_have(robot, tmp_path):
+def test_parameters_are_the_nominal_set_where_none_is_named_and_no_others_than_a_model_can_have(
+    robot, tmp_path
+):
     np.testing.assert_array_equal(choose_parameters(robot).values, robot.nominal_parameters)
-    path, values = tmp_path / "result.json", dict.fromkeys(LAYOUT.dynamic_names, 1.0) | {"crank2.mass": -0.1}
+    path, values = (
+        tmp_path / "result.json",
+        dict.fromkeys(LAYOUT.dynamic_names, 1.0) | {"crank2.mass": -0.1},
+    )
     save_result(path, made_result(values))
-    with pytest.raises(RecordError, match=f"^{path}: crank2.mass = -0.1 kg is not allowed, must be finite and >= 0"):
+    with pytest.raises(
+        RecordError, match=f"^{path}: crank2.mass = -0.1 kg is not allowed, must be finite and >= 0"
+    ):
         choose_parameters(robot, str(path))
 
 
@@ -147,8 +187,8 @@ def mapped(robot):
 
 
 def test_maps_hold_what_each_pose_alone_gives_and_ranges_end_at_the_travel_limit(robot, mapped):
-    """One inverse kinematics at a time: share of the travel, or NaN out of reach; at the end of each range the largest
-    angle is the limit, within the step of the search."""
+    """One inverse kinematics at a time: share of the travel, or NaN out of reach; at the end of
+    each range the largest angle is the limit, within the step of the search."""
     plane = mapped.planes[1]
     assert (plane.across, plane.up, plane.fixed) == (0, 1, 2)
     for row, column in product(range(0, 21, 4), repeat=2):
@@ -162,11 +202,14 @@ def test_maps_hold_what_each_pose_alone_gives_and_ranges_end_at_the_travel_limit
     assert np.isnan(plane.travel_share).any()
     assert 0.2 < plane.allowed.mean() < 0.9
 
-    # The reference robot is its own mirror image in the x-z plane: y -> -y at home's height and orientation.
+    # The reference robot is its own mirror image in the x-z plane: y -> -y at home's height and
+    # orientation.
     np.testing.assert_allclose(plane.travel_share, plane.travel_share[::-1], atol=1e-9)
     for axis, ends in enumerate(mapped.ranges):
         for end in ends:
-            largest = np.abs(robot.inverse_kinematics(robot.home_pose + end * np.eye(6)[axis])).max()
+            largest = np.abs(
+                robot.inverse_kinematics(robot.home_pose + end * np.eye(6)[axis])
+            ).max()
             assert robot.travel_limit - 0.01 < largest <= robot.travel_limit
 
 
@@ -190,8 +233,14 @@ def test_import_writes_a_robot_file_that_every_command_takes_or_nothing(capfd, t
     assert command("export", "mjcf", "ups6", "--out", model, "--quiet") == 0
     assert command("import", "mjcf", model, "--out", out) == 0
     assert capfd.readouterr().out.splitlines()[1] == "legs: ups, ups, ups, ups, ups, ups"
-    np.testing.assert_array_equal(load_robot(out).nominal_parameters[:4], load_robot("ups6").nominal_parameters[:4])
-    model.write_text(model.read_text().replace("<motor ", "<general ").replace('joint="joint2"', 'joint="joint1"'))
+    np.testing.assert_array_equal(
+        load_robot(out).nominal_parameters[:4], load_robot("ups6").nominal_parameters[:4]
+    )
+    model.write_text(
+        model.read_text()
+        .replace("<motor ", "<general ")
+        .replace('joint="joint2"', 'joint="joint1"')
+    )
     out.unlink()
     assert command("import", "mjcf", model, "--out", out) == 1
     assert "leg 2 (cylinder2, rod2): it has 0 actuated joints" in one_line(capfd.readouterr().err)

@@ -1,5 +1,5 @@
-"""Scenarios: what the built-in ones say, what comes from the sensor's file, what no scenario may be, and what may
-change for another estimator on a record that exists."""
+"""Scenarios: what the built-in ones say, what comes from the sensor's file, what no scenario may
+be, and what may change for another estimator on a record that exists."""
 
 import tomllib
 from pathlib import Path
@@ -17,9 +17,9 @@ from identify.experiment.sensor_in_loop import make_sensor
 from identify.files.run_folder import load_result
 from identify.progress import SilentProgress
 from identify.record.recording import read
+from identify.reporting.report_sections import provenance_section
 from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector
-from identify.reporting.sections import provenance_section
 from identify.reporting.settings import changed_settings
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 from identify.scenario.scenario import SECTIONS, estimator_settings, with_estimator_settings
@@ -36,11 +36,26 @@ def test_paper_scenario_has_the_papers_numbers_and_the_quick_one_differs_only_in
     assert (paper.servo.kp, paper.servo.kd, paper.servo.ki) == (0.3, 0.001, 2.4)
     assert (paper.excitation.fundamental_hz, paper.excitation.harmonics) == (0.1, 5)
     assert (paper.timing.frame_rate_hz, paper.timing.latency_s) == (60.0, 0.0)
-    assert (paper.excitation.duration_s, paper.validation.count, paper.validation.duration_s) == (20.0, 10, 10.0)
+    assert (paper.excitation.duration_s, paper.validation.count, paper.validation.duration_s) == (
+        20.0,
+        10,
+        10.0,
+    )
     assert paper.filter.order == 8
     slow, quick = paper.model_dump(), load_scenario("quick").model_dump()
-    differing = {f"{s}.{k}" for s in slow if isinstance(slow[s], dict) for k in slow[s] if slow[s][k] != quick[s][k]}
-    assert {name for name in slow if slow[name] != quick[name]} == {"name", "description", "excitation", "validation"}
+    differing = {
+        f"{s}.{k}"
+        for s in slow
+        if isinstance(slow[s], dict)
+        for k in slow[s]
+        if slow[s][k] != quick[s][k]
+    }
+    assert {name for name in slow if slow[name] != quick[name]} == {
+        "name",
+        "description",
+        "excitation",
+        "validation",
+    }
     takes_time = {"excitation.duration_s", "excitation.candidates", "excitation.method"}
     assert differing == takes_time | {"validation.count", "validation.duration_s"}
 
@@ -62,7 +77,8 @@ def test_resolved_scenario_keeps_its_timing_whatever_the_sensor_file_says(tmp_pa
     """What a run folder holds: every number is stated there, so the sensor's file is not asked."""
     sensor = tmp_path / "mine.toml"
     sensor.write_text(
-        'name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 50\nlatency = 0.02\ndropout = 0.1\n'
+        'name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 50\nlatency = '
+        "0.02\ndropout = 0.1\n"
         "latency_jitter = 0.005\nexposure = 0.002\n"
     )
     scenario = load_scenario("paper").with_overrides({"sensor": str(sensor)})
@@ -70,7 +86,9 @@ def test_resolved_scenario_keeps_its_timing_whatever_the_sensor_file_says(tmp_pa
     assert (timing.frame_rate_hz, timing.exposure_s, timing.latency_s) == (50.0, 0.002, 0.02)
     assert (timing.latency_jitter_s, timing.dropout) == (0.005, 0.1)
     sensor.write_text('name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 5000\n')
-    assert f"timing of the sensor {str(sensor)!r}: frame_rate_hz = 5000.0 [Hz]" in refused({"sensor": str(sensor)})
+    assert f"timing of the sensor {str(sensor)!r}: frame_rate_hz = 5000.0 [Hz]" in refused(
+        {"sensor": str(sensor)}
+    )
     sensor.unlink()
     assert scenario_from_toml(scenario.to_toml()) == scenario
 
@@ -78,7 +96,11 @@ def test_resolved_scenario_keeps_its_timing_whatever_the_sensor_file_says(tmp_pa
 @pytest.mark.parametrize("name", scenario_names())
 def test_resolved_toml_names_every_value_and_reads_back_equal(name):
     scenario = load_scenario(name).with_overrides(
-        {"description": 'quotes " and \\ and é', "plant.friction": "smoothed", "plant.smoothing_velocity_rad_s": 1e-3}
+        {
+            "description": 'quotes " and \\ and é',
+            "plant.friction": "smoothed",
+            "plant.smoothing_velocity_rad_s": 1e-3,
+        }
         | {PRIOR: {"link2.Izz": {"value": 3e-3, "std": 1e-4}}}
     )
     text = scenario.to_toml()
@@ -88,14 +110,22 @@ def test_resolved_toml_names_every_value_and_reads_back_equal(name):
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
-    """A folder with a scenario and the robot and sensor that it names, called from one with files of the same names."""
+    """A folder with a scenario and the robot and sensor that it names, called from one with files
+    of the same names.
+    """
     folder = tmp_path / "project"
     here = tmp_path / "here"
     for place, cranks, rate in ((folder / "files", 0.062, 50), (here / "files", 0.065, 40)):
         place.mkdir(parents=True)
-        changed_robot_file(place / "robot.toml", "crank_length = 0.06\n", f"crank_length = {cranks}\n")
-        (place / "sensor.toml").write_text(f'name = "s"\nbased_on = "ctrack780"\n[timing]\nframe_rate = {rate}\n')
-    (folder / "mine.toml").write_text('name = "mine"\nrobot = "files/robot.toml"\nsensor = "files/sensor.toml"\n')
+        changed_robot_file(
+            place / "robot.toml", "crank_length = 0.06\n", f"crank_length = {cranks}\n"
+        )
+        (place / "sensor.toml").write_text(
+            f'name = "s"\nbased_on = "ctrack780"\n[timing]\nframe_rate = {rate}\n'
+        )
+    (folder / "mine.toml").write_text(
+        'name = "mine"\nrobot = "files/robot.toml"\nsensor = "files/sensor.toml"\n'
+    )
     monkeypatch.chdir(here)
     return folder
 
@@ -105,7 +135,9 @@ def test_paths_in_a_scenario_start_from_its_own_file_and_hold_from_anywhere(else
     assert load_robot(scenario.robot).geometry.legs[0].crank_length == 0.062
     assert scenario.timing.frame_rate_hz == 50
     typed = scenario.with_overrides({"robot": "files/robot.toml"})
-    assert load_robot(typed.robot).geometry.legs[0].crank_length == 0.065, "found from where it is typed"
+    assert load_robot(typed.robot).geometry.legs[0].crank_length == 0.065, (
+        "found from where it is typed"
+    )
     assert Path(typed.robot).is_absolute()
     assert typed.timing.frame_rate_hz == 50
     (elsewhere / "left").mkdir()
@@ -137,7 +169,9 @@ def test_scenario_is_that_of_a_file_and_what_is_none_is_named(tmp_path):
     bad.write_text("name = ", encoding="utf-8")
     with pytest.raises(ScenarioError, match=r"bad\.toml is not valid TOML"):
         load_scenario(bad)
-    with pytest.raises(ScenarioError, match=r"'nope' is neither built in \(geometry, paper, quick\) nor a file"):
+    with pytest.raises(
+        ScenarioError, match=r"'nope' is neither built in \(geometry, paper, quick\) nor a file"
+    ):
         load_scenario("nope")
     with pytest.raises(ValueError, match="frozen"):
         load_scenario("paper").timing.latency_s = 1.0
@@ -150,36 +184,81 @@ PAYLOAD = {"identification.scale_anchor": "payload", "identification.anchor_std"
 @pytest.mark.parametrize(
     ("overrides", "evidence"),
     [
-        ({"timing.frame_rat": 3.0}, ["unknown key 'timing.frame_rat'; valid names in [timing]: frame_rate_hz, "]),
+        (
+            {"timing.frame_rat": 3.0},
+            ["unknown key 'timing.frame_rat'; valid names in [timing]: frame_rate_hz, "],
+        ),
         ({"camera.gain": 3.0}, ["unknown key 'camera'"]),
         ({"robot.name": "x"}, ["robot.name", "not a section"]),
         ({"name": "a/b"}, ["name", "a/b"]),
         ({"sensor": "ctrack79"}, ["ctrack79", "ctrack780", "ctrack780_29hz"]),
-        ({"timing.latency_s": 0.7, "timing.frame_rate_hz": 100.0}, ["0.7 s", "70.0 frames", "at most 60 frames"]),
-        ({"timing.latency_s": 0.9, "timing.latency_jitter_s": 0.1}, ["jitter_s = 0.1 s", "1.2 s", "72.0 frames"]),
-        ({"timing.latency_s": 0.01, "timing.latency_jitter_s": 0.02}, ["latency_jitter 0.02 s", "latency 0.01 s"]),
+        (
+            {"timing.latency_s": 0.7, "timing.frame_rate_hz": 100.0},
+            ["0.7 s", "70.0 frames", "at most 60 frames"],
+        ),
+        (
+            {"timing.latency_s": 0.9, "timing.latency_jitter_s": 0.1},
+            ["jitter_s = 0.1 s", "1.2 s", "72.0 frames"],
+        ),
+        (
+            {"timing.latency_s": 0.01, "timing.latency_jitter_s": 0.02},
+            ["latency_jitter 0.02 s", "latency 0.01 s"],
+        ),
         ({"timing.exposure_s": 0.02}, ["exposure 0.02 s", "60 Hz"]),
         ({"timing.hold": "cubic"}, ["cubic", "zero", "linear"]),
         ({"excitation.harmonics": 1}, ["excitation.harmonics = 1 [1]", "2"]),
         ({"validation.duration_s": 5.01}, ["300.6 frames", "60 Hz"]),
         ({"filter.cutoff_hz": 30.0}, ["30 Hz", "60 Hz", "Nyquist"]),
         ({"filter.cutoff_hz": 0.4}, ["highest harmonic is 0.5 Hz"]),
-        ({"filter.cutoff_hz": 0.4, "timing.frame_rate_hz": 0.9}, ["frame_rate_hz = 0.9 Hz is not above twice the"]),
-        ({"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 120.0}, ["Nyquist"]),  # the paper's, at twice its rate
-        ({PRIOR: {"foo": {"value": 1.0, "std": 0.1}}}, ["no parameter 'foo'", "or viscous of joint1 to joint6"]),
-        ({PRIOR: {"platform": {"mass": {"value": 1.0, "std": 0.1}}}}, ["'platform'", '{"platform.…" = {value']),
-        ({PRIOR: {"platform.mass": {"value": 1.0}}}, ["identification.prior.platform.mass.std is missing"]),
+        (
+            {"filter.cutoff_hz": 0.4, "timing.frame_rate_hz": 0.9},
+            ["frame_rate_hz = 0.9 Hz is not above twice the"],
+        ),
+        (
+            {"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 120.0},
+            ["Nyquist"],
+        ),  # the paper's, at twice its rate
+        (
+            {PRIOR: {"foo": {"value": 1.0, "std": 0.1}}},
+            ["no parameter 'foo'", "or viscous of joint1 to joint6"],
+        ),
+        (
+            {PRIOR: {"platform": {"mass": {"value": 1.0, "std": 0.1}}}},
+            ["'platform'", '{"platform.…" = {value'],
+        ),
+        (
+            {PRIOR: {"platform.mass": {"value": 1.0}}},
+            ["identification.prior.platform.mass.std is missing"],
+        ),
         ({PRIOR: {"platform.mass": {"value": 1.0, "std": 0.0}}}, ["prior.platform.mass.std = 0.0"]),
-        ({PRIOR: {"platform.mass": {"value": 1.0, "std": 0.1, "a": 1}}}, ["mass.a'", "platform.mass]: value, std"]),
-        (PAYLOAD, ["anchor_std = 0.1: the anchor payload measures no parameter", "payload.mass_std_kg"]),
-        ({"payload.Ixx_kg_m2": 100.0}, ["payload: Ixx_kg_m2 100 > Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 kg m2"]),
+        (
+            {PRIOR: {"platform.mass": {"value": 1.0, "std": 0.1, "a": 1}}},
+            ["mass.a'", "platform.mass]: value, std"],
+        ),
+        (
+            PAYLOAD,
+            ["anchor_std = 0.1: the anchor payload measures no parameter", "payload.mass_std_kg"],
+        ),
+        (
+            {"payload.Ixx_kg_m2": 100.0},
+            ["payload: Ixx_kg_m2 100 > Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 kg m2"],
+        ),
         ({"payload.mass_std_kg": 9.0}, ["payload: mass_std_kg = 9 kg exceeds mass_kg = 8 kg"]),
         ({"plant.friction": "smoothed"}, ["smoothing_velocity_rad_s"]),
-        ({"plant.geometry_error_m": 2e-3}, ["plant.geometry_error_m = 0.002 [m]: input should be less than or equal"]),
-        ({"timing.latency_s": -1.0, "servo.kq": 1.0}, ["timing.latency_s = -1.0 [s]", "servo.kq"]),  # all at once
+        (
+            {"plant.geometry_error_m": 2e-3},
+            ["plant.geometry_error_m = 0.002 [m]: input should be less than or equal"],
+        ),
+        (
+            {"timing.latency_s": -1.0, "servo.kq": 1.0},
+            ["timing.latency_s = -1.0 [s]", "servo.kq"],
+        ),  # all at once
         ({"sensor_changes.camera.drk_noise": 1.0}, ["camera.drk_noise", "dark_noise"]),
         ({"sensor_changes.camera": 1.0}, ["camera = 1.0 is a section", "dark_noise"]),
-        ({"sensor_changes.based_on": "ctrack780_29hz"}, ["based_on", "ctrack780_29hz", "another sensor"]),
+        (
+            {"sensor_changes.based_on": "ctrack780_29hz"},
+            ["based_on", "ctrack780_29hz", "another sensor"],
+        ),
     ],
 )
 def test_what_no_scenario_may_be_is_refused_by_name_in_one_line(overrides, evidence):
@@ -193,13 +272,22 @@ def test_what_lies_just_inside_the_limits_is_taken():
     paper = load_scenario("paper")
     for overrides in (flat, smoothed, {"filter.cutoff_hz": 29.9}):
         assert paper.with_overrides(overrides) != paper
-    assert paper.with_overrides({"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 125.0}).filter.cutoff_hz == 60.0
+    assert (
+        paper.with_overrides(
+            {"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 125.0}
+        ).filter.cutoff_hz
+        == 60.0
+    )
     known = {name: {"value": 1.0, "std": 0.1} for name in NAMES}
     assert len(paper.with_overrides({PRIOR: known}).identification.prior) == 67
 
 
 def test_every_number_has_a_unit():
-    for section in (f.annotation for f in Scenario.model_fields.values() if hasattr(f.annotation, "model_fields")):
+    for section in (
+        f.annotation
+        for f in Scenario.model_fields.values()
+        if hasattr(f.annotation, "model_fields")
+    ):
         for name, entry in section.model_fields.items():
             if entry.annotation in (int, float, float | None) and name != "count":
                 assert entry.json_schema_extra["unit"], f"{section.__name__}.{name}"
@@ -208,18 +296,25 @@ def test_every_number_has_a_unit():
 CHANGES = {"camera.dark_noise": 52.0, "lens.psf_px": 0.6, "rig.baseline": 0.8}
 
 
-def test_changed_sensor_is_that_of_a_file_with_the_same_entries_in_the_loop_and_for_the_excitation(tmp_path):
+def test_changed_sensor_is_that_of_a_file_with_the_same_entries_in_the_loop_and_for_the_excitation(
+    tmp_path,
+):
     """Baseline and noise decide what a pose is worth; the loop's sensor must be the changed one."""
     mine = tmp_path / "mine.toml"
     mine.write_text(
-        'name = "ctrack780"\nbased_on = "ctrack780"\n[camera]\ndark_noise = 52.0\n[lens]\npsf_px = 0.6\n'
+        'name = "ctrack780"\nbased_on = "ctrack780"\n[camera]\ndark_noise = 52.0\n[lens]\npsf_px '
+        "= 0.6\n"
         "[rig]\nbaseline = 0.8\n"
     )
     expected = read_sensor_file(mine).model_copy(update={"based_on": None})
     nested = {"camera": {"dark_noise": 52.0}, "lens": {"psf_px": 0.6}, "rig": {"baseline": 0.8}}
-    assert read_sensor_file("ctrack780", CHANGES) == read_sensor_file("ctrack780", nested) == expected
+    assert (
+        read_sensor_file("ctrack780", CHANGES) == read_sensor_file("ctrack780", nested) == expected
+    )
     assert read_sensor_file("ctrack780") == read_sensor_file("ctrack780", {})
-    changed = load_scenario("paper").with_overrides({f"sensor_changes.{key}": CHANGES[key] for key in CHANGES})
+    changed = load_scenario("paper").with_overrides(
+        {f"sensor_changes.{key}": CHANGES[key] for key in CHANGES}
+    )
     sensor = make_sensor(changed, load_robot("rss6"), seed=0)
     assert (sensor.noise.dark_noise, sensor.optics.psf_px) == (52.0, 0.6)
     for rig in (sensor.rig, sight_lines("ctrack780", changed.sensor_changes).rig):
@@ -227,13 +322,24 @@ def test_changed_sensor_is_that_of_a_file_with_the_same_entries_in_the_loop_and_
 
 
 def test_resolved_scenario_with_changes_reads_back_equal_and_its_timing_follows_them():
-    more = {"timing.frame_rate": 125.0, "camera.noise": False, "platform.planes.A.stickers": [[0, 1], [1, 0], [0.1, 1]]}
+    more = {
+        "timing.frame_rate": 125.0,
+        "camera.noise": False,
+        "platform.planes.A.stickers": [[0, 1], [1, 0], [0.1, 1]],
+    }
     paper = load_scenario("paper")
-    changed = paper.with_overrides({f"sensor_changes.{key}": value for key, value in (CHANGES | more).items()})
+    changed = paper.with_overrides(
+        {f"sensor_changes.{key}": value for key, value in (CHANGES | more).items()}
+    )
     assert scenario_from_toml(changed.to_toml()) == changed
-    assert changed.with_overrides({f"sensor_changes.{key}": None for key in changed.sensor_changes}) == paper
+    assert (
+        changed.with_overrides({f"sensor_changes.{key}": None for key in changed.sensor_changes})
+        == paper
+    )
     assert changed.timing.frame_rate_hz == 125.0
-    with pytest.raises(ScenarioError, match=r"frame_rate = 125 has no effect .* timing.frame_rate_hz = 60"):
+    with pytest.raises(
+        ScenarioError, match=r"frame_rate = 125 has no effect .* timing.frame_rate_hz = 60"
+    ):
         changed.with_overrides({"timing.frame_rate_hz": 60.0})
 
 
@@ -246,9 +352,13 @@ def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(recorded_
     assert kept == SHORT.with_overrides(DRIVEN)
     assert result["settings"]["identification.method"] == "command_driven"
     expected = identify(read(recorded_folder.experiment), rss6(), SHORT.with_overrides(DRIVEN))
-    np.testing.assert_array_equal(parameter_vector(rss6(), result["identification"], "estimate"), expected.estimate)
+    np.testing.assert_array_equal(
+        parameter_vector(rss6(), result["identification"], "estimate"), expected.estimate
+    )
     assert result["identification"]["searches"] == ["command_driven"]
-    _, changed = changed_settings(read(recorded_folder.experiment).attrs["scenario"], result["settings"])
+    _, changed = changed_settings(
+        read(recorded_folder.experiment).attrs["scenario"], result["settings"]
+    )
     method = next(one for one in changed if one.key == "identification.method")
     assert (method.value, method.built_in) == ("command_driven", "closed_loop")
     assert method.meaning.endswith("when the record was made: closed_loop")
@@ -261,28 +371,46 @@ def test_without_settings_the_scenario_is_left_as_it_is_and_by_an_identification
 ):
     mine = "# mine\n" + SHORT.to_toml()
     recorded_folder.scenario.write_text(mine, encoding="utf-8")
-    with pytest.raises(ScenarioError, match="robot rss6 has no parameter set 'nobody'; it has identified"):
-        pipeline.identify(recorded_folder.path, SilentProgress(), {"model.start_parameters": "nobody"})
+    with pytest.raises(
+        ScenarioError, match="robot rss6 has no parameter set 'nobody'; it has identified"
+    ):
+        pipeline.identify(
+            recorded_folder.path, SilentProgress(), {"model.start_parameters": "nobody"}
+        )
     assert not recorded_folder.result.exists()
     pipeline.identify(recorded_folder.path, SilentProgress())
     assert recorded_folder.scenario.read_text(encoding="utf-8") == mine
     result = load_result(recorded_folder.result)
     assert result["settings"] == estimator_settings(SHORT)
-    assert changed_settings(SHORT.to_toml(), result["settings"]) == changed_settings(SHORT.to_toml())
+    assert changed_settings(SHORT.to_toml(), result["settings"]) == changed_settings(
+        SHORT.to_toml()
+    )
 
 
 def test_what_the_record_was_made_with_is_refused_in_one_line_and_every_setting_of_the_sections_is_listed(
     recorded_folder, capfd
 ):
     for setting in ({"timing.latency_s": 0.01}, {"sensor": "ctrack780"}, {"identification": {}}):
-        with pytest.raises(ScenarioError, match=f"'{next(iter(setting))}' cannot be set for an identification"):
+        with pytest.raises(
+            ScenarioError, match=f"'{next(iter(setting))}' cannot be set for an identification"
+        ):
             with_estimator_settings(SHORT, setting)
-    with pytest.raises(ScenarioError, match=r"valid names in \[identification\]: method, scale_anchor"):
+    with pytest.raises(
+        ScenarioError, match=r"valid names in \[identification\]: method, scale_anchor"
+    ):
         with_estimator_settings(SHORT, {"identification.methode": "closed_loop"})
-    assert command("identify", "--out", recorded_folder.path, "--set", "identification.scale_anchor=prior") == 1
+    assert (
+        command(
+            "identify", "--out", recorded_folder.path, "--set", "identification.scale_anchor=prior"
+        )
+        == 1
+    )
     said = one_line(capfd.readouterr().err)
     assert "'identification.scale_anchor' cannot be set for an identification" in said
-    assert "allowed: identification.*, model.*, filter.*, except identification.scale_anchor and" in said
+    assert (
+        "allowed: identification.*, model.*, filter.*, except identification.scale_anchor and"
+        in said
+    )
     assert not recorded_folder.result.exists()
     listed = {key.partition(".")[0] for key in estimator_settings(SHORT)}
     assert listed == set(SECTIONS) < set(Scenario.model_fields)
@@ -296,7 +424,11 @@ def test_the_report_says_what_differs_from_the_built_in_scenario_and_what_was_se
     assert base == "paper"
     assert ("timing.latency_s", "0.01", "0.0") in [one[:3] for one in changed]
     data = read_run(run_folder)
-    data.result["settings"] = {"model.steps_per_frame": 9, "filter.order": 8, "identification.anchor_std": 0.1}
+    data.result["settings"] = {
+        "model.steps_per_frame": 9,
+        "filter.order": 8,
+        "identification.anchor_std": 0.1,
+    }
     section = provenance_section(data)
     rows = {row[0]: row for row in section.tables[0].rows}
     assert section.tables[0].title == "What differs from the scenario quick"

@@ -1,4 +1,6 @@
-"""What is drawn of robot, stickers and cameras stands where other parts of the project say that they are."""
+"""What is drawn of robot, stickers and cameras stands where other parts of the project say that
+they are.
+"""
 
 import io
 import json
@@ -15,25 +17,35 @@ from cmmsim.files import read_sensor_file
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
 from dynamics import load_robot
 from dynamics.errors import RobotFileError
-from identify.errors import EstimationError, IdentifyError, OutputFolderError, RecordError, ScenarioError
+from identify.errors import (
+    EstimationError,
+    IdentifyError,
+    OutputFolderError,
+    RecordError,
+    ScenarioError,
+)
 from identify.files.dataset import read_group, write_groups
 from identify.files.run_folder import load_result, save_result
 from identify.scene import (
     Workcell,
     overview_figure,
     read_motion,
+    replay,
     scene_figure,
     stereo_figure,
     stereo_view,
     workcell,
 )
-from identify.scene import page as replay_page
 from identify.scene.gltf import gltf
 from identify.scene.painter import Painter, View
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import changed_robot_file, rss6
 
-LENS = {"focal_px": [2290.0, 2310.0], "centre_px": [1000.0, 770.0], "distortion": [-0.1, 0.05, 1e-3, 0, 0]}
+LENS = {
+    "focal_px": [2290.0, 2310.0],
+    "centre_px": [1000.0, 770.0],
+    "distortion": [-0.1, 0.05, 1e-3, 0, 0],
+}
 MOVED = np.array([0.004, -0.003, 0.206, 0.02, -0.03, 0.015])
 
 
@@ -79,7 +91,9 @@ def test_a_detected_ellipse_parts_what_is_bright_from_what_is_dark(view):
     for side in range(2):
         for centre, shape in zip(found.centres[side], found.shapes[side], strict=True):
             x, y = np.rint(centre - view.corners[side]).astype(int)
-            within, beyond = (centre + scale * np.array([shape[0], -shape[0]]) for scale in (0.4, 1.9))
+            within, beyond = (
+                centre + scale * np.array([shape[0], -shape[0]]) for scale in (0.4, 1.9)
+            )
             grey = [np.mean([view.images[side][tuple(np.rint(p - view.corners[side]).astype(int)[::-1])] for p in ring])
                     for ring in (within, beyond)]  # fmt: skip
             assert view.images[side][y, x] > 150
@@ -98,13 +112,16 @@ def test_bodies_in_the_gltf_file_stand_where_the_robot_has_them(name):
     for part, rod in zip(cell.parts, cell.rods(pose), strict=True):
         place, mesh = scene.graph.get(part.name)
         length = scene.geometry[mesh].bounds[1, 2]
-        np.testing.assert_allclose(apply(place, np.array([[0, 0, 0], [0, 0, length]])), rod, atol=1e-6)
+        np.testing.assert_allclose(
+            apply(place, np.array([[0, 0, 0], [0, 0, length]])), rod, atol=1e-6
+        )
         if part.last:
             ends.append(rod[:, None] - on_platform)
     copies = len(ends) // len(on_platform)
     nearest = np.linalg.norm(np.array(ends), axis=-1).min(axis=(1, 2))
     half = np.linalg.norm(cell.parts[-1].segment.copies, axis=1).max() if copies > 1 else 0.0
-    np.testing.assert_allclose(nearest, half, atol=1e-9)  # links end at the joints, bars beside them
+    # links end at the joints, bars beside them
+    np.testing.assert_allclose(nearest, half, atol=1e-9)
 
 
 def test_what_is_nearer_hides_what_is_farther():
@@ -159,7 +176,9 @@ def test_a_motion_holds_the_poses_of_the_files(finished_run):
 @pytest.mark.slow
 def test_what_a_run_lacks_is_left_out_and_said(run_folder):
     result = load_result(run_folder.result)
-    save_result(run_folder.result, {name: entry for name, entry in result.items() if name != "validation"})
+    save_result(
+        run_folder.result, {name: entry for name, entry in result.items() if name != "validation"}
+    )
     assert "not been validated since" in read_motion(run_folder.path).notes[0]
     run_folder.model.unlink()
     motion = read_motion(run_folder.path)
@@ -190,7 +209,9 @@ def test_what_no_replay_can_be_made_of_is_refused_in_one_line(run_folder, tmp_pa
 
 
 def test_the_robot_of_a_run_is_that_of_its_record(run_folder, tmp_path):
-    other = changed_robot_file(tmp_path / "other.toml", "crank_length = 0.06", "crank_length = 0.061")
+    other = changed_robot_file(
+        tmp_path / "other.toml", "crank_length = 0.06", "crank_length = 0.061"
+    )
     text = run_folder.scenario.read_text().replace('robot = "rss6"', f'robot = "{other}"')
     run_folder.scenario.write_text(text)
     assert "crank_length was 0.06" in refusal(EstimationError, read_motion, run_folder.path)
@@ -202,8 +223,8 @@ def test_the_robot_of_a_run_is_that_of_its_record(run_folder, tmp_path):
 def test_a_failed_replay_leaves_the_page_before(run_folder, monkeypatch, capsys):
     page = run_folder.path / "replay.html"
     page.write_text("before")
-    monkeypatch.setattr(replay_page, "KEY_FRAMES", 2)
-    monkeypatch.setattr(replay_page, "three_js", lambda: 1 / 0)
+    monkeypatch.setattr(replay, "KEY_FRAMES", 2)
+    monkeypatch.setattr(replay, "three_js", lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         command("replay", run_folder.path, "--quiet")
     assert page.read_text() == "before"
@@ -211,13 +232,17 @@ def test_a_failed_replay_leaves_the_page_before(run_folder, monkeypatch, capsys)
 
 
 @pytest.mark.slow
-def test_a_robot_of_ones_own_is_shown_with_its_sensor_and_as_a_picture(tmp_path, monkeypatch, capsys):
+def test_a_robot_of_ones_own_is_shown_with_its_sensor_and_as_a_picture(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     mine = changed_robot_file(tmp_path / "mine.toml", 'name = "rss6"', 'name = "mine"')
     assert command("show", mine, "--quiet") == 0
     page = (tmp_path / "mine.html").read_text()
     assert "Robot mine and sensor ctrack780" in page
-    data = json.loads(page.partition('id="data" type="application/json">')[2].partition("</script>")[0])
+    data = json.loads(
+        page.partition('id="data" type="application/json">')[2].partition("</script>")[0]
+    )
     assert data["frames"] == 1
     assert len(data["looks"][0]["found"]["platform"]["ids"]) == 18
     for name in ("a.png", "a.pdf"):
@@ -228,13 +253,20 @@ def test_a_robot_of_ones_own_is_shown_with_its_sensor_and_as_a_picture(tmp_path,
 
 
 @pytest.mark.slow
-def test_a_robot_that_fits_no_sensor_is_shown_alone_and_a_sensor_without_a_robot(tmp_path, monkeypatch, capsys):
+def test_a_robot_that_fits_no_sensor_is_shown_alone_and_a_sensor_without_a_robot(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
-    away = changed_robot_file(tmp_path / "away.toml", "home_pose = [0.0, 0.0, 0.2,", "home_pose = [0.0, 0.0, 0.12,")
+    away = changed_robot_file(
+        tmp_path / "away.toml", "home_pose = [0.0, 0.0, 0.2,", "home_pose = [0.0, 0.0, 0.12,"
+    )
     assert command("show", away, "--quiet") == 0
     said = capsys.readouterr().err
     assert said.startswith("warning: rss6 is shown without cameras")
-    assert "<svg" not in (tmp_path / "away.html").read_text().partition("<main>")[2].partition("</main>")[0]
+    assert (
+        "<svg"
+        not in (tmp_path / "away.html").read_text().partition("<main>")[2].partition("</main>")[0]
+    )
     assert command("show", "ctrack780", "--quiet") == 0
     assert "Sensor ctrack780" in (tmp_path / "ctrack780.html").read_text()
 
@@ -246,8 +278,8 @@ def test_a_robot_that_fits_no_sensor_is_shown_alone_and_a_sensor_without_a_robot
         (["rss6", "ups6"], "robots"),
         (["pyproject.toml"], "neither a robot nor a sensor"),
         (["rss6", "--png", "a.gif"], ".pdf"),
-        (["rss6", "--png", "/proc/none/a.png"], "--png"),
-        (["rss6", "--out", "/proc/none/a.html"], "--out"),
+        (["rss6", "--png", "/proc/none/a.png"], "cannot write /proc/none/a.png"),
+        (["rss6", "--out", "/proc/none/a.html"], "cannot write /proc/none/a.html"),
     ],
 )
 def test_what_cannot_be_shown_is_refused_in_one_line(names, evidence, capsys):
@@ -260,5 +292,5 @@ def test_a_scene_needs_a_robot_or_a_sensor():
 
 
 def test_an_unknown_library_is_named(monkeypatch):
-    monkeypatch.setattr(replay_page, "LIBRARY_ENDS", "not there")
-    assert trimesh.__version__ in refusal(IdentifyError, replay_page.three_js)
+    monkeypatch.setattr(replay, "LIBRARY_ENDS", "not there")
+    assert trimesh.__version__ in refusal(IdentifyError, replay.three_js)

@@ -1,4 +1,6 @@
-"""``cmmsim calibrate`` reads back the pictures that it rendered; ``detectors`` writes what the leaderboard gives."""
+"""``cmmsim calibrate`` reads back the pictures that it rendered; ``detectors`` writes what the
+leaderboard gives.
+"""
 
 import csv
 import json
@@ -15,7 +17,9 @@ from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.plugins import DEFAULT_DETECTOR
 from tests.identify.commands import command, one_line
 
-SENSOR = (Path(cmmsim.__file__).parent / "files" / "sensors" / "ctrack780.toml").read_text(encoding="utf-8")
+SENSOR = (Path(cmmsim.__file__).parent / "files" / "sensors" / "ctrack780.toml").read_text(
+    encoding="utf-8"
+)
 SMALLER = SENSOR.replace("2048", "640").replace("1536", "480").replace("2300.0", "720.0")
 FILES = {
     "small": 'renderer = "analytic"\n' + SMALLER.replace('name = "ctrack780"\n', ""),
@@ -29,7 +33,9 @@ FILES = {
 def pictures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrate")
     for name, text in FILES.items():
-        (folder / f"{name}.toml").write_text(text if name == "board" else f'name = "{name}"\n{text}')
+        (folder / f"{name}.toml").write_text(
+            text if name == "board" else f'name = "{name}"\n{text}'
+        )
     assert command("calibrate", *rendering(folder, 8), "--out", folder / "pictures", "--quiet") == 0
     return folder
 
@@ -48,7 +54,10 @@ def test_command_calibrates_what_it_rendered_into_a_sensor_file_found_from_where
 ):
     """The sensor file is based on another one beside it."""
     out = tmp_path / "deeper" / "new"
-    assert command("calibrate", *arguments(pictures), "--sensor", pictures / "slow.toml", "--out", out) == 0
+    assert (
+        command("calibrate", *arguments(pictures), "--sensor", pictures / "slow.toml", "--out", out)
+        == 0
+    )
     said = capfd.readouterr()
     assert "8 pairs" in said.out
     assert "right_from_left.tx_m" in said.out
@@ -69,11 +78,16 @@ def test_command_calibrates_what_it_rendered_into_a_sensor_file_found_from_where
     stated = np.sqrt(np.diag(result["covariance"]["matrix"]))
     np.testing.assert_allclose(stated, [p["std"] for p in found.values()])
     rig = tomllib.loads((out / "rig.toml").read_text())["rig"]
-    assert rig["left"]["focal_px"] == [found["left.fx_px"]["estimate"], found["left.fy_px"]["estimate"]]
+    assert rig["left"]["focal_px"] == [
+        found["left.fx_px"]["estimate"],
+        found["left.fy_px"]["estimate"],
+    ]
     assert tomllib.loads((out / "sensor.toml").read_text())["timing"] == {"frame_rate": 29.0}
     calibrated = cmmsim.load_sensor(out / "sensor.toml").rig
     assert calibrated.left.focal_px == found["left.fx_px"]["estimate"]
-    assert calibrated.right_from_left[0, 3] == pytest.approx(found["right_from_left.tx_m"]["estimate"], abs=1e-12)
+    assert calibrated.right_from_left[0, 3] == pytest.approx(
+        found["right_from_left.tx_m"]["estimate"], abs=1e-12
+    )
     np.testing.assert_allclose(calibrated.right_from_left, truth.right_from_left, atol=1e-3)
     for name in ("residuals", "coverage", "distortion"):
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
@@ -83,26 +97,44 @@ def test_command_calibrates_what_it_rendered_into_a_sensor_file_found_from_where
 def test_options_reach_a_calibration_whose_cameras_no_sensor_can_have(pictures, tmp_path, capfd):
     """The folders are given the wrong way round, and the baseline of the sensor file is another."""
     left, right, *rest = arguments(pictures)
-    options = ("--sensor", pictures / "narrow.toml", "--distortion", "none", "--fix-aspect", "--quiet")
+    options = (
+        "--sensor",
+        pictures / "narrow.toml",
+        "--distortion",
+        "none",
+        "--fix-aspect",
+        "--quiet",
+    )
     assert command("calibrate", right, left, *rest, *options, "--out", tmp_path / "new") == 0
     lines = capfd.readouterr().err.splitlines()
     assert all(line.startswith("warning: ") for line in lines)
     said = "\n".join(lines)
     assert "swap the folders LEFT and RIGHT" in said
     assert "the cameras stand 1 m apart, those of the sensor file" in said
-    assert "sensor.toml is not written, no sensor can have these cameras: rig.right_from_left" in said
+    assert (
+        "sensor.toml is not written, no sensor can have these cameras: rig.right_from_left" in said
+    )
     names = ["calibration.json", "coverage.png", "distortion.png", "residuals.png", "rig.toml"]
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == names
     result = json.loads((tmp_path / "new" / "calibration.json").read_text())
     assert result["options"] == {"distortion": "none", "fix_aspect": True}
-    fixed = [name for name, p in result["parameters"].items() if not p["free"] and name.startswith("left")]
+    fixed = [
+        name
+        for name, p in result["parameters"].items()
+        if not p["free"] and name.startswith("left")
+    ]
     assert fixed == ["left.k1", "left.k2", "left.p1", "left.p2", "left.k3"]
 
 
 def test_rendering_again_gives_the_same_complete_set(pictures, tmp_path):
     sets = []
     for out in ("a", "b"):
-        assert command("calibrate", *rendering(pictures), "--quiet", "--seed", 5, "--out", tmp_path / out) == 0
+        assert (
+            command(
+                "calibrate", *rendering(pictures), "--quiet", "--seed", 5, "--out", tmp_path / out
+            )
+            == 0
+        )
         files = (path for path in (tmp_path / out).rglob("*") if path.is_file())
         sets.append({str(path.relative_to(tmp_path / out)): path.read_bytes() for path in files})
     assert sets[0] == sets[1]
@@ -113,24 +145,41 @@ def test_pictures_of_another_size_and_too_few_of_the_board_are_one_line_and_leav
     pictures, monkeypatch, capfd, tmp_path
 ):
     """The size is refused before the board is looked for, which takes minutes."""
-    few = "0 of 8 pairs show the board to both cameras, 9 needed; without it: 000.png (both: nothing found)"
+    few = (
+        "0 of 8 pairs show the board to both cameras, 9 needed; without it: 000.png (both: "
+        "nothing found)"
+    )
     for options, find, said in (
-        (("--sensor", "ctrack780"), pytest.fail, "640 x 480 px, those of the sensor file ctrack780 2048 x 1536"),
+        (
+            ("--sensor", "ctrack780"),
+            pytest.fail,
+            "640 x 480 px, those of the sensor file ctrack780 2048 x 1536",
+        ),
         (("--min-images", 9), lambda *_: "nothing found", few),
     ):
         monkeypatch.setattr("cmmsim.calibration.sightings.find_board", find)
-        assert command("calibrate", *arguments(pictures), *options, "--out", tmp_path / "new", "--quiet") == 1
+        assert (
+            command(
+                "calibrate", *arguments(pictures), *options, "--out", tmp_path / "new", "--quiet"
+            )
+            == 1
+        )
         assert said in one_line(capfd.readouterr().err)
         assert list(tmp_path.iterdir()) == []
 
 
 def test_stopped_rendering_leaves_a_folder_empty_or_none(pictures, tmp_path, monkeypatch, capfd):
-    def stopped(path, _):
-        if "right" in path:
-            raise KeyboardInterrupt
-        return True
+    encode = cv2.imencode
+    pictures_encoded = []
 
-    monkeypatch.setattr(cv2, "imwrite", stopped)
+    def stopped(suffix, image):
+        if len(pictures_encoded) % 2:
+            pictures_encoded.clear()
+            raise KeyboardInterrupt
+        pictures_encoded.append(suffix)
+        return encode(suffix, image)
+
+    monkeypatch.setattr(cv2, "imencode", stopped)
     (tmp_path / "there").mkdir()
     for out in ("there", "new"):
         assert command("calibrate", *rendering(pictures), "--out", tmp_path / out) == 130
@@ -138,13 +187,33 @@ def test_stopped_rendering_leaves_a_folder_empty_or_none(pictures, tmp_path, mon
     assert list(tmp_path.rglob("*")) == [tmp_path / "there"]
 
 
-def test_detectors_leaves_the_scores_of_the_leaderboard_in_files_a_table_and_a_figure(tmp_path, capsys):
+def test_detectors_leaves_the_scores_of_the_leaderboard_in_files_a_table_and_a_figure(
+    tmp_path, capsys
+):
     folder = tmp_path / "detectors"
-    options = ("--radius", 3, "--noise", 1, "--noise", 5, "--tilt", 30, "--psf", 0, "--draws", 30, "--seed", 2)
+    options = (
+        "--radius",
+        3,
+        "--noise",
+        1,
+        "--noise",
+        5,
+        "--tilt",
+        30,
+        "--psf",
+        0,
+        "--draws",
+        30,
+        "--seed",
+        2,
+    )
     assert command("detectors", *options, "--out", folder) == 0
     shown = capsys.readouterr().out
     file = read_sensor_file("ctrack780")
-    conditions = [working_point(file), *(Condition(3.0, np.radians(30.0), noise) for noise in (0.01, 0.05))]
+    conditions = [
+        working_point(file),
+        *(Condition(3.0, np.radians(30.0), noise) for noise in (0.01, 0.05)),
+    ]
     scores = compete(scene_of(file), conditions, 30, np.random.default_rng(2))
     written = json.loads((folder / "detectors.json").read_text())
     with (folder / "detectors.csv").open(newline="") as table:
@@ -156,11 +225,19 @@ def test_detectors_leaves_the_scores_of_the_leaderboard_in_files_a_table_and_a_f
         for name in ("bound_px", "rms_px", "ratio", "ratio_low", "ratio_high", "bias_px", "lost"):
             assert getattr(score, name) == pytest.approx(float(row[name]), rel=1e-12)
             assert getattr(score, name) == pytest.approx(entry[name], rel=1e-12)
-        assert float(row["noise_percent"]) == pytest.approx(100.0 * score.condition.noise, rel=1e-12)
+        assert float(row["noise_percent"]) == pytest.approx(
+            100.0 * score.condition.noise, rel=1e-12
+        )
         assert float(row["tilt_deg"]) == pytest.approx(np.degrees(score.condition.tilt), rel=1e-12)
     assert written["working_point"]["radius_px"] == conditions[0].radius_px
     for figure in (scores[0].bound_px, *(score.rms_px for score in scores)):
         assert f"{figure:.5f}" in shown
-    assert f"{DEFAULT_DETECTOR}: {scores[0].ratio:.3f} times the bound at the working point" in shown
+    assert (
+        f"{DEFAULT_DETECTOR}: {scores[0].ratio:.3f} times the bound at the working point" in shown
+    )
     assert (folder / "detectors.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(f.name for f in folder.iterdir()) == ["detectors.csv", "detectors.json", "detectors.png"]
+    assert sorted(f.name for f in folder.iterdir()) == [
+        "detectors.csv",
+        "detectors.json",
+        "detectors.png",
+    ]

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop
-from dynamics.errors import SimulationError
 from identify.arrays import BLOCK, triangular_factor
 from identify.estimation.base_parameters import structure
 from tests.identify.synthetic import rss6
 
 FRAMES = 60
-SETTINGS = closed_loop.LoopSettings(closed_loop.ServoGains(0.3, 0.001, 2.4), closed_loop.FrameTiming(60.0))
+SETTINGS = closed_loop.LoopSettings(
+    closed_loop.ServoGains(0.3, 0.001, 2.4), closed_loop.FrameTiming(60.0)
+)
 
 
 def _reference(robot):
@@ -24,21 +25,38 @@ def _reference(robot):
     return closed_loop.Reference(robot.home_pose + amplitude * wave, amplitude * rate)
 
 
-def test_sensitivities_by_the_parameters_that_stand_for_all_say_those_by_all():
-    """Beside sensitivities by all parameters, which are computed without a word of groups."""
-    robot = rss6()
-    given = robot, robot.parameter_sets["identified"].vector, _reference(robot), SETTINGS
-    groups = structure(robot).rigid_groups
-    whole = closed_loop.simulate(*given, sensitivities=True)
-    shown = closed_loop.simulate(*given, sensitivities=True, groups=groups)
-    assert shown.events == whole.events > 10
-    assert shown.pose_sensitivity.shape[2] == len(groups.pivots) + 15 < whole.pose_sensitivity.shape[2] - 20
+def _assert_same(groups, shown, whole):
     for name in ("pose_sensitivity", "end_sensitivity"):
         found, expected = groups.of_all(getattr(shown, name)), getattr(whole, name)
         largest = np.abs(expected).max(axis=tuple(range(expected.ndim - 1)))
         assert (np.abs(found - expected) <= 1e-11 * largest + 1e-15).all(), name
-    with pytest.raises(SimulationError, match="groups are for runs that begin at rest"):
-        closed_loop.simulate(*given, groups=groups, start=whole.start, sensitivities=True)
+
+
+def test_sensitivities_by_the_parameters_that_stand_for_all_say_those_by_all():
+    """Beside sensitivities by all parameters, which are computed without a word of groups;
+    of runs from rest and from a state half way.
+    """
+    robot = rss6()
+    given = robot, robot.parameter_sets["identified"].vector, _reference(robot), SETTINGS
+    groups = structure(robot).rigid_groups
+    whole = closed_loop.differentiate_servo(*given)
+    shown = closed_loop.differentiate_servo(*given, groups=groups)
+    assert shown.events == whole.events > 10
+    assert (
+        shown.pose_sensitivity.shape[2]
+        == len(groups.pivots) + 15
+        < whole.pose_sensitivity.shape[2] - 20
+    )
+    _assert_same(groups, shown, whole)
+    start = {"start": whole.state_at(20), "by_start": True}
+    whole, shown = (
+        closed_loop.differentiate_servo(*given, **start, **more)
+        for more in ({}, {"groups": groups})
+    )
+    _assert_same(groups, shown, whole)
+    np.testing.assert_allclose(
+        shown.start_sensitivity, whole.start_sensitivity, rtol=1e-10, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("rows", [5, 2 * BLOCK, 5 * BLOCK + 3])

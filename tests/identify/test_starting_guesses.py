@@ -1,18 +1,23 @@
-"""The searches end in the same optimum wherever they start: guesses drawn around the truth, as in BIRDy.
+"""The searches end in the same optimum wherever they start: guesses drawn around the truth, as in
+BIRDy.
 
-Leboutet et al., "Inertial parameter identification in robotics: a survey" (Applied Sciences 11(9), 2021) draws guesses
-as truth x (1 + s N(0, 1)) with s of 15 % and 50 %. Factors below 0.2 are drawn again: the prior believes a guess to
-100 % of itself, and to one far too small it would hold on against the record.
+Leboutet et al., "Inertial parameter identification in robotics: a survey" (Applied Sciences 11(9),
+2021) draws guesses as truth x (1 + s N(0, 1)) with s of 15 % and 50 %. Factors below 0.2 are drawn
+again: the prior believes a guess to 100 % of itself, and to one far too small it would hold on
+against the record.
 
-That prior moves with the guess, and with it the optimum, a little. So each search is held against one from the truth
-under the same prior: the same optimum has the same cost, to 0.1; one standard deviation away in any direction it is
-higher by 1. And it has the same parameters: each one that the record identifies, to half a standard deviation.
+That prior moves with the guess, and with it the optimum, a little. So each search is held against
+one from the truth under the same prior: the same optimum has the same cost, to 0.1; one standard
+deviation away in any direction it is higher by 1. And it has the same parameters: each one that the
+record identifies, to half a standard deviation.
 
-Without noise, where the plant steps as the model does, that optimum is the truth: beside poses of 1e-11 m and rad the
-weak prior must vanish. The scale is known by the gain lp: a weighed platform would not do, because poses show its mass
-only in a sum with those of the links, which the prior has to divide.
+Without noise, where the plant steps as the model does, that optimum is the truth: beside poses of
+1e-11 m and rad the weak prior must vanish. The scale is known by the gain lp: a weighed platform
+would not do, because poses show its mass only in a sum with those of the links, which the prior has
+to divide.
 
-From where the model does not run, multiple shooting brings it there: the segments of the right model make up its run.
+From where the model does not run, multiple shooting brings it there: the segments of the right
+model make up its run.
 """
 
 from dataclasses import replace
@@ -26,19 +31,42 @@ from identify.errors import EstimationError
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.estimation.identifiability import identifiability
 from identify.estimation.identification import output_error_problem
-from identify.estimation.multiple_shooting import MultipleShooting, end_state, measured_states, segments
-from identify.estimation.output_error_search import output_error_searches, runnable_start, search, shoot
+from identify.estimation.multiple_shooting import (
+    MultipleShooting,
+    end_state,
+    measured_states,
+    segments,
+)
+from identify.estimation.output_error_search import (
+    output_error_searches,
+    runnable_start,
+    search,
+    shoot,
+)
 from identify.estimation.prior import holding_torque, typical_sizes
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import linear_warm_start
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
-from tests.identify.synthetic import LAYOUT, NAMES, SIGMA, Stages, guess_of, quick, rss6, run_plant, silent, truth
+from tests.identify.synthetic import (
+    LAYOUT,
+    NAMES,
+    SIGMA,
+    Stages,
+    guess_of,
+    quick,
+    rss6,
+    run_plant,
+    silent,
+    truth,
+)
 
 SMALLEST_FACTOR = 0.2
 
 SAME_COST, SAME_PARAMETERS = 0.1, 0.5
-"""How far the same optimum may be away: in cost, and in standard deviations of any identified parameter."""
+"""How far the same optimum may be away: in cost, and in standard deviations of any identified
+parameter.
+"""
 
 
 def drawn_guess(spread, seed):
@@ -51,7 +79,9 @@ def drawn_guess(spread, seed):
 
 
 def distance(problem, parameters, others):
-    """Largest difference of two estimates (67,) among the identified parameters, in standard deviations."""
+    """Largest difference of two estimates (67,) among the identified parameters, in standard
+    deviations.
+    """
     _, factor, _ = problem.linearise(others)
     covariance = np.linalg.inv(factor.T @ factor)
     known = identifiability(problem.guess, rss6()).judge(np.eye(67), covariance)
@@ -61,7 +91,8 @@ def distance(problem, parameters, others):
 
 @pytest.fixture(scope="module", params=["ctrack780", "ctrack780_29hz"])
 def recorded(request):
-    """The paper's experiment at the sensor's rate and latency (29 Hz: one frame), with drawn noise."""
+    """The paper's experiment at the sensor's rate and latency (29 Hz: one frame), with drawn
+    noise."""
     scenario = load_scenario("paper").with_overrides({"sensor": request.param})
     record, _ = run_plant(scenario, seed=1, duration_s=scenario.excitation.duration_s)
     return scenario, output_error_problem([record], rss6(), scenario)
@@ -75,25 +106,33 @@ def recorded(request):
         pytest.param(0.5, 25, 1, marks=pytest.mark.thorough),
     ],
 )
-def test_the_optimum_does_not_depend_on_the_starting_guess(recorded, record_property, spread, starts, misses):
+def test_the_optimum_does_not_depend_on_the_starting_guess(
+    recorded, record_property, spread, starts, misses
+):
     """24 of 25 starting guesses reach the same optimum."""
     scenario, stated = recorded
     excess, apart = [], []
     for seed in range(starts):
         problem = replace(stated, guess=drawn_guess(spread, seed))
         warm = linear_warm_start(problem, scenario)
-        found = output_error_searches(problem, scenario, warm, SilentProgress())["closed_loop"].solution
+        found = output_error_searches(problem, scenario, warm, SilentProgress())[
+            "closed_loop"
+        ].solution
         assert "max_iterations" not in found.stop_reason
         from_truth = search(problem, truth(), scenario, silent)
         excess.append(found.costs[-1] - from_truth.costs[-1])
         apart.append(distance(problem, found.parameters, from_truth.parameters))
-    reached = (np.array(excess) <= SAME_COST) & (np.array(apart) <= SAME_PARAMETERS)  # False where one of them is NaN
+    reached = (np.array(excess) <= SAME_COST) & (
+        np.array(apart) <= SAME_PARAMETERS
+    )  # False where one of them is NaN
     record_property("starts_reaching_the_optimum", int(np.sum(reached)))
     assert np.sum(~reached) <= misses, list(zip(excess, apart, strict=True))
 
 
 def found(plant_steps, model_steps):
-    """Problem, solution and base parameters of a noise-free record, started 15 % off in every parameter but lp."""
+    """Problem, solution and base parameters of a noise-free record, started 15 % off in every
+    parameter but lp.
+    """
     tight = {"cost_tolerance": 1e-14, "parameter_tolerance": 1e-9, "max_iterations": 60}
     steps = {"plant.steps_per_frame": plant_steps, "model.steps_per_frame": model_steps}
     scenario = quick(**steps, **{f"identification.{key}": value for key, value in tight.items()})
@@ -130,9 +169,12 @@ def test_every_base_parameter_and_gain_is_recovered_to_a_millionth():
 
 @pytest.mark.slow
 def test_integration_limits_what_a_finer_plant_lets_recover():
-    """Steps of a sixteenth and of a quarter of a frame differ by more than 1e-6: that, not the estimator, is then left.
-    With both four times finer, the fourth-order integrator's difference is some hundred times smaller."""
-    coarse, fine = (relative_errors(solution, base)[0] for _, solution, base in (found(16, 4), found(64, 16)))
+    """Steps of a sixteenth and of a quarter of a frame differ by more than 1e-6: that, not the
+    estimator, is then left. With both four times finer, the fourth-order integrator's difference is
+    some hundred times smaller."""
+    coarse, fine = (
+        relative_errors(solution, base)[0] for _, solution, base in (found(16, 4), found(64, 16))
+    )
     assert np.median(coarse) > 1e-6
     assert np.median(fine) < np.median(coarse) / 30
 
@@ -155,15 +197,23 @@ def states_of(run):
 
 
 def test_segments_from_the_true_states_make_up_the_run_and_states_are_measured_to_what_the_filter_leaves():
-    """Poses to the sensor's noise, and the integral of the joint PID to 2 mrad s of the 0.2 that hold the robot."""
+    """Poses to the sensor's noise, and the integral of the joint PID to 2 mrad s of the 0.2 that
+    hold the robot.
+    """
     scenario, problem, run = driven(3.0)
     chain, true = segments(problem.runs[0]), states_of(run)
-    assert [(part.first, part.last) for part in chain] == list(pairwise([0, 30, 60, 90, 119, 149, 179]))
+    assert [(part.first, part.last) for part in chain] == list(
+        pairwise([0, 30, 60, 90, 119, 149, 179])
+    )
     for part in chain:
         one = part.simulate(truth(), true[part.first])
         assert np.allclose(one.pose, run.pose[part.first : part.last + 1], rtol=0, atol=1e-12)
-        assert np.allclose(end_state(one, rss6().geometry.chart), true[part.last], rtol=0, atol=1e-9)
-    error = np.abs(measured_states(chain, truth(), scenario) - true[[part.first for part in chain]])[1:]
+        assert np.allclose(
+            end_state(one, rss6().geometry.chart), true[part.last], rtol=0, atol=1e-9
+        )
+    error = np.abs(
+        measured_states(chain, truth(), scenario) - true[[part.first for part in chain]]
+    )[1:]
     assert np.all(error[:, :6] < 5 * SIGMA)
     assert np.all(error[:, 6:12] < 0.1 * np.abs(run.pose_rate).max(axis=0))
     assert np.all(error[:, 12:] < 2e-3)
@@ -188,8 +238,9 @@ def relative(found, expected, scale):
 
 @pytest.mark.slow
 def test_condensing_takes_the_step_of_the_whole_problem():
-    """Against a dense Gauss-Newton step in parameters and states, its Jacobian by finite differences. The friction is
-    smoothed, so that no event stands between two of them, and the guess exact enough to tell all parameters apart."""
+    """Against a dense Gauss-Newton step in parameters and states, its Jacobian by finite
+    differences. The friction is smoothed, so that no event stands between two of them, and the
+    guess exact enough to tell all parameters apart."""
     scenario, problem, _ = driven(2.0, SMOOTHED, lost=[30, 47])
     problem = replace(problem, guess=guess_of(truth(), 0.02 * truth()))
     start = truth() * np.random.default_rng(0).uniform(0.95, 1.05, 67)
@@ -219,8 +270,9 @@ def test_condensing_takes_the_step_of_the_whole_problem():
 
 @pytest.mark.slow
 def test_a_model_that_does_not_run_is_brought_to_the_optimum():
-    """No friction and gains far off make an unstable loop: no search can start there, and no warm start is at hand.
-    Segment by segment the model runs, and it ends where the search from the truth does."""
+    """No friction and gains far off make an unstable loop: no search can start there, and no warm
+    start is at hand. Segment by segment the model runs, and it ends where the search from the truth
+    does."""
     scenario = quick()
     record, _ = run_plant(scenario, seed=1)
     problem = output_error_problem([record], rss6(), scenario)
@@ -236,7 +288,10 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     found = {name: search.solution for name, search in searches.items()}
     assert [name for name, _, _ in progress.seen] == ["multiple shooting", "identify"]
     assert all(sum(steps) == total for _, total, steps in progress.seen)
-    assert progress.seen[0][2][: found["multiple_shooting"].iterations] == [1] * found["multiple_shooting"].iterations
+    assert (
+        progress.seen[0][2][: found["multiple_shooting"].iterations]
+        == [1] * found["multiple_shooting"].iterations
+    )
     assert list(found) == ["multiple_shooting", "command_driven", "closed_loop"]
     for name, judged in (("command_driven", commanded), ("closed_loop", problem)):
         from_truth = search(judged, truth(), scenario, silent)

@@ -1,6 +1,7 @@
 """The command ``cmmsim study`` in this process."""
 
 import socket
+import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -21,7 +22,9 @@ from tests.identify.study_rows import KIND
 
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
-    """The file of a small study in a folder of its own, whose figures are not drawn: they take longer than the rows."""
+    """The file of a small study in a folder of its own, whose figures are not drawn: they take
+    longer than the rows.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(summary, "draw", lambda *_: None)
     path, factors = tmp_path / "mine.toml", "[factors]\nsensor.camera.dark_noise = [13.0, 26.0]"
@@ -29,7 +32,9 @@ def mine(tmp_path, monkeypatch):
     return path
 
 
-def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing_where_it_is_quiet(mine, capsys):
+def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing_where_it_is_quiet(
+    mine, capsys
+):
     """Brackets in the name of the folder are shown as they are."""
     for more, progress, says in (
         ([], "rows of mine: 4 of 4", "4 rows; "),
@@ -60,22 +65,37 @@ def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing
         ([1], "spread_um", 9.0, ROWS_FAILED, "1 of 1 laws failed"),
     ],
 )
-def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(mine, capsys, fails, figure, exponent, status, says):
-    """One figure is the standard deviation of 1,000 normal numbers whatever the factor, the other hardly known."""
-    theory = f'[[theory]]\nfigure = "{figure}"\nfactor = "sensor.camera.dark_noise"\nexponent = {exponent}\n'
-    mine.write_text(mine.read_text().replace("repeats = 2", "repeats = 4") + f"fails = {fails}\n" + theory)
+def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(
+    mine, capsys, fails, figure, exponent, status, says
+):
+    """One figure is the standard deviation of 1,000 normal numbers whatever the factor, the other
+    hardly known.
+    """
+    theory = (
+        f'[[theory]]\nfigure = "{figure}"\nfactor = "sensor.camera.dark_noise"\nexponent = '
+        f"{exponent}\n"
+    )
+    mine.write_text(
+        mine.read_text().replace("repeats = 2", "repeats = 4") + f"fails = {fails}\n" + theory
+    )
     assert command("study", mine, "--workers", 0, "--out", "a") == status
     shown = capsys.readouterr()
-    assert shown.out.startswith("undecided: error_um" if figure == "error_um" else ("passed: ", "failed: "))
+    assert shown.out.startswith(
+        "undecided: error_um" if figure == "error_um" else ("passed: ", "failed: ")
+    )
     assert says in shown.err
     frame, _ = read_table("a/study.parquet")
     assert frame.index[frame["error"] != ""].tolist() == fails
 
 
-def test_studies_are_listed_with_their_rows_and_kinds_with_options_figures_and_what_they_read(capsys):
+def test_studies_are_listed_with_their_rows_and_kinds_with_options_figures_and_what_they_read(
+    capsys,
+):
     assert command("study", "--list") == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if line]
-    assert {(name, f"{load_study(name).rows:,}") for name in STUDIES.names()} <= {tuple(line[:2]) for line in lines}
+    assert {(name, f"{load_study(name).rows:,}") for name in STUDIES.names()} <= {
+        tuple(line[:2]) for line in lines
+    }
     assert command("study", "--kinds") == 0
     shown = capsys.readouterr().out
     lines = [line.split() for line in shown.splitlines() if line]
@@ -85,7 +105,9 @@ def test_studies_are_listed_with_their_rows_and_kinds_with_options_figures_and_w
         for name, column in kind.columns.items():
             start = [name, *column.unit.removeprefix("1").split()]
             assert any(line[: len(start)] == start for line in lines), name
-        assert {f"options.{name}" for name in kind.options.model_fields} <= {one[0] for one in lines}
+        assert {f"options.{name}" for name in kind.options.model_fields} <= {
+            one[0] for one in lines
+        }
     assert ["options.stretch_s", "0.5", "s"] in [line[:3] for line in lines]
 
 
@@ -93,16 +115,38 @@ def test_a_file_is_shown_and_single_entries_are_replaced(mine, capsys):
     assert command("study", "--show", "pixel_noise") == 0
     Path("theirs.toml").write_text(capsys.readouterr().out)
     assert load_study("theirs.toml") == load_study("pixel_noise")
-    changes = ("--set", "sensor.camera.dark_noise=[1.0,2.0,3.0]", "--set", "sensor.rig.baseline=0.9", "--seed", 5)
-    assert command("study", mine, "--workers", 0, "--out", "a", "--quiet", "--set", "repeats=1", *changes) == 0
+    changes = (
+        "--set",
+        "sensor.camera.dark_noise=[1.0,2.0,3.0]",
+        "--set",
+        "sensor.rig.baseline=0.9",
+        "--seed",
+        5,
+    )
+    assert (
+        command(
+            "study", mine, "--workers", 0, "--out", "a", "--quiet", "--set", "repeats=1", *changes
+        )
+        == 0
+    )
     frame, study = read_table("a/study.parquet")
     assert frame["sensor.camera.dark_noise"].tolist() == [1.0, 2.0, 3.0]
     assert (study.seed, study.changes, study.repeats) == (5, {"sensor.rig.baseline": 0.9}, 1)
     for setting, says in (
-        ("reapeats=2", "unknown key 'reapeats' of study 'mine'; valid names: name, title, kind, scenario, sample, "),
-        ("sensor.camera.darkness=2", "unknown key 'sensor.camera.darkness'; the nearest are sensor.camera.dark_noise"),
+        (
+            "reapeats=2",
+            "unknown key 'reapeats' of study 'mine'; valid names: name, title, kind, scenario, "
+            "sample, ",
+        ),
+        (
+            "sensor.camera.darkness=2",
+            "unknown key 'sensor.camera.darkness'; the nearest are sensor.camera.dark_noise",
+        ),
         ("repeats=many", "repeats = 'many': input should be a valid integer"),
-        ("scenario.timing.latency_s=late", "scenario.timing.latency_s = 'late': input should be a valid number"),
+        (
+            "scenario.timing.latency_s=late",
+            "scenario.timing.latency_s = 'late': input should be a valid number",
+        ),
         ("repeats", "is not of the form KEY=VALUE"),
     ):
         assert command("study", mine, "--workers", 0, "--out", "b", "--set", setting) == 1
@@ -112,12 +156,18 @@ def test_a_file_is_shown_and_single_entries_are_replaced(mine, capsys):
     assert not Path("b").exists()
 
 
-def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(mine, capsys, monkeypatch):
+def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(
+    mine, capsys, monkeypatch
+):
     keys = ("dsnu", "dark_noise", "black_level", "gain", "full_well", "electrons_at_white")
     factors = "\n".join(f"sensor.camera.{name} = {[*range(1, 11)]}" for name in keys)
-    Path("many.toml").write_text(f'name = "many"\nkind = "{KIND}"\nrepeats = 10\n[factors]\n{factors}\n')
+    Path("many.toml").write_text(
+        f'name = "many"\nkind = "{KIND}"\nrepeats = 10\n[factors]\n{factors}\n'
+    )
     assert command("study", "many.toml", "--out", "a") == 1
-    assert "10,000,000 rows; to run more than 100,000, say --yes" in one_line(capsys.readouterr().err)
+    assert "10,000,000 rows; to run more than 100,000, say --yes" in one_line(
+        capsys.readouterr().err
+    )
     assert not Path("a").exists()
     monkeypatch.setattr(study_command, "MANY_ROWS", 3)
     assert command("study", mine, "--workers", 0, "--quiet") == 1
@@ -126,7 +176,9 @@ def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(m
 
 @pytest.fixture(params=[b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\xff" * 30, b""])
 def another_program(request):
-    """The address of a program that says these words, or nothing, to whoever comes; and what is said of it."""
+    """The address of a program that says these words, or nothing, to whoever comes; and what is
+    said of it.
+    """
 
     def answer():
         with suppress(OSError):
@@ -136,7 +188,20 @@ def another_program(request):
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         threading.Thread(target=answer, daemon=True).start()
-        yield f"tcp://127.0.0.1:{server.getsockname()[1]}", "another protocol" if request.param else "says nothing"
+        yield (
+            f"tcp://127.0.0.1:{server.getsockname()[1]}",
+            "another protocol" if request.param else "says nothing",
+        )
+
+
+def test_a_cluster_without_dask_is_one_line_and_rows_here_need_none(mine, monkeypatch, capsys):
+    monkeypatch.delitem(sys.modules, "identify.studies.dask_cluster")
+    for name in ("dask", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert command("study", mine, "--workers", 0, "--quiet") == 0
+    assert command("study", mine, "--scheduler", "tcp://127.0.0.1:1") == 1
+    assert "pip install '.[cluster]'" in one_line(capsys.readouterr().err)
+    assert command("study", mine, "--insecure") == 2
 
 
 @pytest.mark.slow
@@ -162,19 +227,31 @@ def test_where_no_scheduler_answers_there_is_one_line_and_nothing_left_or_what_w
 
 @pytest.mark.slow
 def test_another_study_is_drawn_beside_one_and_refused_where_it_has_other_factors(mine, capsys):
-    assert command("study", mine, "--workers", 0, "--quiet", "--set", "repeats=3", "--out", "other") == 0
+    assert (
+        command("study", mine, "--workers", 0, "--quiet", "--set", "repeats=3", "--out", "other")
+        == 0
+    )
     assert command("study", mine, "--workers", 0, "--quiet", "--beside", "other") == 0
     drawn = Path("runs/study-mine/figures/side_by_side_sensor.camera.dark_noise.svg").read_text()
     assert "study mine" in drawn
     assert "study other" in drawn
     plain = ("--set", "sensor.camera.dark_noise=8.0", "--workers", 0, "--quiet", "--out")
-    for folder, beside in (("mine", ()), ("one", ()), ("two", ("--beside", "one", "--beside", "mine"))):
+    for folder, beside in (
+        ("mine", ()),
+        ("one", ()),
+        ("two", ("--beside", "one", "--beside", "mine")),
+    ):
         assert command("study", mine, *plain, folder, *beside) == 0
-    drawn = Path("two/figures/side_by_side_study.svg").read_text()  # against the studies: they vary nothing
+    drawn = Path(
+        "two/figures/side_by_side_study.svg"
+    ).read_text()  # against the studies: they vary nothing
     assert all(name in drawn for name in (">mine<", ">one<", "/mine<"))  # three studies of one name
     capsys.readouterr()
     levels = "sensor.rig.baseline=[0.5,1.0]"
-    assert command("study", mine, "--workers", 0, "--set", levels, "--out", "new", "--beside", "other") == 1
+    assert (
+        command("study", mine, "--workers", 0, "--set", levels, "--out", "new", "--beside", "other")
+        == 1
+    )
     assert "other has rows of kind" in capsys.readouterr().err
     assert not Path("new").exists()
 
@@ -184,8 +261,17 @@ def test_rows_that_need_more_memory_than_there_is_are_refused_with_the_workers_t
 ):
     """216,000 frames of an hour take some 4 GB."""
     for there, evidence in ((9e9, "--workers 2 fits"), (3e9, "shorten")):
-        monkeypatch.setattr(psutil, "virtual_memory", lambda there=there: SimpleNamespace(total=there))
-        words = ("--set", "scenario.excitation.duration_s=[10.0,3600.0]", "--workers", 3, "--out", tmp_path / "a")
+        monkeypatch.setattr(
+            psutil, "virtual_memory", lambda there=there: SimpleNamespace(total=there)
+        )
+        words = (
+            "--set",
+            "scenario.excitation.duration_s=[10.0,3600.0]",
+            "--workers",
+            3,
+            "--out",
+            tmp_path / "a",
+        )
         assert command("study", "parameter_groups", *words) == 1
         assert evidence in capsys.readouterr().err
     words = ("--set", "options.stretch_s=[1.0,3600.0]", "--workers", 3, "--out", tmp_path / "a")

@@ -1,4 +1,6 @@
-"""Study files: what they say, what their rows read, and what is refused before anything is computed."""
+"""Study files: what they say, what their rows read, and what is refused before anything is
+computed.
+"""
 
 from functools import reduce
 from itertools import product
@@ -42,7 +44,10 @@ def test_a_grid_has_every_combination_once_a_repeat_the_last_factor_fastest_and_
     assert [row.repeat for row in rows] == [0] * 4 + [1] * 4
     assert [row.factors for row in rows[:4]] == [row.factors for row in rows[4:]]
     assert cases(study(repeats=5))[:8] == rows
-    huge = study(factors={f"sensor.camera.{name}": [*range(1, 101)] for name in ("dsnu", "dark_noise")}, repeats=10**9)
+    huge = study(
+        factors={f"sensor.camera.{name}": [*range(1, 101)] for name in ("dsnu", "dark_noise")},
+        repeats=10**9,
+    )
     assert huge.rows == 10**13
     last = Design(huge).case(huge.rows - 1)
     assert (last.repeat, last.factors) == (10**9 - 1, {"sensor.camera.dsnu": 100, DARK: 100})
@@ -54,13 +59,18 @@ def test_changes_and_options_hold_in_every_row_and_factors_in_their_own():
     setup = prepare(chosen)
     for case in cases(chosen):
         scenario = setup.row_scenario(case)
-        assert scenario.sensor_changes == {"rig.baseline": 0.8, "camera.dark_noise": case.factors[DARK]}
+        assert scenario.sensor_changes == {
+            "rig.baseline": 0.8,
+            "camera.dark_noise": case.factors[DARK],
+        }
         assert (scenario.filter.order, scenario.pose_method) == (4, case.factors[METHOD])
         assert setup.row_options(case) == {"odd": 7, "seconds": case.factors["options.seconds"]}
 
 
 def test_a_sample_is_spread_as_its_factors_say():
-    """Against the distributions' own quantiles; 2,000 points put a share within 0.05 at better than 1e-4."""
+    """Against the distributions' own quantiles; 2,000 points put a share within 0.05 at better than
+    1e-4.
+    """
     factors = {
         "sensor.rig.baseline": {"low": 0.5, "high": 2.0},
         DARK: {"low": 1.0, "high": 100.0, "scale": "log"},
@@ -83,9 +93,22 @@ def test_a_sample_is_spread_as_its_factors_say():
 
 def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
     """So that a new key is not drawn without its unit, nor without words."""
-    without = {"timing.dropout", "camera.noise", "camera.prnu", "camera.pattern_seed", "lens.vignetting"}
-    without |= {"stickers.placement_seed", "stickers.per_plane", "rig.left.distortion", "rig.right.distortion"}
-    without |= {f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background")}
+    without = {
+        "timing.dropout",
+        "camera.noise",
+        "camera.prnu",
+        "camera.pattern_seed",
+        "lens.vignetting",
+    }
+    without |= {
+        "stickers.placement_seed",
+        "stickers.per_plane",
+        "rig.left.distortion",
+        "rig.right.distortion",
+    }
+    without |= {
+        f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background")
+    }
     sections = ("timing", "rig", "camera", "lens", "stickers")
     fields = {path: field for path, field in valid_keys(None).items() if path.startswith("sensor.")}
     keys = {path.removeprefix("sensor.") for path in fields}
@@ -100,15 +123,39 @@ def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
     [
         (toml("repeats = 0"), ["repeats = 0"]),
         (toml("reapeats = 2"), ["unknown key 'reapeats'", "repeats"]),
-        (toml(factors="sensor.camera.dark_noise = { low = 1.0, high = 2.0 }"), ["dark_noise", "sample = N"]),
-        (toml("sample = 5", factors="sensor.camera.dark_noise = { low = 2.0, high = 1.0 }"), ["low = 2", "high = 1"]),
-        (toml("sample = 5", factors='sensor.camera.prnu = { low = 0.0, high = 1.0, scale = "log" }'), ["positive"]),
+        (
+            toml(factors="sensor.camera.dark_noise = { low = 1.0, high = 2.0 }"),
+            ["dark_noise", "sample = N"],
+        ),
+        (
+            toml("sample = 5", factors="sensor.camera.dark_noise = { low = 2.0, high = 1.0 }"),
+            ["low = 2", "high = 1"],
+        ),
+        (
+            toml(
+                "sample = 5",
+                factors='sensor.camera.prnu = { low = 0.0, high = 1.0, scale = "log" }',
+            ),
+            ["positive"],
+        ),
         (toml("[changes]\nsensor.camera.dark_noise = 1.0"), ["sensor.camera.dark_noise", "both"]),
-        (toml(factors="sensor.rig.baseline = 1.0"), ["sensor.rig.baseline = 1.0 is no list", "[changes]"]),
+        (
+            toml(factors="sensor.rig.baseline = 1.0"),
+            ["sensor.rig.baseline = 1.0 is no list", "[changes]"],
+        ),
         (toml(factors="sensor.rig.baseline = []"), ["sensor.rig.baseline", "no values"]),
-        (toml("sample = 5", factors="sensor.rig.baseline = { low = true, high = inf }"), ["low = True", "high = inf"]),
-        (toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, hgh = 2.0 }"), ["'hgh'", "low, high, scale"]),
-        (toml('[[theory]]\nfigure = "x_um"\nfactor = "x"'), ["one of exponent, equals and order, got none"]),
+        (
+            toml("sample = 5", factors="sensor.rig.baseline = { low = true, high = inf }"),
+            ["low = True", "high = inf"],
+        ),
+        (
+            toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, hgh = 2.0 }"),
+            ["'hgh'", "low, high, scale"],
+        ),
+        (
+            toml('[[theory]]\nfigure = "x_um"\nfactor = "x"'),
+            ["one of exponent, equals and order, got none"],
+        ),
         (toml('[[theory]]\nfigure = "x_um"\nexponent = 1.0'), ["needs a factor"]),
         (toml('[[theory]]\nfigure = "x_um"\nequals = "y_um"\nfactor = "x"'), ["has no factor"]),
         (toml('[[theory]]\nfigure = "x_um"\nfactor = "x"\norder = ["one"]'), ["two values"]),
@@ -124,28 +171,68 @@ def test_study_files_that_contradict_themselves_are_refused(text, evidence):
 @pytest.mark.parametrize(
     ("entries", "evidence"),
     [
-        ({"factors": {"sensor.camera.drk_noise": [1.0]}}, ["sensor.camera.drk_noise", "sensor.camera.dark_noise"]),
-        ({"factors": {"camera.dark_noise": [1.0]}}, ["camera.dark_noise", "nearest", "sensor.camera.dark_noise"]),
-        ({"factors": {"sensor.camera.dark_noise": [1.0, "much"]}}, ["sensor.camera.dark_noise = 'much'", "number"]),
+        (
+            {"factors": {"sensor.camera.drk_noise": [1.0]}},
+            ["sensor.camera.drk_noise", "sensor.camera.dark_noise"],
+        ),
+        (
+            {"factors": {"camera.dark_noise": [1.0]}},
+            ["camera.dark_noise", "nearest", "sensor.camera.dark_noise"],
+        ),
+        (
+            {"factors": {"sensor.camera.dark_noise": [1.0, "much"]}},
+            ["sensor.camera.dark_noise = 'much'", "number"],
+        ),
         ({"factors": {"sensor.camera.dark_noise": [True]}}, ["sensor.camera.dark_noise = True"]),
-        ({"factors": {"scenario.filter.order": {"low": 2.5, "high": 4}}, "sample": 2}, ["order = 2.5", "integer"]),
-        ({"factors": {"scenario.sensor_changes": [1.0]}}, ["unknown key 'scenario.sensor_changes'"]),
+        (
+            {"factors": {"scenario.filter.order": {"low": 2.5, "high": 4}}, "sample": 2},
+            ["order = 2.5", "integer"],
+        ),
+        (
+            {"factors": {"scenario.sensor_changes": [1.0]}},
+            ["unknown key 'scenario.sensor_changes'"],
+        ),
         ({"factors": {"sensor.camera.dark_noise": [1.0, 2.0, 1.0]}}, ["a value twice", "repeats"]),
-        ({"factors": {"options.mixed": [1, 2.5, "two"]}}, ["options.mixed", "several kinds: number, str"]),
+        (
+            {"factors": {"options.mixed": [1, 2.5, "two"]}},
+            ["options.mixed", "several kinds: number, str"],
+        ),
         ({"changes": {"options.odd": 1.0}}, ["changes.options.odd", "[options]"]),
         ({"changes": {"scenario.filter.cutoff_hz": 40.0}}, ["filter.cutoff_hz = 40", "Nyquist"]),
-        ({"options": {"odd": 2}, "factors": {"options.odd": [1, 4]}}, ["options.odd is both a factor and among the"]),
-        ({"kind": "static_poses"}, ["static_poses", "static_pose", "path_pose", "module:function"]),
-        ({"kind": "no_such_module:row"}, ["no_such_module", "PYTHONPATH"]),
-        ({"kind": "static_pose", "options": {"capturs": 4}}, ["unknown key 'capturs'; valid names: poses, captures"]),
-        ({"kind": "static_pose", "factors": {"options.captures": ["many"]}}, ["options.captures = 'many'"]),
-        ({"kind": "path_pose", "factors": {"options.zz": [4]}}, ["'options.zz'", "stretch_s, options.teaching"]),
         (
-            {"kind": "static_pose", "changes": {"scenario.renderer": "statistical", "sensor.lens.psf_px": 2.0}},
+            {"options": {"odd": 2}, "factors": {"options.odd": [1, 4]}},
+            ["options.odd is both a factor and among the"],
+        ),
+        ({"kind": "static_poses"}, ["static_poses", "static_pose", "path_pose", "module:function"]),
+        ({"kind": "tests.no_such_module:row"}, ["no_such_module", "PYTHONPATH"]),
+        ({"kind": "os:abort"}, ["not allowed to run", "--plugin os "]),
+        (
+            {"kind": "static_pose", "options": {"capturs": 4}},
+            ["unknown key 'capturs'; valid names: poses, captures"],
+        ),
+        (
+            {"kind": "static_pose", "factors": {"options.captures": ["many"]}},
+            ["options.captures = 'many'"],
+        ),
+        (
+            {"kind": "path_pose", "factors": {"options.zz": [4]}},
+            ["'options.zz'", "stretch_s, options.teaching"],
+        ),
+        (
+            {
+                "kind": "static_pose",
+                "changes": {"scenario.renderer": "statistical", "sensor.lens.psf_px": 2.0},
+            },
             ["first row", "not proved for lens.psf_px 2", "at most 1", "analytic or pyrender"],
         ),
-        ({"kind": f"{__name__}:wrong_row"}, ["wrong_row' takes (scenario);", "(scenario, seed) or (scenario, seed, "]),
-        ({"kind": f"{__name__}:plain_row", "options": {"odd": 1}}, ["plain_row' takes no options, got odd"]),
+        (
+            {"kind": f"{__name__}:wrong_row"},
+            ["wrong_row' takes (scenario);", "(scenario, seed) or (scenario, seed, "],
+        ),
+        (
+            {"kind": f"{__name__}:plain_row", "options": {"odd": 1}},
+            ["plain_row' takes no options, got odd"],
+        ),
     ],
 )
 def test_kinds_keys_and_values_are_checked_before_any_row(entries, evidence):
@@ -154,7 +241,10 @@ def test_kinds_keys_and_values_are_checked_before_any_row(entries, evidence):
 
 
 def test_factors_may_be_written_as_dotted_keys_tables_or_quoted_paths():
-    for text in ("[factors.sensor.camera]\ndark_noise = [13.0, 26.0]", '"sensor.camera.dark_noise" = [13.0, 26.0]'):
+    for text in (
+        "[factors.sensor.camera]\ndark_noise = [13.0, 26.0]",
+        '"sensor.camera.dark_noise" = [13.0, 26.0]',
+    ):
         assert STUDIES.from_toml(toml(factors=text), "study") == STUDIES.from_toml(toml(), "study")
 
 
@@ -162,7 +252,9 @@ DRIFT = "scenario.rig.drift.right.cx_px"
 
 
 def test_numbers_by_names_with_dots_are_varied_by_name_or_as_a_table():
-    """How far a camera drifts, as a change, a factor, a setting of the command line, or several at once."""
+    """How far a camera drifts, as a change, a factor, a setting of the command line, or several at
+    once.
+    """
 
     def drifts(chosen):
         return [prepare(chosen).row_scenario(case).rig.drift for case in cases(chosen)]
@@ -184,16 +276,26 @@ def test_numbers_by_names_with_dots_are_varied_by_name_or_as_a_table():
     )
     assert list(factor.factors) == [DRIFT]
     assert factor_unit(DRIFT) == "px"
-    assert drifts(written("", f'{drift} = [{{}}, {{ "right.cx_px" = 0.1 }}]')) == [{}, {"right.cx_px": 0.1}]
-    assert "input should be a valid number" in refusal(StudyError, prepare, written("", f'{drift}."a.b" = ["x"]'))
+    assert drifts(written("", f'{drift} = [{{}}, {{ "right.cx_px" = 0.1 }}]')) == [
+        {},
+        {"right.cx_px": 0.1},
+    ]
+    assert "input should be a valid number" in refusal(
+        StudyError, prepare, written("", f'{drift}."a.b" = ["x"]')
+    )
     assert "do not read it" in refusal(
-        StudyError, prepare, STUDIES.from_toml(toml("", "static_pose", f'{drift}."right.cx_px" = [0.1]'), "mine")
+        StudyError,
+        prepare,
+        STUDIES.from_toml(toml("", "static_pose", f'{drift}."right.cx_px" = [0.1]'), "mine"),
     )
 
 
 def plain_row(scenario, seed):
     """A row of a study without options."""
-    return {"rate_hz": scenario.timing.frame_rate_hz, "draw": float(np.random.default_rng(seed).normal())}
+    return {
+        "rate_hz": scenario.timing.frame_rate_hz,
+        "draw": float(np.random.default_rng(seed).normal()),
+    }
 
 
 def wrong_row(scenario):
@@ -231,22 +333,37 @@ LAW = {"figure": "position_rms_um", "factor": "sensor.camera.dark_noise", "expon
 @pytest.mark.parametrize(
     ("law", "evidence"),
     [
-        ({"figure": "posishun_rms_um"}, ["figure = 'posishun_rms_um'", "static_pose", "position_rms_um"]),
+        (
+            {"figure": "posishun_rms_um"},
+            ["figure = 'posishun_rms_um'", "static_pose", "position_rms_um"],
+        ),
         ({"per": "sight"}, ["per = 'sight'", "sight_m"]),
-        ({"factor": None, "exponent": None, "equals": "stated_position_um"}, ["equals", "stated_position_rms_um"]),
-        ({"factor": "sensor.camera.dsnu"}, ["factor = 'sensor.camera.dsnu'", "sensor.camera.dark_noise"]),
+        (
+            {"factor": None, "exponent": None, "equals": "stated_position_um"},
+            ["equals", "stated_position_rms_um"],
+        ),
+        (
+            {"factor": "sensor.camera.dsnu"},
+            ["factor = 'sensor.camera.dsnu'", "sensor.camera.dark_noise"],
+        ),
         ({"factor": "pixel_noise"}, ["factor = 'pixel_noise'", "pixel_noise_grey"]),
         ({"exponent": None, "order": [26.0, 14.0]}, ["order has 14.0", "[13.0, 26.0]"]),
     ],
 )
-def test_laws_of_what_a_kind_does_not_measure_or_a_study_does_not_vary_are_refused_before_any_row(law, evidence):
+def test_laws_of_what_a_kind_does_not_measure_or_a_study_does_not_vary_are_refused_before_any_row(
+    law, evidence
+):
     """Figures of a kind of one's own are not known before its rows, but its factors are."""
     right = Law(**LAW)
     prepare(study(kind="static_pose", theory=[right, Law(**LAW | {"factor": "pixel_noise_grey"})]))
-    message = refusal(StudyError, prepare, study(kind="static_pose", theory=[right, Law(**LAW | law)]))
+    message = refusal(
+        StudyError, prepare, study(kind="static_pose", theory=[right, Law(**LAW | law)])
+    )
     assert all(word in message for word in ["[[theory]] 2", *evidence]), message
     prepare(study(theory=[Law(**LAW | {"figure": "any_um"}), Law(**LAW | {"factor": "any_m"})]))
-    message = refusal(StudyError, prepare, study(theory=[Law(**LAW | {"factor": "sensor.camera.drk_noise"})]))
+    message = refusal(
+        StudyError, prepare, study(theory=[Law(**LAW | {"factor": "sensor.camera.drk_noise"})])
+    )
     assert "the nearest are sensor.camera.dark_noise" in message
 
 
@@ -320,15 +437,23 @@ def test_what_a_kind_does_not_read_changes_nothing_in_its_rows(kind, options):
     other, left = with_others(scenario, unread)
     shared = {"sensor.timing.latency", "sensor.timing.latency_jitter"}  # which the scenario states
     assert left <= ALONE | shared | {"sensor.renderer"}
-    one, two = (find_kind(kind).row(settings, np.random.SeedSequence(3), options) for settings in (scenario, other))
+    one, two = (
+        find_kind(kind).row(settings, np.random.SeedSequence(3), options)
+        for settings in (scenario, other)
+    )
     assert one == two
 
 
 def test_what_a_held_pose_reads_acts_on_its_rows():
     def row(options, **changes):
-        return kind.row(scenario.with_overrides(overrides(changes)), np.random.SeedSequence(3), options)
+        return kind.row(
+            scenario.with_overrides(overrides(changes)), np.random.SeedSequence(3), options
+        )
 
-    kind, scenario = find_kind("static_pose"), load_scenario("quick").with_overrides({"renderer": "analytic"})
+    kind, scenario = (
+        find_kind("static_pose"),
+        load_scenario("quick").with_overrides({"renderer": "analytic"}),
+    )
     one = row({"hold_s": 0.1})
     assert kind.reads.covers("options.hold_s")
     assert row({"hold_s": 0.3}) != one
@@ -345,16 +470,19 @@ def test_what_a_held_pose_reads_acts_on_its_rows():
 @pytest.mark.parametrize(
     ("entries", "evidence", "acts"),
     [
-        ({"factors": {KP: [0.1, 0.3]}}, [f"factors.{KP} does nothing", "'static_pose'", "scenario.pose_method"],
+        ({"factors": {KP: [0.1, 0.3]}}, [f"factors.{KP} does "
+                                         "nothing", "'static_pose'", "scenario.pose_method"],
          {"kind": "closed_loop"}),
-        ({"changes": {KP: 0.1}}, [f"changes.{KP} does nothing", "sensor.camera.*", "but sensor.stickers.obstacle_l"],
+        ({"changes": {KP: 0.1}}, [f"changes.{KP} does nothing", "sensor.camera.*", "but "
+                                                                                   "sensor.stickers.obstacle_l"],
          {"kind": KIND}),
         ({"kind": "identification", "factors": {"scenario.identification.qr_threshold": [1e-3, 1e-4]}},
          ["qr_threshold does nothing", "they read scenario.*, sensor.rig.*"], {"kind": KIND}),
         ({"factors": {"options.hold_s": [0.2, 0.4], "options.captures": [1, 4]}},
          ["factors.options.captures does nothing", "where options.hold_s is given"],
          {"factors": {"options.captures": [1, 4]}}),
-        ({"factors": {"scenario.timing.frame_rate_hz": [40.0, 60.0]}}, ["hold_s is not given: options.captures sets"],
+        ({"factors": {"scenario.timing.frame_rate_hz": [40.0, 60.0]}}, ["hold_s is not given: "
+                                                                        "options.captures sets"],
          {"options": {"hold_s": 0.2}}),
         ({"changes": {NOISE: False}, "factors": {DARK: [1.0, 2.0]}}, [f"factors.{DARK}", f"{NOISE} is false"],
          {"changes": {}, "factors": {NOISE: [False, True], DARK: [1.0, 2.0]}}),
@@ -367,7 +495,9 @@ def test_what_a_held_pose_reads_acts_on_its_rows():
                       "scenario.plant.geometry_error_m": {"low": 0, "high": 1e-4}}, "sample": 4}),
     ],
 )  # fmt: skip
-def test_what_does_nothing_is_refused_before_any_row_and_taken_where_it_acts(entries, evidence, acts):
+def test_what_does_nothing_is_refused_before_any_row_and_taken_where_it_acts(
+    entries, evidence, acts
+):
     message = refusal(StudyError, prepare, sensor_study(**entries))
     assert all(word in message for word in evidence), message
     prepare(sensor_study(**entries | acts))

@@ -1,4 +1,6 @@
-"""Rows of studies: the same from the same seed whatever was computed before, and right against closed forms."""
+"""Rows of studies: the same from the same seed whatever was computed before, and right against
+closed forms.
+"""
 
 from functools import partial
 
@@ -11,7 +13,10 @@ from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import invert, rotation_log
 from cmmsim.teaching import exactly_taught
 from dynamics import load_robot
-from dynamics.closed_loop import Reference, simulate
+from dynamics.closed_loop import (
+    Reference,
+    differentiate_servo,
+)
 from identify.errors import EstimationError, ScenarioError
 from identify.experiment.plant import build_plant
 from identify.loop_parameters import model_settings
@@ -66,7 +71,8 @@ def test_a_row_is_that_of_its_seed_whatever_the_process_has_kept():
 def test_exact_teaching_is_what_teaching_finds_to_its_own_uncertainty():
     file = read_sensor_file("ctrack780")
     exact, taught = exactly_taught(file), cmmsim.Sensor(file, seed=3, renderer="analytic").taught
-    error = exact.base_from_camera @ invert(taught.base_from_camera)  # of the base frame as taught, in base axes
+    # of the base frame as taught, in base axes
+    error = exact.base_from_camera @ invert(taught.base_from_camera)
     small = np.concatenate([error[:3, 3], rotation_log(error[:3, :3])])
     assert small @ np.linalg.solve(taught.base_covariance, small) < chi2.ppf(0.9999, 6)
     assert np.linalg.norm(taught.platform_places - exact.platform_places, axis=1).max() < 5e-6
@@ -78,7 +84,12 @@ def test_rows_agree_with_the_sensors_own_covariance_and_err_hardly_without_noise
     square = sum((one["position_rms_um"] / one["stated_position_rms_um"]) ** 2 * 12 for one in many)
     assert chi2.ppf(0.0005, 12 * 40) < square < chi2.ppf(0.9995, 12 * 40)
     quiet = static(0, scenario(**NOISELESS))
-    for figure in ("position_rms_um", "orientation_rms_urad", "centre_rms_px", "point_depth_rms_um"):
+    for figure in (
+        "position_rms_um",
+        "orientation_rms_urad",
+        "centre_rms_px",
+        "point_depth_rms_um",
+    ):
         assert quiet[figure] < 0.1 * many[0][figure]
 
 
@@ -93,14 +104,17 @@ def test_rows_agree_with_the_sensors_own_covariance_and_err_hardly_without_noise
     ],
 )
 def test_rows_without_images_have_the_means_and_bands_of_rows_with_them(kind, rows, options):
-    """Figures of as many rows of both: their means by Welch's test, their bands by the Kolmogorov-Smirnov test.
+    """Figures of as many rows of both: their means by Welch's test, their bands by the
+    Kolmogorov-Smirnov test.
 
-    What is stated beforehand hardly differs among rows along one trajectory: of that the mean counts, to the 1 % for
-    which the sensor without images is proved.
+    What is stated beforehand hardly differs among rows along one trajectory: of that the mean
+    counts, to the 1 % for which the sensor without images is proved.
     """
     figures = {}
     for start, renderer in enumerate(("analytic", "statistical")):
-        found = [row(kind, 1000 * start + k, scenario(renderer=renderer), **options) for k in range(rows)]
+        found = [
+            row(kind, 1000 * start + k, scenario(renderer=renderer), **options) for k in range(rows)
+        ]
         figures[renderer] = {name: np.array([one[name] for one in found]) for name in found[0]}
     for name, drawn in figures["analytic"].items():
         said = figures["statistical"][name]
@@ -110,7 +124,11 @@ def test_rows_without_images_have_the_means_and_bands_of_rows_with_them(kind, ro
         if kind == "identification" and name.startswith("pose_noise"):
             assert said.mean() == pytest.approx(drawn.mean(), rel=0.01), name
             continue
-        assert ttest_ind(drawn, said, equal_var=False).pvalue > 3e-4, (name, drawn.mean(), said.mean())
+        assert ttest_ind(drawn, said, equal_var=False).pvalue > 3e-4, (
+            name,
+            drawn.mean(),
+            said.mean(),
+        )
         assert ks_2samp(drawn, said).pvalue > 3e-4, name
 
 
@@ -139,17 +157,22 @@ def test_a_row_of_one_picture_is_lost_and_says_why_or_is_that_of_a_sensor_that_l
         except EstimationError as error:
             return str(error)
 
-    whole, halved = ([one_picture(number, dropout) for number in range(12)] for dropout in (0.0, 0.5))
+    whole, halved = (
+        [one_picture(number, dropout) for number in range(12)] for dropout in (0.0, 0.5)
+    )
     lost = "no pose was found in any of 1 pictures: dropped frame (a share of 0.5 drops out)"
     assert 0 < halved.count(lost) < 12
     assert all(half in (one, lost) for one, half in zip(whole, halved, strict=True))
-    with pytest.raises(EstimationError, match=r"no pose was found in any of 4 pictures: \d+ visible stickers"):
+    with pytest.raises(
+        EstimationError, match=r"no pose was found in any of 4 pictures: \d+ visible stickers"
+    ):
         static(0, scenario(**{"sensor_changes.stickers.sticker_level": 12}))
 
 
 @pytest.mark.parametrize("renderer", ["analytic", "statistical"])
 def test_a_path_is_measured_in_motion_by_both_methods_as_exactly_as_they_state(renderer):
-    """Over 60 frames of six errors each, whose stickers are drawn out over some tenths of a pixel."""
+    """Over 60 frames of six errors each, whose stickers are drawn out over some tenths of a
+    pixel."""
     moving = {"renderer": renderer, "timing.exposure_s": 0.01}
     for method in ("registration", "planes"):
         path = row("path_pose", 4, scenario(pose_method=method, **moving), stretch_s=1.0)
@@ -158,11 +181,17 @@ def test_a_path_is_measured_in_motion_by_both_methods_as_exactly_as_they_state(r
             assert path[what] == pytest.approx(path[f"stated_{what}"], rel=0.25)
 
 
-@pytest.mark.parametrize(("latency_frames", "expected"), [(0, np.sqrt(1 / 3)), (2, np.sqrt(4 + 2 + 1 / 3))])
+@pytest.mark.parametrize(
+    ("latency_frames", "expected"), [(0, np.sqrt(1 / 3)), (2, np.sqrt(4 + 2 + 1 / 3))]
+)
 def test_pose_in_use_lags_by_what_its_age_says(latency_frames, expected):
-    """A pose that is L old when it arrives and held for T is off by v sqrt(L^2 + L T + T^2 / 3) in the mean."""
+    """A pose that is L old when it arrives and held for T is off by v sqrt(L^2 + L T + T^2 / 3) in
+    the mean.
+    """
     rate = 30.0
-    settings = scenario(**NOISELESS | {"timing.frame_rate_hz": rate, "timing.latency_s": latency_frames / rate})
+    settings = scenario(
+        **NOISELESS | {"timing.frame_rate_hz": rate, "timing.latency_s": latency_frames / rate}
+    )
     path = row("path_pose", 2, settings, stretch_s=1.0)
     assert path["frames"] == 30
     ratio = 1e-3 * path["used_position_rms_um"] / path["speed_rms_mm_s"] * rate
@@ -190,7 +219,15 @@ def test_drawn_sensor_has_the_covariance_that_it_states_and_loses_its_share_of_f
 def test_each_kind_says_unit_and_meaning_of_its_columns_and_which_are_drawn(kind):
     columns = find_kind(kind).columns
     assert any(column.main for column in columns.values())
-    suffixes = {"um": "_um", "urad": "_urad", "px": "_px", "%": "_percent", "mm/s": "_mm_s", "m": "_m", "N m": "_N_m"}
+    suffixes = {
+        "um": "_um",
+        "urad": "_urad",
+        "px": "_px",
+        "%": "_percent",
+        "mm/s": "_mm_s",
+        "m": "_m",
+        "N m": "_N_m",
+    }
     for name, column in columns.items():
         assert column.meaning
         assert name.endswith(suffixes.get(column.unit, ""))
@@ -207,7 +244,9 @@ def test_closed_loop_follows_its_reference_with_the_images_in_the_loop():
 
 
 def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_prediction():
-    """An error d with the covariance d d^T: what is stated is exact but for the curvature of the model."""
+    """An error d with the covariance d d^T: what is stated is exact but for the curvature of the
+    model.
+    """
     settings = scenario()
     robot = load_robot(settings.robot)
     poses = np.tile(robot.home_pose, (60, 1))
@@ -215,9 +254,11 @@ def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_predi
     reference = Reference(poses, np.gradient(poses, settings.timing.frame_period_s, axis=0))
     truth = build_plant(settings, robot).parameters
     error = 1e-4 * truth * np.random.default_rng(0).normal(size=len(truth))
-    model = simulate(robot, truth + error, reference, model_settings(robot, settings), sensitivities=True)
+    model = differentiate_servo(robot, truth + error, reference, model_settings(robot, settings))
     true = model_run(robot, settings, truth, reference)
-    found = prediction_figures([(model.pose, model.pose_sensitivity)], np.outer(error, error), [true])
+    found = prediction_figures(
+        [(model.pose, model.pose_sensitivity)], np.outer(error, error), [true]
+    )
     assert found["prediction_rms_um"] > 0.01
     assert found["stated_prediction_rms_um"] == pytest.approx(found["prediction_rms_um"], rel=0.01)
 
@@ -239,9 +280,15 @@ def test_identification_finds_the_parameters_to_what_it_states():
     [pytest.param(*row, marks=pytest.mark.thorough) for row in ((3.0, 0.2), (10.0, 0.1))],
 )
 def test_identification_from_images_is_as_good_as_from_drawn_noise(duration_s, within):
-    once = {"identification.method": "command_driven", "validation.count": 1, "validation.duration_s": 1.0}
+    once = {
+        "identification.method": "command_driven",
+        "validation.count": 1,
+        "validation.duration_s": 1.0,
+    }
     settings = scenario(**once, **{"excitation.duration_s": duration_s})
-    drawn, images = (row("identification", 5, settings, sensor=sensor) for sensor in ("drawn", "images"))
+    drawn, images = (
+        row("identification", 5, settings, sensor=sensor) for sensor in ("drawn", "images")
+    )
     for figure in ("pose_noise_um", "viscous_std_percent"):
         assert images[figure] == pytest.approx(drawn[figure], rel=within)
 
@@ -249,23 +296,46 @@ def test_identification_from_images_is_as_good_as_from_drawn_noise(duration_s, w
 @pytest.mark.slow
 def test_intervals_that_know_of_inexact_cameras_hold_where_those_that_do_not_do_not():
     """Two rows of the study `inexact`, with short records."""
-    inexact = {"rig.known": "photographs", "timing.latency_std_s": 0.002, "rig.right_later_std_s": 2e-4}
-    driven = {"identification.method": "command_driven", "validation.count": 1, "validation.duration_s": 1.0}
-    settings = scenario(**inexact, **driven, **{"renderer": "statistical", "identification.scale_anchor": "joint_gain"})
-    found = [row("identification", number, settings, sensor="images", unaware=True) for number in (0, 1)]
+    inexact = {
+        "rig.known": "photographs",
+        "timing.latency_std_s": 0.002,
+        "rig.right_later_std_s": 2e-4,
+    }
+    driven = {
+        "identification.method": "command_driven",
+        "validation.count": 1,
+        "validation.duration_s": 1.0,
+    }
+    settings = scenario(
+        **inexact,
+        **driven,
+        **{"renderer": "statistical", "identification.scale_anchor": "joint_gain"},
+    )
+    found = [
+        row("identification", number, settings, sensor="images", unaware=True) for number in (0, 1)
+    ]
     assert found[0]["unseen_position_rms_um"] != found[1]["unseen_position_rms_um"]
     for one in found:
         assert one["covered_percent"] > 80.0
-        assert one["unaware_covered_percent" if one["unaware_intervals"] else "unaware_intervals"] < 80.0
+        assert (
+            one["unaware_covered_percent" if one["unaware_intervals"] else "unaware_intervals"]
+            < 80.0
+        )
         assert one["unaware_poses_covered_percent"] < 80.0
 
 
 @pytest.mark.slow
 def test_a_law_follows_the_closer_the_better_its_model_and_pid_knows_none():
-    settings = scenario(**{"renderer": "statistical", "validation.count": 1, "validation.duration_s": 2.0})
-    truth, between, start = (row("tracking", 0, settings, model_error=share) for share in (0.0, 0.1, 1.0))
+    settings = scenario(
+        **{"renderer": "statistical", "validation.count": 1, "validation.duration_s": 2.0}
+    )
+    truth, between, start = (
+        row("tracking", 0, settings, model_error=share) for share in (0.0, 0.1, 1.0)
+    )
     assert truth == row("tracking", 0, settings)
-    assert start["position_rms_um"] == pytest.approx(row("tracking", 0, settings, model="initial")["position_rms_um"])
+    assert start["position_rms_um"] == pytest.approx(
+        row("tracking", 0, settings, model="initial")["position_rms_um"]
+    )
     figures = [one["position_share_percent"] for one in (truth, between, start)]
     assert figures == sorted(figures)
     assert figures[0] < 1.0 < figures[2] < 100.0
@@ -278,9 +348,17 @@ def test_a_law_follows_the_closer_the_better_its_model_and_pid_knows_none():
 
 @pytest.mark.slow
 def test_estimators_are_compared_on_the_same_record():
-    settings = scenario(**{"renderer": "statistical", "validation.count": 1, "validation.duration_s": 1.0})
-    found = row("estimators", 0, settings, sensor="images", estimators=["torque_ls", "command_driven"])
-    assert found["command_driven_position_um"] < found["torque_ls_position_um"] < found["starting_guess_position_um"]
+    settings = scenario(
+        **{"renderer": "statistical", "validation.count": 1, "validation.duration_s": 1.0}
+    )
+    found = row(
+        "estimators", 0, settings, sensor="images", estimators=["torque_ls", "command_driven"]
+    )
+    assert (
+        found["command_driven_position_um"]
+        < found["torque_ls_position_um"]
+        < found["starting_guess_position_um"]
+    )
     assert "closed_loop_position_um" not in found
     with pytest.raises(ScenarioError, match="nobody"):
         row("estimators", 0, settings, estimators=["nobody"])

@@ -1,7 +1,8 @@
-"""Studies in one process: what an end in the middle leaves, how rows are added, what is refused, and their table."""
+"""Studies in one process: what an end in the middle leaves, how rows are added, what is refused,
+and their table.
+"""
 
 import errno
-import fcntl
 import json
 import os
 import warnings
@@ -14,6 +15,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import xarray as xr
+from filelock import FileLock
 
 from identify.errors import StudyError
 from identify.files.versions import OtherVersionsWarning, versions
@@ -41,7 +43,9 @@ def whole(tmp_path_factory):
 
 
 def stop(folder, rows, error=KeyboardInterrupt, **entries):
-    """Run a study in a folder, one row a batch, until so many are done and Ctrl-C, or an error, comes; what is said."""
+    """Run a study in a folder, one row a batch, until so many are done and Ctrl-C, or an error,
+    comes; what is said.
+    """
 
     def execute(setup, batches):
         for _ in range(rows):
@@ -64,12 +68,18 @@ def test_batches_hold_every_row_once_and_a_quarter_second_of_work(row_seconds, w
     settled = sizes[20 : len(sizes) // 2]
     assert max(sizes) <= max(1, BATCH_SECONDS / row_seconds)
     assert max(sizes) <= LARGEST_BATCH
-    assert all(size >= min(0.9 * BATCH_SECONDS / row_seconds - 1, 50) or size == 1 for size in settled)
+    assert all(
+        size >= min(0.9 * BATCH_SECONDS / row_seconds - 1, 50) or size == 1 for size in settled
+    )
     assert sizes[-1] <= max(1, 5000 // workers // 100)
 
 
-def test_what_is_done_is_shown_while_a_study_runs_but_not_all_the_time(whole, tmp_path, monkeypatch):
-    """As it is in the table at the end; with no time between, after every batch, which is a row here."""
+def test_what_is_done_is_shown_while_a_study_runs_but_not_all_the_time(
+    whole, tmp_path, monkeypatch
+):
+    """As it is in the table at the end; with no time between, after every batch, which is a row
+    here.
+    """
     for every, most in ((0.0, 18), (1e3, 0)):
         monkeypatch.setattr(runner, "SO_FAR_S", every)
         monkeypatch.setattr(runner, "SO_FAR_SHARE", np.inf)
@@ -82,7 +92,10 @@ def test_what_is_done_is_shown_while_a_study_runs_but_not_all_the_time(whole, tm
 
 @pytest.mark.parametrize(
     ("error", "said"),
-    [(KeyboardInterrupt, "stopped: 7 of 18 rows are done and kept"), (SystemError("crash"), "crash")],
+    [
+        (KeyboardInterrupt, "stopped: 7 of 18 rows are done and kept"),
+        (SystemError("crash"), "crash"),
+    ],
 )
 def test_a_study_that_was_stopped_goes_on_where_it_was_and_one_that_is_done_computes_nothing(
     whole, tmp_path, monkeypatch, error, said
@@ -99,7 +112,9 @@ def test_a_study_that_was_stopped_goes_on_where_it_was_and_one_that_is_done_comp
     pd.testing.assert_frame_equal(again.frame, outcome.frame)
 
 
-@pytest.mark.parametrize("torn", [b'{"number": 3, "figu', b'{"number": 3, "figures": {}, "seconds": 1.0, "error": ""}'])
+@pytest.mark.parametrize(
+    "torn", [b'{"number": 3, "figu', b'{"number": 3, "figures": {}, "seconds": 1.0, "error": ""}']
+)
 def test_a_torn_last_line_does_not_count(whole, tmp_path, torn):
     stop(tmp_path, 3)
     with (tmp_path / JOURNAL).open("ab") as file:
@@ -114,7 +129,10 @@ def test_a_torn_last_line_does_not_count(whole, tmp_path, torn):
     ("entry", "says"),
     [
         (b"\x00" * 30, "it is "),
-        ({"figures": {"error_um": float("nan")}}, "figures.error_um is nan: Input should be a finite number"),
+        (
+            {"figures": {"error_um": float("nan")}},
+            "figures.error_um is nan: Input should be a finite number",
+        ),
         ({"figures": {"error_um": 10**400}}, "figures.error_um is 10000"),
         ({"number": -1}, "number is -1"),
         ({"figure": {}}, "figure is {}: Unexpected keyword argument"),
@@ -123,7 +141,9 @@ def test_a_torn_last_line_does_not_count(whole, tmp_path, torn):
 def test_a_line_that_no_study_writes_is_named_and_not_taken_as_done(tmp_path, entry, says):
     run(tmp_path)
     lines = (tmp_path / JOURNAL).read_bytes().splitlines()
-    lines[4] = entry if isinstance(entry, bytes) else json.dumps(json.loads(lines[4]) | entry).encode()
+    lines[4] = (
+        entry if isinstance(entry, bytes) else json.dumps(json.loads(lines[4]) | entry).encode()
+    )
     (tmp_path / JOURNAL).write_bytes(b"\n".join(lines) + b"\n")
     message = refusal(StudyError, run, tmp_path)
     assert message.startswith(f"line 5 of {tmp_path / JOURNAL} is damaged: {says}")
@@ -131,27 +151,31 @@ def test_a_line_that_no_study_writes_is_named_and_not_taken_as_done(tmp_path, en
 
 
 @pytest.mark.parametrize("part", [0, 40])
-def test_full_disk_leaves_whole_lines_and_the_study_goes_on_later(whole, tmp_path, monkeypatch, part):
+def test_full_disk_leaves_whole_lines_and_the_study_goes_on_later(
+    whole, tmp_path, monkeypatch, part
+):
     """The disk takes `part` bytes of the third batch and no more, as a real one may."""
-    real, calls = os.pwrite, []
+    real, calls = os.write, []
 
-    def full(file, data, offset):
+    def full(file, data):
         calls.append(data)
         if len(calls) > 2 + (part > 0):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return real(file, data if len(calls) < 3 else data[:part], offset)
+        return real(file, data if len(calls) < 3 else data[:part])
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, "pwrite", full)
+        patch.setattr(os, "write", full)
         said = stop(tmp_path, 18)
-    assert "rows.jsonl cannot be written: No space left on device; 2 rows are safe" in said
+    assert "rows.jsonl: No space left on device; name another place; 2 rows are safe" in said
     assert journal(tmp_path) == [0, 1]
     outcome = run(tmp_path)
     assert outcome.found == 2
     same_numbers(outcome.frame, whole[1])
 
 
-def test_a_row_that_fails_exits_or_contradicts_itself_says_why_and_the_others_go_on(whole, tmp_path):
+def test_a_row_that_fails_exits_or_contradicts_itself_says_why_and_the_others_go_on(
+    whole, tmp_path
+):
     """Nor may a figure hide a column of the table."""
     outcome = run(tmp_path / "a", options={"fails": [2, 11], "odd": 5, "exits": [7]})
     assert outcome.failures == [
@@ -161,24 +185,34 @@ def test_a_row_that_fails_exits_or_contradicts_itself_says_why_and_the_others_go
         "row 11: ValueError: row 11 has no answer",
     ]
     failed = outcome.frame["error"] != ""
-    assert outcome.frame.loc[failed, figure_names(outcome.frame, small_study())].isna().all(axis=None)
+    assert (
+        outcome.frame.loc[failed, figure_names(outcome.frame, small_study())].isna().all(axis=None)
+    )
     same_numbers(outcome.frame[~failed], whole[1][~failed])
-    together = {"scenario.filter.cutoff_hz": [10.0, 40.0], "scenario.timing.frame_rate_hz": [60.0, 100.0]}
+    together = {
+        "scenario.filter.cutoff_hz": [10.0, 40.0],
+        "scenario.timing.frame_rate_hz": [60.0, 100.0],
+    }
     frame = run(tmp_path / "b", factors=together).frame
     assert ["Nyquist" in error for error in frame["error"]] == [False, False, True, False] * 3
     for name in ("row", "seconds", DARK):
         errors = run(tmp_path / name, options={"also": name}, repeats=1).frame["error"]
-        assert {*errors} == {f"ValueError: a figure must not be called {name!r}: the table has a column of this name"}
+        assert {*errors} == {
+            f"ValueError: a figure must not be called {name!r}: the table has a column of this name"
+        }
 
 
 def test_more_repeats_are_added_to_those_that_are_there(whole, tmp_path):
-    """The same table as that of a study that had them from the start, and no row is computed twice; also in two
-    steps, and of a sample, whose points stay."""
+    """The same table as that of a study that had them from the start, and no row is computed twice;
+    also in two steps, and of a sample, whose points stay."""
     log = tmp_path / "log"
     options = {"log": str(log)}
     few = run(tmp_path / "a", options=options)
     same_numbers(few.frame, whole[1])
-    assert stop(tmp_path / "a", 2, options=options, repeats=5) == "stopped: 20 of 30 rows are done and kept"
+    assert (
+        stop(tmp_path / "a", 2, options=options, repeats=5)
+        == "stopped: 20 of 30 rows are done and kept"
+    )
     many = run(tmp_path / "a", options=options, repeats=5)
     assert (few.rows, many.found, many.rows) == (18, 20, 30)
     assert sorted(map(int, log.read_text().split())) == list(range(30))
@@ -213,7 +247,10 @@ def test_a_folder_or_a_table_of_another_study_or_of_another_sensor_file_is_refus
         return refusal(StudyError, lambda: run(folder, **base | entries))
 
     run(folder, **base)
-    before, another = (folder / JOURNAL).read_bytes(), "study.json is of another study, which differs in study."
+    before, another = (
+        (folder / JOURNAL).read_bytes(),
+        "study.json is of another study, which differs in study.",
+    )
     assert f"{another}seed; name" in refused(seed=5, repeats=4)
     assert f"{another}factors." in refused(factors={DARK: [1.0]})
     more = small_study().factors | {DARK: [13.0, 26.0, 52.0, 99.0]}
@@ -225,7 +262,9 @@ def test_a_folder_or_a_table_of_another_study_or_of_another_sensor_file_is_refus
     folder = table.parent
     folder.mkdir()
     table.write_bytes((whole[0] / TABLE).read_bytes())
-    assert "study.parquet is of another study, which differs in study.seed" in refused(seed=5, changes={})
+    assert "study.parquet is of another study, which differs in study.seed" in refused(
+        seed=5, changes={}
+    )
     pd.DataFrame({"x": [1.0]}).to_parquet(table)
     assert "study.parquet is no table of a study" in refused()
     table.write_text("no table")
@@ -240,8 +279,7 @@ def test_folders_of_other_things_in_use_or_that_cannot_be_made_are_refused_and_l
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     (tmp_path / "thesis.tex").unlink()
     run(tmp_path)
-    with (tmp_path / LOCK).open("a+") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
+    with FileLock(tmp_path / LOCK):
         assert "in use by another process" in refusal(StudyError, run, tmp_path)
     assert run(tmp_path).found == 18
 
@@ -251,16 +289,21 @@ def test_one_warning_names_each_other_version_once_with_how_many_workers_have_it
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_workers({"tcp://a:1": here, "tcp://b:1": here, "tcp://c:1": OSError("closed")})
-    there = {f"tcp://{name}:1": here | {"numpy": "1.2.3"} for name in "abc"} | {"tcp://d:1": here | {"casadi": "3.0"}}
+    there = {f"tcp://{name}:1": here | {"numpy": "1.2.3"} for name in "abc"} | {
+        "tcp://d:1": here | {"casadi": "3.0"}
+    }
     with pytest.warns(OtherVersionsWarning) as caught:
         check_workers(there)
     assert [str(one.message) for one in caught] == [
-        "figures may differ a little where versions do: numpy 1.2.3 (worker tcp://a:1 and 2 more), here "
+        "figures may differ a little where versions do: numpy 1.2.3 (worker tcp://a:1 and 2 "
+        "more), here "
         f"{here['numpy']}; casadi 3.0 (worker tcp://d:1), here {here['casadi']}"
     ]
 
 
-def test_no_rows_are_added_to_those_of_another_version_and_with_a_warning_where_only_other_packages_changed(tmp_path):
+def test_no_rows_are_added_to_those_of_another_version_and_with_a_warning_where_only_other_packages_changed(
+    tmp_path,
+):
     def begun_by(**others):
         entry = json.loads((tmp_path / STUDY).read_text())
         (tmp_path / STUDY).write_text(json.dumps(entry | {"versions": entry["versions"] | others}))
@@ -268,7 +311,9 @@ def test_no_rows_are_added_to_those_of_another_version_and_with_a_warning_where_
     run(tmp_path, repeats=1)
     begun_by(cmmsim="9.8.7")
     kept = (tmp_path / JOURNAL).read_bytes()
-    with pytest.raises(StudyError, match=r"has cmmsim 9\.8\.7, here is \S+; go on with that version"):
+    with pytest.raises(
+        StudyError, match=r"has cmmsim 9\.8\.7, here is \S+; go on with that version"
+    ):
         run(tmp_path, repeats=2)
     assert (tmp_path / JOURNAL).read_bytes() == kept
     with warnings.catch_warnings():
@@ -288,21 +333,30 @@ def test_no_rows_are_added_to_those_of_another_version_and_with_a_warning_where_
 def test_table_has_a_row_each_with_factors_seed_and_figures(whole):
     """Each row can be computed again from what the table says of it."""
     frame, paper = whole[1], load_scenario("paper")
-    before, figures = ["row", "repeat", "seed_entropy", "seed_spawn_key"], ["error_um", "spread_um", "rate_hz"]
+    before, figures = (
+        ["row", "repeat", "seed_entropy", "seed_spawn_key"],
+        ["error_um", "spread_um", "rate_hz"],
+    )
     assert list(frame.columns) == [*before, DARK, METHOD, *figures, "seconds", "error"]
     assert frame["row"].tolist() == list(range(18))
     for entry in frame.to_dict("records"):
-        seed = np.random.SeedSequence(int(entry["seed_entropy"]), spawn_key=(entry["seed_spawn_key"],))
+        seed = np.random.SeedSequence(
+            int(entry["seed_entropy"]), spawn_key=(entry["seed_spawn_key"],)
+        )
         scenario = paper.with_overrides({"sensor_changes.camera.dark_noise": entry[DARK]})
         assert row(scenario, seed, {}) == {name: entry[name] for name in figures}
 
 
-def test_files_hold_the_study_and_its_table_and_the_figures_by_factor_and_repeat_as_xarray_reads_them(whole):
+def test_files_hold_the_study_and_its_table_and_the_figures_by_factor_and_repeat_as_xarray_reads_them(
+    whole,
+):
     folder, table = whole
     frame, found = read_table(str(folder / TABLE))
     pd.testing.assert_frame_equal(frame, table)
     assert found == small_study()
-    assert {"python", "cmmsim", "numpy"} <= {*json.loads(pq.read_schema(folder / TABLE).metadata[b"cmmsim.versions"])}
+    assert {"python", "cmmsim", "numpy"} <= {
+        *json.loads(pq.read_schema(folder / TABLE).metadata[b"cmmsim.versions"])
+    }
     assert json.loads((folder / STUDY).read_text())["sensor"]["name"] == "ctrack780"
     with xr.open_dataset(folder / VIEW) as view:
         xr.testing.assert_identical(view.load(), to_xarray(frame, found))
@@ -315,7 +369,9 @@ def test_files_hold_the_study_and_its_table_and_the_figures_by_factor_and_repeat
 def made(figures=("position_rms_um",), **entries):
     """A table and its study of two repeats; row n has n in each figure."""
     study = small_study(**{"kind": "static_pose", "repeats": 2} | entries)
-    done = [Finished(number, dict.fromkeys(figures, float(number)), 0.5) for number in range(study.rows)]
+    done = [
+        Finished(number, dict.fromkeys(figures, float(number)), 0.5) for number in range(study.rows)
+    ]
     return tidy_table(study, done), study
 
 
@@ -328,11 +384,20 @@ def test_view_of_a_sample_has_points_with_the_factors_as_coordinates_and_all_car
     assert set(frame["options.pair"]) <= {"[1, 2]", "[3, 4]"}
     assert view["position_rms_um"].values.T.ravel().tolist() == list(range(10))
     view = to_xarray(*made(figures=("position_rms_um", "stickers")))
-    units = {"position_rms_um": "um", "stickers": None, "seconds": "s", DARK: "electrons", METHOD: None, "repeat": None}
+    units = {
+        "position_rms_um": "um",
+        "stickers": None,
+        "seconds": "s",
+        DARK: "electrons",
+        METHOD: None,
+        "repeat": None,
+    }
     assert {name: view[name].attrs.get("units") for name in view.variables} == units
 
 
-@pytest.mark.parametrize("factors", [{}, {"options.fast": [True, False]}, {"options.pair": [[1, 2], [3]]}])
+@pytest.mark.parametrize(
+    "factors", [{}, {"options.fast": [True, False]}, {"options.pair": [[1, 2], [3]]}]
+)
 def test_any_factor_and_any_name_of_a_figure_can_be_written(tmp_path, factors):
     frame, study = made(figures=("rate_1/s", "größe m"), kind="my:row", factors=factors)
     write_view(tmp_path / VIEW, frame, study)
@@ -344,8 +409,10 @@ def test_any_factor_and_any_name_of_a_figure_can_be_written(tmp_path, factors):
 def test_full_disk_leaves_the_old_view_and_one_line(tmp_path, monkeypatch):
     path = tmp_path / VIEW
     path.write_text("old")
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", Mock(side_effect=OSError(28, "No space left on device")))
-    with pytest.raises(StudyError, match=r"study\.nc cannot be written: No space left on device"):
+    monkeypatch.setattr(
+        xr.Dataset, "to_netcdf", Mock(side_effect=OSError(28, "No space left on device"))
+    )
+    with pytest.raises(StudyError, match=r"study\.nc: No space left on device"):
         write_view(path, *made())
     assert path.read_text() == "old"
     assert [one.name for one in tmp_path.iterdir()] == [VIEW]

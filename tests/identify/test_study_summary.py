@@ -1,4 +1,6 @@
-"""Summaries of studies against numpy and scipy, and laws against figures drawn with a known exponent or ratio."""
+"""Summaries of studies against numpy and scipy, and laws against figures drawn with a known
+exponent or ratio.
+"""
 
 import json
 from itertools import pairwise, product
@@ -37,7 +39,9 @@ def made_study(**changes):
 
 
 def made_table(study, failed=(), figures=None):
-    """A study's table: position error 0.1 um an electron, with scatter, or other figures of factors and generator."""
+    """A study's table: position error 0.1 um an electron, with scatter, or other figures of factors
+    and generator.
+    """
 
     def drawn(factors, rng):
         position, orientation = np.sqrt(rng.chisquare(12, 2) / 12)
@@ -57,21 +61,32 @@ def made_table(study, failed=(), figures=None):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """Table of a study with three failed rows, and others without a position; what its summary returned; the folder."""
+    """Table of a study with three failed rows, and others without a position; what its summary
+    returned; the folder.
+    """
     study, folder = made_study(repeats=16), tmp_path_factory.mktemp("study")
     frame = made_table(study, failed=(4, 7, 9))
-    frame.loc[(frame["repeat"] == 15) | ((frame[DARK] == 40.0) & (frame[BASELINE] == 1.0)), POSITION] = np.nan
+    frame.loc[
+        (frame["repeat"] == 15) | ((frame[DARK] == 40.0) & (frame[BASELINE] == 1.0)), POSITION
+    ] = np.nan
     return frame, summary.write(folder, study, frame), folder
 
 
 def test_statistics_of_a_point_are_numpys_its_bands_students_and_a_bootstraps():
     values = np.random.default_rng(0).gamma(2.0, size=12)
     found = point_statistics(values)
-    assert (found.mean, found.std) == (pytest.approx(np.mean(values)), pytest.approx(np.std(values, ddof=1)))
+    assert (found.mean, found.std) == (
+        pytest.approx(np.mean(values)),
+        pytest.approx(np.std(values, ddof=1)),
+    )
     assert found.rms == pytest.approx(np.sqrt(np.mean(values**2)))
-    assert found.mean_band == pytest.approx(tuple(stats.ttest_1samp(values, 0.0).confidence_interval(0.95)))
+    assert found.mean_band == pytest.approx(
+        tuple(stats.ttest_1samp(values, 0.0).confidence_interval(0.95))
+    )
     many = np.sqrt(np.random.default_rng(2).chisquare(12, 300) / 12)
-    oracle = stats.bootstrap((many,), lambda v, axis: np.sqrt(np.mean(v**2, axis=axis)), rng=0).confidence_interval
+    oracle = stats.bootstrap(
+        (many,), lambda v, axis: np.sqrt(np.mean(v**2, axis=axis)), rng=0
+    ).confidence_interval
     np.testing.assert_allclose(point_statistics(many).rms_band, oracle, rtol=0.005)
     alone, zeros = point_statistics(np.array([3.0])), point_statistics(np.zeros(5))
     assert (alone.std, alone.mean_band, alone.rms_band) == (None, None, None)
@@ -84,36 +99,55 @@ def test_statistics_of_a_point_are_numpys_its_bands_students_and_a_bootstraps():
      (8, 1, 0.92, 0.95)],
 )  # fmt: skip
 def test_band_of_the_rms_covers_it_as_often_as_it_says(count, freedom, least, most):
-    """Rms errors of so many normal numbers a row; few rows may be covered a little oftener, but by no idle band, and
-    those of single normal numbers, the worst case, a little more seldom."""
+    """Rms errors of so many normal numbers a row; few rows may be covered a little oftener, but by
+    no idle band, and those of single normal numbers, the worst case, a little more seldom."""
     rng, trials = np.random.default_rng(1), 2000
     figures = np.sqrt(rng.chisquare(freedom, (trials, count)) / freedom)
-    covered = sum(low <= 1.0 <= high for low, high in (point_statistics(row).rms_band for row in figures))
+    covered = sum(
+        low <= 1.0 <= high for low, high in (point_statistics(row).rms_band for row in figures)
+    )
     assert stats.binom.ppf(0.001, trials, least) <= covered <= stats.binom.ppf(0.999, trials, most)
 
 
-def test_points_and_laws_are_those_of_the_rows_that_have_the_figure_and_the_failed_are_counted_and_named(written):
+def test_points_and_laws_are_those_of_the_rows_that_have_the_figure_and_the_failed_are_counted_and_named(
+    written,
+):
     frame, entry, folder = written
     assert len(entry["points"]) == 6
     for point, name in product(entry["points"], (POSITION, ORIENTATION)):
-        here = np.logical_and.reduce([frame[path] == value for path, value in point["factors"].items()])
-        values, figure = frame[name][here & (frame["error"] == "")].dropna(), point["figures"].get(name)
+        here = np.logical_and.reduce(
+            [frame[path] == value for path, value in point["factors"].items()]
+        )
+        values, figure = (
+            frame[name][here & (frame["error"] == "")].dropna(),
+            point["figures"].get(name),
+        )
         assert (figure["rows"] if figure else 0) == len(values)
         if figure:
             assert figure["mean"] == pytest.approx(values.mean())
             assert figure["rms"] == pytest.approx(np.sqrt((values**2).mean()))
             assert figure["rms_band"][0] < figure["rms"] < figure["rms_band"][1]
     assert entry["rows"] == {"planned": 96, "done": 93, "failed": 3, "missing": 0}
-    assert entry["failures"]["reasons"] == {"LostError: only 1 stickers": 2, "LostError: only 0 stickers": 1}
+    assert entry["failures"]["reasons"] == {
+        "LostError: only 1 stickers": 2,
+        "LostError: only 0 stickers": 1,
+    }
     assert [one["row"] for one in entry["failures"]["first"]] == [4, 7, 9]
-    stored, text = json.loads((folder / "summary.json").read_text()), (folder / "summary.md").read_text()
+    stored, text = (
+        json.loads((folder / "summary.json").read_text()),
+        (folder / "summary.md").read_text(),
+    )
     assert "nan" not in f"{json.dumps(stored)} {text}".lower()
     law = stored["theory"][0]
     assert (law["verdict"], law["rows"]) == ("passed", 72)
     assert law["low"] < 1.0 < law["high"]
     assert (stored["units"][DARK], stored["units"][POSITION]) == ("electrons", "um")
     assert stored["confidence"] == {"bands": 0.95, "laws": 0.99}
-    for words in ("93 rows done, 3 failed, 0 missing", "2 x LostError: only 1 stickers", "The first: 4, 7, 9."):
+    for words in (
+        "93 rows done, 3 failed, 0 missing",
+        "2 x LostError: only 1 stickers",
+        "The first: 4, 7, 9.",
+    ):
         assert words in text
     assert "| position_rms_um ~ sensor.camera.dark_noise ^ 1 | 1 |" in text
 
@@ -121,7 +155,9 @@ def test_points_and_laws_are_those_of_the_rows_that_have_the_figure_and_the_fail
 def test_figures_show_each_factor_two_as_a_map_and_the_laws(written):
     folder = written[2] / "figures"
     names = {f"by_{DARK}", f"by_{BASELINE}", "map", "laws"}
-    assert {path.name for path in folder.iterdir()} == {f"{name}.{kind}" for name in names for kind in FORMATS}
+    assert {path.name for path in folder.iterdir()} == {
+        f"{name}.{kind}" for name in names for kind in FORMATS
+    }
     for name in names:
         assert np.ptp(imread(folder / f"{name}.png")[..., :3]) > 0.5
         assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
@@ -131,7 +167,9 @@ def test_figures_show_each_factor_two_as_a_map_and_the_laws(written):
 @pytest.mark.parametrize("levels", [[1.0, 1.05, 1.1, 9.0], [0.001, 5e4], np.geomspace(1, 7, 7)])
 @pytest.mark.parametrize("spread", [1.0001, 5.0, 1e7])
 def test_numbers_on_axes_never_touch_and_labels_are_words_with_units(levels, spread):
-    """Of rows whose rms spans a little or seven decades, with bands as wide as few repeats leave them."""
+    """Of rows whose rms spans a little or seven decades, with bands as wide as few repeats leave
+    them.
+    """
     study = made_study(factors={DARK: list(levels), BASELINE: [0.5, 1.0]}, repeats=2, theory=[])
     share = {level: place / (len(levels) - 1) for place, level in enumerate(levels)}
 
@@ -142,14 +180,19 @@ def test_numbers_on_axes_never_touch_and_labels_are_words_with_units(levels, spr
     figure.draw_without_rendering()
     (axes,) = figure.axes
     assert axes.get_xlabel() == "Dark noise, rms [electrons]"
-    assert axes.get_ylabel().replace("\n", " ") == "Error of the measured position, rms over pictures and axes [µm]"
+    assert (
+        axes.get_ylabel().replace("\n", " ")
+        == "Error of the measured position, rms over pictures and axes [µm]"
+    )
     for labels in (axes.get_xticklabels(), axes.get_yticklabels()):
         boxes = [label.get_window_extent() for label in labels if label.get_text()]
         assert len(boxes) >= 2
         assert not any(one.overlaps(other) for one, other in pairwise(boxes))
 
 
-def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refused(tmp_path, monkeypatch):
+def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refused(
+    tmp_path, monkeypatch
+):
     drawn = []
     monkeypatch.setattr(summary, "draw", lambda *arguments: drawn.append(arguments[3]))
     chosen = made_study(figures=[ORIENTATION], theory=[])
@@ -157,7 +200,9 @@ def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refus
     assert "| orientation_rms_urad [urad] |" in (tmp_path / "summary.md").read_text()
     assert "position_rms_um" not in (tmp_path / "summary.md").read_text()
     assert drawn == [[ORIENTATION]]
-    with pytest.raises(StudyError, match="figures has 'speed', no figure of static_pose; the nearest are"):
+    with pytest.raises(
+        StudyError, match="figures has 'speed', no figure of static_pose; the nearest are"
+    ):
         prepare(made_study(figures=["speed"]))
     own = made_study(kind="my_rows:count", figures=["speed"], theory=[])
     with pytest.raises(StudyError, match=f"figures has 'speed', and the rows have {POSITION}"):
@@ -165,7 +210,9 @@ def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refus
 
 
 def test_long_title_stays_within_the_figure_of_a_single_law():
-    study = made_study(title="How far the measured position is from the true one against the noise of the pixels")
+    study = made_study(
+        title="How far the measured position is from the true one against the noise of the pixels"
+    )
     frame = made_table(study)
     figure = laws_figure(study, frame, [(study.theory[0], check_laws(study, frame)[0])])
     figure.draw_without_rendering()
@@ -200,8 +247,13 @@ def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undeci
         sight = rng.uniform(1.0, 4.0)
         return {"sight_m": sight, POSITION: sight**2 * np.sqrt(rng.chisquare(12) / 12)}
 
-    study = made_study(factors={}, repeats=60, theory=[Law(figure=POSITION, factor="sight_m", exponent=2.0)])
-    assert summary.write(tmp_path, study, made_table(study, figures=figures))["theory"][0]["verdict"] == "passed"
+    study = made_study(
+        factors={}, repeats=60, theory=[Law(figure=POSITION, factor="sight_m", exponent=2.0)]
+    )
+    assert (
+        summary.write(tmp_path, study, made_table(study, figures=figures))["theory"][0]["verdict"]
+        == "passed"
+    )
     assert (tmp_path / "figures" / "laws.png").exists()
     factors = {DARK: [10.0], METHOD: ["registration", "planes"]}
     study = made_study(factors=factors, theory=[Law(figure=POSITION, factor=METHOD, exponent=1.0)])
@@ -213,7 +265,9 @@ def test_random_sample_is_summarised_as_a_whole_and_its_points_stand_in_order_wi
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr(figures_of_studies, "FORMATS", ("png",))
-    study = made_study(sample=200, repeats=1, factors={DARK: Range(low=10.0, high=40.0), BASELINE: [0.5, 1.0]})
+    study = made_study(
+        sample=200, repeats=1, factors={DARK: Range(low=10.0, high=40.0), BASELINE: [0.5, 1.0]}
+    )
     entry = summary.write(tmp_path, study, made_table(study))
     assert [point["factors"] for point in entry["points"]] == [{}]
     assert entry["points"][0]["figures"][POSITION]["rows"] == 200
@@ -230,12 +284,16 @@ def drawn(rng, exponent, rows=30, freedom=12, others=(1.0,)):
     """Rms errors of `freedom` normal numbers whose sigma is other * x ** exponent."""
     x, other = (a.ravel() for a in np.meshgrid(np.repeat(LEVELS, rows), others))
     figure = other * x**exponent * np.sqrt(rng.chisquare(freedom, len(x)) / freedom)
-    return pd.DataFrame({"row": range(len(x)), "x": x, "other": other, "error": "", "figure_um": figure})
+    return pd.DataFrame(
+        {"row": range(len(x)), "x": x, "other": other, "error": "", "figure_um": figure}
+    )
 
 
 def verdict(law, frame, factors=("x",), **settings):
     values = {name: frame[name].unique().tolist() for name in factors}
-    return check_laws(made_study(kind="module:function", factors=values, theory=[law], **settings), frame)[0]
+    return check_laws(
+        made_study(kind="module:function", factors=values, theory=[law], **settings), frame
+    )[0]
 
 
 def power(exponent, **more):
@@ -271,8 +329,12 @@ def test_a_wrong_exponent_fails_but_within_its_tolerance_and_few_rows_can_only_r
 
 def test_mean_square_scales_right_though_the_figures_distribution_changes_with_the_factor():
     rng, pairs = np.random.default_rng(5), zip(LEVELS, (1, 2, 6, 30), strict=True)
-    frame = pd.concat(drawn(rng, -1.0, 400, freedom).query(f"x == {level}") for level, freedom in pairs)
-    assert np.polyfit(*np.log([frame["x"], frame["figure_um"]]), 1)[0] > -0.8, "the slope of a straight line"
+    frame = pd.concat(
+        drawn(rng, -1.0, 400, freedom).query(f"x == {level}") for level, freedom in pairs
+    )
+    assert np.polyfit(*np.log([frame["x"], frame["figure_um"]]), 1)[0] > -0.8, (
+        "the slope of a straight line"
+    )
     assert verdict(power(-1.0), frame).verdict == "passed"
 
 
@@ -293,13 +355,16 @@ def test_other_factors_do_not_disturb_an_exponent():
 def test_figures_that_must_be_equal():
     rng = np.random.default_rng(8)
     frame = drawn(rng, 1.0).assign(stated_um=lambda f: f["x"], small_um=lambda f: 0.7 * f["x"])
-    found = [verdict(Law(figure="figure_um", equals=name), frame) for name in ("stated_um", "small_um")]
+    found = [
+        verdict(Law(figure="figure_um", equals=name), frame) for name in ("stated_um", "small_um")
+    ]
     assert [one.verdict for one in found] == ["passed", "failed"]
     assert found[1].measured == pytest.approx(1 / 0.7, rel=0.05)
 
 
 @pytest.mark.parametrize(
-    ("good", "bad", "expected"), [(1.0, 2.0, "passed"), (2.0, 1.0, "failed"), (1.0, 1.01, "undecided")]
+    ("good", "bad", "expected"),
+    [(1.0, 2.0, "passed"), (2.0, 1.0, "failed"), (1.0, 1.01, "undecided")],
 )
 def test_order_of_a_factors_values(good, bad, expected):
     rng, scales = np.random.default_rng(9), {"good": good, "bad": bad}
@@ -314,16 +379,30 @@ def test_order_of_a_factors_values(good, bad, expected):
 @pytest.mark.parametrize(
     ("law", "changes", "reason"),
     [
-        (Law(figure="figur_um", factor="x", exponent=1.0), {}, "no figure 'figur_um'; they have row, x"),
+        (
+            Law(figure="figur_um", factor="x", exponent=1.0),
+            {},
+            "no figure 'figur_um'; they have row, x",
+        ),
         (Law(figure="figure_um", factor="y", exponent=1.0), {}, "no factor or figure 'y'"),
-        (power(1.0, per="some"), {}, "some is zero in 30 of 120 rows, and nothing can be divided by it"),
-        (Law(figure="figure_um", equals="some"), {}, "some is zero in 30 of 120 rows, and nothing can be divided"),
+        (
+            power(1.0, per="some"),
+            {},
+            "some is zero in 30 of 120 rows, and nothing can be divided by it",
+        ),
+        (
+            Law(figure="figure_um", equals="some"),
+            {},
+            "some is zero in 30 of 120 rows, and nothing can be divided",
+        ),
         (power(1.0), {"figure_um": 0.0}, "zero in every row"),
         (power(1.0), {"x": 2.0}, "do not vary"),
     ],
 )
 def test_law_of_what_the_rows_do_not_show_is_undecided_with_the_reason(law, changes, reason):
-    frame = drawn(np.random.default_rng(11), 1.0).assign(some=lambda rows: rows["row"] % 4.0, **changes)
+    frame = drawn(np.random.default_rng(11), 1.0).assign(
+        some=lambda rows: rows["row"] % 4.0, **changes
+    )
     found = verdict(law, frame)
     assert found.verdict == "undecided"
     assert reason in found.reason

@@ -60,7 +60,9 @@ def own(path, rows=40, end=2.0, height=0.004, at=20, to=None):
     times = np.linspace(0, end, rows)
     table = np.tile(rss6().home_pose, (rows, 1))
     table[:, 2] += height * np.sin(np.pi * times / end) ** 2
-    lines = [",".join(f"{value:.9g}" for value in (t, *row)) for t, row in zip(times, table, strict=True)]
+    lines = [
+        ",".join(f"{value:.9g}" for value in (t, *row)) for t, row in zip(times, table, strict=True)
+    ]
     if to is not None:
         lines[at] = to
     path.write_text("t,x,y,z,alpha,beta,gamma\n" + "\n".join(lines) + "\n")
@@ -104,7 +106,9 @@ def test_the_jerk_of_the_square_is_bounded():
     ids=["few", "word", "back", "nan", "late", "jump"],
 )
 def test_a_file_that_is_no_motion_is_refused(tmp_path, changes, said):
-    assert said in refusal(TrajectoryError, read_motion, own(tmp_path / "own.csv", **changes), rss6(), FASTEST)
+    assert said in refusal(
+        TrajectoryError, read_motion, own(tmp_path / "own.csv", **changes), rss6(), FASTEST
+    )
 
 
 def test_a_file_without_a_column_or_that_the_platform_cannot_follow_is_refused(tmp_path):
@@ -113,7 +117,9 @@ def test_a_file_without_a_column_or_that_the_platform_cannot_follow_is_refused(t
     path.write_text("\ufeff" + whole, encoding="utf-8")  # as spreadsheets write it
     assert read_motion(path, rss6(), FASTEST).duration_s == 2.0
     path.write_text(whole.replace(",", ";"))
-    assert "by commas, and these by semicolons" in refusal(TrajectoryError, read_motion, path, rss6(), FASTEST)
+    assert "by commas, and these by semicolons" in refusal(
+        TrajectoryError, read_motion, path, rss6(), FASTEST
+    )
     path.write_text(whole.replace("gamma", "yaw"))
     assert "lacks the columns gamma" in refusal(TrajectoryError, read_motion, path, rss6(), FASTEST)
     tilted = own(tmp_path / "tilted.csv", at=20, to="1.02564103,0,0,0.204,0.01,0,0")
@@ -122,7 +128,9 @@ def test_a_file_without_a_column_or_that_the_platform_cannot_follow_is_refused(t
 
 def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
     motion = read_motion(own(tmp_path / "own.csv", height=0.05), rss6(), np.inf)
-    said = refusal(TrajectoryError, follow, plant(), "pid", rss6().nominal_parameters, motion, seen())
+    said = refusal(
+        TrajectoryError, follow, plant(), "pid", rss6().nominal_parameters, motion, seen()
+    )
     assert "the robot may not follow own" in said
     assert "of leg" in said
     assert "at t = " in said
@@ -131,16 +139,36 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
 @pytest.mark.parametrize(
     ("law", "changes", "error", "said"),
     [
-        ("computed_torque", {"control.torque_access": False}, ScenarioError, "control.torque_access = false"),
-        ("computed_torque", UNSTABLE, SimulationError, "from frame to frame is 2.203, must be below 1; it is up to "),
-        ("computed_torque", {**TOO_FAST, **BLIND}, SimulationError, "frame is 25.74, must be below 1; it is up to "),
+        (
+            "computed_torque",
+            {"control.torque_access": False},
+            ScenarioError,
+            "control.torque_access = false",
+        ),
+        (
+            "computed_torque",
+            UNSTABLE,
+            SimulationError,
+            "from frame to frame is 2.203, must be below 1; it is up to ",
+        ),
+        (
+            "computed_torque",
+            {**TOO_FAST, **BLIND},
+            SimulationError,
+            "frame is 25.74, must be below 1; it is up to ",
+        ),
         (
             "computed_torque",
             TOO_FAST,
             SimulationError,
             "is too fast for 60 Hz, half of which is 188 rad/s: its largest",
         ),
-        ("sliding_mode", {}, ScenarioError, "unknown law 'sliding_mode'; valid: pid, feedforward, computed_torque"),
+        (
+            "sliding_mode",
+            {},
+            ScenarioError,
+            "unknown law 'sliding_mode'; valid: pid, feedforward, computed_torque",
+        ),
         ("builtins:repr", {}, ScenarioError, "must return a LawInLoop, returned str"),
         (
             "builtins:len",
@@ -148,13 +176,21 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
             SimulationError,
             "law 'builtins:len' raised TypeError: object of type 'Assignment' has no",
         ),
-        ("pid", {"control.torque_limit_N_m": 3.0}, ScenarioError, "leg 6 of rss6 takes 3.042 N m to stand still at"),
+        (
+            "pid",
+            {"control.torque_limit_N_m": 3.0},
+            ScenarioError,
+            "leg 6 of rss6 takes 3.042 N m to stand still at",
+        ),
     ],
     ids=["access", "gains", "blind", "fast", "name", "own", "raises", "weak"],
 )
-def test_a_law_that_cannot_be_is_refused(law, changes, error, said):
+def test_a_law_that_cannot_be_is_refused(law, changes, error, said, monkeypatch):
+    monkeypatch.setenv("CMMSIM_PLUGINS", "builtins")
     chosen = plant(**changes)
-    assert said in refusal(error, prepared, chosen, law, KnownModel(chosen.parameters), swing(), seen())
+    assert said in refusal(
+        error, prepared, chosen, law, KnownModel(chosen.parameters), swing(), seen()
+    )
 
 
 def test_torque_beyond_the_limit_is_given_up_to_it_and_counted():
@@ -168,15 +204,24 @@ def test_torque_beyond_the_limit_is_given_up_to_it_and_counted():
 
 
 def holding(assignment):
-    """A law of one's own, by its module and name: joint commands of the desired pose, nothing else."""
+    """A law of one's own, by its module and name: joint commands of the desired pose, nothing
+    else."""
     robot, motion = assignment.model.robot, assignment.motion
     times = np.arange(assignment.frames) * assignment.period
-    return LawInLoop(feedforward=robot.inverse_kinematics(motion.pose(times)), drives=assignment.settings.drives)
+    return LawInLoop(
+        feedforward=robot.inverse_kinematics(motion.pose(times)), drives=assignment.settings.drives
+    )
 
 
 def test_a_law_of_ones_own_is_a_function():
     chosen = plant()
-    done = follow(chosen, "tests.identify.test_tracking:holding", KnownModel(chosen.parameters), swing(), seen())
+    done = follow(
+        chosen,
+        "tests.identify.test_tracking:holding",
+        KnownModel(chosen.parameters),
+        swing(),
+        seen(),
+    )
     alone = follow(chosen, "pid", KnownModel(chosen.parameters), swing(), seen())
     assert np.abs(done.errors).max() < np.abs(alone.errors).max()
 
@@ -184,15 +229,26 @@ def test_a_law_of_ones_own_is_a_function():
 def failing(assignment):
     """A law whose list of commands is too short."""
     commands = assignment.model.robot.inverse_kinematics(assignment.motion.pose(np.zeros(20)))
-    return LawInLoop(controller=lambda frame, *_: commands[frame], drives=assignment.settings.drives)
+    return LawInLoop(
+        controller=lambda frame, *_: commands[frame], drives=assignment.settings.drives
+    )
 
 
 def test_a_law_of_ones_own_that_fails_is_one_line_with_frame_time_and_place():
     chosen = plant()
-    given = chosen, "tests.identify.test_tracking:failing", KnownModel(chosen.parameters), swing(), seen()
+    given = (
+        chosen,
+        "tests.identify.test_tracking:failing",
+        KnownModel(chosen.parameters),
+        swing(),
+        seen(),
+    )
     said = refusal(LoopFailure, follow, *given)
-    assert "at frame 20 (t = 0.333 s): law 'tests.identify.test_tracking:failing' raised IndexError: index" in said
-    assert f"(test_tracking.py, line {failing.__code__.co_firstlineno + 3})" in said
+    assert (
+        "at frame 20 (t = 0.333 s): law 'tests.identify.test_tracking:failing' raised IndexError: "
+        "index" in said
+    )
+    assert f"(test_tracking.py, line {failing.__code__.co_firstlineno + 4})" in said
 
 
 KNOWN_LATENCIES = []
@@ -208,14 +264,17 @@ def test_what_is_not_known_of_the_mean_latency_is_drawn_for_a_seed_and_no_law_kn
     """The run is that with the drawn latency; the same for all motions of a seed."""
     stated = {"timing.latency_s": 0.006, "timing.latency_std_s": 0.002}
     vague, model = plant(**stated), tracking.known_model(plant(), "true", None)
-    drawn = [drawn_latencies(vague.scenario, 120, seed, run) for seed, run in ((3, 0), (3, 7), (4, 0))]
+    drawn = [
+        drawn_latencies(vague.scenario, 120, seed, run) for seed, run in ((3, 0), (3, 7), (4, 0))
+    ]
     first, other, another = (float(one.true[0]) for one in drawn)
     assert first == other != another
     assert abs(first - 0.006) > 1e-4
     exact = plant(**{"timing.latency_s": first})
     name = "tests.identify.test_tracking:noting"
     followed = [
-        tracking.follow_by_images(one, DrawnSensor(NOISE), name, model, swing(), 3)[0] for one in (vague, exact)
+        tracking.follow_by_images(one, DrawnSensor(NOISE), name, model, swing(), 3)[0]
+        for one in (vague, exact)
     ]
     assert np.array_equal(followed[0].run.pose, followed[1].run.pose)
     assert (np.array(KNOWN_LATENCIES[0]) == 0.006).all()
@@ -231,12 +290,26 @@ def test_the_scale_of_all_parameters_makes_no_difference_to_feedforward():
 
 @pytest.mark.slow
 def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
-    """By drawn poses; `pid`, which knows no model, is there once. A model that is better leaves less error."""
+    """By drawn poses; `pid`, which knows no model, is there once. A model that is better leaves
+    less error.
+    """
     monkeypatch.setattr(tracking, "taught_sensor", lambda *given: Sensor(NOISE))
     out = tmp_path / "track"
     settings = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
     settings += ["--set", "renderer=analytic", "--set", "control.observer=false"]
-    asked = ["--law", "pid", "--law", "feedforward", "--model", "initial", "--model", "true", "--out", out, "--quiet"]
+    asked = [
+        "--law",
+        "pid",
+        "--law",
+        "feedforward",
+        "--model",
+        "initial",
+        "--model",
+        "true",
+        "--out",
+        out,
+        "--quiet",
+    ]
     assert command("track", "quick", *asked, *settings) == 0
     told = json.loads((out / "track.json").read_text())
     runs = {(run["law"], run["model"]): run for run in told["runs"]}
@@ -249,7 +322,11 @@ def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
         assert list(run["shares"]) == ["sensor", "model", "latency", "rest"]
         for part in ("position", "orientation"):
             assert sum(share[part] for share in run["shares"].values()) == pytest.approx(1)
-    assert {row["motion"] for row in runs["pid", None]["motions"]} == {"unseen 1", "circle", "corner"}
+    assert {row["motion"] for row in runs["pid", None]["motions"]} == {
+        "unseen 1",
+        "circle",
+        "corner",
+    }
     assert (out / "scenario.toml").is_file()
 
 
@@ -263,26 +340,37 @@ def test_a_robot_that_no_law_keeps_on_its_motion_is_no_success(tmp_path, monkeyp
     said, (run,) = capsys.readouterr(), json.loads((out / "track.json").read_text())["runs"]
     assert f"error: no law kept the robot on its motion; pid: {run['failed']}" in said.err
     assert said.out == f"files: {out}\n"
-    assert f"saturated in {run['saturated_frames']} of {run['frames']} frames, limit 3.1 N m" in run["failed"]
+    assert (
+        f"saturated in {run['saturated_frames']} of {run['frames']} frames, limit 3.1 N m"
+        in run["failed"]
+    )
     assert "eigenvalue" in run["failed"]
 
 
 @pytest.mark.slow
 def test_an_exact_sensor_takes_away_more_than_half_of_an_error_that_noise_makes():
-    """Of a law that weighs what it sees by the noise that is stated, with a model that is one per cent off."""
+    """Of a law that weighs what it sees by the noise that is stated, with a model that is one per
+    cent off.
+    """
     chosen = plant()
-    known = KnownModel(chosen.parameters * (1 + 0.01 * np.random.default_rng(4).standard_normal(67)))
+    known = KnownModel(
+        chosen.parameters * (1 + 0.01 * np.random.default_rng(4).standard_normal(67))
+    )
     size = {}
     for exact in (False, True):
         drawn = by_drawing(NOISE, np.zeros(120, bool), np.random.default_rng(0), exact)
-        size[exact] = np.sqrt(np.mean(follow(chosen, "computed_torque", known, swing(), drawn).errors[:, :3] ** 2))
+        size[exact] = np.sqrt(
+            np.mean(follow(chosen, "computed_torque", known, swing(), drawn).errors[:, :3] ** 2)
+        )
     assert size[True] < 0.5 * size[False]
 
 
 def test_a_feedforward_that_is_lost_by_the_servos_gains_says_its_eigenvalue():
     """With an observer, too, as its corrections are those of the servo."""
     wild = plant(**{"servo.ki": 400.0})
-    said = refusal(LoopFailure, follow, wild, "feedforward", KnownModel(wild.parameters), swing(), seen())
+    said = refusal(
+        LoopFailure, follow, wild, "feedforward", KnownModel(wild.parameters), swing(), seen()
+    )
     assert "its largest eigenvalue from frame to frame near the start is" in said
 
 
@@ -312,6 +400,9 @@ def test_the_identified_model_is_that_of_a_run(tmp_path):
 def test_what_cannot_be_tracked_is_one_line_and_leaves_nothing(asked, said, tmp_path, capsys):
     out = tmp_path / "out"
     given = ["--model", "true", *asked] if "--model" not in asked else asked
-    assert command("track", "quick", "--set", "renderer=analytic", "--quiet", "--out", out, *given) == 1
+    assert (
+        command("track", "quick", "--set", "renderer=analytic", "--quiet", "--out", out, *given)
+        == 1
+    )
     assert said in one_line(capsys.readouterr().err)
     assert not out.exists()

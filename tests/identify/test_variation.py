@@ -1,4 +1,6 @@
-"""Variation of estimates: by hand, and `cmmsim variation` on runs of the reference robot with drawn noise."""
+"""Variation of estimates: by hand, and `cmmsim variation` on runs of the reference robot with drawn
+noise.
+"""
 
 import json
 from itertools import combinations
@@ -25,9 +27,14 @@ IDENTIFIED = {
 
 
 def result(estimate, std, identifiable):
-    names, columns = ("link1.mass", "joint1.coulomb", "link2.Ixx"), map(np.array, (estimate, std, identifiable))
+    names, columns = (
+        ("link1.mass", "joint1.coulomb", "link2.Ixx"),
+        map(np.array, (estimate, std, identifiable)),
+    )
     layout = SimpleNamespace(names=names, unit=LAYOUT.unit)
-    return SimpleNamespace(layout=layout, **dict(zip(("estimate", "std", "identifiable"), columns, strict=True)))
+    return SimpleNamespace(
+        layout=layout, **dict(zip(("estimate", "std", "identifiable"), columns, strict=True))
+    )
 
 
 def test_variation_is_the_standard_deviation_over_the_mean_and_its_table_stands_beside_the_papers():
@@ -56,7 +63,9 @@ def test_variation_is_the_standard_deviation_over_the_mean_and_its_table_stands_
 
 @pytest.mark.slow
 def test_the_command_identifies_each_unseen_run(tmp_path, capsys):
-    """Estimates vary as their intervals say: the mean square of variation over expectation is near one."""
+    """Estimates vary as their intervals say: the mean square of variation over expectation is near
+    one.
+    """
     (tmp_path / "scenario.toml").write_text(quick().to_toml(), encoding="utf-8")
     runs = [(run_plant(quick(), seed, trajectory_seed=seed)[0], None) for seed in range(3)]
     recording.write_runs(tmp_path / "validation.nc", runs)
@@ -64,9 +73,15 @@ def test_the_command_identifies_each_unseen_run(tmp_path, capsys):
     assert "largest:" in capsys.readouterr().out
     entry = json.loads((tmp_path / "variation.json").read_text(encoding="utf-8"))
     assert (entry["runs"], entry["trajectories"]) == (3, "unseen")
-    judged = {n: p for n, p in entry["parameters"].items() if p["identified_in_every_run"] and n != "platform.mass"}
+    judged = {
+        n: p
+        for n, p in entry["parameters"].items()
+        if p["identified_in_every_run"] and n != "platform.mass"
+    }
     assert len(judged) > 15
-    assert entry["worst"]["variation_percent"] == max(p["variation_percent"] for p in judged.values())
+    assert entry["worst"]["variation_percent"] == max(
+        p["variation_percent"] for p in judged.values()
+    )
     ratios = [p["variation_percent"] / p["expected_percent"] for p in judged.values()]
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.7, ratios
     assert "| joint1.coulomb |" in (tmp_path / "variation.md").read_text(encoding="utf-8")
@@ -86,8 +101,16 @@ def test_a_folder_without_runs_or_with_too_few_is_refused(tmp_path, capsys):
 def designed(folder, count, scenario, *settings, workers=2):
     """Entry of `variation.json` of runs with images, each on an exciting trajectory of its own."""
     words = [word for setting in settings for word in ("--set", setting)]
-    assert command("excite", scenario, "--out", folder, "--quiet", "--set", "renderer=analytic", *words) == 0
-    assert command("variation", "--out", folder, "--designed", count, "--workers", workers, "--quiet") == 0
+    assert (
+        command(
+            "excite", scenario, "--out", folder, "--quiet", "--set", "renderer=analytic", *words
+        )
+        == 0
+    )
+    assert (
+        command("variation", "--out", folder, "--designed", count, "--workers", workers, "--quiet")
+        == 0
+    )
     records = recording.read_runs(folder / "variation.nc")
     paths = [recording.poses(record, "reference") for record in records]
     assert len(paths) == count
@@ -97,21 +120,32 @@ def designed(folder, count, scenario, *settings, workers=2):
 
 @pytest.mark.thorough
 def test_runs_are_designed_and_recorded_one_by_one_where_asked(tmp_path):
-    entry = designed(tmp_path / "run", 3, "quick", "excitation.candidates=2", "excitation.duration_s=6", workers=1)
+    entry = designed(
+        tmp_path / "run",
+        3,
+        "quick",
+        "excitation.candidates=2",
+        "excitation.duration_s=6",
+        workers=1,
+    )
     assert (entry["runs"], entry["trajectories"]) == (3, "designed: random")
     assert entry["worst"]["variation_percent"] > 0
 
 
 @pytest.mark.thorough
 def test_every_identified_parameter_varies_by_5_percent_at_most(tmp_path):
-    """Runs of 20 s with images, each on a fast trajectory of its own, the best of three climbs; the goal for table 5.
+    """Runs of 20 s with images, each on a fast trajectory of its own, the best of three climbs; the
+    goal for table 5.
 
-    Their own intervals let expect no more, and they vary no more than these say, but for one chance in a thousand.
+    Their own intervals let expect no more, and they vary no more than these say, but for one chance
+    in a thousand.
     """
     runs = 10
     entry = designed(tmp_path / "run", runs, "paper", "excitation.fundamental_hz=0.3")
     assert (entry["runs"], entry["trajectories"]) == (runs, "designed: gradient")
-    found = {name: seen for name, seen in entry["parameters"].items() if seen["identified_in_every_run"]}
+    found = {
+        name: seen for name, seen in entry["parameters"].items() if seen["identified_in_every_run"]
+    }
     assert set(found) == IDENTIFIED
     chance = np.sqrt(chi2.ppf(1 - 1e-3 / len(found), runs - 1) / (runs - 1))
     for name, seen in found.items():

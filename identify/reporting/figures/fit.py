@@ -1,4 +1,6 @@
-"""How well models follow the robot: over a run, component by component, and in one look; and run by run."""
+"""How well models follow the robot: over a run, component by component, and in one look; and run by
+run.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +29,7 @@ from identify.reporting.figures.style import (
     moving,
 )
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
-from identify.reporting.numbers import number
+from identify.reporting.number_format import number
 
 BAND = 2.0
 """Predicted standard deviations drawn around an error of zero: 95 % of true errors lie within."""
@@ -48,7 +50,13 @@ class Curve(NamedTuple):
 
 STARTING: dict[str, Any] = {"color": GREEN, "linestyle": (0, (4, 2)), "linewidth": 1.0}
 IDENTIFIED: dict[str, Any] = {"color": BLUE, "linestyle": "-"}
-MEASURED: dict[str, Any] = {"color": INK, "linestyle": "none", "marker": "o", "markersize": 2.4, "fillstyle": "none"}
+MEASURED: dict[str, Any] = {
+    "color": INK,
+    "linestyle": "none",
+    "marker": "o",
+    "markersize": 2.4,
+    "fillstyle": "none",
+}
 NOISE: dict[str, Any] = {"color": GREY, "linestyle": "-", "linewidth": 0.4}
 TRUE: dict[str, Any] = {"color": RED, "linestyle": "-", "linewidth": 1.4}
 
@@ -57,9 +65,9 @@ TRUE: dict[str, Any] = {"color": RED, "linestyle": "-", "linewidth": 1.4}
 class Fit:
     """What was measured of a run over its time (N,) [s], and what models do: poses (N, 6) [m, rad].
 
-    NaN where a measurement was lost or a model has diverged. initial: of the starting model; std: predicted deviation
-    of the truth from the identified model; noise (6,): standard deviation of one measured pose, as the sensor states
-    it.
+    NaN where a measurement was lost or a model has diverged. initial: of the starting model; std:
+    predicted deviation of the truth from the identified model; noise (6,): standard deviation of
+    one measured pose, as the sensor states it.
     """
 
     time: Array
@@ -73,24 +81,40 @@ class Fit:
     def pose_curves(self, i: int) -> list[Curve]:
         """Component i, in mm or mrad: measurement and models."""
         marked = MEASURED | {"markevery": max(1, len(self.time) // MARKS)}
-        curves = [("measured", self.measured, marked), ("identified model", self.identified, IDENTIFIED)]
+        curves = [
+            ("measured", self.measured, marked),
+            ("identified model", self.identified, IDENTIFIED),
+        ]
         if self.initial is not None:
             curves.insert(1, ("starting model", self.initial, STARTING))
         return [Curve(name, 1e3 * poses[:, i], drawn) for name, poses, drawn in curves]
 
     def error_curves(self, i: int) -> list[Curve]:
-        """Errors of the identified model in component i, in µm or µrad, against measurement and truth."""
-        curves = [Curve("measured − identified", 1e6 * (self.measured - self.identified)[:, i], NOISE)]
+        """Errors of the identified model in component i, in µm or µrad, against measurement and
+        truth.
+        """
+        curves = [
+            Curve("measured − identified", 1e6 * (self.measured - self.identified)[:, i], NOISE)
+        ]
         if self.truth is not None:
-            curves.append(Curve("true − identified", 1e6 * (self.truth - self.identified)[:, i], TRUE))
+            curves.append(
+                Curve("true − identified", 1e6 * (self.truth - self.identified)[:, i], TRUE)
+            )
         return curves
 
     def pose_range(self, i: int) -> tuple[float, float]:
-        """Range of the measurement, widened for the models by half at most: an unstable one must not hide the rest."""
-        measured, *models = (curve.values[np.isfinite(curve.values)] for curve in self.pose_curves(i))
-        low, high = measured.min(), measured.max()
-        reach, every = (high - low) / 2 or 1.0, np.concatenate([measured, *models])
-        low, high = max(low - reach, every.min()), min(high + reach, every.max())
+        """Range of the measurement, widened for the models by half at most: an unstable one must
+        not hide the rest.
+        """
+        measured, *models = (
+            curve.values[np.isfinite(curve.values)] for curve in self.pose_curves(i)
+        )
+        low = measured.min()
+        high = measured.max()
+        reach = (high - low) / 2 or 1.0
+        every = np.concatenate([measured, *models])
+        low = max(low - reach, every.min())
+        high = min(high + reach, every.max())
         margin = 0.05 * (high - low) or 1.0
         return low - margin, high + margin
 
@@ -103,9 +127,14 @@ class Fit:
         return f"RMS {' → '.join(shown)} {UNITS[i]}"
 
     def distances(self, first: int) -> list[Curve]:
-        """Length of the error of position (first = 0) [µm] or orientation (3) [µrad]: of both models, and of what the
-        camera measured, against the truth; where none is known, of the models against the measurement."""
-        goal, whose = (self.truth, "") if self.truth is not None else (self.measured, ", against the measurement")
+        """Length of the error of position (first = 0) [µm] or orientation (3) [µrad]: of both
+        models, and of what the camera measured, against the truth; where none is known, of the
+        models against the measurement."""
+        goal, whose = (
+            (self.truth, "")
+            if self.truth is not None
+            else (self.measured, ", against the measurement")
+        )
         poses: dict[str, tuple[Array | None, dict[str, Any]]] = {
             f"starting model{whose}": (self.initial, STARTING),
             f"identified model{whose}": (self.identified, IDENTIFIED),
@@ -120,8 +149,8 @@ class Fit:
 
 
 def fit_figure(fit: Fit) -> Figure:
-    """Measured poses, starting and identified model, and beneath each component what is left of it; as the paper's
-    figures 12 and 13."""
+    """Measured poses, starting and identified model, and beneath each component what is left of it;
+    as the paper's figures 12 and 13."""
     shown = moving(fit.identified)
     rows = -(-len(shown) // 3)
     figure = Figure(figsize=(WIDTH, 0.6 + 3.3 * rows), layout="constrained")
@@ -129,7 +158,8 @@ def fit_figure(fit: Fit) -> Figure:
     for panel in axes.ravel()[2 * len(shown) :]:
         panel.set_visible(False)
     for place, i in enumerate(shown):
-        above, below = axes[2 * (place // 3), place % 3], axes[2 * (place // 3) + 1, place % 3]
+        above = axes[2 * (place // 3), place % 3]
+        below = axes[2 * (place // 3) + 1, place % 3]
         _draw(above, fit.time, fit.pose_curves(i))
         above.set_ylim(*fit.pose_range(i))
         above.set_title(f"({'abcdef'[place]}) {COMPONENTS[i]}")
@@ -137,7 +167,9 @@ def fit_figure(fit: Fit) -> Figure:
         _draw(below, fit.time, fit.error_curves(i))
         if fit.std is not None:
             band = BAND * 1e6 * fit.std[:, i]
-            below.plot(fit.time, np.column_stack([-band, band]), color=RED, linestyle=":", linewidth=0.9)
+            below.plot(
+                fit.time, np.column_stack([-band, band]), color=RED, linestyle=":", linewidth=0.9
+            )
             below.lines[-1].set_label(BAND_NAME)
         below.set_title(fit.rms_text(i), fontsize=7)
         below.set_ylabel(f"error of {COMPONENTS[i]} [{UNITS[i]}]")
@@ -148,10 +180,15 @@ def fit_figure(fit: Fit) -> Figure:
 
 
 def error_figure(fit: Fit) -> Figure:
-    """In one look: how far both models are from the true robot over a run, beside what the cameras measure; from the
-    measurement, beside the noise that the cameras state, where no truth is known."""
-    parts = [first for first in (0, 3) if any(first <= i < first + 3 for i in moving(fit.identified))]
-    figure = Figure(figsize=(COLUMN, 0.9 + (1.4 if len(parts) > 1 else 2.4) * len(parts)), layout="constrained")
+    """In one look: how far both models are from the true robot over a run, beside what the cameras
+    measure; from the measurement, beside the noise that the cameras state, where no truth is known.
+    """
+    parts = [
+        first for first in (0, 3) if any(first <= i < first + 3 for i in moving(fit.identified))
+    ]
+    figure = Figure(
+        figsize=(COLUMN, 0.9 + (1.4 if len(parts) > 1 else 2.4) * len(parts)), layout="constrained"
+    )
     panels = figure.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
     for axes, first in zip(panels, parts, strict=True):
         _draw(axes, fit.time, fit.distances(first))
@@ -162,8 +199,12 @@ def error_figure(fit: Fit) -> Figure:
         axes.yaxis.set_major_locator(LogLocator(numticks=12))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.set_ylabel("position [µm]" if first == 0 else "orientation [µrad]")
-        values = np.concatenate([curve.values[np.isfinite(curve.values)] for curve in fit.distances(first)[-2:]])
-        low = max(float(np.quantile(values[values > 0], 0.01)), 1e-3) if (values > 0).any() else 1e-3
+        values = np.concatenate(
+            [curve.values[np.isfinite(curve.values)] for curve in fit.distances(first)[-2:]]
+        )
+        low = (
+            max(float(np.quantile(values[values > 0], 0.01)), 1e-3) if (values > 0).any() else 1e-3
+        )
         axes.set_ylim(bottom=low / 2)
     panels[-1].set_xlabel("time [s]")
     legend_above(figure, panels[0], columns=1)
@@ -178,17 +219,21 @@ def _draw(axes: Axes, time: Array, curves: Sequence[Curve]) -> None:
 def _legend_of(figure: Figure, panels: Sequence[Axes]) -> None:
     """One legend above of what is in several panels, the measurement first."""
     entries = {
-        label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        label: handle
+        for axes in panels
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
-    figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=3, handlelength=3.0)
+    figure.legend(
+        list(entries.values()), list(entries), loc="outside upper left", ncols=3, handlelength=3.0
+    )
 
 
 HATCHES = ("", "////", "xxxx")
 
 
 def validation_figure(validation: list[dict[str, Any]]) -> Figure:
-    """RMS of the identified model on each unseen trajectory, against truth and measurement, with what was predicted and
-    the goals."""
+    """RMS of the identified model on each unseen trajectory, against truth and measurement, with
+    what was predicted and the goals."""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
@@ -198,12 +243,42 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
             measured = [rms_row(run["measured"])[i] for run in validation]
             predicted = [predicted_row(run)[i] for run in validation]
             places = runs + 0.25 * (i - first - 1)
-            look = {"edgecolor": LINES[i]["color"], "facecolor": PAPER if i % 3 else LINES[i]["color"]}
-            axes.bar(places, true, 0.2, hatch=HATCHES[i % 3], label=f"{COMPONENTS[i]}, against the truth", **look)
+            look = {
+                "edgecolor": LINES[i]["color"],
+                "facecolor": PAPER if i % 3 else LINES[i]["color"],
+            }
+            axes.bar(
+                places,
+                true,
+                0.2,
+                hatch=HATCHES[i % 3],
+                label=f"{COMPONENTS[i]}, against the truth",
+                **look,
+            )
             said = i == first
-            axes.plot(places, measured, "_", color=INK, markersize=9, label="against the measurement" if said else None)
-            axes.plot(places, predicted, "D", color=INK, fillstyle="none", label="predicted" if said else None)
-        axes.axhline(limit, color=GREY, linestyle="--", linewidth=0.9, label=f"limit {limit:g} {UNITS[first]}")
+            axes.plot(
+                places,
+                measured,
+                "_",
+                color=INK,
+                markersize=9,
+                label="against the measurement" if said else None,
+            )
+            axes.plot(
+                places,
+                predicted,
+                "D",
+                color=INK,
+                fillstyle="none",
+                label="predicted" if said else None,
+            )
+        axes.axhline(
+            limit,
+            color=GREY,
+            linestyle="--",
+            linewidth=0.9,
+            label=f"limit {limit:g} {UNITS[first]}",
+        )
         axes.set_ylabel(f"RMS of {'position' if first == 0 else 'orientation'} [{UNITS[first]}]")
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
         axes.grid(visible=False, axis="x")

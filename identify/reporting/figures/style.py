@@ -1,7 +1,8 @@
-"""What all figures share: a size and fonts for print, and colours whose curves also differ without colour.
+"""What all figures share: a size and fonts for print, and colours whose curves also differ without
+colour.
 
-Every curve has a line style or a marker of its own. A report replaces the colours by those of its reader's screen, so
-figures take theirs from `PALETTE`, and nowhere else.
+Every curve has a line style or a marker of its own. A report replaces the colours by those of its
+reader's screen, so figures take theirs from `PALETTE`, and nowhere else.
 """
 
 import io
@@ -90,7 +91,9 @@ def drawn(draw: Callable[[], Figure]) -> Figure:
 
 
 def svg_text(figure: Figure, name: str) -> str:
-    """A figure as an <svg> element, whose identifiers begin with a name, so that several may share a page."""
+    """A figure as an <svg> element, whose identifiers begin with a name, so that several may share
+    a page.
+    """
     with mpl.rc_context(STYLE | {"svg.hashsalt": name}):
         stream = io.StringIO()
         figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
@@ -107,8 +110,12 @@ def moving(poses: Array) -> list[int]:
     return [i for i in range(6) if np.nanmax(poses[:, i]) - np.nanmin(poses[:, i]) > STILL]
 
 
-def panel_grid(count: int, width: float, height: float, above: float = 0.0, **shared: Any) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels of that size, inches, three beside each other, and room above them for a title."""
+def panel_grid(
+    count: int, width: float, height: float, above: float = 0.0, **shared: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels of that size, inches, three beside each other, and room above
+    them for a title.
+    """
     columns = min(count, 3)
     rows = -(-count // columns)
     figure = Figure(figsize=(width * columns, above + height * rows), layout="constrained")

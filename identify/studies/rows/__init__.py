@@ -1,8 +1,10 @@
-"""The kinds of row a study can have: one file each, and a line in ``KINDS``; or ``module:function`` of a user's own.
+"""The kinds of row a study can have: one file each, and a line in ``KINDS``; or ``module:function``
+of a user's own.
 
-A function of one's own is ``run(scenario, seed)`` or ``run(scenario, seed, options)``: it takes the scenario, the row's
-``numpy.random.SeedSequence`` and, where the study has any, the options by name, and returns the row's figures by name,
-units in the names. Workers import it, so it must be in a module that they find.
+A function of one's own is ``run(scenario, seed)`` or ``run(scenario, seed, options)``: it takes the
+scenario, the row's ``numpy.random.SeedSequence`` and, where the study has any, the options by name,
+and returns the row's figures by name, units in the names. Workers import it, so it must be in a
+module that they find.
 """
 
 import inspect
@@ -20,20 +22,23 @@ from identify.studies.rows.static_pose import STATIC_POSE
 from identify.studies.rows.tracking import TRACKING
 
 KINDS: dict[str, Kind] = {
-    kind.name: kind for kind in (STATIC_POSE, PATH_POSE, IDENTIFICATION, ESTIMATION, CLOSED_LOOP, TRACKING)
+    kind.name: kind
+    for kind in (STATIC_POSE, PATH_POSE, IDENTIFICATION, ESTIMATION, CLOSED_LOOP, TRACKING)
 }
 
 
 def find_kind(name: str) -> Kind:
     """The kind of that name, built in or of one's own.
 
-    Raises StudyError: no such kind, with the built-in ones; no such module or function, or one that takes other
-    arguments.
+    Raises StudyError: no such kind, with the built-in ones; no such module or function, or one that
+    takes other arguments.
     """
     if is_own(name):
         return _own(name, own_function(name, "kind", StudyError))
     if name not in KINDS:
-        raise StudyError(f"unknown kind of row {name!r}, valid are {', '.join(KINDS)}, or module:function")
+        raise StudyError(
+            f"unknown kind of row {name!r}, valid are {', '.join(KINDS)}, or module:function"
+        )
     return KINDS[name]
 
 
@@ -52,5 +57,6 @@ def _own(name: str, function: Callable[..., Any]) -> Kind:
             return Kind(name, function)
         return Kind(name, lambda scenario, seed, _: function(scenario, seed), takes_options=False)
     raise StudyError(
-        f"kind {name!r} takes {signature}; a row's function takes (scenario, seed) or (scenario, seed, options)"
+        f"kind {name!r} takes {signature}; a row's function takes (scenario, seed) or (scenario, "
+        "seed, options)"
     )

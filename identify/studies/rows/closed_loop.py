@@ -1,7 +1,8 @@
 """Rows of kind `closed_loop`: the plant follows an unseen trajectory with the images in the loop.
 
-Each row draws a trajectory in the scenario's box and runs it for `validation.duration_s`; sensor, timing, servo and
-plant are the scenario's. The sensor teaches itself, seeded by the row, unless exact teaching is asked for.
+Each row draws a trajectory in the scenario's box and runs it for `validation.duration_s`; sensor,
+timing, servo and plant are the scenario's. The sensor teaches itself, seeded by the row, unless
+exact teaching is asked for.
 """
 
 import numpy as np
@@ -19,27 +20,47 @@ from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.scenario import Scenario
 from identify.scenario.section import Section
-from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row, unwatched
+from identify.studies.rows.kind import (
+    LIMITS,
+    NOISE_OFF,
+    PATH,
+    PICTURES,
+    PLANT,
+    Column,
+    Kind,
+    Reads,
+    Row,
+    unwatched,
+)
 from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 
-EXPERIMENT, TRAJECTORY = 0, 1
+EXPERIMENT = 0
+TRAJECTORY = 1
 
 COLUMNS = {
     "frames": Column("1", "frames of the run"),
-    "lost_frames": Column("1", "frames without a pose; they do not count in the sensor's error", main=True),
-    "tracking_position_rms_um": Column("um", "deviation of the true from the desired position, rms", main=True),
+    "lost_frames": Column(
+        "1", "frames without a pose; they do not count in the sensor's error", main=True
+    ),
+    "tracking_position_rms_um": Column(
+        "um", "deviation of the true from the desired position, rms", main=True
+    ),
     "tracking_orientation_rms_urad": Column(
         "urad", "deviation of the true from the desired orientation, rms", main=True
     ),
     **POSE_COLUMNS,
-    "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints", main=True),
+    "torque_rms_N_m": Column(
+        "N m", "torque of the joint controllers, rms over frames and joints", main=True
+    ),
 }
 
 
 class ClosedLoopOptions(Section):
     """How the sensor was taught."""
 
-    teaching: Teaching = Field("sensor", description="by the sensor itself, seeded by the row, or exact")
+    teaching: Teaching = Field(
+        "sensor", description="by the sensor itself, seeded by the row, or exact"
+    )
 
 
 READS = Reads(
@@ -64,7 +85,9 @@ READS = Reads(
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoopOptions) -> Row:
-    """One row. Raises EstimationError where no frame was measured, LoopFailure, and what the sensor raises."""
+    """One row. Raises EstimationError where no frame was measured, LoopFailure, and what the sensor
+    raises.
+    """
     scenario = unwatched(scenario)
     robot = load_robot(scenario.robot)
     number = stream_seed(seed, EXPERIMENT)
@@ -77,7 +100,9 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     run = run_plant(build_plant(scenario, robot), sensor, trajectory, duration, number, 1)
     ok = run.record["measured_ok"].values.astype(bool)
     if not ok.any():
-        raise EstimationError(f"no frame of {len(ok)} was measured, the first: {run.record.attrs['lost_frames']}")
+        raise EstimationError(
+            f"no frame of {len(ok)} was measured, the first: {run.record.attrs['lost_frames']}"
+        )
     true = true_poses(run.truth)
     tracking = true - recording.poses(run.record, "reference")
     errors = (recording.poses(run.record, "measured") - true)[ok]

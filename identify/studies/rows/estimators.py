@@ -1,7 +1,9 @@
-"""Rows of kind `estimators`: a record, and how far from the truth each of several estimators comes with it.
+"""Rows of kind `estimators`: a record, and how far from the truth each of several estimators comes
+with it.
 
-The record is that of kind `identification`; instruments at the joints are simulated from its truth, for those
-estimators that need them. All of a row's estimators have the same record, so that rows compare them as pairs.
+The record is that of kind `identification`; instruments at the joints are simulated from its truth,
+for those estimators that need them. All of a row's estimators have the same record, so that rows
+compare them as pairs.
 """
 
 import math
@@ -19,14 +21,29 @@ from identify.studies.rows.kind import Column, Kind, Row
 from identify.validation.estimator_comparison import START, Score, compare_on_record, instrumented
 
 FIGURES = {
-    "groups_percent": ("%", "error of the base parameters that the record shows, median", 100.0, "group_median"),
-    "gains_percent": ("%", "error of the gains of the joint controller, rms", 100.0, "gain_distance"),
-    "position_um": ("um", "position of the model on unseen trajectories, rms of the worst axis and run", 1.0, None),
+    "groups_percent": (
+        "%",
+        "error of the base parameters that the record shows, median",
+        100.0,
+        "group_median",
+    ),
+    "gains_percent": (
+        "%",
+        "error of the gains of the joint controller, rms",
+        100.0,
+        "gain_distance",
+    ),
+    "position_um": (
+        "um",
+        "position of the model on unseen trajectories, rms of the worst axis and run",
+        1.0,
+        None,
+    ),
     "orientation_urad": ("urad", "orientation of the same", 1.0, None),
     "seconds": ("s", "time of the estimate", 1.0, None),
 }
-"""Figures of each estimator by the ends of their names: unit, meaning, factor and, where it differs, the score's
-field."""
+"""Figures of each estimator by the ends of their names: unit, meaning, factor and, where it
+differs, the score's field."""
 
 STARTING = START.replace(" ", "_")
 
@@ -34,7 +51,9 @@ STARTING = START.replace(" ", "_")
 class EstimatorOptions(RecordOptions):
     """How the record is made, and who estimates."""
 
-    estimators: list[str] = Field([], description="names, or module:function of one's own; none: all built-in ones")
+    estimators: list[str] = Field(
+        [], description="names, or module:function of one's own; none: all built-in ones"
+    )
 
     @field_validator("estimators")
     @classmethod
@@ -51,20 +70,31 @@ COLUMNS = {
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: EstimatorOptions) -> Row:
-    """One row; what an estimator does not give is left out. Raises EstimationError and what experiment and sensor
-    raise."""
+    """One row; what an estimator does not give is left out. Raises EstimationError and what
+    experiment and sensor raise."""
     made = recorded(scenario, seed, options)
-    robot, run = made.plant.nominal, made.excitation
+    robot = made.plant.nominal
+    run = made.excitation
     channels = instrumented(run.record, run.truth, scenario, instruments_of(robot), made.number)
     unseen = [(one.record, one.truth) for one in made.unseen]
     chosen = find_estimators(options.estimators or None)
-    scores = compare_on_record((run.record, run.truth), channels, robot, scenario, unseen, chosen, SilentProgress())
-    return {name: value for score in scores for name, value in _figures(score).items() if math.isfinite(value)}
+    scores = compare_on_record(
+        (run.record, run.truth), channels, robot, scenario, unseen, chosen, SilentProgress()
+    )
+    return {
+        name: value
+        for score in scores
+        for name, value in _figures(score).items()
+        if math.isfinite(value)
+    }
 
 
 def _figures(score: Score) -> Row:
     name = score.name.replace(" ", "_").replace(":", ".")
-    return {f"{name}_{end}": factor * getattr(score, field or end) for end, (*_, factor, field) in FIGURES.items()}
+    return {
+        f"{name}_{end}": factor * getattr(score, field or end)
+        for end, (*_, factor, field) in FIGURES.items()
+    }
 
 
 ESTIMATION = Kind(

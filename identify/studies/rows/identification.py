@@ -1,9 +1,10 @@
-"""Rows of kind `identification`: a record, the parameters identified from it, and how far they are from the truth.
+"""Rows of kind `identification`: a record, the parameters identified from it, and how far they are
+from the truth.
 
-The sensor is `drawn` unless images are asked for: Gaussian noise of the covariance that the scenario's sensor states at
-the home pose, so that the sensor's entries act on it. The exciting and the unseen trajectories are those of
-`trajectory_seed`, the same in all rows: rows differ by their factors and their noise. With images the sensor teaches
-itself, seeded by the row.
+The sensor is `drawn` unless images are asked for: Gaussian noise of the covariance that the
+scenario's sensor states at the home pose, so that the sensor's entries act on it. The exciting and
+the unseen trajectories are those of `trajectory_seed`, the same in all rows: rows differ by their
+factors and their noise. With images the sensor teaches itself, seeded by the row.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from pydantic import Field
 
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import simulate
+from dynamics.closed_loop import differentiate_servo
 from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
@@ -28,13 +29,24 @@ from identify.loop_parameters import model_settings, with_drive
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.record.command_times import logged_latencies
-from identify.record.recorded_run import recorded_reference
+from identify.record.recording import recorded_reference
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario, scenario_from_toml
 from identify.scenario.section import Section
 from identify.scenario.sections import Rig
 from identify.studies.rows.coverage import coverage, predictions
-from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing, unwatched
+from identify.studies.rows.kind import (
+    NOISE_OFF,
+    PLANT,
+    SENSOR,
+    Column,
+    Idle,
+    Kind,
+    Reads,
+    Row,
+    timing,
+    unwatched,
+)
 from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
 from identify.validation.unseen import PosePrediction, model_on_record
@@ -45,29 +57,44 @@ CHOSEN = {
     "viscous": ("viscous friction", "viscous"),
     "gains": ("joint gains", "joint_pid"),
 }
-"""Parameters that a record always shows, so that their spread follows the noise, with their slice of the layout; rms
-over each set."""
+"""Parameters that a record always shows, so that their spread follows the noise, with their slice
+of the layout; rms over each set."""
 
 COLUMNS = {
     "frames": Column("1", "frames of the record"),
     "lost_frames": Column("1", "frames of the record without a pose"),
-    "pose_noise_um": Column("um", "stated standard deviation of a measured position, rms over frames and axes"),
-    "pose_noise_urad": Column("urad", "stated standard deviation of a measured orientation, rms over frames and axes"),
+    "pose_noise_um": Column(
+        "um", "stated standard deviation of a measured position, rms over frames and axes"
+    ),
+    "pose_noise_urad": Column(
+        "urad", "stated standard deviation of a measured orientation, rms over frames and axes"
+    ),
     **{
-        f"{name}_{figure}_percent": Column("%", f"{words} of {what}, rms relative to the truth", main=figure == "std")
+        f"{name}_{figure}_percent": Column(
+            "%", f"{words} of {what}, rms relative to the truth", main=figure == "std"
+        )
         for figure, words in (("std", "stated standard deviation"), ("error", "error"))
         for name, (what, _) in CHOSEN.items()
     },
     "identified_groups": Column("1", "base parameters that the record identifies"),
-    "group_std_percent": Column("%", "stated standard deviation of identified groups, relative, median", main=True),
-    "normalised_error": Column("1", "error of identified groups over the stated one, rms; 1 where stated well"),
-    "intervals": Column("1", "quantities that the record identifies: parameters, and groups of several"),
+    "group_std_percent": Column(
+        "%", "stated standard deviation of identified groups, relative, median", main=True
+    ),
+    "normalised_error": Column(
+        "1", "error of identified groups over the stated one, rms; 1 where stated well"
+    ),
+    "intervals": Column(
+        "1", "quantities that the record identifies: parameters, and groups of several"
+    ),
     "covered_percent": Column("%", "of their 95 % intervals, those that hold the truth", main=True),
     "noise_ratio": Column(
-        "1", "mean squared residual over the variance of the noise; 1 where noise is all that is left"
+        "1",
+        "mean squared residual over the variance of the noise; 1 where noise is all that is left",
     ),
     "iterations": Column("1", "iterations of all searches"),
-    "prediction_rms_um": Column("um", "error of the identified model's position on unseen trajectories, without noise"),
+    "prediction_rms_um": Column(
+        "um", "error of the identified model's position on unseen trajectories, without noise"
+    ),
     "stated_prediction_rms_um": Column(
         "um", "error of the model's position, as the covariance of the parameters states it"
     ),
@@ -77,29 +104,44 @@ COLUMNS = {
     "unseen_orientation_rms_urad": Column(
         "urad", "error of the model's orientation on unseen trajectories, rms over axes", main=True
     ),
-    "poses_covered_percent": Column("%", "of true coordinates on unseen trajectories, those within the 95 % predicted"),
+    "poses_covered_percent": Column(
+        "%", "of true coordinates on unseen trajectories, those within the 95 % predicted"
+    ),
     "predicted_position_rms_um": Column(
-        "um", "error of the predicted position there, with what the record taught of sensor and geometry"
+        "um",
+        "error of the predicted position there, with what the record taught of sensor and geometry",
     ),
     "unaware_intervals": Column("1", "the same without a word of what all frames have in common"),
-    "unaware_covered_percent": Column("%", "the same without a word of what all frames have in common"),
-    "unaware_poses_covered_percent": Column("%", "the same without a word of what all frames have in common"),
-    "unaware_predicted_position_rms_um": Column("um", "the same without a word of what all frames have in common"),
+    "unaware_covered_percent": Column(
+        "%", "the same without a word of what all frames have in common"
+    ),
+    "unaware_poses_covered_percent": Column(
+        "%", "the same without a word of what all frames have in common"
+    ),
+    "unaware_predicted_position_rms_um": Column(
+        "um", "the same without a word of what all frames have in common"
+    ),
 }
 
 
 class RecordOptions(Section):
     """How the record is made."""
 
-    sensor: Literal["drawn", "images"] = Field("drawn", description="noise of the stated covariance, or images")
-    trajectory_seed: int = Field(0, ge=0, description="seed of the exciting and of the unseen trajectories")
+    sensor: Literal["drawn", "images"] = Field(
+        "drawn", description="noise of the stated covariance, or images"
+    )
+    trajectory_seed: int = Field(
+        0, ge=0, description="seed of the exciting and of the unseen trajectories"
+    )
 
 
 class IdentificationOptions(RecordOptions):
     """How the record is made, and what is identified from it."""
 
     unaware: bool = Field(
-        False, description="identify also without a word of what is not exact: cameras, teaching, clocks, geometry"
+        False,
+        description="identify also without a word of what is not exact: cameras, teaching, "
+        "clocks, geometry",
     )
 
 
@@ -107,12 +149,25 @@ DRAWN = {"options.sensor": lambda sensor: sensor == "drawn"}
 READS = Reads(
     ("scenario.", *SENSOR, "sensor.timing."),
     but=(
-        *("scenario.name", "scenario.description", "scenario.sensor_note", "scenario.identification.qr_threshold"),
+        *(
+            "scenario.name",
+            "scenario.description",
+            "scenario.sensor_note",
+            "scenario.identification.qr_threshold",
+        ),
         "scenario.rig.watch",
     ),
     idle=(
-        Idle(NOISE_OFF.keys, {**NOISE_OFF.where, "options.sensor": lambda sensor: sensor == "images"}, NOISE_OFF.why),
-        Idle(("sensor.camera.noise",), DRAWN, "options.sensor is drawn: that noise is added all the same"),
+        Idle(
+            NOISE_OFF.keys,
+            {**NOISE_OFF.where, "options.sensor": lambda sensor: sensor == "images"},
+            NOISE_OFF.why,
+        ),
+        Idle(
+            ("sensor.camera.noise",),
+            DRAWN,
+            "options.sensor is drawn: that noise is added all the same",
+        ),
         Idle(
             ("scenario.renderer", "sensor.stickers.obstacle_level", *timing("exposure_s")),
             DRAWN,
@@ -135,8 +190,9 @@ READS = Reads(
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a row identifies from: the plant, its run of the exciting trajectory and all records, of which that is the
-    first, and its runs of the unseen trajectories; number: the seed of them all."""
+    """What a row identifies from: the plant, its run of the exciting trajectory and all records, of
+    which that is the first, and its runs of the unseen trajectories; number: the seed of them all.
+    """
 
     plant: Plant
     excitation: Experiment
@@ -147,15 +203,22 @@ class Recorded:
 
 def recorded(scenario: Scenario, seed: np.random.SeedSequence, options: RecordOptions) -> Recorded:
     """Run the plant of a row with its sensor. Raises what experiment and sensor raise."""
-    number, scenario = stream_seed(seed, EXPERIMENT), unwatched(scenario)
+    number = stream_seed(seed, EXPERIMENT)
+    scenario = unwatched(scenario)
     plant = build_plant(scenario, robot_named(scenario.robot), number)
     trajectories = designed_trajectories(scenario, options.trajectory_seed)
     drawn = options.sensor == "drawn"
-    sensor = _drawn(scenario) if drawn else taught_sensor(scenario, plant.nominal, number, SilentProgress())
+    sensor = (
+        _drawn(scenario)
+        if drawn
+        else taught_sensor(scenario, plant.nominal, number, SilentProgress())
+    )
     experiment = excitation_run(plant, sensor, trajectories.excitation, number)
     records = [experiment.record]
     if scenario.identification.scale_anchor == "payload":
-        records.append(excitation_run(plant, sensor, trajectories.excitation, number, payload=True).record)
+        records.append(
+            excitation_run(plant, sensor, trajectories.excitation, number, payload=True).record
+        )
     unseen = [
         run_plant(plant, sensor, trajectory, scenario.validation.duration_s, number, run)
         for run, trajectory in enumerate(trajectories.validation, start=1)
@@ -163,15 +226,20 @@ def recorded(scenario: Scenario, seed: np.random.SeedSequence, options: RecordOp
     return Recorded(plant, experiment, records, unseen, number)
 
 
-def compute(scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions) -> Row:
+def compute(
+    scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions
+) -> Row:
     """One row. Raises EstimationError and what experiment and sensor raise."""
     made = recorded(scenario, seed, options)
-    plant, unseen = made.plant, made.unseen
+    plant = made.plant
+    unseen = made.unseen
     result = identify_record(made.records, plant.nominal, scenario)
     plant = replace(plant, scenario=with_drive(scenario, result.drive.law))
     row = _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
     predicted = predictions(result, plant, unseen, made.number)
-    row |= _unseen_figures(result, plant, unseen, predicted) | coverage(result, plant, unseen, predicted)
+    row |= _unseen_figures(result, plant, unseen, predicted) | coverage(
+        result, plant, unseen, predicted
+    )
     if not options.unaware:
         return row
     unaware = scenario.with_overrides({"identification.nuisances": []})
@@ -182,22 +250,29 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
 
 
 def _unseen_figures(
-    result: IdentificationResult, plant: Plant, unseen: list[Experiment], predicted: list[PosePrediction]
+    result: IdentificationResult,
+    plant: Plant,
+    unseen: list[Experiment],
+    predicted: list[PosePrediction],
 ) -> Row:
     """Errors of the identified model on unseen trajectories, by what was predicted there."""
-    robot, scenario = plant.nominal, plant.scenario
+    robot = plant.nominal
+    scenario = plant.scenario
     settings = model_settings(robot, scenario)
     models = []
     for of, one in zip(predicted, unseen, strict=True):
         if of.slopes is not None:
             models.append((of.poses, of.slopes))
             continue
-        reference, latencies = recorded_reference(one.record), logged_latencies(one.record, scenario.timing)
-        run = simulate(robot, result.estimate, reference, settings, sensitivities=True, latencies=latencies)
+        reference = recorded_reference(one.record)
+        latencies = logged_latencies(one.record, scenario.timing)
+        run = differentiate_servo(robot, result.estimate, reference, settings, latencies=latencies)
         assert run.pose_sensitivity is not None
         models.append((run.pose, run.pose_sensitivity))
     true = [model_on_record(robot, scenario, plant.parameters, one.record) for one in unseen]
-    errors = np.concatenate([poses - true_poses(one.truth) for (poses, _), one in zip(models, unseen, strict=True)])
+    errors = np.concatenate(
+        [poses - true_poses(one.truth) for (poses, _), one in zip(models, unseen, strict=True)]
+    )
     return prediction_figures(models, result.covariance, true) | {
         "unseen_position_rms_um": rms_um(errors[:, :3]),
         "unseen_orientation_rms_urad": rms_um(errors[:, 3:]),
@@ -221,26 +296,37 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
         for name, (_, members) in CHOSEN.items():
             index = np.arange(len(truth))[getattr(result.layout, members)]
             index = index[truth[index] != 0]  # drives may lack a gain
-            row[f"{name}_{figure}_percent"] = 100.0 * float(np.sqrt(np.mean((values[index] / truth[index]) ** 2)))
+            row[f"{name}_{figure}_percent"] = 100.0 * float(
+                np.sqrt(np.mean((values[index] / truth[index]) ** 2))
+            )
     groups = result.groups
     true_groups = groups.combinations @ truth[result.layout.dynamic]
     seen = groups.identifiable
     row["identified_groups"] = int(seen.sum())
-    if seen.any():  # a wrong model identifies nothing, and the row has its other figures all the same
+    if (
+        seen.any()
+    ):  # a wrong model identifies nothing, and the row has its other figures all the same
         normalised = (groups.estimate - true_groups)[seen] / groups.std[seen]
-        row["group_std_percent"] = 100.0 * float(np.median(groups.std[seen] / np.abs(true_groups[seen])))
+        row["group_std_percent"] = 100.0 * float(
+            np.median(groups.std[seen] / np.abs(true_groups[seen]))
+        )
         row["normalised_error"] = float(np.sqrt(np.mean(normalised**2)))
     return row | {"noise_ratio": result.noise_ratio, "iterations": result.iterations}
 
 
-def prediction_figures(models: list[tuple[Array, Array]], covariance: Array, true: list[Array]) -> Row:
-    """What the error of parameters, estimated with a covariance (p, p), makes of the model's positions, and what the
-    covariance states of it: by poses (N, 6) of the estimated model, their slopes (N, 6, p), and poses of the true one.
+def prediction_figures(
+    models: list[tuple[Array, Array]], covariance: Array, true: list[Array]
+) -> Row:
+    """What the error of parameters, estimated with a covariance (p, p), makes of the model's
+    positions, and what the covariance states of it: by poses (N, 6) of the estimated model, their
+    slopes (N, 6, p), and poses of the true one.
 
-    Every direction in which the parameters can err counts as much as it shows; so the figure has the scatter of many
-    errors, where that of a few parameters that err together has the scatter of hardly two.
+    Every direction in which the parameters can err counts as much as it shows; so the figure has
+    the scatter of many errors, where that of a few parameters that err together has the scatter of
+    hardly two.
     """
-    squares, stated = [], []
+    squares = []
+    stated = []
     for (poses, slopes), true_ones in zip(models, true, strict=True):
         shown = slopes[:, :3]
         squares.append(np.mean((poses - true_ones)[:, :3] ** 2))
@@ -253,7 +339,9 @@ def prediction_figures(models: list[tuple[Array, Array]], covariance: Array, tru
 
 def _drawn(scenario: Scenario) -> DrawnSensor:
     home = robot_named(scenario.robot).home_pose
-    covariance = expected_covariance(scenario.sensor, home, scenario.pose_method, changes=scenario.sensor_changes)
+    covariance = expected_covariance(
+        scenario.sensor, home, scenario.pose_method, changes=scenario.sensor_changes
+    )
     return DrawnSensor(covariance, scenario.timing.dropout)
 
 
@@ -264,8 +352,8 @@ def robot_named(name: str) -> Robot:
 
 
 def designed_trajectories(scenario: Scenario, seed: int) -> TrajectorySet:
-    """The trajectories of a scenario, which know neither the plant nor what is known of the rig: rows that differ in
-    these share them."""
+    """The trajectories of a scenario, which know neither the plant nor what is known of the rig:
+    rows that differ in these share them."""
     design = {"rig": Rig(), "plant": PlantSwitches(), "renderer": "auto"}
     return _designed(scenario.model_copy(update=design).to_toml(), seed)
 
@@ -281,7 +369,9 @@ HELD = 5
 
 
 def memory(scenario: Scenario, options: object) -> float:
-    """Bytes held to identify from the records of a scenario, as was measured with up to 24,000 frames."""
+    """Bytes held to identify from the records of a scenario, as was measured with up to 24,000
+    frames.
+    """
     parameters = len(robot_named(scenario.robot).layout.names)
     return HELD * 8.0 * 6 * parameters * scenario.timing.frames(scenario.excitation.duration_s)
 

@@ -1,10 +1,12 @@
-"""Rows of kind `path_pose`: the sensor alone follows a platform along a random path of the scenario's excitation.
+"""Rows of kind `path_pose`: the sensor alone follows a platform along a random path of the
+scenario's excitation.
 
-Exposure, latency, its jitter and dropout act as the scenario says. A row is a short stretch from a random instant of
-the path. Its pictures are measured together: stickers are looked for where the path has them, as they move along it,
-and no picture is searched or tracked. A measured pose counts as that in the middle of its exposure. Beside its error a
-row gives that of the pose in use: the last one that had arrived, held until the next one arrives. Teaching is exact
-unless asked for otherwise.
+Exposure, latency, its jitter and dropout act as the scenario says. A row is a short stretch from a
+random instant of the path. Its pictures are measured together: stickers are looked for where the
+path has them, as they move along it, and no picture is searched or tracked. A measured pose counts
+as that in the middle of its exposure. Beside its error a row gives that of the pose in use: the
+last one that had arrived, held until the next one arrives. Teaching is exact unless asked for
+otherwise.
 """
 
 import numpy as np
@@ -21,13 +23,17 @@ from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, 
 from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um, row_sensor
 from identify.trajectory import FourierTrajectory
 
-DRAWN_PATH, SENSOR, LATENCY = 0, 1, 2
+DRAWN_PATH = 0
+SENSOR = 1
+LATENCY = 2
 INSTANTS_PER_FRAME = 16
 """Instants of a frame period at which the pose in use is compared with the true one."""
 
 COLUMNS = {
     "frames": Column("1", "stereo pictures taken"),
-    "lost_frames": Column("1", "frames without a pose; they count in no other figure but the pose in use"),
+    "lost_frames": Column(
+        "1", "frames without a pose; they count in no other figure but the pose in use"
+    ),
     "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
     **POSE_COLUMNS,
     "used_position_rms_um": Column(
@@ -42,19 +48,29 @@ COLUMNS = {
 class PathPoseOptions(Section):
     """How much a row looks at."""
 
-    stretch_s: float = Field(0.5, gt=0, le=3600, description="time along the path, at least two frames")
-    teaching: Teaching = Field("exact", description="exact, or by the sensor itself, seeded by the row")
+    stretch_s: float = Field(
+        0.5, gt=0, le=3600, description="time along the path, at least two frames"
+    )
+    teaching: Teaching = Field(
+        "exact", description="exact, or by the sensor itself, seeded by the row"
+    )
 
 
 READS = Reads(
-    (*PICTURES, *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"), *PATH),
+    (
+        *PICTURES,
+        *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"),
+        *PATH,
+    ),
     but=("sensor.stickers.obstacle_level",),
     idle=(NOISE_OFF,),
 )
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseOptions) -> Row:
-    """One row. Raises EstimationError where fewer than two poses were measured, and what the sensor raises."""
+    """One row. Raises EstimationError where fewer than two poses were measured, and what the sensor
+    raises.
+    """
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
     path = drawn_trajectory(rng, Chart("free", tuple(eye.sensor.home)), scenario.excitation)
@@ -64,9 +80,13 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     seen = eye.sensor.measure_many(path.pose(times), path.pose_rate(times))
     ok = np.isfinite(seen.poses[:, 0])
     if ok.sum() < 2:
-        raise EstimationError(f"{ok.sum()} of {frames} frames along the path gave a pose, 2 are needed")
+        raise EstimationError(
+            f"{ok.sum()} of {frames} frames along the path gave a pose, 2 are needed"
+        )
     errors = (seen.poses - path.pose(times))[ok]
-    latencies = scenario.timing.drawn_latencies(len(times), np.random.default_rng(stream_seed(seed, LATENCY)))
+    latencies = scenario.timing.drawn_latencies(
+        len(times), np.random.default_rng(stream_seed(seed, LATENCY))
+    )
     arrivals: Array = times + (scenario.timing.latency_s if latencies is None else latencies)
     used = _used_errors(path, seen.poses[ok], arrivals[ok], scenario.timing.frame_period_s)
     return {
@@ -80,7 +100,9 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
 
 
 def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_s: float) -> Array:
-    """Errors (m, 6) of the pose in use from the first arrival to the last; poses come into use in their order."""
+    """Errors (m, 6) of the pose in use from the first arrival to the last; poses come into use in
+    their order.
+    """
     arrivals = np.maximum.accumulate(arrivals)
     count = max(1, round(INSTANTS_PER_FRAME * float(arrivals[-1] - arrivals[0]) / period_s))
     instants = arrivals[0] + (np.arange(count) + 0.5) / count * (arrivals[-1] - arrivals[0])

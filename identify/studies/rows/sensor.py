@@ -1,8 +1,9 @@
-"""The sensor of a row: taught exactly or by itself, or one without images, whose noise is drawn; its figures.
+"""The sensor of a row: taught exactly or by itself, or one without images, whose noise is drawn;
+its figures.
 
-It is built once a process for each content of a sensor file. A row that is taught exactly depends on nothing that
-another row left behind: every picture has a noise stream of its own, begun by `start_run`. So a sensor from the cache
-gives the same numbers as a new one.
+It is built once a process for each content of a sensor file. A row that is taught exactly depends
+on nothing that another row left behind: every picture has a noise stream of its own, begun by
+`start_run`. So a sensor from the cache gives the same numbers as a new one.
 """
 
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 
 import cmmsim
 from cmmsim.files import SensorFile
-from cmmsim.pose_estimation.estimator import lost_measurement, measurement_without_stickers
+from cmmsim.measuring.measurement import lost_measurement, measurement_without_stickers
 from cmmsim.teaching import exactly_taught
 from identify.arrays import Array
 from identify.experiment.sensor_in_loop import sensor_file
@@ -26,14 +27,14 @@ SENSORS_KEPT = 16
 """Sensors a process keeps; one of them takes about a megabyte."""
 
 Teaching = Literal["exact", "sensor"]
-"""``exact``: frames and sticker places without error, so that rows show observation noise alone; ``sensor``: the sensor
-teaches itself from images, seeded by the row (1.4 s a row)."""
+"""``exact``: frames and sticker places without error, so that rows show observation noise alone;
+``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s a row)."""
 
 
 @dataclass(frozen=True)
 class RowSensor:
-    """A sensor and what it cannot know: truth, a teaching without error; middle (3,), that of the baseline in the base
-    frame, m; rim: radiance half-way between a sticker and its ring."""
+    """A sensor and what it cannot know: truth, a teaching without error; middle (3,), that of the
+    baseline in the base frame, m; rim: radiance half-way between a sticker and its ring."""
 
     sensor: cmmsim.Sensor
     truth: cmmsim.Taught
@@ -42,7 +43,9 @@ class RowSensor:
 
 
 def row_sensor(scenario: Scenario, teaching: Teaching, seed: int) -> RowSensor:
-    """The sensor of a scenario without the robot's links in its view, at the beginning of a run of its own."""
+    """The sensor of a scenario without the robot's links in its view, at the beginning of a run of
+    its own.
+    """
     file = sensor_file(scenario)
     if teaching == "exact":
         built = exact_sensor(file.model_dump_json(), scenario.pose_method, scenario.renderer)
@@ -59,14 +62,17 @@ def exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
     return _built(file, method, renderer, exactly_taught(file), 0)
 
 
-def _built(file: SensorFile, method: str, renderer: str, taught: cmmsim.Taught | None, seed: int) -> RowSensor:
+def _built(
+    file: SensorFile, method: str, renderer: str, taught: cmmsim.Taught | None, seed: int
+) -> RowSensor:
     sensor = cmmsim.Sensor(file, seed, method, taught, renderer=renderer)
     rim = 0.5 * (file.stickers.sticker_level + file.stickers.ring_level) / 255.0
     return RowSensor(sensor, taught or exactly_taught(file), np.array(file.rig.position), rim)
 
 
 class DrawnSensor:
-    """Measures as a `cmmsim.Sensor` does, without images: Gaussian noise of a covariance (6, 6) [m, rad], and dropout.
+    """Measures as a `cmmsim.Sensor` does, without images: Gaussian noise of a covariance (6, 6) [m,
+    rad], and dropout.
 
     Fast, and with known statistics.
     """
@@ -74,7 +80,8 @@ class DrawnSensor:
     sees_bodies = False
 
     def __init__(self, covariance: Array, dropout: float = 0.0) -> None:
-        self._covariance, self._dropout = covariance, dropout
+        self._covariance = covariance
+        self._dropout = dropout
         self._factor = np.linalg.cholesky(covariance)
         self.start_run(0)
 
@@ -83,10 +90,16 @@ class DrawnSensor:
         self._rng = np.random.default_rng(seed)
 
     def measure(
-        self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
+        self,
+        pose: ArrayLike,
+        obstacles: Mapping[str, Array] | None = None,
+        pose_rate: ArrayLike | None = None,
     ) -> cmmsim.Measurement:
-        """The pose (6,) with noise; what stands in the way and how fast it moves make no difference."""
-        noise, dropped = self._factor @ self._rng.standard_normal(6), self._rng.random() < self._dropout
+        """The pose (6,) with noise; what stands in the way and how fast it moves make no
+        difference.
+        """
+        noise = self._factor @ self._rng.standard_normal(6)
+        dropped = self._rng.random() < self._dropout
         if dropped:
             return lost_measurement("dropped frame")
         return measurement_without_stickers(np.asarray(pose, dtype=float) + noise, self._covariance)
@@ -98,15 +111,25 @@ def rms_um(errors: Array) -> float:
 
 
 def stated_um(covariances: Array) -> tuple[float, float]:
-    """Rms standard deviation per axis of position [um] and orientation [urad] of covariances (n, 6, 6)."""
+    """Rms standard deviation per axis of position [um] and orientation [urad] of covariances (n, 6,
+    6).
+    """
     variances = np.diagonal(covariances, axis1=1, axis2=2)
-    return 1e6 * float(np.sqrt(variances[:, :3].mean())), 1e6 * float(np.sqrt(variances[:, 3:].mean()))
+    return 1e6 * float(np.sqrt(variances[:, :3].mean())), 1e6 * float(
+        np.sqrt(variances[:, 3:].mean())
+    )
 
 
 POSE_COLUMNS = {
-    "position_rms_um": Column("um", "error of the measured position, rms over pictures and axes", main=True),
-    "orientation_rms_urad": Column("urad", "error of the measured orientation, rms over pictures and axes", main=True),
-    "stated_position_rms_um": Column("um", "error of the measured position, as the sensor's covariance states it"),
+    "position_rms_um": Column(
+        "um", "error of the measured position, rms over pictures and axes", main=True
+    ),
+    "orientation_rms_urad": Column(
+        "urad", "error of the measured orientation, rms over pictures and axes", main=True
+    ),
+    "stated_position_rms_um": Column(
+        "um", "error of the measured position, as the sensor's covariance states it"
+    ),
     "stated_orientation_rms_urad": Column(
         "urad", "error of the measured orientation, as the sensor's covariance states it"
     ),
@@ -115,6 +138,8 @@ POSE_COLUMNS = {
 
 
 def pose_figures(errors: Array, covariances: Array) -> Row:
-    """The figures of POSE_COLUMNS of errors (n, 6) [m, rad] and stated covariances (n, 6, 6), n >= 1."""
+    """The figures of POSE_COLUMNS of errors (n, 6) [m, rad] and stated covariances (n, 6, 6), n >=
+    1.
+    """
     figures = (rms_um(errors[:, :3]), rms_um(errors[:, 3:]), *stated_um(covariances))
     return dict(zip(POSE_COLUMNS, figures, strict=True))

@@ -1,9 +1,11 @@
-"""Rows of kind `static_pose`: the sensor alone looks at a platform that stands still at a pose drawn in the box.
+"""Rows of kind `static_pose`: the sensor alone looks at a platform that stands still at a pose
+drawn in the box.
 
-The box is the scenario's excitation amplitude around the sensor's home pose. Each row draws one pose (or several) and
-takes several pictures of it. Stickers are looked for where a tracker would expect them, a little beside the true place;
-no picture is searched as a whole. The timing's dropout loses pictures, and changes nothing in the others. Teaching is
-exact unless asked for otherwise: the rows show observation noise alone.
+The box is the scenario's excitation amplitude around the sensor's home pose. Each row draws one
+pose (or several) and takes several pictures of it. Stickers are looked for where a tracker would
+expect them, a little beside the true place; no picture is searched as a whole. The timing's dropout
+loses pictures, and changes nothing in the others. Teaching is exact unless asked for otherwise: the
+rows show observation noise alone.
 """
 
 from collections.abc import Iterator
@@ -20,31 +22,66 @@ from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
-from identify.studies.rows.kind import BOX, NOISE_OFF, PICTURES, Column, Idle, Kind, Reads, Row, timing
-from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
+from identify.studies.rows.kind import (
+    BOX,
+    NOISE_OFF,
+    PICTURES,
+    Column,
+    Idle,
+    Kind,
+    Reads,
+    Row,
+    timing,
+)
+from identify.studies.rows.sensor import (
+    POSE_COLUMNS,
+    RowSensor,
+    Teaching,
+    pose_figures,
+    rms_um,
+    row_sensor,
+)
 
-POSES, SENSOR, DROPOUT = 0, 1, 2
+POSES = 0
+SENSOR = 1
+DROPOUT = 2
 TOGETHER = 256  # pictures that are drawn and measured at once
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
-"""Standard deviation [m, rad] of the pose near which a picture's stickers are looked for: what a tracker predicts."""
+"""Standard deviation [m, rad] of the pose near which a picture's stickers are looked for: what a
+tracker predicts.
+"""
 
 COLUMNS = {
     "captures": Column("1", "stereo pictures taken"),
-    "lost_frames": Column("1", "pictures in which no pose was found; they count in no other figure"),
+    "lost_frames": Column(
+        "1", "pictures in which no pose was found; they count in no other figure"
+    ),
     "stickers": Column("1", "stickers used, mean over the pictures"),
-    "pixel_noise_grey": Column("grey values", "rms noise of a grey value half-way between sticker and ring"),
+    "pixel_noise_grey": Column(
+        "grey values", "rms noise of a grey value half-way between sticker and ring"
+    ),
     **POSE_COLUMNS,
-    "mean_position_rms_um": Column("um", "error of the position averaged over the pictures of a pose", main=True),
+    "mean_position_rms_um": Column(
+        "um", "error of the position averaged over the pictures of a pose", main=True
+    ),
     "mean_orientation_rms_urad": Column(
         "urad", "error of the orientation averaged over the pictures of a pose", main=True
     ),
     "sight_m": Column("m", "distance of the stickers from the middle of the baseline, mean"),
-    "point_depth_rms_um": Column("um", "error of single stickers along the line of sight", main=True),
-    "point_lateral_rms_um": Column("um", "error of single stickers across the line of sight, rms over both axes"),
-    "centre_rms_px": Column(
-        "px", "error of sticker centres in the images, rms over stickers, cameras and axes", main=True
+    "point_depth_rms_um": Column(
+        "um", "error of single stickers along the line of sight", main=True
     ),
-    "disparity_rms_px": Column("px", "error of the difference of a sticker's x in both images, rms over stickers"),
+    "point_lateral_rms_um": Column(
+        "um", "error of single stickers across the line of sight, rms over both axes"
+    ),
+    "centre_rms_px": Column(
+        "px",
+        "error of sticker centres in the images, rms over stickers, cameras and axes",
+        main=True,
+    ),
+    "disparity_rms_px": Column(
+        "px", "error of the difference of a sticker's x in both images, rms over stickers"
+    ),
 }
 
 
@@ -52,11 +89,18 @@ class StaticPoseOptions(Section):
     """How much a row looks at."""
 
     poses: int = Field(1, ge=1, le=10_000, description="poses drawn a row")
-    captures: int = Field(4, ge=1, le=100_000, description="pictures of each pose, where hold_s is not given")
-    hold_s: float | None = Field(
-        None, gt=0, le=3600, description="time for which each pose is held: pictures at the frame rate, not `captures`"
+    captures: int = Field(
+        4, ge=1, le=100_000, description="pictures of each pose, where hold_s is not given"
     )
-    teaching: Teaching = Field("exact", description="exact, or by the sensor itself, seeded by the row")
+    hold_s: float | None = Field(
+        None,
+        gt=0,
+        le=3600,
+        description="time for which each pose is held: pictures at the frame rate, not `captures`",
+    )
+    teaching: Teaching = Field(
+        "exact", description="exact, or by the sensor itself, seeded by the row"
+    )
 
 
 READS = Reads(
@@ -80,7 +124,9 @@ READS = Reads(
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a picture of a pose gave: error (6,) and covariance (6, 6) of the pose, and what `_sticker_errors` says."""
+    """What a picture of a pose gave: error (6,) and covariance (6, 6) of the pose, and what
+    `_sticker_errors` says.
+    """
 
     pose: int
     error: Array
@@ -90,19 +136,29 @@ class _Seen:
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPoseOptions) -> Row:
-    """One row. Raises EstimationError, with a reason, where every picture was lost, and what the sensor raises."""
+    """One row. Raises EstimationError, with a reason, where every picture was lost, and what the
+    sensor raises.
+    """
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, POSES))
     dropout = np.random.default_rng(stream_seed(seed, DROPOUT))
-    box = np.repeat((scenario.excitation.position_amplitude_m, scenario.excitation.orientation_amplitude_rad), 3)
-    captures = options.captures if options.hold_s is None else max(1, scenario.timing.frames(options.hold_s))
+    box = np.repeat(
+        (scenario.excitation.position_amplitude_m, scenario.excitation.orientation_amplitude_rad), 3
+    )
+    captures = (
+        options.captures
+        if options.hold_s is None
+        else max(1, scenario.timing.frames(options.hold_s))
+    )
     seen: list[_Seen] = []
     lost = ""
     planned = _pictures(eye.sensor.home, box, (options.poses, captures), rng)
     while together := list(islice(planned, TOGETHER)):
         poses, near = (np.array(values) for values in list(zip(*together, strict=True))[1:])
         # those that drop out are measured, too, so that the next have the noise they had
-        for (number, pose, _), measured in zip(together, eye.sensor.measure_each(poses, near), strict=True):
+        for (number, pose, _), measured in zip(
+            together, eye.sensor.measure_each(poses, near), strict=True
+        ):
             if dropout.random() < (share := eye.sensor.timing.dropout):
                 lost = f"dropped frame (a share of {share:.3g} drops out)"
             elif not measured.ok:
@@ -111,15 +167,17 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
                 errors = _sticker_errors(eye, measured, pose)
                 seen.append(_Seen(number, measured.pose - pose, measured.covariance, *errors))
     if not seen:
-        raise EstimationError(f"no pose was found in any of {captures * options.poses} pictures: {lost}")
+        raise EstimationError(
+            f"no pose was found in any of {captures * options.poses} pictures: {lost}"
+        )
     return _row(eye, seen, captures * options.poses)
 
 
 def _pictures(
     home: Array, box: Array, count: tuple[int, int], rng: np.random.Generator
 ) -> Iterator[tuple[int, Array, Array]]:
-    """Of each of so many poses, and so many pictures of it: its number, the pose (6,), and that near which stickers are
-    looked for."""
+    """Of each of so many poses, and so many pictures of it: its number, the pose (6,), and that
+    near which stickers are looked for."""
     for number in range(count[0]):
         pose = home + box * rng.uniform(-1.0, 1.0, 6)
         for _ in range(count[1]):
@@ -127,8 +185,8 @@ def _pictures(
 
 
 def _sticker_errors(eye: RowSensor, seen: cmmsim.Measurement, pose: Array) -> tuple[Array, Array]:
-    """Of the stickers seen: [distance, error along the line of sight, error across it] (k, 3), m, and the errors of
-    their centres in both images (2, k, 2), px."""
+    """Of the stickers seen: [distance, error along the line of sight, error across it] (k, 3), m,
+    and the errors of their centres in both images (2, k, 2), px."""
     estimator = eye.sensor.estimator
     index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
     places = apply(cmmsim.pose_to_transform(pose), eye.truth.platform_places[index])
@@ -139,7 +197,9 @@ def _sticker_errors(eye: RowSensor, seen: cmmsim.Measurement, pose: Array) -> tu
     errors = (seen.points - in_camera) @ eye.truth.base_from_camera[:3, :3].T
     along = np.einsum("ki,ki->k", errors, sight) / distance
     across = np.sqrt(np.maximum(np.einsum("ki,ki->k", errors, errors) - along**2, 0.0))
-    return np.column_stack([distance, along, across]), np.stack([seen.left_pixels, seen.right_pixels]) - pixels
+    return np.column_stack([distance, along, across]), np.stack(
+        [seen.left_pixels, seen.right_pixels]
+    ) - pixels
 
 
 def _row(eye: RowSensor, seen: list[_Seen], captures: int) -> Row:

@@ -1,7 +1,9 @@
-"""Rows of kind `tracking`: the plant follows unseen trajectories under a law with a model, and under `pid` beside it.
+"""Rows of kind `tracking`: the plant follows unseen trajectories under a law with a model, and
+under `pid` beside it.
 
-Both see the same motions with the same noise. The model is the starting one, that identified from a record of the row's
-own, or the true one; or one between the truth and the starting model; or, in all parameters, wrong by a share.
+Both see the same motions with the same noise. The model is the starting one, that identified from a
+record of the row's own, or the true one; or one between the truth and the starting model; or, in
+all parameters, wrong by a share.
 """
 
 from dataclasses import replace
@@ -20,26 +22,50 @@ from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
 from identify.studies.rows.identification import designed_trajectories, robot_named
-from identify.studies.rows.kind import NOISE_OFF, PICTURES, PLANT, Column, Kind, Reads, Row, unwatched
+from identify.studies.rows.kind import (
+    NOISE_OFF,
+    PICTURES,
+    PLANT,
+    Column,
+    Kind,
+    Reads,
+    Row,
+    unwatched,
+)
 from identify.studies.rows.sensor import rms_um
 from identify.tracking.following import Followed
 from identify.tracking.motions import motions
 from identify.tracking.track import follow_by_images, identified_model, known_model
 
-EXPERIMENT, SIGNS = 0, 1
+EXPERIMENT = 0
+SIGNS = 1
 AXES = (("position", slice(0, 3), "um"), ("orientation", slice(3, 6), "urad"))
 
 COLUMNS = {
-    "position_rms_um": Column("um", "deviation of the true from the desired position, rms", main=True),
-    "orientation_rms_urad": Column("urad", "deviation of the true from the desired orientation, rms", main=True),
+    "position_rms_um": Column(
+        "um", "deviation of the true from the desired position, rms", main=True
+    ),
+    "orientation_rms_urad": Column(
+        "urad", "deviation of the true from the desired orientation, rms", main=True
+    ),
     "pid_position_rms_um": Column("um", "that of the position under the law pid, rms"),
     "pid_orientation_rms_urad": Column("urad", "that of the orientation under the law pid, rms"),
-    "position_share_percent": Column("%", "position's deviation over that under the law pid", main=True),
-    "orientation_share_percent": Column("%", "orientation's deviation over that under the law pid", main=True),
-    "observer_normalised_error": Column("1", "mean squared error of the observer over the stated one"),
-    "starting_position_excess_um": Column("um", "that with the starting model less this, of the position", main=True),
+    "position_share_percent": Column(
+        "%", "position's deviation over that under the law pid", main=True
+    ),
+    "orientation_share_percent": Column(
+        "%", "orientation's deviation over that under the law pid", main=True
+    ),
+    "observer_normalised_error": Column(
+        "1", "mean squared error of the observer over the stated one"
+    ),
+    "starting_position_excess_um": Column(
+        "um", "that with the starting model less this, of the position", main=True
+    ),
     "starting_orientation_excess_urad": Column("urad", "and of the orientation", main=True),
-    "true_position_ratio": Column("1", "this over that with the true model, of the position", main=True),
+    "true_position_ratio": Column(
+        "1", "this over that with the true model, of the position", main=True
+    ),
     "true_orientation_ratio": Column("1", "and of the orientation", main=True),
     "effort_rms": Column("N m or N", "torque or force of the actuators, rms"),
     "lost_frames": Column("1", "frames that the sensor lost"),
@@ -49,51 +75,85 @@ COLUMNS = {
 class TrackingOptions(Section):
     """Who leads the robot, and what is known of it."""
 
-    law: str = Field("feedforward", description="pid, feedforward, computed_torque, or module:function")
-    model: Literal["initial", "identified", "true"] = Field("true", description="the model that the law knows")
+    law: str = Field(
+        "feedforward", description="pid, feedforward, computed_torque, or module:function"
+    )
+    model: Literal["initial", "identified", "true"] = Field(
+        "true", description="the model that the law knows"
+    )
     model_error: float | None = Field(
-        None, ge=0, description="instead: how far the model is from the truth, 1: as far as the starting one"
+        None,
+        ge=0,
+        description="instead: how far the model is from the truth, 1: as far as the starting one",
     )
     off: float = Field(
-        0.0, ge=0, lt=1, description="share by which each parameter is too large or too small, at random"
+        0.0,
+        ge=0,
+        lt=1,
+        description="share by which each parameter is too large or too small, at random",
     )
     compared: bool = Field(
-        False, description="whether the same motions are followed with the starting and the true model, too"
+        False,
+        description="whether the same motions are followed with the starting and the true model, "
+        "too",
     )
-    trajectory_seed: int = Field(0, ge=0, description="seed of the trajectory from which the model is identified")
+    trajectory_seed: int = Field(
+        0, ge=0, description="seed of the trajectory from which the model is identified"
+    )
 
 
 READS = Reads(
     (
-        *PICTURES, "scenario.robot", "scenario.rig.", "scenario.geometry.known", "scenario.timing.",
-        "sensor.timing.", "scenario.servo.", "scenario.plant.", "scenario.model.", "scenario.control.",
-        "scenario.validation.", "scenario.excitation.", "scenario.identification.",
+        *PICTURES,
+        "scenario.robot",
+        "scenario.rig.",
+        "scenario.geometry.known",
+        "scenario.timing.",
+        "sensor.timing.",
+        "scenario.servo.",
+        "scenario.plant.",
+        "scenario.model.",
+        "scenario.control.",
+        "scenario.validation.",
+        "scenario.excitation.",
+        "scenario.identification.",
     ),
     idle=(NOISE_OFF, *PLANT),
-)  # fmt: skip
+)
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingOptions) -> Row:
     """One row. Raises what sensor, identification and laws raise, such as LoopFailure."""
-    number, robot = stream_seed(seed, EXPERIMENT), robot_named(scenario.robot)
+    number = stream_seed(seed, EXPERIMENT)
+    robot = robot_named(scenario.robot)
     scenario = unwatched(scenario)
     plant = build_plant(scenario, robot, number)
     sensor = taught_sensor(scenario, robot, number, SilentProgress())
-    signs = np.random.default_rng(stream_seed(seed, SIGNS)).choice([-1.0, 1.0], len(plant.parameters))
+    signs = np.random.default_rng(stream_seed(seed, SIGNS)).choice(
+        [-1.0, 1.0], len(plant.parameters)
+    )
     model = _model(plant, sensor, number, options)
     if options.off:
-        model = replace(model, parameters=model.parameters * (1.0 + options.off * signs), doubt=VAGUE)
+        model = replace(
+            model, parameters=model.parameters * (1.0 + options.off * signs), doubt=VAGUE
+        )
     unseen = motions(robot, scenario, number)[: scenario.validation.count]
 
     def followed(law: str, known: KnownModel) -> list[Followed]:
-        return [follow_by_images(plant, sensor, law, known, motion, number, k)[0] for k, motion in enumerate(unseen)]
+        return [
+            follow_by_images(plant, sensor, law, known, motion, number, k)[0]
+            for k, motion in enumerate(unseen)
+        ]
 
-    done, beside = followed(options.law, model), followed("pid", model)
+    done = followed(options.law, model)
+    beside = followed("pid", model)
     normalised = [one.normalised_squared_error(robot) for one in done]
     known = [value for value in normalised if value is not None]
     row = _figures(done, beside)
     if options.compared:
-        start, truth = (followed(options.law, known_model(plant, name, None)) for name in ("initial", "true"))
+        start, truth = (
+            followed(options.law, known_model(plant, name, None)) for name in ("initial", "true")
+        )
         row |= _against(done, start, truth)
     return row | ({"observer_normalised_error": float(np.mean(known))} if known else {})
 
@@ -120,7 +180,10 @@ def _against(done: list[Followed], start: list[Followed], truth: list[Followed])
     for name, axes, unit in AXES:
         own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
         if with_truth:  # not of coordinates that the platform does not have
-            row |= {f"starting_{name}_excess_{unit}": with_start - own, f"true_{name}_ratio": own / with_truth}
+            row |= {
+                f"starting_{name}_excess_{unit}": with_start - own,
+                f"true_{name}_ratio": own / with_truth,
+            }
     return row
 
 

@@ -1,14 +1,22 @@
 """Test your own controller: any callable from measurement and reference to a command.
 
-This one is proportional: the crank angles of the desired pose, corrected by what the sensor still sees of the error.
-The stereo sensor is in the loop, as it is for the built-in visual servo beside which it is judged.
+This one is proportional: the crank angles of the desired pose, corrected by what the sensor still
+sees of the error. The stereo sensor is in the loop, as it is for the built-in visual servo beside
+which it is judged.
 """
 
 import numpy as np
 import pytest
 
 import dynamics
-from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains, simulate
+from dynamics.closed_loop import (
+    FrameTiming,
+    LoopSettings,
+    Reference,
+    ServoGains,
+    simulate_controller,
+    simulate_servo,
+)
 
 RATE_HZ, FRAMES = 60.0, 90
 AMPLITUDE = np.array([0.004, 0.003, 0.003, 0.012, 0.012, 0.015])  # m and rad
@@ -22,7 +30,12 @@ class ProportionalController:
         self.robot, self.gain = robot, gain
 
     def __call__(
-        self, frame: int, time: float, measured: np.ndarray, desired: np.ndarray, desired_rate: np.ndarray
+        self,
+        frame: int,
+        time: float,
+        measured: np.ndarray,
+        desired: np.ndarray,
+        desired_rate: np.ndarray,
     ) -> np.ndarray:
         correction = self.robot.pose_jacobian(measured) @ (desired - measured)
         return self.robot.inverse_kinematics(desired) + self.gain * correction
@@ -32,7 +45,10 @@ class ProportionalController:
 def reference(cmmsim_robot):
     """Sines that start gently from rest."""
     time = np.arange(FRAMES)[:, None] / RATE_HZ
-    growth, growth_rate = 1 - np.exp(-((time / 0.3) ** 3)), 3 * time**2 / 0.3**3 * np.exp(-((time / 0.3) ** 3))
+    growth, growth_rate = (
+        1 - np.exp(-((time / 0.3) ** 3)),
+        3 * time**2 / 0.3**3 * np.exp(-((time / 0.3) ** 3)),
+    )
     wave, wave_rate = np.sin(FREQUENCY * time), FREQUENCY * np.cos(FREQUENCY * time)
     poses = cmmsim_robot.home_pose + AMPLITUDE * growth * wave
     return Reference(poses, AMPLITUDE * (growth_rate * wave + growth * wave_rate))
@@ -44,10 +60,12 @@ def test_tracking_error(accuracy, cmmsim_robot, cmmsim_sensor, cmmsim_seed, refe
 
     def track(controller=None):
         cmmsim_sensor.start_run(cmmsim_seed)
-        run = simulate(
-            cmmsim_robot, plant, reference, settings, lambda _frame, _time, pose: cmmsim_sensor.measure(pose).pose,
-            controller=controller,
-        )  # fmt: skip
+        given = cmmsim_robot, plant, reference, settings
+        sensor = lambda _frame, _time, pose: cmmsim_sensor.measure(pose).pose  # noqa: E731
+        if controller is None:
+            run = simulate_servo(*given, sensor)
+        else:
+            run = simulate_controller(*given, controller, sensor)
         return 1e6 * np.sqrt(np.mean((run.pose - reference.poses) ** 2, axis=0))
 
     own, built_in = track(ProportionalController(cmmsim_robot, gain=0.5)), track()

@@ -1,7 +1,8 @@
 """Test your own identification method: any callable from a record to parameters.
 
-This one is linear least squares. The joint controller's torque, lp (U - theta) + li integral + ld rate, balances the
-robot's, which is linear in its parameters; both sides come from the logged commands and the measured poses.
+This one is linear least squares. The joint controller's torque, lp (U - theta) + li integral + ld
+rate, balances the robot's, which is linear in its parameters; both sides come from the logged
+commands and the measured poses.
 """
 
 import numpy as np
@@ -29,7 +30,8 @@ def least_squares(record: xr.Dataset, robot: dynamics.Robot) -> np.ndarray:
     to_joints = np.linalg.inv(jacobian).transpose(0, 2, 1)
     angle, velocity = robot.inverse_kinematics(pose), np.einsum("nij,nj->ni", jacobian, twist)
 
-    # A command is held for a frame, so on the average it acts half a frame late; its rate, a difference, a whole one.
+    # A command is held for a frame, so on the average it acts half a frame late; its rate, a
+    # difference, a whole one.
     command, command_rate = (smooth(record["command"].values, order, period) for order in range(2))
     lag = command - 0.5 * period * command_rate - angle
     lag_rate = command_rate - period * smooth(record["command"].values, 2, period) - velocity
@@ -37,7 +39,9 @@ def least_squares(record: xr.Dataset, robot: dynamics.Robot) -> np.ndarray:
 
     held = np.broadcast_to(np.eye(6), (len(pose), 6, 6))  # what each integrator holds at the start
     gains = np.stack([lag, lag_sum, lag_rate], axis=2)
-    balance = np.concatenate([to_joints @ robot.regressor(pose, twist, twist_dot), -gains, -held], axis=2)
+    balance = np.concatenate(
+        [to_joints @ robot.regressor(pose, twist, twist_dot), -gains, -held], axis=2
+    )
     usable = np.abs(velocity) > SLIPPING
     usable[:WINDOW] = usable[-WINDOW:] = False
     return solve(balance[usable] / TORQUE_STD, robot, record.attrs["scale_anchor_value"])
@@ -49,7 +53,9 @@ def smooth(samples: np.ndarray, derivative: int, period: float) -> np.ndarray:
 
 
 def solve(balance: np.ndarray, robot: dynamics.Robot, platform_mass: float) -> np.ndarray:
-    """Least squares beside the starting guess and the weighed platform, which fixes the scale; none below zero."""
+    """Least squares beside the starting guess and the weighed platform, which fixes the scale; none
+    below zero.
+    """
     guess = robot.parameter_sets["initial"].vector
     spread = np.where(guess > 0, 0.5 * guess, UNSEEN_FRICTION)
     weighed = np.zeros(73)
@@ -65,8 +71,12 @@ def test_unseen_motion(accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_seed):
     record = identify.run_experiment(cmmsim_scenario, seed=cmmsim_seed)
     estimate = least_squares(record, cmmsim_robot)
     start = cmmsim_robot.parameter_sets["initial"].vector
-    for who, parameters, limits in (("least squares", estimate, (15, 75)), ("starting guess", start, (None, None))):
+    for who, parameters, limits in (
+        ("least squares", estimate, (15, 75)),
+        ("starting guess", start, (None, None)),
+    ):
         errors = identify.unseen_errors(parameters, cmmsim_robot, cmmsim_scenario, seed=cmmsim_seed)
-        worst = 1e6 * np.sqrt(np.mean(errors**2, axis=1)).max(axis=0)  # RMS of the worst run, component by component
+        # RMS of the worst run, component by component
+        worst = 1e6 * np.sqrt(np.mean(errors**2, axis=1)).max(axis=0)
         accuracy.record(f"unseen position, {who}", worst[:3].max(), unit="um", limit=limits[0])
         accuracy.record(f"unseen orientation, {who}", worst[3:].max(), unit="urad", limit=limits[1])

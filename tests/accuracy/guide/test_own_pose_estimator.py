@@ -1,7 +1,7 @@
 """Test your own pose estimator: any callable from a stereo frame to a pose.
 
-This one takes grey centroids of bright blobs, triangulates and fits a rigid motion. It starts from where the stickers
-would be with the platform at home, so the platform must not be far from there.
+This one takes grey centroids of bright blobs, triangulates and fits a rigid motion. It starts from
+where the stickers would be with the platform at home, so the platform must not be far from there.
 """
 
 import cv2
@@ -23,12 +23,19 @@ class BlobEstimator:
 
     def __init__(self, rig: cmmsim.StereoRig, taught: cmmsim.Taught, home: np.ndarray) -> None:
         self.rig, self.taught = rig, taught
-        camera_from_platform = np.linalg.inv(taught.base_from_camera) @ cmmsim.pose_to_transform(home)
-        places = taught.platform_places @ camera_from_platform[:3, :3].T + camera_from_platform[:3, 3]
+        camera_from_platform = np.linalg.inv(taught.base_from_camera) @ cmmsim.pose_to_transform(
+            home
+        )
+        places = (
+            taught.platform_places @ camera_from_platform[:3, :3].T + camera_from_platform[:3, 3]
+        )
         self.expected, _ = rig.project(places)  # pixels (2, n, 2)
 
     def __call__(self, frame: cmmsim.StereoFrame) -> np.ndarray:
-        left, right = self.find(frame.left, self.expected[0]), self.find(frame.right, self.expected[1])
+        left, right = (
+            self.find(frame.left, self.expected[0]),
+            self.find(frame.right, self.expected[1]),
+        )
         seen = np.isfinite(left + right).all(axis=1)
         points = cv2.triangulatePoints(*self.rig.projection_matrices, left[seen].T, right[seen].T)
         points, places = (points[:3] / points[3]).T, self.taught.platform_places[seen]
@@ -39,10 +46,14 @@ class BlobEstimator:
         return cmmsim.transform_to_pose(self.taught.base_from_camera @ camera_from_platform)
 
     def find(self, image: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Centres (n, 2) of the blobs nearest to the expected pixels (n, 2), NaN where there is none."""
+        """Centres (n, 2) of the blobs nearest to the expected pixels (n, 2), NaN where there is
+        none.
+        """
         blobs = blob_centres(image)
         distance, index = cKDTree(blobs).query(near, distance_upper_bound=FARTHEST_PX)
-        return np.where(np.isfinite(distance)[:, None], blobs[np.minimum(index, len(blobs) - 1)], np.nan)
+        return np.where(
+            np.isfinite(distance)[:, None], blobs[np.minimum(index, len(blobs) - 1)], np.nan
+        )
 
 
 def blob_centres(image: np.ndarray) -> np.ndarray:
@@ -53,7 +64,9 @@ def blob_centres(image: np.ndarray) -> np.ndarray:
         if AREA_PX[0] <= area <= AREA_PX[1]:
             window = image[y - 2 : y + height + 2, x - 2 : x + width + 2]
             moments = cv2.moments(np.clip(window.astype(float) - GROUND, 0, None))
-            centres.append((x - 2 + moments["m10"] / moments["m00"], y - 2 + moments["m01"] / moments["m00"]))
+            centres.append(
+                (x - 2 + moments["m10"] / moments["m00"], y - 2 + moments["m01"] / moments["m00"])
+            )
     return np.array(centres)
 
 
@@ -67,8 +80,16 @@ def test_pose_error(accuracy, cmmsim_sensor, cmmsim_seed, estimate_pose):
     poses = cmmsim_sensor.home + shifts
     errors = 1e6 * np.array([estimate_pose(cmmsim_sensor.capture(pose)) - pose for pose in poses])
     accuracy.sample("position error", np.linalg.norm(errors[:, :3], axis=1), unit="um", limit=25)
-    accuracy.sample("orientation error", np.linalg.norm(errors[:, 3:], axis=1), unit="urad", limit=150)
+    accuracy.sample(
+        "orientation error", np.linalg.norm(errors[:, 3:], axis=1), unit="urad", limit=150
+    )
     cmmsim_sensor.start_run(cmmsim_seed)
     built_in = 1e6 * np.array([cmmsim_sensor.measure(pose).pose - pose for pose in poses])
-    accuracy.sample("position error, built-in estimator", np.linalg.norm(built_in[:, :3], axis=1), unit="um")
-    accuracy.sample("orientation error, built-in estimator", np.linalg.norm(built_in[:, 3:], axis=1), unit="urad")
+    accuracy.sample(
+        "position error, built-in estimator", np.linalg.norm(built_in[:, :3], axis=1), unit="um"
+    )
+    accuracy.sample(
+        "orientation error, built-in estimator",
+        np.linalg.norm(built_in[:, 3:], axis=1),
+        unit="urad",
+    )

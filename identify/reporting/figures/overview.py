@@ -1,14 +1,16 @@
-"""What an experiment looks like: the scene above both camera images, and the images with their residuals."""
+"""What an experiment looks like: the scene above both camera images, and the images with their
+residuals.
+"""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from identify.arrays import Array
-from identify.reporting.figures.motion import round_down
+from identify.reporting.figures.paths import round_down
 from identify.reporting.figures.style import WIDTH
 from identify.scene import StereoView, View, Workcell, stereo_figure
-from identify.scene.figures import FOUND, SIDES, draw_scene, show_image
+from identify.scene.drawings import FOUND, SIDES, draw_scene, show_image
 
 OVERVIEW = (4.8, 4.9)
 """Width and height of the overview, inches."""
@@ -18,9 +20,11 @@ BENEATH = 0.4
 
 
 def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None) -> Figure:
-    """Robot, stickers and cameras with the platform at a pose (6,), and beneath it what both cameras see of it.
+    """Robot, stickers and cameras with the platform at a pose (6,), and beneath it what both
+    cameras see of it.
 
-    Higher than it is wide, as a phone is. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    Higher than it is wide, as a phone is. Raises dynamics.UnreachablePoseError,
+    dynamics.ChartError.
     """
     width, height = OVERVIEW
     beneath = 0.0 if view is None else BENEATH
@@ -30,7 +34,9 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
     if view is not None:
         side = (beneath - 0.05) * height / width
         for number, name in enumerate(SIDES):
-            axes = figure.add_axes((0.5 + (number - 1) * side + (number - 0.5) * 0.04, 0.0, side, beneath - 0.05))
+            axes = figure.add_axes(
+                (0.5 + (number - 1) * side + (number - 0.5) * 0.04, 0.0, side, beneath - 0.05)
+            )
             show_image(axes, view, number)
             for body, found in view.found.items():
                 x, y = found.centres[number].T
@@ -45,9 +51,11 @@ ARROW = 0.12
 
 
 def residual_figure(view: StereoView) -> Figure:
-    """Both camera images with the detected ellipses, and how far each detected centre is from the true one: arrows,
-    enlarged, beside one whose length is written in px."""
-    errors = np.concatenate([(found.centres - found.expected).reshape(-1, 2) for found in view.found.values()])
+    """Both camera images with the detected ellipses, and how far each detected centre is from the
+    true one: arrows, enlarged, beside one whose length is written in px."""
+    errors = np.concatenate(
+        [(found.centres - found.expected).reshape(-1, 2) for found in view.found.values()]
+    )
     longest = float(np.linalg.norm(errors, axis=1).max(initial=1e-6))
     width = view.images.shape[2]
     factor = round_down(ARROW * width / longest)
@@ -62,5 +70,21 @@ def _scale_arrow(axes: Axes, width: int, factor: float, length: float) -> None:
     """An arrow that stands for a length, px, in the lower left corner of an image."""
     (left, _), (low, high) = axes.get_xlim(), axes.get_ylim()
     foot = left + 0.04 * width, low + 0.05 * (high - low)
-    axes.quiver(*foot, factor * length, 0.0, angles="xy", scale_units="xy", scale=1, color="white", width=0.004)
-    axes.annotate(f"{length:g} px", foot, xytext=(0, 4), textcoords="offset points", color="white", fontsize=7.5)
+    axes.quiver(
+        *foot,
+        factor * length,
+        0.0,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        color="white",
+        width=0.004,
+    )
+    axes.annotate(
+        f"{length:g} px",
+        foot,
+        xytext=(0, 4),
+        textcoords="offset points",
+        color="white",
+        fontsize=7.5,
+    )

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from identify.reporting import paper, parameter_tables, tables
-from identify.reporting.numbers import number, spelled
+from identify.reporting.number_format import number, spelled
 from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
 
@@ -23,8 +23,8 @@ class Fold:
 
 @dataclass(frozen=True)
 class Section:
-    """One section of the report: its text in paragraphs, the names of its pictures, those that stand folded under a
-    title, its tables, and what else is folded."""
+    """One section of the report: its text in paragraphs, the names of its pictures, those that
+    stand folded under a title, its tables, and what else is folded."""
 
     title: str
     text: tuple[str, ...] = ()
@@ -44,20 +44,30 @@ def sensor_section(data: RunData) -> Section:
         said.append(f"Robot and cameras are not drawn: {data.scene}.")
     if "sensor" not in data.result:
         said.append(
-            f"{len(ok)} frames were recorded at {data.scenario.timing.frame_rate_hz:g} Hz; in {int((~ok).sum())} of "
-            "them the platform was lost. No truth is known here: what follows is what the sensor states of itself."
+            f"{len(ok)} frames were recorded at {data.scenario.timing.frame_rate_hz:g} Hz; in "
+            f"{int((~ok).sum())} of "
+            "them the platform was lost. No truth is known here: what follows is what the sensor "
+            "states of itself."
         )
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
     if data.cameras_acquitted is not None:
         said.append(
             "Its errors are the noise that it states, new in every frame"
-            + (", beside what is wrong in all frames alike." if data.result["identification"].get("nuisances") else ".")
+            + (
+                ", beside what is wrong in all frames alike."
+                if data.result["identification"].get("nuisances")
+                else "."
+            )
             if data.cameras_acquitted
-            else "Its errors are larger than the noise that it states, or depend on those of the frames before."
+            else "Its errors are larger than the noise that it states, or depend on those of the "
+            "frames before."
         )
     watch = data.result.get("drift_watch")
     if watch and watch.get("noticed_s") is None:
-        said.append("By the stickers' pattern and the gaps of the rays, the cameras stayed as they were calibrated.")
+        said.append(
+            "By the stickers' pattern and the gaps of the rays, the cameras stayed as they were "
+            "calibrated."
+        )
     common = [table for table in (tables.common_error_table(data.result),) if table.rows]
     shown = (tables.sensor_table(data.result), *common)
     return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)
@@ -71,7 +81,10 @@ def excitation_section(data: RunData) -> Section:
 def fit_section(data: RunData) -> Section:
     """How the models follow the exciting trajectory, and how the search ended."""
     found = data.result["identification"]
-    text = f"The search took {found['iterations']} steps; it ended because {spelled(found['stop_reason'])}."
+    text = (
+        f"The search took {found['iterations']} steps; it ended because "
+        f"{spelled(found['stop_reason'])}."
+    )
     table = tables.excitation_error_table(data.result, data.beside_paper)
     return Section("Fit", (text, *_paper_text(data)), ("fit_excitation",), tables=(table,))
 
@@ -79,13 +92,19 @@ def fit_section(data: RunData) -> Section:
 def parameter_section(data: RunData) -> Section:
     """What is identified first; what is not, folded, with the reason."""
     found = data.result["identification"]
-    parameters, groups = found["parameters"], found.get("groups", {})
+    parameters = found["parameters"]
+    groups = found.get("groups", {})
     known = [p for p in parameters.values() if p["identifiable"]]
     sums = [group for group in groups.values() if len(group["coefficients"]) > 1]
     text = [
         f"The record identifies {len(known)} of {len(parameters)} parameters"
-        + (f", and {sum(bool(g['identifiable']) for g in sums)} of {len(sums)} sums of several." if sums else ".")
-        + " Identified means that it at least halves what the starting value left open, and leaves less than half of "
+        + (
+            f", and {sum(bool(g['identifiable']) for g in sums)} of {len(sums)} sums of several."
+            if sums
+            else "."
+        )
+        + " Identified means that it at least halves what the starting value left open, and "
+        "leaves less than half of "
         "the quantity in doubt.",
         parameter_tables.scale_sentence(found),
         *filter(None, [parameter_tables.drive_sentence(found)]),
@@ -100,18 +119,25 @@ def parameter_section(data: RunData) -> Section:
     shown = [table for table in (parameter_tables.parameter_table(data.result),) if table.rows]
     shown += [table for table in (parameter_tables.group_table(data.result),) if table.rows]
     folded = {"How the errors of the parameters go together": "correlation"} if known else {}
-    return Section("Parameters", tuple(text), ("parameters", "groups"), folded, (*shown, *pairs), tuple(folds))
+    return Section(
+        "Parameters", tuple(text), ("parameters", "groups"), folded, (*shown, *pairs), tuple(folds)
+    )
 
 
 def validation_section(data: RunData) -> Section:
     """Unseen trajectories."""
     if not data.validation:
         text = (
-            "There are no unseen trajectories of this record. Record another motion of the robot, and compare what the "
-            "model predicts of it: a model that only follows the motion that it was fitted to is of no use."
+            "There are no unseen trajectories of this record. Record another motion of the robot, "
+            "and compare what the "
+            "model predicts of it: a model that only follows the motion that it was fitted to is "
+            "of no use."
         )
         return Section("Validation", (text,))
-    both = (tables.validation_table(data.result, data.beside_paper), tables.prediction_table(data.result))
+    both = (
+        tables.validation_table(data.result, data.beside_paper),
+        tables.prediction_table(data.result),
+    )
     text = f"{len(data.validation)} trajectories that had no part in the identification."
     return Section("Validation", (text,), ("validation_errors", "fit_validation"), tables=both)
 
@@ -122,7 +148,9 @@ def provenance_section(data: RunData) -> Section:
     made = f"Record made {data.experiment.attrs.get('created', 'at an unknown time')}."
     text = [made, "Every picture is also in the folder figures, as PDF for print and as PNG."]
     if not changed.rows:
-        text.append(f"No setting differs from those of the built-in scenario: {changed.title.split()[-1]}.")
+        text.append(
+            f"No setting differs from those of the built-in scenario: {changed.title.split()[-1]}."
+        )
     return Section(
         "How it was made",
         tuple(text),
@@ -154,16 +182,22 @@ def _prior_text(found: dict[str, Any]) -> list[str]:
     said = " and ".join(f"{count} of these {kind}" for kind, count in counts.items() if count)
     if not said:
         return []
-    return [f"{said} rest on the starting values of others: they are as good as those, and are marked in the tables."]
+    return [
+        f"{said} rest on the starting values of others: they are as good as those, and are marked "
+        "in the tables."
+    ]
 
 
 def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
     if conditioning is None:
         return []
-    directions, unshown = conditioning["directions"], conditioning["unshown"]
+    directions = conditioning["directions"]
+    unshown = conditioning["unshown"]
     return [
-        f"Poses can show {directions} independent quantities of this robot and its controller, but for one common "
-        f"factor of all of them. This record shows {directions - unshown} of them better than the starting values do."
+        f"Poses can show {directions} independent quantities of this robot and its controller, "
+        "but for one common "
+        f"factor of all of them. This record shows {directions - unshown} of them better than the "
+        "starting values do."
     ]
 
 
@@ -173,13 +207,15 @@ def _index_text(data: RunData) -> tuple[str, ...]:
     if chosen is None:
         return ()
     text = (
-        f"The observability index (eq. 39 of the paper; larger is better) is {number(chosen.first_index, 3)} for the "
+        "The observability index (eq. 39 of the paper; larger is better) is "
+        f"{number(chosen.first_index, 3)} for the "
         f"first random candidate, {number(chosen.median_index, 3)} for the middle one, and "
         f"{number(chosen.observability_index, 3)} for the trajectory that was used."
     )
     if data.beside_paper:
         text += (
-            f" The paper, on its own geometry, went from {paper.INDEX_FIRST:g} to {paper.INDEX_BEST:g} by a genetic "
+            f" The paper, on its own geometry, went from {paper.INDEX_FIRST:g} to "
+            f"{paper.INDEX_BEST:g} by a genetic "
             "algorithm."
         )
     return (text,)
@@ -189,6 +225,9 @@ def _paper_text(data: RunData) -> tuple[str, ...]:
     if not data.beside_paper:
         return ()
     return (
-        "This run repeats the paper's experiment, with its settings, on a simulated robot of the same kind; the "
+        "This run repeats the paper's experiment on a simulated robot of the same kind, with its "
+        "masses, gains and "
+        "motion frequencies; where it filters and how it searches for its trajectory are its own "
+        "(scenario.toml). The "
         "paper's own figures stand beside. They are of a real robot whose truth nobody knows.",
     )

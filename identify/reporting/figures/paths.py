@@ -1,4 +1,5 @@
-"""The motion of a run: over time, as a path in space, and how well each of its poses was measured."""
+"""The motion of a run: over time, as a path in space, and how well each of its poses was
+measured."""
 
 from itertools import combinations
 from typing import Any
@@ -31,7 +32,8 @@ PARTS = (("position", 0, "mm", "µm"), ("orientation", 3, "mrad", "µrad"))
 
 
 def excitation_figure(time: Array, poses: Array) -> Figure:
-    """Position and orientation of a trajectory: ``time`` (N,) [s], ``poses`` (N, 6) [m, rad]; as the paper's figure 11.
+    """Position and orientation of a trajectory: ``time`` (N,) [s], ``poses`` (N, 6) [m, rad]; as
+    the paper's figure 11.
 
     What does not move is left out.
     """
@@ -53,26 +55,38 @@ MARKED = 10
 
 
 def path_figure(time: Array, poses: Array) -> Figure:
-    """The path (N, 6) [m, rad] of the platform over the time (N,) [s]: its position and, beside it, its orientation,
-    with the same times marked on both; what does not move is left out."""
+    """The path (N, 6) [m, rad] of the platform over the time (N,) [s]: its position and, beside it,
+    its orientation, with the same times marked on both; what does not move is left out."""
     shown = moving(poses)
-    halves = [([i for i in shown if first <= i < first + 3], name, unit) for name, first, unit, _ in PARTS]
+    halves = [
+        ([i for i in shown if first <= i < first + 3], name, unit) for name, first, unit, _ in PARTS
+    ]
     halves = [half for half in halves if half[0]]
     figure = Figure(figsize=(WIDTH if len(halves) > 1 else WIDTH / 1.6, 3.2))
     figure.subplots_adjust(left=0.02, right=0.94, bottom=0.06, top=0.94, wspace=0.12)
     elapsed = time - time[0]
-    marks = np.searchsorted(elapsed, np.arange(0, elapsed[-1], _round_up(elapsed[-1] / MARKED)) - 1e-9)
+    marks = np.searchsorted(
+        elapsed, np.arange(0, elapsed[-1], _round_up(elapsed[-1] / MARKED)) - 1e-9
+    )
     for place, (columns, name, unit) in enumerate(halves, start=1):
         solid = len(columns) == 3
-        axes: Any = figure.add_subplot(1, len(halves), place, **({"projection": "3d"} if solid else {}))
+        axes: Any = figure.add_subplot(
+            1, len(halves), place, **({"projection": "3d"} if solid else {})
+        )
         path = 1e3 * (poses[:, columns] - poses[0, columns])
         if len(columns) == 1:
             path = np.column_stack([time, path])
         _draw_path(axes, path, marks, time)
         labels = [f"{COMPONENTS[i]} [{unit}]" for i in columns]
-        for axis, label in zip("xyz", labels if len(columns) > 1 else ["time [s]", *labels], strict=False):
+        for axis, label in zip(
+            "xyz", labels if len(columns) > 1 else ["time [s]", *labels], strict=False
+        ):
             getattr(axes, f"set_{axis}label")(label)
-        axes.set_title(f"({'ab'[place - 1]}) {name} from the start" if len(halves) > 1 else f"{name} from the start")
+        axes.set_title(
+            f"({'ab'[place - 1]}) {name} from the start"
+            if len(halves) > 1
+            else f"{name} from the start"
+        )
         if solid:
             _plain_box(axes)
         else:
@@ -84,7 +98,14 @@ def path_figure(time: Array, poses: Array) -> Figure:
 def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
     """A path (N, 2 or 3) with numbered times, its start as a square."""
     axes.plot(*path.T, color=BLUE, linewidth=1.0)
-    axes.plot(*path[marks[1:]].T, linestyle="none", marker="o", color=INK, markersize=3, markerfacecolor=PAPER)
+    axes.plot(
+        *path[marks[1:]].T,
+        linestyle="none",
+        marker="o",
+        color=INK,
+        markersize=3,
+        markerfacecolor=PAPER,
+    )
     axes.plot(*path[:1].T, linestyle="none", marker="s", color=RED, markersize=6)
     lift = 0.03 * np.ptp(path, axis=0)
     for k in marks:
@@ -114,15 +135,26 @@ SHARE = 0.15
 """Of the path's size: the half axis of the largest ellipse as it is drawn, at most."""
 
 
-def ellipse_figure(poses: Array, covariances: Array, shown: list[int], errors: Array | None = None) -> Figure:
-    """How well poses (N, 6) [m, rad] were measured: 95 % ellipses of the covariances (N, 6, 6) that the sensor states,
-    along the path and enlarged, in views of the components that move (`shown`); where the truth is known, with the
-    errors (N, 6) true - measured of these poses, enlarged alike. NaN where a pose was lost."""
-    kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
+def ellipse_figure(
+    poses: Array, covariances: Array, shown: list[int], errors: Array | None = None
+) -> Figure:
+    """How well poses (N, 6) [m, rad] were measured: 95 % ellipses of the covariances (N, 6, 6) that
+    the sensor states, along the path and enlarged, in views of the components that move (`shown`);
+    where the truth is known, with the errors (N, 6) true - measured of these poses, enlarged alike.
+    NaN where a pose was lost."""
+    kept = np.flatnonzero(
+        np.isfinite(poses).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    )
     chosen = kept[np.linspace(0, len(kept) - 1, min(ELLIPSES, len(kept))).round().astype(int)]
     path = 1e3 * (poses - poses[kept[0]])
     views = [
-        (part, [list(pair) for pair in combinations([i for i in shown if part[1] <= i < part[1] + 3], 2)])
+        (
+            part,
+            [
+                list(pair)
+                for pair in combinations([i for i in shown if part[1] <= i < part[1] + 3], 2)
+            ],
+        )
         for part in PARTS
     ]
     views = [(part, pairs) for part, pairs in views if pairs]
@@ -134,10 +166,21 @@ def ellipse_figure(poses: Array, covariances: Array, shown: list[int], errors: A
         factor = round_down(SHARE * float(np.ptp(path[kept, half], axis=0).max()) / largest)
         for axes, columns in zip(row, pairs, strict=False):
             axes.plot(*path[kept][:, columns].T, color=GREY, linewidth=0.5)
-            _draw_ellipses(axes, path[chosen][:, columns], covariances[chosen][:, columns][:, :, columns], factor)
+            _draw_ellipses(
+                axes,
+                path[chosen][:, columns],
+                covariances[chosen][:, columns][:, :, columns],
+                factor,
+            )
             if errors is not None:
                 ends = path[chosen][:, columns] + 1e3 * factor * errors[chosen][:, columns]
-                axes.plot(*ends.T, linestyle="none", marker=".", color=RED, label="true pose, enlarged alike")
+                axes.plot(
+                    *ends.T,
+                    linestyle="none",
+                    marker=".",
+                    color=RED,
+                    label="true pose, enlarged alike",
+                )
             axes.set_aspect("equal", adjustable="datalim")
             axes.set_xlabel(f"{COMPONENTS[columns[0]]} [{unit}]")
             axes.set_ylabel(f"{COMPONENTS[columns[1]]} [{unit}]")
@@ -152,9 +195,13 @@ def ellipse_figure(poses: Array, covariances: Array, shown: list[int], errors: A
 
 
 def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float) -> None:
-    """Ellipses of covariances (n, 2, 2) [SI], enlarged, about measured places (n, 2) [thousandths of it]."""
+    """Ellipses of covariances (n, 2, 2) [SI], enlarged, about measured places (n, 2) [thousandths
+    of it].
+    """
     gap = np.full((1, 2), np.nan)
-    rings = [c + 1e3 * factor * ellipse_outline(cov) for c, cov in zip(centres, covariances, strict=True)]
+    rings = [
+        c + 1e3 * factor * ellipse_outline(cov) for c, cov in zip(centres, covariances, strict=True)
+    ]
     outline = np.concatenate([part for ring in rings for part in (ring, gap)])
     axes.plot(*outline.T, color=BLUE, linewidth=0.9, label=RING)
     axes.plot(*centres.T, linestyle="none", marker="+", color=BLUE, label="measured pose")
@@ -168,14 +215,26 @@ def ellipse_outline(covariance: Array) -> Array:
     """Outline (n, 2) of the ellipse that covers `COVERED` of a covariance (2, 2)."""
     angle = np.linspace(0, 2 * np.pi, 49)
     root = np.linalg.cholesky(covariance + 1e-12 * np.trace(covariance) * np.eye(2))
-    return np.asarray(np.sqrt(REACH) * np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T, dtype=float)
+    return np.asarray(
+        np.sqrt(REACH) * np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T, dtype=float
+    )
 
 
 def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
-    """A bar that is so many of the fine unit long in the enlargement; the axes are in the coarse one."""
-    look: dict[str, Any] = {"frameon": False, "sep": 3, "borderpad": 0.3, "color": BLUE, "label_top": True}
+    """A bar that is so many of the fine unit long in the enlargement; the axes are in the coarse
+    one.
+    """
+    look: dict[str, Any] = {
+        "frameon": False,
+        "sep": 3,
+        "borderpad": 0.3,
+        "color": BLUE,
+        "label_top": True,
+    }
     reach = 1e-3 * factor * length
-    axes.add_artist(AnchoredSizeBar(axes.transData, reach, f"{length:g} {fine}", "lower right", **look))
+    axes.add_artist(
+        AnchoredSizeBar(axes.transData, reach, f"{length:g} {fine}", "lower right", **look)
+    )
 
 
 def _round_up(value: float) -> float:

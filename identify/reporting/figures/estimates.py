@@ -1,4 +1,6 @@
-"""The parameters of a result: how near they are to the truth, which sums of them motion shows, how they go together."""
+"""The parameters of a result: how near they are to the truth, which sums of them motion shows, how
+they go together.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -13,7 +15,9 @@ from identify.reporting.goals import PARAMETER_FRACTION, is_friction_or_pid
 
 
 class RelativeErrors(NamedTuple):
-    """Names, and in per cent of the truth: error and reach of the 95 % interval below and above the estimate, (n,)."""
+    """Names, and in per cent of the truth: error and reach of the 95 % interval below and above the
+    estimate, (n,).
+    """
 
     names: list[str]
     error: Array
@@ -24,14 +28,25 @@ class RelativeErrors(NamedTuple):
 def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
     """Of the identifiable parameters of a result; no reach where there is no interval.
 
-    In per cent of the truth or, where that is not known, of the estimate, whose error then counts as zero.
+    In per cent of the truth or, where that is not known, of the estimate, whose error then counts
+    as zero.
     """
-    shown = {n: p for n, p in parameters.items() if p["identifiable"] and _size(p) and p["estimate"] is not None}
-    rows = [(_size(p), p["estimate"], *(p.get("interval") or 2 * [p["estimate"]])) for p in shown.values()]
+    shown = {
+        n: p
+        for n, p in parameters.items()
+        if p["identifiable"] and _size(p) and p["estimate"] is not None
+    }
+    rows = [
+        (_size(p), p["estimate"], *(p.get("interval") or 2 * [p["estimate"]]))
+        for p in shown.values()
+    ]
     true, estimate, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
     percent = 100 / np.abs(true)
     return RelativeErrors(
-        list(shown), percent * (estimate - true), percent * (estimate - low), percent * (high - estimate)
+        list(shown),
+        percent * (estimate - true),
+        percent * (estimate - low),
+        percent * (high - estimate),
     )
 
 
@@ -42,7 +57,9 @@ def _size(parameter: dict[str, Any]) -> float | None:
 
 
 def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
-    """Relative error of every identified parameter with its 95 % interval, friction and gains apart."""
+    """Relative error of every identified parameter with its 95 % interval, friction and gains
+    apart.
+    """
     judged = {name: p for name, p in parameters.items() if is_friction_or_pid(name)}
     others = {name: p for name, p in parameters.items() if name not in judged}
     groups = {"friction and joint controller": judged, "masses and inertias": others}
@@ -51,37 +68,58 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     known = any(p["true"] is not None for p in parameters.values())
     for axes, (title, found) in zip(figure.subplots(1, 2), shown.items(), strict=True):
-        rows, reach = np.arange(len(found.names)), 100 * PARAMETER_FRACTION
+        rows = np.arange(len(found.names))
+        reach = 100 * PARAMETER_FRACTION
         axes.axvspan(-reach, reach, color=LINE, alpha=0.5, linewidth=0)
         axes.axvline(0, color=GREY, linewidth=0.8)
         axes.errorbar(
-            found.error, rows, xerr=(found.below, found.above), fmt="o", color=BLUE, capsize=2.5, elinewidth=1
+            found.error,
+            rows,
+            xerr=(found.below, found.above),
+            fmt="o",
+            color=BLUE,
+            capsize=2.5,
+            elinewidth=1,
         )
         axes.set_yticks(rows, found.names)
         axes.invert_yaxis()
-        axes.set_xlabel("estimate − truth [% of the truth]" if known else "95 % interval [% of the estimate]")
+        axes.set_xlabel(
+            "estimate − truth [% of the truth]" if known else "95 % interval [% of the estimate]"
+        )
         axes.set_title(title)
         axes.grid(visible=False, axis="y")
         if not found.names:
-            axes.text(0.5, 0.5, "none is identified", transform=axes.transAxes, ha="center", color=GREY)
+            axes.text(
+                0.5, 0.5, "none is identified", transform=axes.transAxes, ha="center", color=GREY
+            )
             axes.set_yticks([])
     return figure
 
 
-def group_figure(groups: Mapping[str, dict[str, Any]], parameters: Mapping[str, dict[str, Any]]) -> Figure:
-    """Which parameters enter which sum that motion shows, and how much of it they make: one row a sum, one column a
-    parameter, the area of a dot the share of coefficient times starting value; open where it is subtracted. A star
-    marks a sum that is identified."""
+def group_figure(
+    groups: Mapping[str, dict[str, Any]], parameters: Mapping[str, dict[str, Any]]
+) -> Figure:
+    """Which parameters enter which sum that motion shows, and how much of it they make: one row a
+    sum, one column a parameter, the area of a dot the share of coefficient times starting value;
+    open where it is subtracted. A star marks a sum that is identified."""
     sums = {name: group for name, group in groups.items() if len(group["coefficients"]) > 1}
-    columns = [name for name in parameters if any(name in group["coefficients"] for group in sums.values())]
+    columns = [
+        name for name in parameters if any(name in group["coefficients"] for group in sums.values())
+    ]
     shares = np.zeros((len(sums), len(columns)))
     for row, group in enumerate(sums.values()):
-        parts = {n: weight * (parameters[n]["initial"] or 0.0) for n, weight in group["coefficients"].items()}
+        parts = {
+            n: weight * (parameters[n]["initial"] or 0.0)
+            for n, weight in group["coefficients"].items()
+        }
         whole = sum(abs(part) for part in parts.values()) or 1.0
         for name, part in parts.items():
             shares[row, columns.index(name)] = part / whole
     used = [k for k in range(len(columns)) if shares[:, k].any()]
-    labels = [f"{name.removesuffix(' +')} + …{' *' if group['identifiable'] else ''}" for name, group in sums.items()]
+    labels = [
+        f"{name.removesuffix(' +')} + …{' *' if group['identifiable'] else ''}"
+        for name, group in sums.items()
+    ]
     figure = Figure(figsize=(WIDTH, 1.3 + 0.185 * len(labels)), layout="constrained")
     axes = figure.subplots()
     if not labels:
@@ -94,8 +132,8 @@ def group_figure(groups: Mapping[str, dict[str, Any]], parameters: Mapping[str, 
 
 
 def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
-    """Correlations (n, n) of estimates: the area of a dot its size, open where negative; a line of text where nothing
-    is identified."""
+    """Correlations (n, n) of estimates: the area of a dot its size, open where negative; a line of
+    text where nothing is identified."""
     side = min(WIDTH, max(3.0, 1.4 + 0.2 * len(names)))
     figure = Figure(figsize=(side + 0.3, side), layout="constrained")
     axes = figure.subplots()
@@ -109,7 +147,9 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
 
 
 def dot_matrix(axes: Axes, values: Array, rows: Sequence[str], columns: Sequence[str]) -> None:
-    """Values (rows, columns) from -1 to 1 as dots whose area is their size, open where they are negative."""
+    """Values (rows, columns) from -1 to 1 as dots whose area is their size, open where they are
+    negative.
+    """
     axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=6.5)
     axes.set_yticks(range(len(rows)), rows, fontsize=6.5)
     axes.set_xlim(-0.7, len(columns) - 0.3)
@@ -129,7 +169,12 @@ LARGEST = 58.0
 
 def _dots(sizes: Array | float, sign: float) -> dict[str, Any]:
     face = BLUE if sign > 0 else PAPER
-    return {"s": LARGEST * np.asarray(sizes), "facecolor": face, "edgecolor": BLUE, "linewidth": 0.8}
+    return {
+        "s": LARGEST * np.asarray(sizes),
+        "facecolor": face,
+        "edgecolor": BLUE,
+        "linewidth": 0.8,
+    }
 
 
 def _key(axes: Axes, sizes: Sequence[float], of: str, negative: str) -> None:
@@ -137,4 +182,10 @@ def _key(axes: Axes, sizes: Sequence[float], of: str, negative: str) -> None:
     for size in sizes:
         axes.scatter([], [], label=f"{size:g}", **_dots(size, 1.0))
     axes.scatter([], [], label=negative, **_dots(sizes[1], -1.0))
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(sizes) + 1, title=f"{of}:", alignment="left")
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=len(sizes) + 1,
+        title=f"{of}:",
+        alignment="left",
+    )

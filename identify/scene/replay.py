@@ -1,7 +1,8 @@
-"""The page that replays a motion: one HTML file with scene, images and curves that opens without a network.
+"""The page that replays a motion: one HTML file with scene, images and curves that opens without a
+network.
 
-What draws the scene is three.js, as trimesh carries it; what moves it is in `replay_page/`. Numbers go into the page in
-double precision, so that it shows what the files say.
+What draws the scene is three.js, as trimesh carries it; what moves it is in `replay_page/`. Numbers
+go into the page in double precision, so that it shows what the files say.
 """
 
 import base64
@@ -18,13 +19,13 @@ from matplotlib.figure import Figure
 from trimesh.viewer.notebook import scene_to_html
 
 from identify.arrays import Array
-from identify.errors import IdentifyError, OutputFolderError
-from identify.files.atomic import atomic_path
+from identify.errors import IdentifyError
+from identify.files.atomic import check_writable, write_text
 from identify.progress import Progress, SilentProgress
-from identify.scene.figures import scene_figure
+from identify.scene.camera_images import Found, StereoEye, StereoView, region_of
+from identify.scene.drawings import scene_figure
 from identify.scene.gltf import gltf
-from identify.scene.images import Found, StereoEye, StereoView, region_of
-from identify.scene.motion import TRUE, Motion
+from identify.scene.replayed_motion import TRUE, Motion
 
 PARTS = Path(__file__).parent / "replay_page"
 SCRIPTS = ("scene.js", "curves.js", "images.js", "player.js")
@@ -33,7 +34,8 @@ KEY_FRAMES = 24
 """Frames of which the images are drawn: they take most of the time and half of the file."""
 
 IMAGE_QUALITY = 45
-"""Of JPEG: some 30 kB an image. WebP would be half as large and take as long as drawing the image."""
+"""Of JPEG: some 30 kB an image. WebP would be half as large and take as long as drawing the image.
+"""
 
 CONFIDENCE = 2.7955
 """Standard deviations that hold 95 % of a normal distribution in space."""
@@ -45,13 +47,11 @@ LIBRARY_ENDS = "THREE.GLTFLoader=GLTFLoader;})();"
 def write_page(path: Path | str, motion: Motion, progress: Progress | None = None) -> None:
     """Write the page of a motion, whole or not at all.
 
-    Raises OutputFolderError: the file cannot be written. Raises dynamics.UnreachablePoseError, cmmsim.CmmError.
+    Raises WriteError: the file cannot be written, which is tried before anything is drawn. Raises
+    dynamics.UnreachablePoseError, cmmsim.CmmError.
     """
-    try:
-        with atomic_path(path) as temporary:  # which fails before anything is drawn where it cannot be written
-            temporary.write_text(page(motion, progress or SilentProgress()), encoding="utf-8")
-    except OSError as error:
-        raise OutputFolderError(f"cannot write {path}: {error.strerror}; name another file with --out") from None
+    check_writable(path)
+    write_text(path, page(motion, progress or SilentProgress()), parents=True)
 
 
 def page(motion: Motion, progress: Progress) -> str:
@@ -86,14 +86,17 @@ def page(motion: Motion, progress: Progress) -> str:
 
 
 def three_js() -> str:
-    """The text of three.js with its loader of glTF files and its controls by the mouse, as trimesh carries them.
+    """The text of three.js with its loader of glTF files and its controls by the mouse, as trimesh
+    carries them.
 
     Raises IdentifyError where the installed trimesh carries them otherwise.
     """
     whole = scene_to_html(trimesh.Scene(trimesh.creation.box()))
     library, found, _ = whole.partition("<script>")[2].partition(LIBRARY_ENDS)
     if not found:
-        raise IdentifyError(f"trimesh {trimesh.__version__} carries no three.js that this version of cmmsim knows")
+        raise IdentifyError(
+            f"trimesh {trimesh.__version__} carries no three.js that this version of cmmsim knows"
+        )
     return library + found
 
 
@@ -117,7 +120,11 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
     cell = motion.cell
     bodies = {body.name: {"ids": body.ids, "places": body.places.tolist()} for body in cell.bodies}
     cameras = [
-        {"name": camera.name, "centre": camera.centre.tolist(), "corners": camera.frustum(0.3).tolist()}
+        {
+            "name": camera.name,
+            "centre": camera.centre.tolist(),
+            "corners": camera.frustum(0.3).tolist(),
+        }
         for camera in cell.cameras
     ]
     return {
@@ -125,7 +132,9 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
         "time": _numbers(motion.time, "f8"),
         "poses": {kind: _numbers(poses, "f8") for kind, poses in motion.poses.items()},
         "drawn": _numbers(motion.drawn, "f8"),
-        "ellipsoid": None if motion.covariance is None else _numbers(_shapes(motion.covariance[:, :3, :3]), "f4"),
+        "ellipsoid": None
+        if motion.covariance is None
+        else _numbers(_shapes(motion.covariance[:, :3, :3]), "f4"),
         "parts": [part.name for part in cell.parts],
         "rods": _numbers(rods, "f4"),
         "frame": cell.frame.tolist(),
@@ -158,7 +167,9 @@ def _stickers(found: Found) -> dict[str, Any]:
 
 
 def _shapes(covariances: Array) -> Array:
-    """Matrices (n, 3, 3) that carry the unit ball onto the ellipsoids that hold 95 %; NaN where a covariance is."""
+    """Matrices (n, 3, 3) that carry the unit ball onto the ellipsoids that hold 95 %; NaN where a
+    covariance is.
+    """
     known = np.isfinite(covariances).all(axis=(1, 2))
     shapes = np.full_like(covariances, np.nan)
     shapes[known] = CONFIDENCE * np.linalg.cholesky(covariances[known])
@@ -178,6 +189,8 @@ def _numbers(values: Array, kind: str) -> str:
 
 
 def _jpeg(image: Array) -> str:
-    """A grey image as the address of itself; the page brightens it, which here would spend the file on noise."""
+    """A grey image as the address of itself; the page brightens it, which here would spend the file
+    on noise.
+    """
     encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, IMAGE_QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(encoded.tobytes()).decode()}"

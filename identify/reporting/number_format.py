@@ -1,4 +1,6 @@
-"""How numbers are written: with the digits that they deserve, and zero where nothing but rounding is left."""
+"""How numbers are written: with the digits that they deserve, and zero where nothing but rounding
+is left.
+"""
 
 import math
 import re
@@ -39,11 +41,15 @@ def interval(low: float, high: float) -> str:
 
 
 def _to_the_second_digit(values: tuple[float, float], of: float, between: str) -> str:
-    """Two values to the second digit of another number; with a common power of ten where they are small or large."""
+    """Two values to the second digit of another number; with a common power of ten where they are
+    small or large.
+    """
     power = math.floor(math.log10(max(map(abs, values))))
     power = 0 if -4 < power < LONG else power
     places = max(0, 1 - math.floor(math.log10(of)) + power)
-    text = between.join(f"{value / 10**power + 0.0:.{places}f}" for value in values).replace("-", "−")
+    text = between.join(f"{value / 10**power + 0.0:.{places}f}" for value in values).replace(
+        "-", "−"
+    )
     return f"({text}) × 10{str(power).translate(SUPERSCRIPTS)}" if power else text
 
 

@@ -1,4 +1,6 @@
-"""Both camera images of a pose, cut to where the robot is, and the stickers that the project's detector finds there."""
+"""Both camera images of a pose, cut to where the robot is, and the stickers that the project's
+detector finds there.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
-from cmmsim.radiometry.images import StereoFrame
 from cmmsim.radiometry.noise import cut_windows
+from cmmsim.radiometry.stereo_images import StereoFrame
 from identify.arrays import Array
 from identify.scene.workcell import Workcell
 
@@ -20,9 +22,10 @@ MARGIN_PX = 24.0
 class Found:
     """k stickers of one body that were found in both images.
 
-    ids (k,); centres (2, k, 2) in the whole images, px; shapes (2, k, 2, 2) px: each carries the unit disc onto the
-    detected ellipse, None where the detector states none; expected (2, k, 2): where the true places are seen, px;
-    points (k, 3) m and covariances (k, 3, 3) m^2, triangulated, base axes.
+    ids (k,); centres (2, k, 2) in the whole images, px; shapes (2, k, 2, 2) px: each carries the
+    unit disc onto the detected ellipse, None where the detector states none; expected (2, k, 2):
+    where the true places are seen, px; points (k, 3) m and covariances (k, 3, 3) m^2, triangulated,
+    base axes.
     """
 
     ids: tuple[str, ...]
@@ -37,8 +40,8 @@ class Found:
 class StereoView:
     """Both camera images of one pose (6,) m and rad, drawn with noise.
 
-    images (2, h, w) uint8, a part of the whole images whose first pixels (x, y) are corners (2, 2); found: stickers by
-    the body's name, "platform" and "base".
+    images (2, h, w) uint8, a part of the whole images whose first pixels (x, y) are corners (2, 2);
+    found: stickers by the body's name, "platform" and "base".
     """
 
     pose: Array
@@ -48,10 +51,12 @@ class StereoView:
 
 
 class StereoEye:
-    """Draws the images of a workcell's sensor at one pose after another, and finds the stickers in them.
+    """Draws the images of a workcell's sensor at one pose after another, and finds the stickers in
+    them.
 
-    Nothing is taught: a sticker is looked for about its nominal place. seed: of the noise; renderer: "analytic" needs
-    no OpenGL; region: first pixels (2, 2) and side px of the part that is shown, None: the whole images.
+    Nothing is taught: a sticker is looked for about its nominal place. seed: of the noise;
+    renderer: "analytic" needs no OpenGL; region: first pixels (2, 2) and side px of the part that
+    is shown, None: the whole images.
     """
 
     def __init__(
@@ -62,18 +67,22 @@ class StereoEye:
         region: tuple[NDArray[np.int_], int] | None = None,
     ) -> None:
         assert cell.rig is not None
-        self._cell, self._sensor = cell, cell.live_sensor(seed, renderer)
+        self._cell = cell
+        self._sensor = cell.live_sensor(seed, renderer)
         self._rig, self._camera_from_base = cell.rig
         self._region = region
 
     def look(self, pose: Array) -> StereoView:
-        """Images and stickers at a pose (6,). Raises dynamics.UnreachablePoseError, cmmsim.CmmError."""
+        """Images and stickers at a pose (6,). Raises dynamics.UnreachablePoseError,
+        cmmsim.CmmError.
+        """
         drawn = self._sensor.look(pose, self._cell.obstacles(pose))
         if self._region is not None and self._sensor.renderer == "analytic":
             corners, side = self._region
             images: NDArray = drawn.windows(corners[:, None], side)[:, 0]
         else:
-            whole, corners = drawn.full(), np.zeros((2, 2), dtype=int)
+            whole = drawn.full()
+            corners = np.zeros((2, 2), dtype=int)
             images = np.stack([whole.left, whole.right])
             if self._region is not None:
                 corners, side = self._region
@@ -81,13 +90,18 @@ class StereoEye:
         cut = _Cut(images, corners)
         found = {body.name: self._found(cut, pose, k) for k, body in enumerate(self._cell.bodies)}
         white = self._sensor.noise.white_level
-        return StereoView(pose, np.asarray(images * (255.0 / white), dtype=np.uint8), corners, found)
+        return StereoView(
+            pose, np.asarray(images * (255.0 / white), dtype=np.uint8), corners, found
+        )
 
     def _found(self, images: "_Cut", pose: Array, number: int) -> Found:
         """Stickers of the platform (0) or the base (1)."""
-        body, nominal = self._cell.bodies[number], self._cell.marked(self._cell.bodies[number].name)
+        body = self._cell.bodies[number]
+        nominal = self._cell.marked(self._cell.bodies[number].name)
         place = self._camera_from_base @ (pose_to_transform(pose) if number == 0 else np.eye(4))
-        seen = self._sensor.observer.observe(images, place, nominal.nominal, nominal.sticker_normals)
+        seen = self._sensor.observer.observe(
+            images, place, nominal.nominal, nominal.sticker_normals
+        )
         base_from_camera = invert(self._camera_from_base)
         turn = base_from_camera[:3, :3]
         return Found(
@@ -100,17 +114,23 @@ class StereoEye:
         )
 
 
-def stereo_view(cell: Workcell, pose: Array | None = None, seed: int = 0, renderer: str = "analytic") -> StereoView:
-    """Both camera images of a workcell at a pose (6,), by default home, cut to the robot, and the stickers in them.
+def stereo_view(
+    cell: Workcell, pose: Array | None = None, seed: int = 0, renderer: str = "analytic"
+) -> StereoView:
+    """Both camera images of a workcell at a pose (6,), by default home, cut to the robot, and the
+    stickers in them.
 
-    seed: of the noise; renderer: "pyrender" needs OpenGL. Raises dynamics.UnreachablePoseError, cmmsim.CmmError.
+    seed: of the noise; renderer: "pyrender" needs OpenGL. Raises dynamics.UnreachablePoseError,
+    cmmsim.CmmError.
     """
     at = cell.home if pose is None else np.asarray(pose, dtype=float)
     return StereoEye(cell, seed, renderer, region_of(cell, [at])).look(at)
 
 
 def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_], int]:
-    """First pixels (2, 2) and side px of a square part of both images that shows both bodies at all poses (6,)."""
+    """First pixels (2, 2) and side px of a square part of both images that shows both bodies at all
+    poses (6,).
+    """
     assert cell.rig is not None
     rig, camera_from_base = cell.rig
     platform, base = (body.vertices for body in cell.bodies)
@@ -118,7 +138,8 @@ def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_],
     pixels = rig.project(apply(camera_from_base, points))[0]
     size = np.array([[camera.width, camera.height] for camera in rig.cameras])
     low, high = (
-        np.clip(extreme, 0, size - 1) for extreme in (pixels.min(axis=1) - MARGIN_PX, pixels.max(axis=1) + MARGIN_PX)
+        np.clip(extreme, 0, size - 1)
+        for extreme in (pixels.min(axis=1) - MARGIN_PX, pixels.max(axis=1) + MARGIN_PX)
     )
     side = int(min(np.ceil((high - low).max()), size.min()))
     corners = np.clip(np.rint(0.5 * (low + high - side)), 0, size - side).astype(int)
@@ -129,13 +150,16 @@ class _Cut:
     """Parts of two images, read as if they were whole."""
 
     def __init__(self, images: NDArray, corners: NDArray[np.int_]) -> None:
-        self._images, self._corners = images, corners
+        self._images = images
+        self._corners = corners
 
     def full(self) -> StereoFrame:
         """Both parts."""
         return StereoFrame(*self._images)
 
     def windows(self, corners: NDArray[np.int_], size: int) -> NDArray:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) in the whole images."""
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) in the
+        whole images.
+        """
         sides = zip(self._images, corners, self._corners, strict=True)
         return np.stack([cut_windows(image, at - first, size) for image, at, first in sides])

@@ -1,4 +1,5 @@
-"""The scene and what both cameras see, drawn for print: matplotlib figures that become PDF, SVG or PNG.
+"""The scene and what both cameras see, drawn for print: matplotlib figures that become PDF, SVG or
+PNG.
 
 Every colour stands beside another brightness or a word, so that they can be read without colour.
 """
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import apply
 from identify.arrays import Array
-from identify.scene.images import StereoView
+from identify.scene.camera_images import StereoView
 from identify.scene.painter import Painter, View, extent, tube
 from identify.scene.workcell import Solid, ViewingCamera, Workcell
 
@@ -21,7 +22,10 @@ SOLIDS = {"platform": "#a9bdd0", "base": "#b8b3a6"}
 LEGS = ("#c9723a", "#e6c79c", "#7d9d8f", "#8a7fa8")
 """Of the first, second, ... body of each leg."""
 
-CAMERA, RAY, DARK, BRIGHT = "#3b3f46", "#c8102e", "#22262b", "#fdfdf5"
+CAMERA = "#3b3f46"
+RAY = "#c8102e"
+DARK = "#22262b"
+BRIGHT = "#fdfdf5"
 FOUND = {"platform": "#ff9f1c", "base": "#4cc9f0"}
 
 SIDES = ("left", "right")
@@ -43,20 +47,24 @@ def scene_figure(
     rays: bool = True,
     labels: bool = True,
 ) -> Figure:
-    """Robot with legs and stickers, both cameras with their field of view and rays to the stickers that both can see.
+    """Robot with legs and stickers, both cameras with their field of view and rays to the stickers
+    that both can see.
 
-    pose (6,) of the platform, m and rad, by default home; size in inches; rays, labels: whether to draw them. Needs no
-    OpenGL. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    pose (6,) of the platform, m and rad, by default home; size in inches; rays, labels: whether to
+    draw them. Needs no OpenGL. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
     """
     figure = Figure(figsize=size, layout="constrained")
     draw_scene(figure.add_subplot(), cell, _at(cell, pose), view or View(), rays, labels)
     return figure
 
 
-def stereo_figure(view: StereoView, *, size: tuple[float, float] = (7.0, 3.9), arrows: float | None = ARROWS) -> Figure:
+def stereo_figure(
+    view: StereoView, *, size: tuple[float, float] = (7.0, 3.9), arrows: float | None = ARROWS
+) -> Figure:
     """Both camera images with the detected ellipses, and each centre's error as an arrow.
 
-    size in inches; arrows: how many times the errors (detected less true centre) are enlarged, None: no arrows.
+    size in inches; arrows: how many times the errors (detected less true centre) are enlarged,
+    None: no arrows.
     """
     figure = Figure(figsize=size, layout="constrained")
     for side, axes in enumerate(figure.subplots(1, 2, squeeze=False)[0]):
@@ -75,8 +83,9 @@ def overview_figure(
 ) -> Figure:
     """The scene, and beside it what both cameras see of it, with the detected ellipses.
 
-    view: as `stereo_view` gives it, of the pose that the scene has too; towards: from where the scene is looked at;
-    size in inches; arrows: as of `stereo_figure`. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    view: as `stereo_view` gives it, of the pose that the scene has too; towards: from where the
+    scene is looked at; size in inches; arrows: as of `stereo_figure`. Raises
+    dynamics.UnreachablePoseError, dynamics.ChartError.
     """
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplot_mosaic([["scene", "left"], ["scene", "right"]], width_ratios=[2.6, 1.0])
@@ -88,9 +97,12 @@ def overview_figure(
     return figure
 
 
-def draw_scene(axes: Axes, cell: Workcell, pose: Array, view: View, rays: bool, labels: bool) -> None:
+def draw_scene(
+    axes: Axes, cell: Workcell, pose: Array, view: View, rays: bool, labels: bool
+) -> None:
     """Draw a scene into axes, as `scene_figure` does."""
-    placed, rods = cell.placed(pose), cell.rods(pose)
+    placed = cell.placed(pose)
+    rods = cell.rods(pose)
     solids = [apply(place, body.vertices) for body, place in placed]
     shown = [*solids, rods.reshape(-1, 3), *(camera.frustum(FRUSTUM_M) for camera in cell.cameras)]
     painter = Painter(view, *extent(shown))
@@ -111,7 +123,9 @@ def draw_scene(axes: Axes, cell: Workcell, pose: Array, view: View, rays: bool, 
 
 
 def draw_image(axes: Axes, view: StereoView, side: int, arrows: float | None) -> None:
-    """Draw one image, 0 left or 1 right, with the detected ellipses into axes, px of the whole image."""
+    """Draw one image, 0 left or 1 right, with the detected ellipses into axes, px of the whole
+    image.
+    """
     show_image(axes, view, side)
     for body in view.found:
         _ellipses(axes, view, side, body, arrows)
@@ -124,19 +138,27 @@ def _at(cell: Workcell, pose: Array | None) -> Array:
 
 def _explain(figure: Figure, view: StereoView, arrows: float | None) -> None:
     """The legend below images."""
-    handles = [Line2D([], [], ls="", marker="o", mfc="none", mec=FOUND[name]) for name in view.found]
+    handles = [
+        Line2D([], [], ls="", marker="o", mfc="none", mec=FOUND[name]) for name in view.found
+    ]
     words = [f"{len(found.ids)} stickers found on the {name}" for name, found in view.found.items()]
-    note = None if arrows is None else f"arrows: detected less true centre, {arrows:g} times enlarged"
+    note = (
+        None if arrows is None else f"arrows: detected less true centre, {arrows:g} times enlarged"
+    )
     small = {"title_fontsize": 8, "fontsize": 8, "frameon": False}
     figure.legend(handles, words, title=note, loc="outside lower center", ncols=2, **small)
 
 
 def show_image(axes: Axes, view: StereoView, side: int) -> None:
-    """One image of a view in its place in the whole image, px, brightened so that dark bodies show in print."""
+    """One image of a view in its place in the whole image, px, brightened so that dark bodies show
+    in print.
+    """
     image, (x, y) = view.images[side], view.corners[side]
     height, width = image.shape
     edges = (x - 0.5, x + width - 0.5, y + height - 0.5, y - 0.5)
-    axes.imshow(brightened(image), cmap="gray", vmin=0, vmax=255, extent=edges, interpolation="bilinear")
+    axes.imshow(
+        brightened(image), cmap="gray", vmin=0, vmax=255, extent=edges, interpolation="bilinear"
+    )
     axes.tick_params(labelsize=7)
     axes.set_xlabel("px", fontsize=8)
     axes.label_outer()
@@ -148,7 +170,8 @@ def brightened(image: Array) -> Array:
 
 
 def ellipse_points(centre: Array, shape: Array, count: int = 32) -> Array:
-    """Points (count + 1, 2) px along a detected ellipse, closed; centre (2,) and shape (2, 2) px."""
+    """Points (count + 1, 2) px along a detected ellipse, closed; centre (2,) and shape (2,
+    2) px."""
     turn = np.linspace(0, 2 * np.pi, count + 1)
     return np.asarray(centre + np.column_stack([np.cos(turn), np.sin(turn)]) @ shape.T)
 
@@ -175,7 +198,9 @@ def camera_box(camera: ViewingCamera) -> tuple[Array, NDArray[np.int_]]:
 
     width, height, length = CAMERA_M
     box = trimesh.creation.box((2 * width, 2 * height, length))
-    return apply(camera.base_from_camera, np.asarray(box.vertices) - [0.0, 0.0, 0.5 * length]), np.asarray(box.faces)
+    return apply(
+        camera.base_from_camera, np.asarray(box.vertices) - [0.0, 0.0, 0.5 * length]
+    ), np.asarray(box.faces)
 
 
 def _camera(painter: Painter, camera: ViewingCamera) -> None:
@@ -194,20 +219,38 @@ def _triad(painter: Painter, axes: Axes, labels: bool) -> None:
         ends = np.array([np.zeros(3), 0.15 * direction])
         painter.line(ends, DARK, 1.4, towards=1.0)
         if labels:
-            axes.annotate(name, tuple(painter.pixels(1.15 * ends[1])), fontsize=8, ha="center", va="center", zorder=5,
-                          path_effects=[effects.withStroke(linewidth=2, foreground="white")])  # fmt: skip
+            axes.annotate(
+                name,
+                tuple(painter.pixels(1.15 * ends[1])),
+                fontsize=8,
+                ha="center",
+                va="center",
+                zorder=5,
+                path_effects=[effects.withStroke(linewidth=2, foreground="white")],
+            )
 
 
 def _labels(painter: Painter, axes: Axes, cell: Workcell, solids: list[Array]) -> None:
     named = [(camera.base_from_camera @ [0, -0.09, -0.06, 1])[:3] for camera in cell.cameras]
     words = [f"{camera.name} camera" for camera in cell.cameras]
     for text, place in zip(words, named, strict=True):
-        axes.annotate(text, tuple(painter.pixels(place)), fontsize=8, ha="center", va="bottom", zorder=5)
+        axes.annotate(
+            text, tuple(painter.pixels(place)), fontsize=8, ha="center", va="bottom", zorder=5
+        )
     for body, vertices, side in zip(cell.bodies, solids, (-1, 1), strict=False):
         flat = painter.pixels(vertices)
-        end, align = flat[np.argmax(side * flat[:, 0])], "left" if side > 0 else "right"
-        axes.annotate(body.name, tuple(end), (8 * side, 8), textcoords="offset points", fontsize=8, ha=align, zorder=5,
-                      arrowprops={"arrowstyle": "-", "lw": 0.6, "shrinkA": 1, "shrinkB": 0})  # fmt: skip
+        end = flat[np.argmax(side * flat[:, 0])]
+        align = "left" if side > 0 else "right"
+        axes.annotate(
+            body.name,
+            tuple(end),
+            (8 * side, 8),
+            textcoords="offset points",
+            fontsize=8,
+            ha=align,
+            zorder=5,
+            arrowprops={"arrowstyle": "-", "lw": 0.6, "shrinkA": 1, "shrinkB": 0},
+        )
     axes.annotate("axes of the base: 0.15 m", (0.0, 0.0), xycoords="axes fraction", fontsize=7)
 
 
@@ -217,7 +260,22 @@ def _ellipses(axes: Axes, view: StereoView, side: int, body: str, arrows: float 
     if found.shapes is not None:
         outlines = [ellipse_points(*one) for one in zip(centres, found.shapes[side], strict=True)]
         axes.add_collection(LineCollection(outlines, colors=FOUND[body], linewidths=0.8))
-    axes.scatter(centres[:, 0], centres[:, 1], s=26, facecolors="none", edgecolors=FOUND[body], linewidths=0.6)
+    axes.scatter(
+        centres[:, 0],
+        centres[:, 1],
+        s=26,
+        facecolors="none",
+        edgecolors=FOUND[body],
+        linewidths=0.6,
+    )
     if arrows is not None and len(centres):
         errors = arrows * (centres - found.expected[side])
-        axes.quiver(*centres.T, *errors.T, angles="xy", scale_units="xy", scale=1, color=FOUND[body], width=0.004)
+        axes.quiver(
+            *centres.T,
+            *errors.T,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            color=FOUND[body],
+            width=0.004,
+        )

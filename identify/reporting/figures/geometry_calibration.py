@@ -14,11 +14,14 @@ ROOM = 20.0
 
 
 def geometry_figure(entry: Mapping[str, Any]) -> Figure:
-    """Of the content of a geometry.json: how well each number is known, and its error where the truth is; and by how
-    much poses that were not measured are missed, after so many poses, random and chosen."""
+    """Of the content of a geometry.json: how well each number is known, and its error where the
+    truth is; and by how much poses that were not measured are missed, after so many poses, random
+    and chosen."""
     several = "random_poses" in entry
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, 1 + several, width_ratios=(3, 2) if several else None))
+    panels = np.atleast_1d(
+        figure.subplots(1, 1 + several, width_ratios=(3, 2) if several else None)
+    )
     _numbers(panels[0], entry["parameters"])
     if several:
         _by_count(panels[1], entry)
@@ -26,21 +29,37 @@ def geometry_figure(entry: Mapping[str, Any]) -> Figure:
 
 
 def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
-    """Standard deviations and errors over the tolerance, one column a kind of number, one point a leg."""
+    """Standard deviations and errors over the tolerance, one column a kind of number, one point a
+    leg.
+    """
     kinds = list(dict.fromkeys(name.partition(".")[2] for name in parameters))
     legs = list(dict.fromkeys(name.partition(".")[0] for name in parameters))
     at = [
-        kinds.index(name.partition(".")[2]) + 0.6 * (legs.index(name.partition(".")[0]) / len(legs) - 0.4)
+        kinds.index(name.partition(".")[2])
+        + 0.6 * (legs.index(name.partition(".")[0]) / len(legs) - 0.4)
         for name in parameters
     ]
     rows = parameters.values()
-    missed = [(x, p) for x, p in zip(at, rows, strict=True) if p["true"] is not None and p["estimate"] != p["true"]]
+    missed = [
+        (x, p)
+        for x, p in zip(at, rows, strict=True)
+        if p["true"] is not None and p["estimate"] != p["true"]
+    ]
     known = [(x, abs(p["estimate"] - p["true"]) / p["tolerance"]) for x, p in missed]
-    axes.plot(at, [p["std"] / p["tolerance"] for p in rows], "o", color=BLUE, label="standard deviation")
+    axes.plot(
+        at, [p["std"] / p["tolerance"] for p in rows], "o", color=BLUE, label="standard deviation"
+    )
     if known:
         axes.plot(*zip(*known, strict=True), "x", color=RED, label="error")
     axes.axhline(1 / 3, color=GREY, linewidth=0.8, linestyle="--")
-    axes.annotate("told below", (1, 1 / 3), xycoords=("axes fraction", "data"), color=GREY, ha="right", va="bottom")
+    axes.annotate(
+        "told below",
+        (1, 1 / 3),
+        xycoords=("axes fraction", "data"),
+        color=GREY,
+        ha="right",
+        va="bottom",
+    )
     axes.set_yscale("log")
     axes.set_xticks(range(len(kinds)), kinds, rotation=40, ha="right", rotation_mode="anchor")
     axes.set_ylabel("share of the tolerance [1]")
@@ -50,15 +69,21 @@ def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def _by_count(axes: Axes, entry: Mapping[str, Any]) -> None:
-    """Expected errors of poses that were not measured against the number of poses, random and chosen."""
-    random, chosen = entry["random_poses"], entry["selection"]["chosen"]
+    """Expected errors of poses that were not measured against the number of poses, random and
+    chosen.
+    """
+    random = entry["random_poses"]
+    chosen = entry["selection"]["chosen"]
     for key, unit, color, line in (
         ("position_rms_um", "position [µm]", BLUE, "-"),
         ("orientation_rms_urad", "orientation [µrad]", RED, "--"),
     ):
-        counts, values = [one["poses"] for one in random], [_rms(one[key]) for one in random]
+        counts = [one["poses"] for one in random]
+        values = [_rms(one[key]) for one in random]
         axes.plot(counts, values, line, color=color, label=f"random poses, {unit}")
-        axes.plot([chosen["poses"]], [_rms(chosen[key])], "o", color=color, label=f"chosen poses, {unit}")
+        axes.plot(
+            [chosen["poses"]], [_rms(chosen[key])], "o", color=color, label=f"chosen poses, {unit}"
+        )
     axes.set_yscale("log")
     axes.set_ylim(top=axes.get_ylim()[1] * ROOM)
     axes.set_xlabel("number of poses")

@@ -1,0 +1,108 @@
+"""What runs need in machine code, compiled beforehand: robots, the loop around them, and the
+sensor, side by side.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from multiprocessing import get_context
+from multiprocessing.connection import wait
+from multiprocessing.context import SpawnProcess
+
+import numpy as np
+
+from dynamics import Robot, load_robot
+from dynamics.closed_loop import RateSensor, Reference, prepare
+from identify.errors import IdentifyError
+from identify.experiment.plant import Plant, build_plant
+from identify.experiment.run import taught_sensor
+from identify.experiment.sensor_in_loop import SensorInLoop, with_renderer
+from identify.progress import Progress, SilentProgress
+from identify.runtime import cores, deaf_offspring
+from identify.scenario import Scenario
+
+WARM_UP_FRAMES = 12
+
+Task = Callable[[], None]
+
+
+def compile_robots(robots: tuple[Robot, ...], progress: Progress) -> None:
+    """Compile robots and the loop around them, unless that has been done."""
+    with progress.stage("compile the robot", 2 * len(robots)) as advance:
+        for robot in robots:
+            _ = robot.functions
+            advance()
+            prepare(robot)
+            advance()
+
+
+def warm_up(scenario: Scenario, progress: Progress, robots: tuple[str, ...] = ()) -> None:
+    """Compile into the caches on disk what runs of a scenario need, and what built-in robots do, on
+    all cores.
+
+    Each task is a process of its own: LLVM compiles on one core. Raises what a run raises before
+    its first frame, and IdentifyError where a process dies.
+    """
+    scenario = with_renderer(scenario)
+    build_plant(scenario)
+    renderers = dict.fromkeys((scenario.renderer, "analytic"))
+    tasks: dict[str, Task] = {"the robot": partial(_compile_plant, scenario)}
+    tasks["the sensor"] = partial(_compile_sensor, scenario, tuple(renderers))
+    tasks |= {name: partial(_compile_named, name) for name in robots if name != scenario.robot}
+    with progress.stage("compile", len(tasks)) as advance:
+        _side_by_side(tasks, advance)
+
+
+def _compile_plant(scenario: Scenario) -> None:
+    plant = build_plant(scenario)
+    compile_robots((plant.nominal, plant.robot), SilentProgress())
+    plant.run(_nearby(plant), RateSensor(lambda frame, time, pose, rate: np.array(pose)))
+
+
+def _compile_sensor(scenario: Scenario, renderers: tuple[str, ...]) -> None:
+    """Teach the sensor and measure some frames with each renderer."""
+    plant = build_plant(scenario)
+    motion = _nearby(plant)
+    for renderer in renderers:
+        sensor = taught_sensor(
+            scenario.with_overrides({"renderer": renderer}), plant.nominal, 0, SilentProgress()
+        )
+        eye = SensorInLoop(sensor, plant.robot, 0)
+        for frame, (pose, rate) in enumerate(zip(motion.poses, motion.rates, strict=True)):
+            eye.measure(frame, frame / scenario.timing.frame_rate_hz, pose, rate)
+
+
+def _compile_named(name: str) -> None:
+    compile_robots((load_robot(name),), SilentProgress())
+
+
+def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
+    """Do tasks by their names, each in a new process, as many at a time as there are cores."""
+    spawn = get_context("spawn")
+    waiting = [spawn.Process(target=task, name=name, daemon=True) for name, task in tasks.items()]
+    running: list[SpawnProcess] = []
+    try:
+        while waiting or running:
+            while waiting and len(running) < cores():
+                running.append(waiting.pop(0))
+                with deaf_offspring():
+                    running[-1].start()
+            wait([process.sentinel for process in running])
+            for process in [one for one in running if one.exitcode is not None]:
+                running.remove(process)
+                if process.exitcode:
+                    raise IdentifyError(
+                        f"compiling {process.name} failed: its process ended with status "
+                        f"{process.exitcode}"
+                    )
+                advance()
+    finally:
+        for process in running:
+            process.kill()
+
+
+def _nearby(plant: Plant) -> Reference:
+    """A motion of some millimetres from home."""
+    chart = plant.nominal.geometry.chart
+    rate = chart.basis @ chart.coordinates(np.array([0.02, 0.0, 0.0, 0.0, 0.05, 0.0]))
+    times = np.arange(WARM_UP_FRAMES)[:, None] / plant.scenario.timing.frame_rate_hz
+    return Reference(plant.nominal.home_pose + times * rate, np.tile(rate, (WARM_UP_FRAMES, 1)))

@@ -1,0 +1,90 @@
+"""Files that carry a digest of their own content: a damaged one is refused before it is opened.
+
+A netCDF file has it behind its end, JSON as its first entry, TOML in its first line. It comes and
+goes with the file, so that a file that is whole is never taken for a damaged one, whatever ends the
+program that writes it. A file without a digest is of somebody else's making.
+"""
+
+import json
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from identify.errors import RecordError
+
+KEY = "sha256"
+"""First entry of a JSON file."""
+
+_TRAILER = b"\ncmmsim sha256 "
+_HEX = 2 * sha256().digest_size
+_COMMENT = "# sha256 "
+_REMEDY = ", of all that follows; take this line away to have a change by hand stand"
+
+
+def sealed(content: bytes) -> bytes:
+    """Return a netCDF file with its digest behind it, where HDF5 does not look."""
+    return content + _TRAILER + _hex(content) + b"\n"
+
+
+def is_sealed(path: Path | str, content: bytes) -> bool:
+    """Tell whether a netCDF file carries a digest.
+
+    Raises RecordError: it has another one.
+    """
+    start = len(content) - len(_TRAILER) - _HEX - 1
+    if start < 0 or content[start : start + len(_TRAILER)] != _TRAILER:
+        return False
+    if content[start:] != sealed(content[:start])[start:]:
+        raise RecordError(f"{path} is damaged: {_DIFFERS}; write it anew")
+    return True
+
+
+def sealed_json(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a JSON file holds, with its digest as the first entry."""
+    return {KEY: _of_json(entry), **entry}
+
+
+def opened_json(path: Path | str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a JSON file holds, without its digest.
+
+    Raises RecordError: it has another digest than it carries.
+    """
+    held = {name: value for name, value in entry.items() if name != KEY}
+    if KEY in entry and entry[KEY] != _of_json(held):
+        raise RecordError(f"{path} is damaged: {_DIFFERS}; write it anew")
+    return held
+
+
+def sealed_toml(text: str) -> str:
+    """Return a TOML file with its digest in a comment of the first line."""
+    return f"{_COMMENT}{_hex(text.encode()).decode()}{_REMEDY}\n{text}"
+
+
+def check_toml(path: Path) -> Path:
+    """Return the path of a TOML file that carries no digest or has the one that it carries.
+
+    Raises RecordError: another one, or no such file.
+    """
+    try:
+        first, _, text = path.read_bytes().partition(b"\n")
+    except OSError as error:
+        raise RecordError(f"cannot read {path}: {error.strerror or error}") from None
+    comment = _COMMENT.encode()
+    if first.startswith(comment) and first[len(comment) :][:_HEX] != _hex(text):
+        raise RecordError(
+            f"{path} is damaged, or was changed by hand: {_DIFFERS}; take its first line away to "
+            "have the change stand, or write it anew"
+        )
+    return path
+
+
+_DIFFERS = "it does not have the digest that it carries"
+
+
+def _hex(content: bytes) -> bytes:
+    return sha256(content).hexdigest().encode()
+
+
+def _of_json(entry: Mapping[str, Any]) -> str:
+    return _hex(json.dumps(entry, sort_keys=True).encode()).decode()

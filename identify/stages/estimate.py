@@ -1,0 +1,168 @@
+"""From the records in a run folder to the identified parameters and their covariance."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from identify.arrays import Array
+from identify.estimation import identification
+from identify.estimation.result import IdentificationResult
+from identify.files.atomic import write_files
+from identify.files.dataset import covariance_netcdf, netcdf, parameter_units
+from identify.files.run_folder import (
+    RunFolder,
+    result_json,
+    rms_figures,
+)
+from identify.files.versions import versions
+from identify.loop_parameters import with_drive
+from identify.progress import Progress
+from identify.record import recording
+from identify.record.drift import DRIFT, read_finding
+from identify.record.geometry_errors import COVARIANCE as GEOMETRY_COVARIANCE
+from identify.record.geometry_errors import store_geometry_covariance
+from identify.record.known_geometry import known_geometry
+from identify.record.own_record import read_own_records
+from identify.record.provenance import ENTRY, RECORDS, RunFiles, digest
+from identify.record.recording import build_model_run, model_groups
+from identify.scenario import Scenario, load_scenario
+from identify.scenario.scenario import estimator_settings, with_estimator_settings
+from identify.stages.plan import check_planned, open_run, record_files, scenario_file
+from identify.validation.unseen import model_on_record
+
+
+def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | None = None) -> None:
+    """Estimate the parameters from the record; writes result.json (without the truth) and
+    covariance.nc.
+
+    settings: of the estimator, by dotted path, instead of the scenario's. Once they have given a
+    result, scenario.toml holds them for the stages that follow. Raises as `identification.identify`
+    does, and ScenarioError for a setting that the record was made with.
+    """
+    run_folder = RunFolder(folder)
+    if run_folder.holds_own_record:
+        planned = load_scenario(run_folder.whole_scenario)
+        seed = None
+    else:
+        _, planned, trajectories, _ = open_run(folder)
+        seed = trajectories.seed
+    scenario = with_estimator_settings(planned, settings or {})
+    files = RunFiles(run_folder)
+    names = record_files(scenario)
+    run_folder.require(*names)
+    records = {name: files.content(name) for name in names}
+    if seed is not None:
+        for name, one in records.items():
+            check_planned(run_folder.path / name, one, scenario, trajectories)
+    found = _identified(records, scenario, progress, folder)
+    changed = {} if scenario == planned else scenario_file(run_folder, scenario)
+    write_files(changed | _identified_files(run_folder, found, scenario, seed))
+
+
+def identify_own(
+    paths: Sequence[Path], folder: Path, progress: Progress, settings: Mapping[str, Any]
+) -> None:
+    """Estimate the parameters from records of one's own, `read_own_records`; writes a run folder
+    without the truth.
+
+    Nothing is written where they cannot carry an identification. Raises as `identify`, and as
+    `read_own_records`.
+    """
+    run_folder = RunFolder(folder)
+    contents, stated = read_own_records(list(paths))
+    scenario = with_estimator_settings(stated, settings)
+    records = dict(zip(RECORDS, contents, strict=False))
+    known = known_geometry(scenario)
+    for one in contents:
+        if known.covariance is not None and GEOMETRY_COVARIANCE not in one:
+            store_geometry_covariance(one, known.robot, known.covariance)
+    found = _identified(records, scenario, progress)
+    files = scenario_file(run_folder, scenario)
+    for name, one in records.items():
+        files[folder / name] = netcdf(recording.record_groups(one))
+    files |= _identified_files(run_folder, found, scenario, None)
+    write_files(files, parents=True)
+
+
+@dataclass(frozen=True)
+class _Identified:
+    """Records by file, what an identification made of them, the models' poses (N, 6) on the first,
+    before and after, and the time that it took."""
+
+    records: Mapping[str, xr.Dataset]
+    result: IdentificationResult
+    models: tuple[Array, Array]
+    seconds: float
+
+    @property
+    def record(self) -> xr.Dataset:
+        """The first record."""
+        return next(iter(self.records.values()))
+
+
+def _identified(
+    records: Mapping[str, xr.Dataset],
+    scenario: Scenario,
+    progress: Progress,
+    folder: Path | None = None,
+) -> _Identified:
+    began = time.perf_counter()
+    robot = known_geometry(scenario, folder).robot
+    result = identification.identify(list(records.values()), robot, scenario, progress)
+    first = next(iter(records.values()))
+    scenario = with_drive(scenario, result.drive.law)
+    before, after = (
+        model_on_record(robot, scenario, values, first)
+        for values in (result.initial, result.estimate)
+    )
+    return _Identified(records, result, (before, after), time.perf_counter() - began)
+
+
+def _identified_files(
+    run_folder: RunFolder, found: _Identified, scenario: Scenario, seed: int | None
+) -> dict[Path, bytes]:
+    """Return covariance.nc and result.json; and model.nc of a record of one's own.
+
+    Such a record has no seed, and `validate`, which writes model.nc else, cannot judge it.
+    """
+    seen = found.record
+    result = found.result
+    measured = recording.poses(seen, "measured")
+    ok = seen["measured_ok"].values.astype(bool)
+    before, after = found.models
+    covariance = result.whole_covariance
+    made_of = {name: digest(one) for name, one in found.records.items()} | {
+        "covariance.nc": digest(covariance)
+    }
+    files = {}
+    if seed is None:
+        runs = model_groups(build_model_run(seen["time"].values, before, after))
+        files[run_folder.model] = netcdf(runs)
+        made_of["model.nc"] = digest(runs)
+    seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
+    units = parameter_units(result.layout, result.common_errors.names)
+    files[run_folder.covariance] = covariance_netcdf(units, covariance)
+    files[run_folder.result] = result_json(
+        {
+            "scenario": scenario.name,
+            "seed": seed,
+            "settings": estimator_settings(scenario),
+            "date": str(seen.attrs.get("created", ""))[:10] or None,
+            "versions": versions(),
+            ENTRY: made_of,
+            "seconds": {
+                "record": seen.attrs.get("record_seconds"),
+                "identify": found.seconds,
+                **seconds,
+            },
+            DRIFT: read_finding(seen),
+            "identification": result.to_dict(),
+            "before": rms_figures(before - measured, ok),
+            "after": rms_figures(after - measured, ok),
+        },
+    )
+    return files

@@ -1,0 +1,118 @@
+"""Identified model against the plant on unseen trajectories, and against the truth."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import cmmsim
+from dynamics import Robot
+from identify.arrays import Array
+from identify.errors import OutputFolderError, RecordError
+from identify.experiment.run import taught_sensor
+from identify.experiment.truth import read_truth, true_parameters
+from identify.files.atomic import write_files
+from identify.files.dataset import netcdf
+from identify.files.run_folder import (
+    RunFolder,
+    check_entries,
+    load_result,
+    result_json,
+)
+from identify.loop_parameters import settled_drive, with_drive
+from identify.progress import Progress
+from identify.record import recording
+from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
+from identify.record.recording import build_model_run, model_groups
+from identify.reporting.run_result import (
+    add_truth,
+    parameter_vector,
+    prediction_entry,
+    sensor_entry,
+    validation_entry,
+)
+from identify.stages.plan import check_planned, open_run
+from identify.validation.unseen import model_on_record, predicted_runs, run_unseen
+
+
+def validate(
+    folder: Path,
+    progress: Progress,
+    workers: int | None = None,
+    taught: cmmsim.Taught | None = None,
+) -> None:
+    """Run plant and models on the unseen trajectories and open the truth: validation.nc, model.nc,
+    result.json.
+
+    Raises RecordError for a result that is not whole, or was made of another record or covariance.
+    Raises OutputFolderError for a record of one's own, whose truth nobody knows.
+    """
+    if RunFolder(folder).holds_own_record:
+        raise OutputFolderError(
+            f"{folder} holds a record of your own: no plant is there that could run unseen "
+            "trajectories; go on with: "
+            f"cmmsim report --out {folder}"
+        )
+    run_folder, scenario, trajectories, known = open_run(folder)
+    began = time.perf_counter()
+    robot = known.robot
+    run_folder.require("covariance.nc")
+    files = RunFiles(run_folder)
+    result = load_result(run_folder.result)
+    check_robot(files.experiment, robot)
+    check_planned(run_folder.experiment, files.experiment, scenario, trajectories)
+    excitation_truth = read_truth(run_folder.experiment)
+    check_entries(run_folder.result, result, "identify")
+    files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
+    covariance = files.covariance_of(robot)
+    models = _identified_models(robot, run_folder, result)
+    scenario = with_drive(scenario, settled_drive(result["identification"]))
+    taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
+    runs = run_unseen(
+        scenario, trajectories.validation, trajectories.seed, taught, workers, progress, known
+    )
+    records = [files.experiment, *(run.record for run in runs)]
+    model_poses = [
+        [model_on_record(robot, scenario, values, seen) for values in models] for seen in records
+    ]
+    found = result["identification"].get("nuisance_estimates", {})
+    predictions = predicted_runs(
+        robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress, found
+    )
+    deviations = [None, *(prediction.std for prediction in predictions)]
+    drawn = [
+        build_model_run(seen["time"].values, initial, identified, std)
+        for seen, (initial, identified), std in zip(records, model_poses, deviations, strict=True)
+    ]
+    model_runs = model_groups(drawn[0], drawn[1:])
+    pairs = [(files.experiment, excitation_truth), *((run.record, run.truth) for run in runs)]
+    result["sensor"] = sensor_entry(pairs)
+    result["validation"] = [
+        validation_entry(*pair, *poses) | prediction_entry(prediction, pair[1])
+        for pair, poses, prediction in zip(pairs[1:], model_poses[1:], predictions, strict=True)
+    ]
+    add_truth(result["identification"], true_parameters(excitation_truth))
+    result[ENTRY] = result.get(ENTRY, {}) | {
+        "validation.nc": digest(records[1:]),
+        "model.nc": digest(model_runs),
+    }
+    result["seconds"]["validate"] = time.perf_counter() - began
+    unseen = recording.run_groups([(one.record, one.truth) for one in runs])
+    write_files(
+        {
+            run_folder.validation: netcdf(unseen),
+            run_folder.model: netcdf(model_runs),
+            run_folder.result: result_json(result),
+        }
+    )
+
+
+def _identified_models(robot: Robot, run_folder: RunFolder, result: dict[str, Any]) -> list[Array]:
+    """Parameters (p,) of the starting and of the identified model."""
+    try:
+        return [
+            parameter_vector(robot, result["identification"], column)
+            for column in ("initial", "estimate")
+        ]
+    except RecordError as error:
+        again = f"run `cmmsim identify --out {run_folder.path}` again"
+        raise RecordError(f"{run_folder.result}: {error}; {again}") from None
