@@ -20,9 +20,11 @@ html_title = f"cmmsim {release}"
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",  # Parameters, Returns and Raises as NumPy writes them
     "sphinx_gallery.gen_gallery",
     "mathml",  # formulas without a script from outside
-    "generated_pages",  # commands, file formats, figures and the API, from the code and from .readme/*.json
+    # commands, file formats, figures and the API, from the code and from .readme/*.json
+    "generated_pages",
 ]
 exclude_patterns = [
     "_ext",
@@ -34,7 +36,14 @@ exclude_patterns = [
 ]
 suppress_warnings = ["config.cache"]  # what sphinx-gallery is told cannot be pickled
 
-myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence", "substitution", "attrs_inline"]
+myst_enable_extensions = [
+    "dollarmath",
+    "amsmath",
+    "deflist",
+    "colon_fence",
+    "substitution",
+    "attrs_inline",
+]
 myst_heading_anchors = 4
 myst_substitutions = kept_figures.substitutions(DOCS.parent / ".readme")
 smartquotes = False  # two dashes begin an option

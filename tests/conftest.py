@@ -1,4 +1,6 @@
-"""What all tests share: no display, no growing cache, few threads, two processes, and results that are kept."""
+"""What all tests share: no display, no growing cache, few threads, two processes, and results that
+are kept.
+"""
 
 import json
 import os
@@ -22,6 +24,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Tests name parts of their own as a user's files do, also in processes that they start.
+os.environ.setdefault("CMMSIM_PLUGINS", "tests")
 
 # A job that a shell began in the background ignores Ctrl-C, which tests send to themselves.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -29,7 +33,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    said = "keep outcome, seconds and figures of each test that is run in a file, beside those of others in it"
+    said = (
+        "keep outcome, seconds and figures of each test that is run in a file, beside those of "
+        "others in it"
+    )
     parser.addoption("--keep-results", metavar="FILE", type=Path, help=said)
 
 
@@ -40,16 +47,20 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Two processes for the whole suite; none where files are named, to be watched, timed or stepped through."""
+    """Two processes for the whole suite; none where files are named, to be watched, timed or
+    stepped through.
+    """
     return 2 if config.args_source == config.ArgsSource.TESTPATHS else 0
 
 
 class KeptResults:
-    """Keeps results of the long proofs and the speeds, which the README quotes: `sh .ci/thorough` writes them.
+    """Keeps results of the long proofs and the speeds, which the README quotes: `sh .ci/thorough`
+    writes them.
 
-    An entry has the date, the outcome, the seconds, and the figures that a test gave to `record_property` or recorded
-    with `accuracy`. At the end of a session its tests replace what the file says of them, but for those that were
-    skipped, and those whose file is gone leave it. An entry that another machine or other versions made says so.
+    An entry has the date, the outcome, the seconds, and the figures that a test gave to
+    `record_property` or recorded with `accuracy`. At the end of a session its tests replace what
+    the file says of them, but for those that were skipped, and those whose file is gone leave it.
+    An entry that another machine or other versions made says so.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,7 +68,9 @@ class KeptResults:
         self._found: dict[str, dict[str, Any]] = {}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Add the time of each phase of a test; keep the first outcome that is no success, and the last figures."""
+        """Add the time of each phase of a test; keep the first outcome that is no success, and the
+        last figures.
+        """
         test = re.sub(r"@\w+$", "", report.nodeid)  # the group of --dist loadgroup
         entry = self._found.setdefault(test, {"outcome": "passed", "seconds": 0.0, "figures": {}})
         entry["seconds"] = round(entry["seconds"] + report.duration, 2)
@@ -71,8 +84,16 @@ class KeptResults:
             return
         from identify.files.versions import versions
 
-        engines = {one.name: one.version for one in metadata.distributions() if one.name in ("mujoco", "numba", "pin")}
-        place = {"cores": os.cpu_count(), "machine": platform.machine(), "versions": versions() | engines}
+        engines = {
+            one.name: one.version
+            for one in metadata.distributions()
+            if one.name in ("mujoco", "numba", "pin")
+        }
+        place = {
+            "cores": os.cpu_count(),
+            "machine": platform.machine(),
+            "versions": versions() | engines,
+        }
         old = json.loads(self._path.read_text(encoding="utf-8")) if self._path.exists() else {}
         elsewhere = {key: old[key] for key in old.keys() & place if old[key] != place[key]}
         tests = {
@@ -85,7 +106,9 @@ class KeptResults:
             if entry["outcome"] != "skipped" or test not in tests:
                 tests[test] = {"date": date} | entry
         write_text(
-            self._path, json.dumps(place | {"tests": dict(sorted(tests.items()))}, indent=2, ensure_ascii=False) + "\n"
+            self._path,
+            json.dumps(place | {"tests": dict(sorted(tests.items()))}, indent=2, ensure_ascii=False)
+            + "\n",
         )
 
 

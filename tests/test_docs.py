@@ -1,4 +1,6 @@
-"""The documentation can be followed: its commands exist with their options and settings, its links and files do."""
+"""The documentation can be followed: its commands exist with their options and settings, its links
+and files do.
+"""
 
 import json
 import re
@@ -17,11 +19,16 @@ from identify.scenario import load_scenario, scenario_names
 
 ROOT = Path(__file__).parent.parent
 PAGES = [path for path in sorted((ROOT / "docs").rglob("*.md")) if "generated" not in path.parts]
-TEXTS = {path: path.read_text(encoding="utf-8") for path in (*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md")}
+TEXTS = {
+    path: path.read_text(encoding="utf-8")
+    for path in (*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md")
+}
 
 
 def commands(text):
-    """The command lines of ``cmmsim`` in blocks of a shell and between backquotes, as lists of words."""
+    """The command lines of ``cmmsim`` in blocks of a shell and between backquotes, as lists of
+    words.
+    """
     blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
     lines += re.findall(r"`((?:\.venv/bin/)?cmmsim [^`]+)`", text)
@@ -42,18 +49,24 @@ def parsed(words):
 
 
 ANSWERS = ROOT / ".readme" / "answers" / "commands.txt"
-RENEWED = {name: words for name, *words in map(str.split, ANSWERS.read_text(encoding="utf-8").splitlines())}
+RENEWED = {
+    name: words for name, *words in map(str.split, ANSWERS.read_text(encoding="utf-8").splitlines())
+}
 FOUND = [(path, words) for path, text in TEXTS.items() for words in commands(text)]
 FOUND += [(ANSWERS, ["study", *words]) for words in RENEWED.values()]
 
 
 def test_every_kept_answer_has_the_command_of_its_study():
-    kept = {path.stem: json.loads(path.read_text(encoding="utf-8"))["name"] for path in ANSWERS.parent.glob("*.json")}
+    kept = {
+        path.stem: json.loads(path.read_text(encoding="utf-8"))["name"]
+        for path in ANSWERS.parent.glob("*.json")
+    }
     assert kept == {name: study for name, (study, *_) in RENEWED.items()}
 
 
 def test_every_command_line_is_one_that_the_program_takes():
-    """A command alone, as it is mentioned in a sentence, must exist; one with arguments must parse."""
+    """A command alone, as it is mentioned in a sentence, must exist; one with arguments must
+    parse."""
     assert len(FOUND) > 100
     wrong = []
     for path, words in FOUND:
@@ -64,8 +77,12 @@ def test_every_command_line_is_one_that_the_program_takes():
             scenario = values.get("scenario")
             if name in ("run", "excite") and scenario in scenario_names():
                 settings = parse_settings(values.get("settings"))
-                own = {key: value for key, value in settings.items() if str(value).endswith(".toml")}
-                load_scenario(scenario).with_overrides({k: v for k, v in settings.items() if k not in own})
+                own = {
+                    key: value for key, value in settings.items() if str(value).endswith(".toml")
+                }
+                load_scenario(scenario).with_overrides(
+                    {k: v for k, v in settings.items() if k not in own}
+                )
         except (Exception, SystemExit) as error:
             wrong.append(f"{path.relative_to(ROOT)}: cmmsim {shlex.join(words)}: {error}")
     assert not wrong, "\n".join(wrong)
@@ -81,10 +98,16 @@ def test_every_link_and_every_file_that_is_named_exists():
         wrong += [
             f"{path.relative_to(ROOT)}: {target}"
             for target in targets
-            if not target.startswith("http") and "generated/" not in target and not (path.parent / target).exists()
+            if not target.startswith("http")
+            and "generated/" not in target
+            and not (path.parent / target).exists()
         ]
-        named = re.findall(r"`(?:sh )?((?:cmmsim|dynamics|identify|tests|docs|\.ci|\.readme)/[\w./]*)`", text)
-        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in named if not (ROOT / name).exists()]
+        named = re.findall(
+            r"`(?:sh )?((?:cmmsim|dynamics|identify|tests|docs|\.ci|\.readme)/[\w./]*)`", text
+        )
+        wrong += [
+            f"{path.relative_to(ROOT)}: {name}" for name in named if not (ROOT / name).exists()
+        ]
     assert [one for one in wrong if not one.endswith("tests/FILE.py")] == []
 
 
@@ -94,16 +117,26 @@ def test_every_page_can_be_reached():
     while waiting:
         path = waiting.pop()
         reached.add(path)
-        for block in re.findall(r"^```\{toctree\}\n(.*?)^```", TEXTS.get(path, ""), re.MULTILINE | re.DOTALL):
-            names = [line for line in block.split() if not line.startswith(":") and not line.isdecimal()]
-            found = [(path.parent / f"{name}.md").resolve() for name in names if not name.startswith("generated/")]
+        for block in re.findall(
+            r"^```\{toctree\}\n(.*?)^```", TEXTS.get(path, ""), re.MULTILINE | re.DOTALL
+        ):
+            names = [
+                line for line in block.split() if not line.startswith(":") and not line.isdecimal()
+            ]
+            found = [
+                (path.parent / f"{name}.md").resolve()
+                for name in names
+                if not name.startswith("generated/")
+            ]
             waiting += [one for one in found if one not in reached]
     assert sorted(set(PAGES) - reached) == []
 
 
 @pytest.mark.slow
 def test_it_is_built_without_a_warning(tmp_path):
-    """Without running the examples, which `sh .ci/docs` does; on a copy, whose outputs are nobody else's."""
+    """Without running the examples, which `sh .ci/docs` does; on a copy, whose outputs are nobody
+    else's.
+    """
     pytest.importorskip("sphinx_gallery")
     for entry in ROOT.iterdir():
         if entry.is_file():  # pages may include it, with links from its own place

@@ -1,4 +1,6 @@
-"""What a stranger meets first: public names, their help and types, what starts, and rooms that import downwards."""
+"""What a stranger meets first: public names, their help and types, what starts, and rooms that
+import downwards.
+"""
 
 import inspect
 import os
@@ -15,9 +17,13 @@ import identify
 
 PACKAGES = ("cmmsim", "dynamics", "identify")
 ROOT = Path(__file__).parents[1]
-SOURCES = {path: path.read_text("utf-8") for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
+SOURCES = {
+    path: path.read_text("utf-8") for name in PACKAGES for path in (ROOT / name).rglob("*.py")
+}
 HEAVY = ("casadi", "cv2", "numba", "numpy", "pydantic", "pyrender", "scipy", "xarray")
-PYTEST = "import pytest; assert pytest.main(['-p', 'no:hypothesispytest', '--accuracy-seed', '0']) == 5"
+PYTEST = (
+    "import pytest; assert pytest.main(['-p', 'no:hypothesispytest', '--accuracy-seed', '0']) == 5"
+)
 
 SCRIPT = """
 import cmmsim
@@ -35,28 +41,46 @@ identify.estimate
 
 
 def python(*arguments, cwd, path=()):
-    """A process that finds the packages where they are installed, and before them what lies in a path."""
+    """A process that finds the packages where they are installed, and before them what lies in a
+    path.
+    """
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))}
     return subprocess.run(
-        [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, *arguments],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 
 def test_every_name_that_identify_offers_is_in_its_help_can_be_had_and_has_a_signature_that_can_be_read():
-    """Types stand in signatures by their names: spelled out, `ArrayLike` alone takes 200 characters."""
+    """Types stand in signatures by their names: spelled out, `ArrayLike` alone takes 200
+    characters.
+    """
     offered = {name: getattr(identify, name) for name in identify.__all__}
     assert [name for name in offered if not re.search(rf"\b{name}\b", identify.__doc__)] == []
     assert len(offered) <= 15
-    assert max(len(str(inspect.signature(value))) for name, value in offered.items() if name.islower()) < 400
+    assert (
+        max(len(str(inspect.signature(value))) for name, value in offered.items() if name.islower())
+        < 400
+    )
     assert all(value.__name__ == name for name, value in offered.items())
     assert set(offered) < set(dir(identify))
-    with pytest.raises(AttributeError, match="no attribute 'estimate'; it has IdentifyError, Scenario, "):
+    with pytest.raises(
+        AttributeError, match="no attribute 'estimate'; it has IdentifyError, Scenario, "
+    ):
         _ = identify.estimate
 
 
-@pytest.mark.parametrize("start", ["import identify", "import cmmsim", "import identify.__main__", PYTEST])
+@pytest.mark.parametrize(
+    "start", ["import identify", "import cmmsim", "import identify.__main__", PYTEST]
+)
 def test_nothing_heavy_is_imported_before_it_is_wanted(start, tmp_path):
-    """Not at the start of pytest either, for who has the package installed and tests something else."""
+    """Not at the start of pytest either, for who has the package installed and tests something
+    else.
+    """
     text = f"import sys; {start}; print([name for name in {HEAVY} if name in sys.modules])"
     assert python("-c", text, cwd=tmp_path, path=[ROOT]).stdout.endswith("[]\n")
 
@@ -67,7 +91,9 @@ def test_a_type_checker_follows_the_installed_packages(tmp_path):
     (tmp_path / "mine.py").write_text(SCRIPT)
     said = python("-m", "mypy", "--cache-dir", tmp_path / "cache", "mine.py", cwd=tmp_path).stdout
     types = re.findall(r'Revealed type is "[\w.]*\b(\w+)"', said)
-    assert types == ["IdentificationResult", "Robot", "Sensor"], f"{said}\ninstalled otherwise than by sh .ci/setup?"
+    assert types == ["IdentificationResult", "Robot", "Sensor"], (
+        f"{said}\ninstalled otherwise than by sh .ci/setup?"
+    )
     assert '"estimate"  [attr-defined]' in said
     assert said.count("error:") == 1
 
@@ -75,17 +101,24 @@ def test_a_type_checker_follows_the_installed_packages(tmp_path):
 @pytest.mark.parametrize("rooms", [[], ["errors.py", "scenario"]])
 @pytest.mark.slow
 def test_a_foreign_package_of_the_name_identify_is_named(tmp_path, rooms):
-    """PyPI's, whose `__init__.py` is empty, lies in a folder before ours, or was installed over ours."""
+    """PyPI's, whose `__init__.py` is empty, lies in a folder before ours, or was installed over
+    ours.
+    """
     foreign = tmp_path / "identify"
     foreign.mkdir()
     (foreign / "__init__.py").touch()
     for room in rooms:
         (foreign / room).symlink_to(ROOT / "identify" / room)
-    said = f"another package stands in the place of cmmsim's `identify`: {foreign}; install cmmsim alone"
+    said = (
+        f"another package stands in the place of cmmsim's `identify`: {foreign}; install "
+        "cmmsim alone"
+    )
     warned = python("-c", "from cmmsim import load_sensor", cwd=tmp_path, path=[tmp_path, ROOT])
     assert warned.returncode == 0
     assert f"UserWarning: {said}" in warned.stderr
-    command = python("-c", "import cmmsim.__main__ as c; c.main()", cwd=tmp_path, path=[tmp_path, ROOT])
+    command = python(
+        "-c", "import cmmsim.__main__ as c; c.main()", cwd=tmp_path, path=[tmp_path, ROOT]
+    )
     assert command.returncode == 1
     assert command.stderr.startswith(f"error: {said}")
     assert command.stderr.count("\n") == 1
@@ -111,18 +144,30 @@ def test_every_file_that_the_packages_need_is_named_for_the_wheel():
 
 
 def test_import_linter_keeps_every_contract():
-    """Sensor and robot know neither each other nor `identify`; estimators know neither sensor nor truth."""
+    """Sensor and robot know neither each other nor `identify`; estimators know neither sensor nor
+    truth.
+    """
     from importlinter.cli import lint_imports
 
     assert lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True) == 0
 
 
-@pytest.mark.parametrize(("room", "forbidden"), [("dynamics", "cv2|trimesh"), ("cmmsim", "casadi"), ("", r"\.")])
-def test_robots_draw_no_images_the_sensor_needs_no_casadi_and_no_file_imports_relatively(room, forbidden):
+@pytest.mark.parametrize(
+    ("room", "forbidden"), [("dynamics", "cv2|trimesh"), ("cmmsim", "casadi"), ("", r"\.")]
+)
+def test_robots_draw_no_images_the_sensor_needs_no_casadi_and_no_file_imports_relatively(
+    room, forbidden
+):
     imports = re.compile(rf"^\s*(from|import) ({forbidden})", re.MULTILINE)
-    assert [path for path, text in SOURCES.items() if path.is_relative_to(ROOT / room) and imports.search(text)] == []
+    assert [
+        path
+        for path, text in SOURCES.items()
+        if path.is_relative_to(ROOT / room) and imports.search(text)
+    ] == []
 
 
 def test_no_file_is_longer_than_a_reader_can_hold():
     assert len(SOURCES) > 100
-    assert {path.name: n for path, text in SOURCES.items() if (n := len(text.splitlines())) > 400} == {}
+    assert {
+        path.name: n for path, text in SOURCES.items() if (n := len(text.splitlines())) > 400
+    } == {}

@@ -1,7 +1,8 @@
-"""README, CONTRIBUTING and the samples of the documentation are true: figures are those of kept runs, names exist.
+"""README, CONTRIBUTING and the samples of the documentation are true: figures are those of kept
+runs, names exist.
 
-The documentation takes its figures from the same files when it is built, so they are not checked again. The commands
-that it names `tests/test_docs.py` parses.
+The documentation takes its figures from the same files when it is built, so they are not checked
+again. The commands that it names `tests/test_docs.py` parses.
 """
 
 import json
@@ -40,17 +41,35 @@ def page(name):
 
 
 def figures(content, part=""):
-    """Figures by name that the tests of a kept file recorded, and the last of their dates; none of them failed."""
+    """Figures by name that the tests of a kept file recorded, and the last of their dates; none of
+    them failed.
+    """
     entries = [entry for test, entry in content["tests"].items() if part in test]
     assert "failed" not in {entry["outcome"] for entry in entries}
     return (
-        {name: value for entry in entries if entry["outcome"] == "passed" for name, value in entry["figures"].items()},
+        {
+            name: value
+            for entry in entries
+            if entry["outcome"] == "passed"
+            for name, value in entry["figures"].items()
+        },
         max(entry["date"] for entry in entries),
     )
 
 
+def figures_of_each(content, name):
+    """Values of a figure that several tests recorded, and the last of their dates; none of them
+    failed.
+    """
+    entries = [entry for entry in content["tests"].values() if name in entry["figures"]]
+    assert {entry["outcome"] for entry in entries} == {"passed"}
+    return [entry["figures"][name] for entry in entries], max(entry["date"] for entry in entries)
+
+
 def test_the_headline_figures_are_those_of_kept_runs():
-    """Each row with its date; the run of the paper's scenario meets every goal, and every proof passed."""
+    """Each row with its date; the run of the paper's scenario meets every goal, and every proof
+    passed.
+    """
     result = kept("result")
     assert (result["scenario"], len(result["validation"])) == ("paper", 10)
     assert [goal for goal in check_goals(result) if not goal.passed] == []
@@ -59,7 +78,8 @@ def test_the_headline_figures_are_those_of_kept_runs():
         for what, unit in (("position", "um"), ("orientation", "urad"))
     ]
     seen = [
-        max(result["sensor"][f"{what}_{unit}"]) for what, unit in (("position_rms", "um"), ("orientation_rms", "urad"))
+        max(result["sensor"][f"{what}_{unit}"])
+        for what, unit in (("position_rms", "um"), ("orientation_rms", "urad"))
     ]
     figures(kept("thorough"))  # none of all has failed
     proved, proved_on = figures(kept("thorough"), "test_interval_coverage.py")
@@ -67,16 +87,27 @@ def test_the_headline_figures_are_those_of_kept_runs():
     others = [value for name, value in robots.items() if name.startswith("unseen_position_um_")]
     assert len(others) == len(dynamics.built_in_robots()) == 8
     frames, frames_on = figures(kept("speeds"), "test_sensor_speed.py")
-    faster, faster_on = figures(kept("speeds"), "test_dynamics_speed.py")
+    faster, faster_on = figures_of_each(kept("speeds"), "forward_dynamics_over_lcaba")
+    assert len(faster) == 8
+    points = kept("answers/interval_coverage")["points"]
+    predicted = [point["figures"]["poses_covered_percent"]["mean"] for point in points]
+    assert len(predicted) == 8
+    in_a_run = result["sensor"]["stereo_frames_per_second"]
+    alone = [frames[f"{renderer}_frames_a_second"] for renderer in ("pyrender", "analytic")]
     rows = [
         f"| {unseen[0]:.1f} µm, {unseen[1]:.1f} µrad | `cmmsim run`, {result['date']} |",
         f"| {seen[0]:.1f} µm, {seen[1]:.1f} µrad | `cmmsim run`, {result['date']} |",
-        f"| {100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} % | `sh .ci/thorough`, {proved_on} |",
+        f"| {100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} % | `sh "
+        f".ci/thorough`, {proved_on} |",
         f"| {min(others):.1f} to {max(others):.1f} µm | `sh .ci/thorough`, {robots_on} |",
-        f"| {frames['analytic_frames_a_second']:.0f} | `sh .ci/thorough`, {frames_on} |",
-        f"| {faster['forward_dynamics_over_pinocchio']:.1f} | `sh .ci/thorough`, {faster_on} |",
+        f"| {in_a_run:.0f} | `cmmsim run`, {result['date']} |",
+        f"| {alone[0]:.0f}, {alone[1]:.0f} | `sh .ci/thorough`, {frames_on} |",
+        f"| {min(faster):.1f} to {max(faster):.1f} | `sh .ci/thorough`, {faster_on} |",
     ]
-    missing = [row for row in rows if row not in README]
+    undated = (
+        f"| {min(predicted):.0f} to {max(predicted):.0f} % | `cmmsim study interval_coverage` |"
+    )
+    missing = [row for row in [*rows, undated] if row not in README]
     assert not missing, "the README wants these ends of rows:\n" + "\n".join(missing)
     assert len(re.findall(r"\d{4}-\d\d-\d\d", README)) == len(rows), "a figure that nobody checks"
 
@@ -90,7 +121,10 @@ def test_kept_speeds_are_within_their_limits_and_no_search_ended_elsewhere():
 
 
 def test_kept_accuracy_agrees_with_mujoco_and_the_estimators_are_counted():
-    found = {figure.name: figure.value for figure in read_saved(ROOT / ".readme" / "accuracy.json").figures}
+    found = {
+        figure.name: figure.value
+        for figure in read_saved(ROOT / ".readme" / "accuracy.json").figures
+    }
     assert found["the paper's loop against MuJoCo, position"] < 0.010
     assert found["the paper's loop against MuJoCo, angle"] < 0.020
     numbers = {"eight": 8, "nine": 9, "ten": 10, "eleven": 11}
@@ -100,7 +134,9 @@ def test_kept_accuracy_agrees_with_mujoco_and_the_estimators_are_counted():
 
 
 def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_path):
-    """The very line of the documentation, with the quoted run where it says that runs are; it says what changes."""
+    """The very line of the documentation, with the quoted run where it says that runs are; it says
+    what changes.
+    """
     mujoco = pytest.importorskip("mujoco")
     line = re.findall(r"^cmmsim export mjcf .+$", page("howto/robot_alone"), re.MULTILINE)[0]
     assert "--parameters runs/paper-0/result.json" in line
@@ -112,7 +148,9 @@ def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_pat
         command_line.main()
     assert not ended.value.code
     said = capfd.readouterr().out
-    changes = [float(value) for value in re.findall(r"accelerations differ by up to ([\d.]+) %", said)]
+    changes = [
+        float(value) for value in re.findall(r"accelerations differ by up to ([\d.]+) %", said)
+    ]
     assert len(changes) == 1, "one body alone alters the motion"
     model = mujoco.MjModel.from_xml_path("rss6.xml")
     data = mujoco.MjData(model)
@@ -146,20 +184,26 @@ def test_every_file_and_command_that_is_named_exists_and_ci_calls_the_command_of
     text, command = README + CONTRIBUTING, "sh .ci/setup && sh .ci/test"
     for target in re.findall(r"\]\(([^)#]+)", text):
         assert target.startswith("http") or (ROOT / target).exists(), target
-    for path in re.findall(r"`(?:sh )?((?:cmmsim|dynamics|identify|tests|\.ci|\.readme)/[\w./]*)`", text):
+    for path in re.findall(
+        r"`(?:sh )?((?:cmmsim|dynamics|identify|tests|\.ci|\.readme)/[\w./]*)`", text
+    ):
         assert (ROOT / path).exists() or path == "tests/FILE.py", path
     assert command in README
     assert command in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
 def test_contributors_find_the_file_and_the_line_where_something_new_goes():
-    """Each row of the table: a file of the kind that it shows, and the name in the file where a new one is entered."""
+    """Each row of the table: a file of the kind that it shows, and the name in the file where a new
+    one is entered.
+    """
     shown = re.findall(r"`([\w/]+/)`, as `(\w+\.py)`", CONTRIBUTING)
     entered = re.findall(r"`([A-Z]+|family)` in `([\w/]+\.py)`", CONTRIBUTING)
     assert (len(shown), len(entered)) == (7, 10)
     assert [folder + file for folder, file in shown if not (ROOT / folder / file).exists()] == []
     for name, file in entered:
-        assert re.search(rf"^ *{name}\b.*[:=]", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE), (name, file)
+        assert re.search(
+            rf"^ *{name}\b.*[:=]", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE
+        ), (name, file)
 
 
 TESTS = """
@@ -179,15 +223,28 @@ def test_skipped(name): pass
 
 
 @pytest.mark.parametrize("workers", ["0", pytest.param("1", marks=pytest.mark.slow)])
-def test_each_test_of_a_session_replaces_its_entry_and_leaves_those_of_others(pytester, monkeypatch, workers):
+def test_each_test_of_a_session_replaces_its_entry_and_leaves_those_of_others(
+    pytester, monkeypatch, workers
+):
     monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
     pytester.makeconftest("from tests.conftest import pytest_addoption, pytest_configure")
     pytester.makepyfile(test_mine=TESTS, test_other="")
     old = {"date": "2020-01-01", "outcome": "passed", "seconds": 1.0, "figures": {}}
-    names = ("test_other.py::a", "gone.py::b", "test_mine.py::test_bad", "test_mine.py::test_skipped[old]")
+    names = (
+        "test_other.py::a",
+        "gone.py::b",
+        "test_mine.py::test_bad",
+        "test_mine.py::test_skipped[old]",
+    )
     kept = pytester.path / "kept.json"
-    kept.write_text(json.dumps({"cores": os.cpu_count(), "machine": "abacus", "tests": dict.fromkeys(names, old)}))
-    pytester.runpytest_inprocess("-n", workers, "--dist", "loadgroup", "-p", "no:cacheprovider", "--keep-results", kept)
+    kept.write_text(
+        json.dumps(
+            {"cores": os.cpu_count(), "machine": "abacus", "tests": dict.fromkeys(names, old)}
+        )
+    )
+    pytester.runpytest_inprocess(
+        "-n", workers, "--dist", "loadgroup", "-p", "no:cacheprovider", "--keep-results", kept
+    )
     content = json.loads(kept.read_text())
     tests = content["tests"]
     assert {name: entry["outcome"] for name, entry in tests.items()} == {
@@ -197,7 +254,11 @@ def test_each_test_of_a_session_replaces_its_entry_and_leaves_those_of_others(py
         "test_mine.py::test_skipped[old]": "passed",
         "test_other.py::a": "passed",
     }
-    assert tests["test_other.py::a"] == tests["test_mine.py::test_skipped[old]"] == {"machine": "abacus"} | old
+    assert (
+        tests["test_other.py::a"]
+        == tests["test_mine.py::test_skipped[old]"]
+        == {"machine": "abacus"} | old
+    )
     assert tests["test_mine.py::test_proof"]["figures"] == {"held": 0.9491, "bias": 0.25}
     assert tests["test_mine.py::test_bad"]["date"] > "2020-01-01"
     assert {"cmmsim", "numpy", "pin", "python"} <= set(content["versions"])

@@ -1,4 +1,5 @@
-"""A picture of each kept answer: its figures against what the study varies, with their 95 % bands."""
+"""A picture of each kept answer: its figures against what the study varies, with their 95 %
+bands."""
 
 from textwrap import fill
 from typing import Any
@@ -25,9 +26,12 @@ Point = tuple[tuple[Any, ...], dict[str, Middle]]
 
 
 def picture(points: list[Point], factors: list[str], shown: dict[str, str]) -> Figure:
-    """A panel for each figure under its head in `shown`, against the factor with most levels; a curve for each setting
-    of the others, which have these heads."""
-    levels = [list(dict.fromkeys(setting[place] for setting, _ in points)) for place in range(len(factors))]
+    """A panel for each figure under its head in `shown`, against the factor with most levels; a
+    curve for each setting of the others, which have these heads."""
+    levels = [
+        list(dict.fromkeys(setting[place] for setting, _ in points))
+        for place in range(len(factors))
+    ]
     along = max(range(len(factors)), key=lambda place: len(levels[place]))
     with mpl.rc_context(STYLE):
         figure, panels = panel_grid(len(shown), *PANEL)
@@ -35,10 +39,17 @@ def picture(points: list[Point], factors: list[str], shown: dict[str, str]) -> F
             curves: dict[tuple[Any, ...], list[Point]] = {}
             for setting, figures in points:
                 if name in figures:
-                    curves.setdefault(setting[:along] + setting[along + 1 :], []).append((setting, figures))
+                    curves.setdefault(setting[:along] + setting[along + 1 :], []).append(
+                        (setting, figures)
+                    )
             for others, own in curves.items():
                 said = ", ".join(str(level) for level in others)
-                _curve(axes, [(setting[along], figures[name]) for setting, figures in own], levels[along], said)
+                _curve(
+                    axes,
+                    [(setting[along], figures[name]) for setting, figures in own],
+                    levels[along],
+                    said,
+                )
             if _names(levels[along]):
                 _scale_over_names(axes, levels[along])
             else:
@@ -46,7 +57,9 @@ def picture(points: list[Point], factors: list[str], shown: dict[str, str]) -> F
             axes.set_ylabel(fill(head.replace("`", ""), LETTERS))
             axes.set_xlabel(factors[along])
             if len(curves) > 1:
-                axes.legend(fontsize="small", title=", ".join(factors[:along] + factors[along + 1 :]))
+                axes.legend(
+                    fontsize="small", title=", ".join(factors[:along] + factors[along + 1 :])
+                )
     return figure
 
 
@@ -56,9 +69,20 @@ def _curve(axes: Axes, values: list[tuple[Any, Any]], levels: list[Any], label: 
     at = [levels.index(level) if names else level for level, _ in values]
     middles = [middle for _, (middle, _) in values]
     bands = [band or (middle, middle) for _, (middle, band) in values]
-    reach = [[max(middle - low, 0.0) for middle, (low, _) in zip(middles, bands, strict=True)],
-             [max(high - middle, 0.0) for middle, (_, high) in zip(middles, bands, strict=True)]]  # fmt: skip
-    axes.errorbar(at, middles, reach, marker="o", markersize=4, capsize=2, ls="" if names else "-", label=label)
+    reach = [
+        [max(middle - low, 0.0) for middle, (low, _) in zip(middles, bands, strict=True)],
+        [max(high - middle, 0.0) for middle, (_, high) in zip(middles, bands, strict=True)],
+    ]
+    axes.errorbar(
+        at,
+        middles,
+        reach,
+        marker="o",
+        markersize=4,
+        capsize=2,
+        ls="" if names else "-",
+        label=label,
+    )
 
 
 def _scale_over_names(axes: Axes, names: list[Any]) -> None:

@@ -1,4 +1,6 @@
-"""The public names of a package, each with its docstring, in the groups that the package's own docstring makes."""
+"""The public names of a package, each with its docstring, in the groups that the package's own
+docstring makes.
+"""
 
 import importlib
 import inspect
@@ -12,7 +14,10 @@ def package(name: str) -> str:
         found = getattr(module, public)
         if inspect.ismodule(found):
             parts += [f"## {name}.{public}", f"```text\n{inspect.getdoc(found)}\n```"]
-            parts += [_directive(f"{name}.{public}", inner, getattr(found, inner)) for inner in found.__all__]
+            parts += [
+                _directive(f"{name}.{public}", inner, getattr(found, inner))
+                for inner in found.__all__
+            ]
         else:
             parts.append(_directive(name, public, found))
     return "\n\n".join(parts) + "\n"

@@ -1,4 +1,6 @@
-"""Pages that are written from the code and from kept figures before each build, into docs/generated."""
+"""Pages that are written from the code and from kept figures before each build, into
+docs/generated.
+"""
 
 import inspect
 from collections.abc import Callable
@@ -60,7 +62,10 @@ COVERED = {
 
 ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "friction_timing": (
-        {"scenario.timing.frame_rate_hz": "frame rate, Hz", "scenario.timing.latency_s": "latency, s"},
+        {
+            "scenario.timing.frame_rate_hz": "frame rate, Hz",
+            "scenario.timing.latency_s": "latency, s",
+        },
         {
             "coulomb_error_percent": "error of Coulomb friction, %",
             "coulomb_std_percent": "as stated, %",
@@ -119,10 +124,16 @@ FIGURES: dict[str, Callable[[Path], str]] = {
         at_both_rates("control_laws"), TIMING, {"options.law": "law"}, COMPARED
     ),
     "answer_control_robots.md": kept_figures.answers(
-        at_both_rates("control_robots"), TIMING, {"scenario.robot": "robot", "options.law": "law"}, COMPARED
+        at_both_rates("control_robots"),
+        TIMING,
+        {"scenario.robot": "robot", "options.law": "law"},
+        COMPARED,
     ),
     "answer_model_off.md": kept_figures.answers(
-        at_both_rates("model_off"), TIMING, {"scenario.robot": "robot", "options.law": "law"}, SHARES
+        at_both_rates("model_off"),
+        TIMING,
+        {"scenario.robot": "robot", "options.law": "law"},
+        SHARES,
     ),
     "answer_observer.md": kept_figures.answers(
         at_both_rates("observer"),
@@ -152,7 +163,11 @@ def draw_answers(figures: Path, folder: Path) -> None:
         name: (kept_figures.answer_points(figures, name, *heads), list(heads[0].values()), heads[1])
         for name, heads in ANSWERS.items()
     }
-    drawn["estimators"] = kept_figures.leaderboard_points(figures), ["estimator"], kept_figures.ESTIMATED
+    drawn["estimators"] = (
+        kept_figures.leaderboard_points(figures),
+        ["estimator"],
+        kept_figures.ESTIMATED,
+    )
     for name, (points, factors, shown) in drawn.items():
         write_figure(folder / f"answer_{name}.png", picture(points, factors, shown))
 
@@ -167,7 +182,9 @@ def without_fields(
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Write the pages when the build begins; they are included by others, and are no documents of their own."""
+    """Write the pages when the build begins; they are included by others, and are no documents of
+    their own.
+    """
     app.connect("builder-inited", write_pages, priority=100)
     app.connect("autodoc-process-signature", without_fields)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,5 @@
-"""Figures of kept runs, for the text: `{{ name }}` in a page is a figure of .readme/*.json, and none is out of date.
+"""Figures of kept runs, for the text: `{{ name }}` in a page is a figure of .readme/*.json, and
+none is out of date.
 
 Pages take single figures as substitutions; the tables of the page of results are written whole.
 """
@@ -56,7 +57,10 @@ def substitutions(folder: Path) -> dict[str, str]:
         for entry in speeds["tests"].values()
         if "forward_dynamics_over_lcaba" in entry["figures"]
     ]
-    reached = [entry["figures"].get("starts_reaching_the_optimum", 25) for entry in thorough["tests"].values()]
+    reached = [
+        entry["figures"].get("starts_reaching_the_optimum", 25)
+        for entry in thorough["tests"].values()
+    ]
     outcomes = [entry["outcome"] for entry in thorough["tests"].values()]
     identification = result["identification"]
     return {
@@ -95,7 +99,8 @@ def sensor_speed(folder: Path) -> str:
         "times_straightforward": "times as fast as the straightforward pipeline",
     }
     rows = [
-        (title, *(f"{found[f'{renderer}_{name}']:.0f}" for renderer in renderers)) for name, title in titles.items()
+        (title, *(f"{found[f'{renderer}_{name}']:.0f}" for renderer in renderers))
+        for name, title in titles.items()
     ]
     others = {
         "images_in_the_loop": "`pyrender`, in the loop, between other work",
@@ -104,23 +109,30 @@ def sensor_speed(folder: Path) -> str:
     }
     more = [(title, f"{found[f'{name}_frames_a_second']:,.0f}") for name, title in others.items()]
     table = _table(("renderer", "`analytic`", "`pyrender`"), rows)
-    return f"{table}\n\n{_table(('frames a second', ''), more)}" + _measured(folder, "test_sensor_speed")
+    return f"{table}\n\n{_table(('frames a second', ''), more)}" + _measured(
+        folder, "test_sensor_speed"
+    )
 
 
 def dynamics_speed(folder: Path) -> str:
     """The dynamics against other engines."""
     found = figures_of(kept(folder, "speeds"), "test_dynamics_speed")
     shown: list[tuple[str, str, Callable[[float], str]]] = [
-        ("forward dynamics against Pinocchio's closed chain, relative difference", "pinocchio_relative_difference",
+        ("forward dynamics against Pinocchio's closed chain, relative "
+         "difference", "pinocchio_relative_difference",
          lambda value: f"{value:.0e}"),
-        ("forward dynamics against Pinocchio's `constraintDynamics`", "forward_dynamics_over_pinocchio", _faster),
+        ("forward dynamics against Pinocchio's "
+         "`constraintDynamics`", "forward_dynamics_over_pinocchio", _faster),
         ("forward dynamics against MuJoCo's `mj_step`", "forward_dynamics_over_mj_step", _faster),
         ("closed loop with exact stick-slip friction, 60 Hz frames", "times_real_time",
          lambda value: f"{value:.0f} times real time"),
-        ("all 67 sensitivities of a run", "sensitivities_plain_runs", lambda value: f"{value:.1f} plain runs"),
-        ("a batch of runs on two cores", "two_cores_gain", lambda value: f"{value:.2f} times faster than on one"),
+        ("all 67 sensitivities of a run", "sensitivities_plain_runs", lambda value: f"{value:.1f} "
+                                                                                    "plain runs"),
+        ("a batch of runs on two cores", "two_cores_gain", lambda value: f"{value:.2f} times "
+                                                                         "faster than on one"),
         ("compiling a robot, at first use", "robot_compilation_s", lambda value: f"{value:.0f} s"),
-        ("compiling the loop, once after installation", "loop_compilation_s", lambda value: f"{value:.0f} s"),
+        ("compiling the loop, once after "
+         "installation", "loop_compilation_s", lambda value: f"{value:.0f} s"),
     ]  # fmt: skip
     rows = [(title, text(found[name])) for title, name, text in shown]
     return _table(("figure", "measured"), rows) + _measured(folder, "test_dynamics_speed")
@@ -132,7 +144,12 @@ def robots(folder: Path) -> str:
     found = figures_of(thorough, "test_families")
     names = sorted(name.removeprefix(WORST) for name in found if name.startswith(WORST))
     rows = [
-        (f"`{name}`", f"{found[WORST + name]:.2f}", f"{found[f'unseen_orientation_urad_{name}']:.1f}") for name in names
+        (
+            f"`{name}`",
+            f"{found[WORST + name]:.2f}",
+            f"{found[f'unseen_orientation_urad_{name}']:.1f}",
+        )
+        for name in names
     ]
     heads = ("robot", "unseen position, µm", "unseen orientation, µrad")
     return _table(heads, rows) + f"\n\nMeasured {date_of(thorough, 'test_families')}.\n"
@@ -148,7 +165,9 @@ def laws(folder: Path) -> str:
             key = f"law {name} {number}"
             measured = ""
             if f"{key} measured" in found:
-                middle, low, high = (found[f"{key} {figure}"] for figure in ("measured", "low", "high"))
+                middle, low, high = (
+                    found[f"{key} {figure}"] for figure in ("measured", "low", "high")
+                )
                 measured = f"{middle:.3f} ({low:.3f} to {high:.3f})"
             statement = law.statement.replace("_", "\\_").replace("^", "\\^").replace("~", "\\~")
             rows.append((f"`{name}`", f"{statement}: {law.why.replace('^', '&#94;')}", measured))
@@ -157,25 +176,38 @@ def laws(folder: Path) -> str:
 
 
 def answer(name: str, factors: dict[str, str], shown: dict[str, str]) -> Callable[[Path], str]:
-    """The table of a built-in study that asks a question, of its kept summary: factors and figures with their heads."""
+    """The table of a built-in study that asks a question, of its kept summary: factors and figures
+    with their heads.
+    """
     return answers({name: ()}, (), factors, shown)
 
 
-def answer_points(folder: Path, name: str, factors: dict[str, str], shown: dict[str, str]) -> list[Point]:
+def answer_points(
+    folder: Path, name: str, factors: dict[str, str], shown: dict[str, str]
+) -> list[Point]:
     """The same as numbers."""
     return [
         (
             tuple(point["factors"][path] for path in factors),
-            {figure: _middle(figure, point["figures"]) for figure in shown if figure in point["figures"]},
+            {
+                figure: _middle(figure, point["figures"])
+                for figure in shown
+                if figure in point["figures"]
+            },
         )
         for point in kept(folder / "answers", name)["points"]
     ]
 
 
 def answers(
-    kept_as: dict[str, tuple[str, ...]], heads: tuple[str, ...], factors: dict[str, str], shown: dict[str, str]
+    kept_as: dict[str, tuple[str, ...]],
+    heads: tuple[str, ...],
+    factors: dict[str, str],
+    shown: dict[str, str],
 ) -> Callable[[Path], str]:
-    """The same of several kept summaries, each with what its rows have in common, under these heads."""
+    """The same of several kept summaries, each with what its rows have in common, under these
+    heads.
+    """
 
     def table(folder: Path) -> str:
         contents = {name: kept(folder / "answers", name) for name in kept_as}
@@ -188,7 +220,9 @@ def answers(
             for name, content in contents.items()
             for point in content["points"]
         ]
-        return _table((*heads, *factors.values(), *shown.values()), rows) + _kept_rows(folder, contents)
+        return _table((*heads, *factors.values(), *shown.values()), rows) + _kept_rows(
+            folder, contents
+        )
 
     return table
 
@@ -196,7 +230,8 @@ def answers(
 def leaderboard(folder: Path) -> str:
     """Median errors of the nine estimators, rms over the kept experiments."""
     rows = [
-        (f"`{name}`", *(_text(found.get(end)) for end in ESTIMATED)) for (name,), found in leaderboard_points(folder)
+        (f"`{name}`", *(_text(found.get(end)) for end in ESTIMATED))
+        for (name,), found in leaderboard_points(folder)
     ]
     contents = {"estimators": kept(folder / "answers", "estimators")}
     return _table(("estimator", *ESTIMATED.values()), rows) + _kept_rows(folder, contents)
@@ -208,7 +243,10 @@ def leaderboard_points(folder: Path) -> list[Point]:
     found, end = point["figures"], "_position_um"
     names = [name.removesuffix(end) for name in found if name.endswith(end)]
     return [
-        ((name,), {end: _middle(f"{name}_{end}", found) for end in ESTIMATED if f"{name}_{end}" in found})
+        (
+            (name,),
+            {end: _middle(f"{name}_{end}", found) for end in ESTIMATED if f"{name}_{end}" in found},
+        )
         for name in names
     ]
 
@@ -232,8 +270,11 @@ def _text(figure: Middle | None) -> str:
 
 
 def _kept_rows(folder: Path, contents: dict[str, dict[str, Any]]) -> str:
-    """How many rows answers have, by their names, and with which commands: those of `.ci/answers`."""
-    done, failed = (sum(content["rows"][what] for content in contents.values()) for what in ("done", "failed"))
+    """How many rows answers have, by their names, and with which commands: those of
+    `.ci/answers`."""
+    done, failed = (
+        sum(content["rows"][what] for content in contents.values()) for what in ("done", "failed")
+    )
     lost, seed = f"; {failed} failed" if failed else "", next(iter(contents.values()))["seed"]
     lines = (folder / "answers" / "commands.txt").read_text(encoding="utf-8").splitlines()
     renewed = dict(line.split(" ", 1) for line in lines)

@@ -1,4 +1,5 @@
-"""Formulas as MathML, which browsers draw themselves: no script, no picture, no font from outside."""
+"""Formulas as MathML, which browsers draw themselves: no script, no picture, no font from
+outside."""
 
 from docutils import nodes
 from docutils.utils.math import latex2mathml
@@ -7,7 +8,8 @@ from sphinx.writers.html5 import HTML5Translator
 
 
 def _mathml(formula: str, block: bool) -> str:
-    """The formula in MathML. Raises docutils' MathError, with the place, for what it cannot read."""
+    """The formula in MathML. Raises docutils' MathError, with the place, for what it cannot
+    read."""
     return latex2mathml.tex2mathml(formula, as_block=block)
 
 

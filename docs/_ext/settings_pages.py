@@ -29,8 +29,14 @@ def sensor() -> str:
 
 def robot() -> str:
     """Robot files."""
-    families = "\n".join(f"| `{name}` | `{one.kind}` | {one.legs} | `{one.chart}` |" for name, one in FAMILIES.items())
-    head = f"| family | kind of its legs | legs | freedoms |\n| --- | --- | --- | --- |\n{families}\n\n"
+    families = "\n".join(
+        f"| `{name}` | `{one.kind}` | {one.legs} | `{one.chart}` |"
+        for name, one in FAMILIES.items()
+    )
+    head = (
+        "| family | kind of its legs | legs | freedoms |\n| --- | --- | --- | --- "
+        f"|\n{families}\n\n"
+    )
     return head + _page(robot_schema())
 
 
@@ -40,7 +46,13 @@ def study() -> str:
     for kind in KINDS.values():
         parts.append(f"## Rows of kind `{kind.name}`\n\n{_sentence(kind.what)}")
         if kind.options is not None:
-            parts.append(_table(kind.options.model_json_schema(), {}, units=lambda key: factor_unit(f"options.{key}")))
+            parts.append(
+                _table(
+                    kind.options.model_json_schema(),
+                    {},
+                    units=lambda key: factor_unit(f"options.{key}"),
+                )
+            )
         figures = "\n".join(
             f"| `{name}` | {'' if one.unit == '1' else one.unit} | {_plain(one.meaning)} |"
             for name, one in kind.columns.items()
@@ -74,11 +86,15 @@ def _page(schema: dict[str, Any], mark: str = "##") -> str:
     parts = [f"{mark} At the top of the file", _table(schema, definitions)]
     seen: set[str] = set()
     _tables(schema, definitions, "", parts, seen)
-    parts = [part.replace("## ", f"{mark} ", 1) if part.startswith("## ") else part for part in parts]
+    parts = [
+        part.replace("## ", f"{mark} ", 1) if part.startswith("## ") else part for part in parts
+    ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _tables(schema: dict[str, Any], definitions: dict[str, Any], path: str, parts: list[str], seen: set[str]) -> None:
+def _tables(
+    schema: dict[str, Any], definitions: dict[str, Any], path: str, parts: list[str], seen: set[str]
+) -> None:
     """A heading and a table for each section, once, where it is first met."""
     extra = schema.get("additionalProperties")
     properties = dict(schema.get("properties", {}))
@@ -93,7 +109,9 @@ def _tables(schema: dict[str, Any], definitions: dict[str, Any], path: str, part
             inner = definitions[name]
             if "properties" not in inner and "additionalProperties" not in inner:
                 continue
-            several = value.get("type") == "array" or any(one.get("type") == "array" for one in value.get("anyOf", []))
+            several = value.get("type") == "array" or any(
+                one.get("type") == "array" for one in value.get("anyOf", [])
+            )
             by_name = isinstance(value.get("additionalProperties"), dict)
             shown = f"{place}.NAME" if by_name else place
             title = f"`[[{shown}]]`" if several else f"`[{shown}]`"
@@ -111,7 +129,12 @@ def _referenced(value: Any) -> list[str]:
         return []
     if "$ref" in value:
         return [value["$ref"].rpartition("/")[2]]
-    return [name for key, one in value.items() if key not in ("default", "discriminator") for name in _referenced(one)]
+    return [
+        name
+        for key, one in value.items()
+        if key not in ("default", "discriminator")
+        for name in _referenced(one)
+    ]
 
 
 def _table(schema: dict[str, Any], definitions: dict[str, Any], units: Any = None) -> str:
@@ -122,7 +145,9 @@ def _table(schema: dict[str, Any], definitions: dict[str, Any], units: Any = Non
         default = "required" if key in required else _default(value)
         unit = units(key) if units else value.get("unit", "")
         unit = "" if unit == "1" else unit
-        what = "; ".join(part for part in (_plain(value.get("description", "")), _limits(value)) if part)
+        what = "; ".join(
+            part for part in (_plain(value.get("description", "")), _limits(value)) if part
+        )
         rows.append((f"`{key}`", _type(value, definitions), default, unit, what))
     if not rows:
         return ""
@@ -159,23 +184,34 @@ def _type(value: dict[str, Any], definitions: dict[str, Any]) -> str:
             return " or ".join(dict.fromkeys(kinds))
     if value.get("type") == "array":
         if "prefixItems" in value:
-            return f"{len(value['prefixItems'])} {_plural(_type(value['prefixItems'][0], definitions))}"
+            return (
+                f"{len(value['prefixItems'])} "
+                f"{_plural(_type(value['prefixItems'][0], definitions))}"
+            )
         inner = _plural(_type(value.get("items", {}), definitions))
         least, most = value.get("minItems"), value.get("maxItems")
         return f"{least} {inner}" if least is not None and least == most else f"list of {inner}"
-    words = {"integer": "whole number", "number": "number", "string": "text", "boolean": "true or false",
+    words = {"integer": "whole number", "number": "number", "string": "text", "boolean": "true or "
+                                                                                         "false",
              "object": "table"}  # fmt: skip
     return words.get(value.get("type", ""), "any value")
 
 
 def _plural(kind: str) -> str:
-    words = {"number": "numbers", "whole number": "whole numbers", "text": "texts", "table": "tables"}
+    words = {
+        "number": "numbers",
+        "whole number": "whole numbers",
+        "text": "texts",
+        "table": "tables",
+    }
     return words.get(kind, kind)
 
 
 def _limits(value: dict[str, Any]) -> str:
     parts = [value, *(one for one in value.get("anyOf", []) if isinstance(one, dict))]
-    return " and ".join(f"{sign} {part[name]:g}" for part in parts for name, sign in LIMITS.items() if name in part)
+    return " and ".join(
+        f"{sign} {part[name]:g}" for part in parts for name, sign in LIMITS.items() if name in part
+    )
 
 
 def _sentence(text: str) -> str:

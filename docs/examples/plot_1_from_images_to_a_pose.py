@@ -2,9 +2,9 @@
 From two images to a pose
 =========================
 
-The sensor of this testbed is a pair of cameras. It looks at a platform and at a fixed base, both with round stickers,
-and tells the pose of the platform in the frame of the base. Nothing of the truth is handed over: the images are drawn,
-noise is added, and what follows knows the images only.
+The sensor of this testbed is a pair of cameras. It looks at a platform and at a fixed base, both
+with round stickers, and tells the pose of the platform in the frame of the base. Nothing of the
+truth is handed over: the images are drawn, noise is added, and what follows knows the images only.
 """
 
 import matplotlib.pyplot as plt
@@ -40,8 +40,8 @@ for axes, image, centres, side in zip(
 plt.show()
 
 # %%
-# The bright discs are stickers. Those with a circle belong to the platform and were used for its pose; the others
-# stand on the base.
+# The bright discs are stickers. Those with a circle belong to the platform and were used for its
+# pose; the others stand on the base.
 #
 # One sticker
 # -----------
@@ -80,8 +80,9 @@ for name, unit, e, s in zip(
     print(f"{name:6s} error {e:7.2f} {unit:5s} claimed standard deviation {s:6.2f} {unit}")
 
 # %%
-# One error proves nothing. A claim about noise is checked by repeating: here the same pose is measured 300 times, and the
-# spread of the results is set beside the claim. Bars of one height are what an honest sensor shows.
+# One error proves nothing. A claim about noise is checked by repeating: here the same pose is
+# measured 300 times, and the spread of the results is set beside the claim. Bars of one height are
+# what an honest sensor shows.
 
 poses = np.array([sensor.measure(pose).pose for _ in range(300)])
 spread = poses.std(axis=0, ddof=1)

@@ -2,9 +2,9 @@
 From a motion to parameters with intervals
 ==========================================
 
-One experiment: a robot moves along a trajectory that shows its dynamics, the stereo sensor measures its platform, a
-visual servo closes the loop around these measurements, and what was logged is turned into masses, inertias, friction
-and gains, each with an interval.
+One experiment: a robot moves along a trajectory that shows its dynamics, the stereo sensor measures
+its platform, a visual servo closes the loop around these measurements, and what was logged is
+turned into masses, inertias, friction and gains, each with an interval.
 """
 
 import matplotlib.pyplot as plt
@@ -36,8 +36,9 @@ print(
 )
 
 # %%
-# What was logged: where the platform should be, where the sensor saw it, and the commands to the joints. The servo lags
-# behind the reference. That is as it should be: the parameters are estimated through the closed loop.
+# What was logged: where the platform should be, where the sensor saw it, and the commands to the
+# joints. The servo lags behind the reference. That is as it should be: the parameters are estimated
+# through the closed loop.
 
 time = record["time"]
 figure, panels = plt.subplots(1, 3, figsize=(10, 3.1), layout="constrained")
@@ -73,9 +74,9 @@ table = result.to_dataframe()
 table.loc[table["identifiable"], ["unit", "initial", "estimate", "low", "high"]].round(4)
 
 # %%
-# The table shows the parameters that this record identifies. Of the others it says nothing, and they are not reported
-# as numbers: the poses cannot tell them apart. What the poses do show of them are *groups*, weighted sums of parameters,
-# which are estimated as well as if they were parameters:
+# The table shows the parameters that this record identifies. Of the others it says nothing, and
+# they are not reported as numbers: the poses cannot tell them apart. What the poses do show of them
+# are *groups*, weighted sums of parameters, which are estimated as well as if they were parameters:
 
 groups = result.groups
 sums = [k for k in range(len(groups.names)) if np.count_nonzero(groups.combinations[k]) > 1]
@@ -147,5 +148,6 @@ for who, parameters in (
 with xr.open_dataset(record.attrs["path"], group="truth") as true:
     difference = 1e6 * (true["position"] - record["measured_position"])
     print(
-        f"the sensor itself was off by {float(np.sqrt((difference**2).mean())):.1f} µm rms in this run"
+        f"the sensor itself was off by {float(np.sqrt((difference**2).mean())):.1f} µm rms in "
+        "this run"
     )

@@ -2,8 +2,9 @@
 Cameras that are not exact
 ==========================
 
-In the pages before, the estimator knew the cameras exactly. No calibration does. Here the true cameras are moved by what
-a calibration may leave unknown, and the estimator is not told. What becomes of the poses, and does the covariance know?
+In the pages before, the estimator knew the cameras exactly. No calibration does. Here the true
+cameras are moved by what a calibration may leave unknown, and the estimator is not told. What
+becomes of the poses, and does the covariance know?
 """
 
 import matplotlib.pyplot as plt
@@ -22,9 +23,9 @@ import cmmsim
 known_to = [0.0, 0.03, 0.1]  # px, standard deviation of each principal point
 
 # %%
-# ``move_rig`` moves the true cameras, here their principal points. It is called before the first measurement, so the sensor
-# also teaches itself with the wrong cameras, as a real one would: what is wrong in base and platform alike cancels. The
-# platform then moves along a small closed path.
+# ``move_rig`` moves the true cameras, here their principal points. It is called before the first
+# measurement, so the sensor also teaches itself with the wrong cameras, as a real one would: what
+# is wrong in base and platform alike cancels. The platform then moves along a small closed path.
 
 turn = np.linspace(0, 2 * np.pi, 25)
 path = np.stack(
@@ -89,6 +90,7 @@ axes.legend()
 plt.show()
 
 # %%
-# So the covariance of a measurement knows the noise of the pixels, and not the cameras. A scenario can tell the estimator how
-# well it knows them: ``rig.known`` takes the covariance of a calibration, and its error, the same in all poses of a run, is
-# then estimated beside the robot's parameters. The tutorial of the same name shows how.
+# So the covariance of a measurement knows the noise of the pixels, and not the cameras. A
+# scenario can tell the estimator how well it knows them: ``rig.known`` takes the covariance of a
+# calibration, and its error, the same in all poses of a run, is then estimated beside the robot's
+# parameters. The tutorial of the same name shows how.

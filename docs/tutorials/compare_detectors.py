@@ -4,6 +4,7 @@ import numpy as np
 
 import cmmsim
 
+cmmsim.allow_plugin("my_detector")
 turn = np.linspace(0, 2 * np.pi, 60)
 path = 0.008 * np.stack([np.cos(turn), np.sin(turn), np.sin(2 * turn)], axis=1)
 tilt = 0.03 * np.stack([np.sin(turn), np.sin(2 * turn), np.cos(turn)], axis=1)

@@ -1,8 +1,9 @@
-"""The same identification by `mujoco.sysid`, set up as in its own tests: a modifier a parameter, its default optimizer,
-its normalisation of residuals, its intervals.
+"""The same identification by `mujoco.sysid`, set up as in its own tests: a modifier a parameter,
+its default optimizer, its normalisation of residuals, its intervals.
 
-MuJoCo steps with the 1 ms of the record, semi-implicitly (`implicitfast`) or, at four times the cost, by RK4. What is
-compared is its state (the free joint of the platform): a sensor of MuJoCo would show the state before the last step.
+MuJoCo steps with the 1 ms of the record, semi-implicitly (`implicitfast`) or, at four times the
+cost, by RK4. What is compared is its state (the free joint of the platform): a sensor of MuJoCo
+would show the state before the last step.
 """
 
 import time
@@ -23,11 +24,17 @@ PLATFORM = slice(1, 8)
 
 
 def model_spec(integrator="implicitfast"):
-    """rss6 as an editable model of MuJoCo, its motors turned into servos that damp the joints' rates."""
+    """rss6 as an editable model of MuJoCo, its motors turned into servos that damp the joints'
+    rates.
+    """
     solver = MjcfSolver(timestep_s=1 / servo.RATE_HZ, integrator=integrator)
     spec = mujoco.MjSpec.from_string(
         mjcf_text(
-            servo.robot(), servo.table()[:64], allow_unphysical_inertia=True, solver=solver, source="true parameters"
+            servo.robot(),
+            servo.table()[:64],
+            allow_unphysical_inertia=True,
+            solver=solver,
+            source="true parameters",
         )
     )
     lp, ld = servo.servo_gains()
@@ -40,9 +47,12 @@ def model_spec(integrator="implicitfast"):
 
 
 def simulated_poses(commands):
-    """Poses (frames, 6) of the true robot in MuJoCo's simulation with the estimator's own settings."""
+    """Poses (frames, 6) of the true robot in MuJoCo's simulation with the estimator's own
+    settings."""
     model = model_spec().compile()
-    state, _ = rollout.rollout(model, mujoco.MjData(model), at_home(model), servo.felt_commands(commands)[:-1])
+    state, _ = rollout.rollout(
+        model, mujoco.MjData(model), at_home(model), servo.felt_commands(commands)[:-1]
+    )
     states = np.vstack([at_home(model), state[0]])[:, PLATFORM]
     return servo.Measured(states[:, :3], states[:, 3:]).pose
 
@@ -51,7 +61,9 @@ def estimate(commands, measured, guess, integrator="implicitfast"):
     """The 14 unknowns from commands (frames, 6), what was `Measured`, and a first guess (14,)."""
     spec, free = model_spec(integrator), unknowns(guess)
     seen = np.hstack([measured.position, measured.quaternion])
-    signal = TimeSeries.from_custom_map(servo.TIMES, seen, [("platform_qpos", 7, SignalType.MjStateQPos)])
+    signal = TimeSeries.from_custom_map(
+        servo.TIMES, seen, [("platform_qpos", 7, SignalType.MjStateQPos)]
+    )
     sequences = sysid.ModelSequences(
         "rss6",
         spec,
@@ -86,7 +98,9 @@ def unknowns(guess):
         spec.body("platform").inertia = moments * found.value[0]
 
     def coulomb(leg):
-        return lambda spec, found: setattr(spec.joint(f"joint{leg}"), "frictionloss", found.value[0])
+        return lambda spec, found: setattr(
+            spec.joint(f"joint{leg}"), "frictionloss", found.value[0]
+        )
 
     def viscous(leg):
         return lambda spec, found: spec.joint(f"joint{leg}").damping.__setitem__(0, found.value[0])

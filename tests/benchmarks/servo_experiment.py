@@ -1,15 +1,17 @@
-"""An experiment that `mujoco.sysid` can evaluate too: rss6 behind joint servos of known gains, 14 unknowns.
+"""An experiment that `mujoco.sysid` can evaluate too: rss6 behind joint servos of known gains, 14
+unknowns.
 
-Unknown are the platform's mass, one scale of its three moments of inertia, and Coulomb and viscous friction of the six
-joints: the rigid bodies of Table 1 (of its impossible moments only those are changed for MuJoCo that no motion feels)
-with the friction of Table 2. The joints follow logged commands by a proportional-derivative servo with the gains lp and
-ld of Table 2, so torque, and with it the scale, is known. Measured is the pose of the platform alone, 5 s at 1 kHz,
-positions with 30 um and the four components of the quaternion with 6e-5 of noise. The robot starts at rest at home,
+Unknown are the platform's mass, one scale of its three moments of inertia, and Coulomb and viscous
+friction of the six joints: the rigid bodies of Table 1 (of its impossible moments only those are
+changed for MuJoCo that no motion feels) with the friction of Table 2. The joints follow logged
+commands by a proportional-derivative servo with the gains lp and ld of Table 2, so torque, and with
+it the scale, is known. Measured is the pose of the platform alone, 5 s at 1 kHz, positions with 30
+um and the four components of the quaternion with 6e-5 of noise. The robot starts at rest at home,
 which is known, and its commands carry the platform's nominal weight.
 
-This package identifies by output error: `identify`'s bounded Gauss-Newton on exact sensitivities, after a linear start.
-That is the least-squares solution of the torque balance of the joints that slip: with a known servo the torque follows
-from commands and poses, and is linear in the unknowns.
+This package identifies by output error: `identify`'s bounded Gauss-Newton on exact sensitivities,
+after a linear start. That is the least-squares solution of the torque balance of the joints that
+slip: with a known servo the torque follows from commands and poses, and is linear in the unknowns.
 """
 
 import time
@@ -20,7 +22,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import dynamics
-from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains, StartState, simulate
+from dynamics.closed_loop import (
+    FrameTiming,
+    LoopSettings,
+    Reference,
+    ServoGains,
+    StartState,
+    differentiate_commands,
+    simulate_commands,
+)
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.warm_start import SLIPPING_SHARE
 from identify.excitation.design import design_trajectories
@@ -32,7 +42,9 @@ TIMES = np.arange(round(RATE_HZ * SECONDS) + 1) / RATE_HZ
 POSITION_STD, QUATERNION_STD = 30e-6, 6e-5
 
 UNKNOWNS = 14
-"""Mass of the platform, scale of its inertia, Coulomb friction (6) and viscous friction (6) of the joints."""
+"""Mass of the platform, scale of its inertia, Coulomb friction (6) and viscous friction (6) of the
+joints.
+"""
 
 NO_INTEGRAL = 1e-9
 """Integral gain of the joint PID, which must not be zero: 1e-9 N m in the whole run."""
@@ -93,32 +105,38 @@ def servo_gains():
 def home_commands():
     """Commands (6,) that hold the robot at home against its nominal weight."""
     home = robot().home_pose
-    return robot().inverse_kinematics(home) + robot().static_torque(home, table()[:64]) / servo_gains()[0]
+    return (
+        robot().inverse_kinematics(home)
+        + robot().static_torque(home, table()[:64]) / servo_gains()[0]
+    )
 
 
 def sine_commands():
-    """One sine a joint, frequencies and phases as in the tests of `mujoco.sysid` on an arm of five joints, of a tenth
-    of the travel: (frames, 6), rad."""
+    """One sine a joint, frequencies and phases as in the tests of `mujoco.sysid` on an arm of five
+    joints, of a tenth of the travel: (frames, 6), rad."""
     angle = 2 * np.pi * SINE_HZ * TIMES[:, None] + SINE_PHASE
     return home_commands() + SINE_RAD * (np.sin(angle) - np.sin(SINE_PHASE))
 
 
 def designed_commands():
-    """Two periods of five harmonics, as in the paper, the best of 64 random ones by its index: (frames, 6), rad.
+    """Two periods of five harmonics, as in the paper, the best of 64 random ones by its index:
+    (frames, 6), rad.
 
     The searches that this package has besides take longer than the identifications here.
     """
     design = {"method": "random", "criterion": "observability", "candidates": 64}
     period = {"fundamental_hz": 2 / SECONDS, "harmonics": 5, "duration_s": SECONDS}
     asked = {f"excitation.{key}": value for key, value in (design | period).items()}
-    trajectory = design_trajectories(robot(), load_scenario("paper").with_overrides(asked), seed=0).excitation
+    trajectory = design_trajectories(
+        robot(), load_scenario("paper").with_overrides(asked), seed=0
+    ).excitation
     home = robot().inverse_kinematics(robot().home_pose)
     return home_commands() - home + robot().inverse_kinematics(trajectory.pose(TIMES))
 
 
 def felt_commands(commands):
-    """Commands (frames, 6) to which lp (felt - angle) - ld rate is the torque of the servo, whose derivative part damps
-    the rate of the error: the commands' own rate moved into them."""
+    """Commands (frames, 6) to which lp (felt - angle) - ld rate is the torque of the servo, whose
+    derivative part damps the rate of the error: the commands' own rate moved into them."""
     lp, ld = servo_gains()
     return commands + ld / lp * RATE_HZ * np.diff(commands, axis=0, prepend=commands[:1])
 
@@ -129,9 +147,8 @@ def run(free, commands, *, sensitivities=False, steps=1):
     still = Reference(np.tile(home, (len(commands), 1)), np.zeros_like(commands))
     settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), FrameTiming(RATE_HZ), steps_per_frame=steps)
     start = StartState(home, rest, rest, rest, commands[:1], home)
-    return simulate(
-        robot(), parameters(free), still, settings, start=start, commands=commands, sensitivities=sensitivities
-    )
+    simulate = differentiate_commands if sensitivities else simulate_commands
+    return simulate(robot(), parameters(free), still, settings, commands, start=start)
 
 
 @dataclass(frozen=True)
@@ -168,7 +185,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class ServoProblem:
-    """Whitened pose residuals of the model under the logged commands; see `bounded_least_squares.Problem`."""
+    """Whitened pose residuals of the model under the logged commands; see
+    `bounded_least_squares.Problem`.
+    """
 
     commands: np.ndarray
     measured: np.ndarray
@@ -184,7 +203,11 @@ class ServoProblem:
         residual = ((model.pose - self.measured) / POSE_STD).ravel()
         jacobian = (model.pose_sensitivity @ span() / POSE_STD[:, None]).reshape(-1, UNKNOWNS)
         triangle = np.linalg.qr(np.column_stack([jacobian, residual]), mode="r")
-        return float(residual @ residual), triangle[:UNKNOWNS, :UNKNOWNS], triangle[:UNKNOWNS, UNKNOWNS]
+        return (
+            float(residual @ residual),
+            triangle[:UNKNOWNS, :UNKNOWNS],
+            triangle[:UNKNOWNS, UNKNOWNS],
+        )
 
 
 def estimate(commands, measured, guess):
@@ -206,12 +229,15 @@ def standard_deviations(factor):
 
 
 def linear_start(commands, measured):
-    """The 14 unknowns by least squares on the joints' torque balance, at every tenth filtered pose."""
+    """The 14 unknowns by least squares on the joints' torque balance, at every tenth filtered
+    pose."""
     filtered = filtered_derivatives(measured, RATE_HZ, CUTOFF_HZ)
     pose, rate, acceleration = (values[EDGE:-EDGE:EVERY] for values in filtered)
     twist, twist_dot = robot().twist(pose, rate), robot().twist_dot(pose, rate, acceleration)
     jacobian = robot().joint_jacobian(pose)
-    torque_map = np.linalg.solve(jacobian.transpose(0, 2, 1), robot().regressor(pose, twist, twist_dot))
+    torque_map = np.linalg.solve(
+        jacobian.transpose(0, 2, 1), robot().regressor(pose, twist, twist_dot)
+    )
     velocity = np.einsum("nij,nj->ni", jacobian, twist)
     torque = servo_torque(commands, robot().inverse_kinematics(pose), velocity)
     slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
@@ -221,7 +247,9 @@ def linear_start(commands, measured):
 
 
 def servo_torque(commands, angle, velocity):
-    """Torque (n, 6) of the servo at the instants of the start; a held command counts as the mean before and after."""
+    """Torque (n, 6) of the servo at the instants of the start; a held command counts as the mean
+    before and after.
+    """
     lp, ld = servo_gains()
     smooth = zero_phase_filter(felt_commands(commands), RATE_HZ, CUTOFF_HZ)
     held = (smooth + np.roll(smooth, 1, axis=0)) / 2

@@ -1,4 +1,6 @@
-"""The leaderboard of detectors: the default one works at the Cramer-Rao bound, and no unbiased one beats it."""
+"""The leaderboard of detectors: the default one works at the Cramer-Rao bound, and no unbiased one
+beats it.
+"""
 
 from itertools import product
 
@@ -24,7 +26,9 @@ def wide_interval(score):
 
 
 def test_working_point_is_what_the_sensor_sees():
-    """6 mm stickers from 1.7 to 1.9 m with 2300 px, on three planes of which one is seen at about 50 degrees."""
+    """6 mm stickers from 1.7 to 1.9 m with 2300 px, on three planes of which one is seen at about
+    50 degrees.
+    """
     point = working_point(FILE)
     assert 2300 * 0.003 / 1.95 < point.radius_px < 2300 * 0.003 / 1.6
     assert np.radians(30.0) < point.tilt < np.radians(60.0)
@@ -34,7 +38,9 @@ def test_working_point_is_what_the_sensor_sees():
 
 @pytest.mark.slow
 def test_default_detector_is_of_all_the_closest_to_the_bound_at_the_working_point_without_beating_it():
-    scores = {s.detector: s for s in compete(SCENE, [working_point(FILE)], 600, np.random.default_rng(0))}
+    scores = {
+        s.detector: s for s in compete(SCENE, [working_point(FILE)], 600, np.random.default_rng(0))
+    }
     assert list(scores) == [*DETECTORS, *(peer.name for peer in PEERS)]
     default = scores[DEFAULT_DETECTOR]
     assert min(scores.values(), key=lambda score: score.ratio) is default
@@ -49,13 +55,18 @@ def test_interval_holds_the_ratio_in_95_of_100_repetitions():
     best = [find_detector("dual_conic")]
     true = compete(SCENE, [working_point(FILE)], 4000, np.random.default_rng(1), best)[0].ratio
     rng = np.random.default_rng(2)
-    held = [s.ratio_low <= true <= s.ratio_high for s in compete(SCENE, [working_point(FILE)] * 60, 100, rng, best)]
+    held = [
+        s.ratio_low <= true <= s.ratio_high
+        for s in compete(SCENE, [working_point(FILE)] * 60, 100, rng, best)
+    ]
     assert 0.83 < np.mean(held) <= 1.0
 
 
 def test_same_seed_same_scores_and_one_draw_is_refused():
     point = working_point(FILE)
-    first, again, other = (compete(SCENE, [point], 20, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    first, again, other = (
+        compete(SCENE, [point], 20, np.random.default_rng(seed)) for seed in (3, 3, 4)
+    )
     assert first == again
     assert first[0].rms_px != other[0].rms_px
     with pytest.raises(CmmError, match="at least 2 draws, got 1"):
@@ -67,7 +78,11 @@ def test_default_detector_stays_at_the_bound_over_all_conditions():
     """Radius 2.5 to 10 px, noise 0.2 to 5 %, tilt 0 to 60 degrees; some blurred."""
     sizes, tilts, noises = (2.5, 5.0, 10.0), np.radians([0.0, 30.0, 60.0]), (0.002, 0.01, 0.05)
     conditions = [Condition(*values) for values in product(sizes, tilts, noises)]
-    conditions += [Condition(radius, np.radians(45.0), noise, 0.6) for radius in (2.5, 10.0) for noise in (0.002, 0.05)]
+    conditions += [
+        Condition(radius, np.radians(45.0), noise, 0.6)
+        for radius in (2.5, 10.0)
+        for noise in (0.002, 0.05)
+    ]
     scores = compete(SCENE, conditions, 400, np.random.default_rng(5))
     for score in (s for s in scores if s.detector == DEFAULT_DETECTOR):
         assert 1.0 <= wide_interval(score)[1] <= LIMIT, score

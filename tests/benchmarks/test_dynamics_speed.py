@@ -34,16 +34,22 @@ def robot():
 
 @pytest.fixture(scope="module")
 def loop(robot):
-    """Runs at 60 Hz with 4 steps a frame, exact friction and the parameters of Table 2; compiled."""
+    """Runs at 60 Hz with 4 steps a frame, exact friction and the parameters of Table 2;
+    compiled."""
     loop = Loop(robot, robot.parameter_sets["identified"].vector)
     loop.run(3)
     return loop
 
 
 def test_sensitivities_against_the_plain_run_and_it_against_real_time(loop, record_property):
-    """All 67 sensitivities of a run cost at most 15 plain runs (finite differences would cost 67 or more)."""
+    """All 67 sensitivities of a run cost at most 15 plain runs (finite differences would cost 67 or
+    more).
+    """
     whole = loop.reference(FRAMES)
-    rounds = {name: lambda wanted=name == "all": loop.run(whole, sensitivities=wanted) for name in ("plain", "all")}
+    rounds = {
+        name: lambda wanted=name == "all": loop.run(whole, sensitivities=wanted)
+        for name in ("plain", "all")
+    }
     with OtherLoad() as load:
         best = fastest(rounds, 12)
     ratio = best["all"] / best["plain"]
@@ -53,10 +59,16 @@ def test_sensitivities_against_the_plain_run_and_it_against_real_time(loop, reco
 
 
 def test_a_batch_uses_both_cores(loop, record_property):
-    """At least 1.8 times one core on two, where a loop of plain work shows that the second one is whole and free."""
+    """At least 1.8 times one core on two, where a loop of plain work shows that the second one is
+    whole and free.
+    """
     if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("needs two cores")
-    vectors, whole, settings = np.tile(loop.parameters, (24, 1)), loop.reference(FRAMES), loop.settings()
+    vectors, whole, settings = (
+        np.tile(loop.parameters, (24, 1)),
+        loop.reference(FRAMES),
+        loop.settings(),
+    )
 
     def batch(workers):
         return lambda: simulate_batch(loop.robot, vectors, whole, settings, workers=workers)
@@ -69,14 +81,16 @@ def test_a_batch_uses_both_cores(loop, record_property):
     ratio = min(best["one"] for best in rounds) / min(best["two"] for best in rounds)
     disturbed = load.more_than(FREE / 2)
     if float(np.median(gains)) < WHOLE_SECOND_CORE:
-        disturbed = f"plain work gains {np.median(gains):.2f} < {WHOLE_SECOND_CORE} from the second core"
+        disturbed = (
+            f"plain work gains {np.median(gains):.2f} < {WHOLE_SECOND_CORE} from the second core"
+        )
     record_property("two_cores_gain", ratio)
     judge(ratio >= 1.8, f"two cores are {ratio:.2f} times one, goal 1.8", load, disturbed)
 
 
 def test_everything_compiles_only_once(tmp_path, record_property):
-    """Functions, and then kernels, into an empty cache; another process finds them, compiles nothing, and takes a
-    quarter of the time."""
+    """Functions, and then kernels, into an empty cache; another process finds them, compiles
+    nothing, and takes a quarter of the time."""
     load_robot = "import dynamics as d; robot = d.load_robot('rss6'); "
     steps = [load_robot + "robot.functions", *[load_robot + "d.closed_loop.prepare(robot)"] * 2]
     environment = os.environ | {"CMMSIM_CACHE": str(tmp_path)}
@@ -84,7 +98,11 @@ def test_everything_compiles_only_once(tmp_path, record_property):
     with OtherLoad() as load:
         for step in steps:
             spent.append(
-                seconds(lambda code=step: subprocess.run([sys.executable, "-c", code], check=True, env=environment))
+                seconds(
+                    lambda code=step: subprocess.run(
+                        [sys.executable, "-c", code], check=True, env=environment
+                    )
+                )
             )
             stamps.append({path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*")})
     assert {path.suffix for path in stamps[0]} == {".robot"}
@@ -92,11 +110,17 @@ def test_everything_compiles_only_once(tmp_path, record_property):
     assert stamps[1] == stamps[2]
     record_property("robot_compilation_s", spent[0])
     record_property("loop_compilation_s", spent[1])
-    judge(spent[2] < spent[1] / 4, f"first use took {spent[1]:.1f} s, the second {spent[2]:.1f} s", load)
+    judge(
+        spent[2] < spent[1] / 4,
+        f"first use took {spent[1]:.1f} s, the second {spent[2]:.1f} s",
+        load,
+    )
 
 
 def test_memory_does_not_grow_over_ten_thousand_runs(loop):
-    """Memory in use after 10,000 runs of three frames is that after the first thousand, within 4 MB."""
+    """Memory in use after 10,000 runs of three frames is that after the first thousand, within 4
+    MB.
+    """
     for n in range(10_000):
         loop.run(3, sensitivities=n % 10 == 0)
         if n == 1000:
@@ -106,7 +130,9 @@ def test_memory_does_not_grow_over_ten_thousand_runs(loop):
 
 def test_forward_kinematics_of_a_batch_against_single_poses(robot, record_property):
     """A batch shares the overhead of Python: at least five times faster a pose than one by one."""
-    angles = robot.inverse_kinematics(robot.home_pose + BOX * np.random.default_rng(0).uniform(-1, 1, (POSES, 6)))
+    angles = robot.inverse_kinematics(
+        robot.home_pose + BOX * np.random.default_rng(0).uniform(-1, 1, (POSES, 6))
+    )
     rounds = {
         "alone": lambda: [robot.forward_kinematics(one) for one in angles[:100]],
         "batch": lambda: robot.forward_kinematics(angles),
@@ -139,15 +165,22 @@ def mujoco_call(robot, states):
 
 
 def test_forward_dynamics_is_pinocchios_and_eight_times_faster_than_both(robot, record_property):
-    """The same robot (Table 1), states and torques, once a state from a Python loop: state and torque in, acceleration
-    (mj_step: also the next state) out; to 1e-9 of its size that of Pinocchio. A round takes a millisecond with each
-    engine, so this one computes ten times the states: load hits all alike."""
+    """The same robot (Table 1), states and torques, once a state from a Python loop: state and
+    torque in, acceleration (mj_step: also the next state) out; to 1e-9 of its size that of
+    Pinocchio. A round takes a millisecond with each engine, so this one computes ten times the
+    states: load hits all alike."""
     pytest.importorskip("pinocchio")
     from tests.closed_chain import ClosedChain
 
-    drawn, torques = random_states(robot, STATES, 9), 5 * np.random.default_rng(9).standard_normal((STATES, 6))
+    drawn, torques = (
+        random_states(robot, STATES, 9),
+        5 * np.random.default_rng(9).standard_normal((STATES, 6)),
+    )
     states = list(zip(drawn.pose, drawn.twist, torques, strict=True))
-    model, chain = dynamics.fast_forward_dynamics(robot), ClosedChain(robot, robot.nominal_parameters)
+    model, chain = (
+        dynamics.fast_forward_dynamics(robot),
+        ClosedChain(robot, robot.nominal_parameters),
+    )
     theirs = np.array([chain.twist_dot(chain.state(*state)) for state in states])
     misses = np.abs(theirs - [model(*state).copy() for state in states]).max(axis=1)
     difference = (misses / np.abs(theirs).max(axis=1)).max()
@@ -155,7 +188,9 @@ def test_forward_dynamics_is_pinocchios_and_eight_times_faster_than_both(robot, 
     assert difference <= 1e-9
     rounds = {
         "ours": round_robin(states, model, 500),
-        "pinocchio": round_robin([(chain.state(*state),) for state in states], chain.acceleration, 50),
+        "pinocchio": round_robin(
+            [(chain.state(*state),) for state in states], chain.acceleration, 50
+        ),
         "mj_step": round_robin(*mujoco_call(robot, states), 50),
     }
     with OtherLoad() as load:
@@ -168,9 +203,11 @@ def test_forward_dynamics_is_pinocchios_and_eight_times_faster_than_both(robot, 
 
 
 @pytest.mark.parametrize("name", dynamics.robot_file.built_in_robots())
-def test_forward_dynamics_of_every_robot_is_five_times_faster_than_recursive_closed_chains(name, record_property):
-    """The same states and torques, once a state from a Python loop, as above, against `lcaba` of Pinocchio, which
-    agrees to 1e-5: it regularises its loops."""
+def test_forward_dynamics_of_every_robot_is_five_times_faster_than_recursive_closed_chains(
+    name, record_property
+):
+    """The same states and torques, once a state from a Python loop, as above, against `lcaba` of
+    Pinocchio, which agrees to 1e-5: it regularises its loops."""
     if not hasattr(pytest.importorskip("pinocchio"), "lcaba"):
         pytest.skip("this Pinocchio has no lcaba")
     from tests.closed_chain import ClosedChain
@@ -181,10 +218,16 @@ def test_forward_dynamics_of_every_robot_is_five_times_faster_than_recursive_clo
     poses = robot.home_pose + BOX * rng.uniform(-1, 1, (STATES, 6)) @ free
     twists = rng.standard_normal((STATES, 6)) * np.repeat([0.1, 0.5], 3) @ free
     states = list(zip(poses, twists, largest * rng.standard_normal((STATES, joints)), strict=True))
-    model, chain = dynamics.fast_forward_dynamics(robot), ClosedChain(robot, robot.nominal_parameters)
+    model, chain = (
+        dynamics.fast_forward_dynamics(robot),
+        ClosedChain(robot, robot.nominal_parameters),
+    )
     chains = [chain.state(*state) for state in states]
     for state, closed in zip(states, chains, strict=True):
-        theirs, ours = chain.platform_acceleration(closed, chain.recursive_acceleration(closed)), model(*state)
+        theirs, ours = (
+            chain.platform_acceleration(closed, chain.recursive_acceleration(closed)),
+            model(*state),
+        )
         assert np.abs(theirs - ours).max() <= 1e-5 * np.abs(ours).max()
     rounds = {
         "ours": round_robin(states, model, 500),
@@ -194,7 +237,11 @@ def test_forward_dynamics_of_every_robot_is_five_times_faster_than_recursive_clo
         best = fastest(rounds, ROUNDS)
     ratio = 10 * best["lcaba"] / best["ours"]
     record_property("forward_dynamics_over_lcaba", ratio)
-    judge(ratio >= 5, f"{1e6 * best['ours'] / 500:.2f} us a call, lcaba {ratio:.1f} times as much, goal 5", load)
+    judge(
+        ratio >= 5,
+        f"{1e6 * best['ours'] / 500:.2f} us a call, lcaba {ratio:.1f} times as much, goal 5",
+        load,
+    )
 
 
 def round_robin(states, call, size):

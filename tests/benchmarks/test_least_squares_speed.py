@@ -1,11 +1,13 @@
-"""Speed of an identification (its solver beside scipy's, and the times of all of it) and of the search for excitation.
+"""Speed of an identification (its solver beside scipy's, and the times of all of it) and of the
+search for excitation.
 
-The record is of the `paper` scenario (20 s at 60 Hz), with drawn noise of the sensor's size instead of images. Both
-solvers get the same problem: residuals of the same compiled model, whitened alike, beside the same rows of starting
-guess and scale anchor, with the same lower bounds and scales, from the same linear warm start; first driven by the
-logged commands and then, from what was found, in closed loop, as an identification does. Ours is timed until eq. 35
-stops it, before and after scipy's turn; scipy's only until its cost is within 0.1 % of ours. Where that takes too long
-it is stopped, and the ratio is a lower bound.
+The record is of the `paper` scenario (20 s at 60 Hz), with drawn noise of the sensor's size instead
+of images. Both solvers get the same problem: residuals of the same compiled model, whitened alike,
+beside the same rows of starting guess and scale anchor, with the same lower bounds and scales, from
+the same linear warm start; first driven by the logged commands and then, from what was found, in
+closed loop, as an identification does. Ours is timed until eq. 35 stops it, before and after
+scipy's turn; scipy's only until its cost is within 0.1 % of ours. Where that takes too long it is
+stopped, and the ratio is a lower bound.
 """
 
 import time
@@ -34,8 +36,8 @@ MOST_TIMES = 8.0
 """Times our own that scipy's solver may take."""
 
 BEFORE, TIMES_FASTER = 303.0, 4.0
-"""Pieces of `plain_work`, in CPU time, that an identification of the paper's record took before legs and derivatives
-were computed in vectors (100c7df), and how many times faster it has to be."""
+"""Pieces of `plain_work`, in CPU time, that an identification of the paper's record took before
+legs and derivatives were computed in vectors (100c7df), and how many times faster it has to be."""
 
 INSIDE = 1e-3
 UNSTABLE = 1e3
@@ -72,16 +74,24 @@ def lower_bounds(problem):
 
 
 def residuals(problem, values):
-    """All residuals of parameters (67,), whose squares sum up to the cost. Raises LoopFailure where it is infinite."""
+    """All residuals of parameters (67,), whose squares sum up to the cost. Raises LoopFailure where
+    it is infinite.
+    """
     place, measured = problem.anchor.row(problem.guess.layout)
-    known = np.append((values - problem.guess.values) / problem.guess.std, place @ values - measured)
+    known = np.append(
+        (values - problem.guess.values) / problem.guess.std, place @ values - measured
+    )
     seen = [run.whiten(run.model_poses(values) - run.measured).ravel() for run in problem.runs]
     return np.concatenate([known, *seen])
 
 
 def by_this_package(problems, start, settings):
-    """What Gauss-Newton with exact sensitivities finds until eq. 35 stops it, of each problem from what was found."""
-    criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
+    """What Gauss-Newton with exact sensitivities finds until eq. 35 stops it, of each problem from
+    what was found.
+    """
+    criteria = StopCriteria(
+        settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations
+    )
     searches = []
     for problem in problems:
         began = time.perf_counter()
@@ -92,7 +102,9 @@ def by_this_package(problems, start, settings):
 
 
 def by_scipy(problem, start, target, most_s):
-    """scipy's trust region with finite differences, until the cost is at most `target` or `most_s` have passed."""
+    """scipy's trust region with finite differences, until the cost is at most `target` or `most_s`
+    have passed.
+    """
     size, began = len(residuals(problem, start)), time.perf_counter()
     last, bounds = Found(start, np.inf, 0.0), (lower_bounds(problem), np.inf)
 
@@ -112,17 +124,23 @@ def by_scipy(problem, start, target, most_s):
             raise StopIteration
 
     try:
-        least_squares(timed, start, method="trf", bounds=bounds, x_scale=problem.guess.std, callback=watch)
+        least_squares(
+            timed, start, method="trf", bounds=bounds, x_scale=problem.guess.std, callback=watch
+        )
     except TimeoutError:
         return Found(last.parameters, last.cost, most_s)
     return last
 
 
-def test_solver_is_three_times_faster_than_scipys_with_finite_differences(problem, scenario, record_property):
+def test_solver_is_three_times_faster_than_scipys_with_finite_differences(
+    problem, scenario, record_property
+):
     """Both searches by this package, by scipy, and by this package again."""
     driven, settings = problem.driven_by_commands(), scenario.identification
     # A little inside the bounds, where scipy's solver can move.
-    start = np.maximum(linear_warm_start(problem, scenario), lower_bounds(problem) + INSIDE * problem.guess.std)
+    start = np.maximum(
+        linear_warm_start(problem, scenario), lower_bounds(problem) + INSIDE * problem.guess.std
+    )
     for one in (problem, driven):
         assert np.sum(residuals(one, start) ** 2) == pytest.approx(one.cost(start), rel=1e-12)
 
@@ -130,21 +148,30 @@ def test_solver_is_three_times_faster_than_scipys_with_finite_differences(proble
         before = by_this_package((driven, problem), start, settings)
         most_s = MOST_TIMES * sum(one.seconds for one in before)
         first = by_scipy(driven, start, (1 + CLOSE) * before[0].cost, most_s)
-        second = by_scipy(problem, first.parameters, (1 + CLOSE) * before[1].cost, max(most_s - first.seconds, 0.0))
+        second = by_scipy(
+            problem,
+            first.parameters,
+            (1 + CLOSE) * before[1].cost,
+            max(most_s - first.seconds, 0.0),
+        )
         after = by_this_package((driven, problem), start, settings)
     ours_s = min(sum(one.seconds for one in turn) for turn in (before, after))
     theirs_s = first.seconds + second.seconds
     costs = [f"{one.cost:.0f}" for one in (*before, first, second)]
     figure = (
-        f"scipy {theirs_s:.1f} s, this package {ours_s:.1f} s: x {theirs_s / ours_s:.1f}, goal {RATIO:g}; costs driven "
-        f"by commands and in closed loop: this package {costs[0]} and {costs[1]}, scipy {costs[2]} and {costs[3]}"
+        f"scipy {theirs_s:.1f} s, this package {ours_s:.1f} s: x {theirs_s / ours_s:.1f}, goal "
+        f"{RATIO:g}; costs driven "
+        f"by commands and in closed loop: this package {costs[0]} and {costs[1]}, scipy "
+        f"{costs[2]} and {costs[3]}"
     )
     record_property("figure", figure)
     judge(theirs_s >= RATIO * ours_s, figure, load)
 
 
 def test_times_of_an_identification_and_its_stages(record, scenario, record_property):
-    """All 67 parameters with their intervals, groups and tests; the libraries are compiled before. No verdict."""
+    """All 67 parameters with their intervals, groups and tests; the libraries are compiled before.
+    No verdict.
+    """
     identify.identify(record, rss6(), scenario)
     began = time.perf_counter()
     result = identify.identify(record, rss6(), scenario)
@@ -153,8 +180,12 @@ def test_times_of_an_identification_and_its_stages(record, scenario, record_prop
         record_property(f"{name}_s", value)
 
 
-def test_an_identification_takes_a_fraction_of_the_plain_work_that_it_took(record, scenario, record_property):
-    """CPU time with all intervals, the fastest of three, in turn with the piece of work that it is counted in."""
+def test_an_identification_takes_a_fraction_of_the_plain_work_that_it_took(
+    record, scenario, record_property
+):
+    """CPU time with all intervals, the fastest of three, in turn with the piece of work that it is
+    counted in.
+    """
     robot = rss6()
     identify.identify(record, robot, scenario)
 
@@ -170,20 +201,30 @@ def test_an_identification_takes_a_fraction_of_the_plain_work_that_it_took(recor
             wholes.append(cpu(lambda: identify.identify(record, robot, scenario)))
     taken = min(wholes) / min(pieces)
     figure = (
-        f"{min(wholes):.2f} s, {taken:.0f} pieces of plain work, before {BEFORE:.0f}: {BEFORE / taken:.1f} x as fast"
+        f"{min(wholes):.2f} s, {taken:.0f} pieces of plain work, before {BEFORE:.0f}: "
+        f"{BEFORE / taken:.1f} x as fast"
     )
     figure += f", goal {TIMES_FASTER:g} x"
     record_property("figure", figure)
     judge(TIMES_FASTER * taken <= BEFORE, figure, load)
 
 
-@pytest.mark.parametrize(("criterion", "generations"), [("observability", 324), ("information", 150)])
-def test_gradient_search_takes_less_time_than_the_evolutionary_one(scenario, criterion, generations):
-    """The paper's settings, and for its own criterion its number of generations; that it finds more is proved apart."""
+@pytest.mark.parametrize(
+    ("criterion", "generations"), [("observability", 324), ("information", 150)]
+)
+def test_gradient_search_takes_less_time_than_the_evolutionary_one(
+    scenario, criterion, generations
+):
+    """The paper's settings, and for its own criterion its number of generations; that it finds more
+    is proved apart.
+    """
     overrides = {"excitation.criterion": criterion, "excitation.generations": generations}
     with OtherLoad() as load:
         _, evolutionary, gradient = compare_methods(
             rss6(), scenario.with_overrides(overrides), 0, SilentProgress()
         ).entries
-    figure = f"gradient search {gradient.seconds:.1f} s, evolutionary search {evolutionary.seconds:.1f} s"
+    figure = (
+        f"gradient search {gradient.seconds:.1f} s, evolutionary search "
+        f"{evolutionary.seconds:.1f} s"
+    )
     judge(gradient.seconds < evolutionary.seconds, figure, load)

@@ -1,4 +1,6 @@
-"""Rendering and measuring in the loop: frames a second, against a straightforward pipeline, and over many frames."""
+"""Rendering and measuring in the loop: frames a second, against a straightforward pipeline, and
+over many frames.
+"""
 
 import os
 import subprocess
@@ -11,15 +13,16 @@ import pytest
 
 import cmmsim
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
-from cmmsim.geometry.registration import rigid_start
 from cmmsim.imaging import pyrender_renderer as render
 from cmmsim.imaging.pyrender_meshes import disc_mesh
 from tests.benchmarks.timing import OtherLoad, judge, plain_work, resident_bytes, seconds
+from tests.cmmsim.plain import rigid_start
 
 pytestmark = [pytest.mark.thorough, pytest.mark.rendering]
 TIMES_STRAIGHTFORWARD = {"analytic": 20.0, "pyrender": 8.0}
 BATCH = 20
-GOALS = {  # renderer, frames, and how many of them a piece of `plain_work` of 24 ms should see at least
+# renderer, frames, and how many of them a piece of `plain_work` of 24 ms should see at least
+GOALS = {
     "without images": ("statistical", 40_000, 2400.0),  # 100,000 a second
     "images together": ("analytic", 1000, 36.0),  # 1,500 a second
     "images in the loop": ("pyrender", 5 * BATCH, 2.4),  # 100 a second
@@ -62,17 +65,25 @@ def frame_seconds(sensor, poses):
 
 @pytest.mark.parametrize("kind", GOALS)
 def test_frames_during_a_piece_of_plain_work(taught, kind, record_property):
-    """On all cores where poses are known beforehand, and frame after frame in the loop; rounds alternate."""
+    """On all cores where poses are known beforehand, and frame after frame in the loop; rounds
+    alternate.
+    """
     renderer, count, goal = GOALS[kind]
-    sensor, together = cmmsim.load_sensor("ctrack780", taught=taught, renderer=renderer), count > 5 * BATCH
-    rounds = path(sensor, 9 * count).reshape(9, count, 6)  # without a jump, after which stickers have to be searched
+    sensor, together = (
+        cmmsim.load_sensor("ctrack780", taught=taught, renderer=renderer),
+        count > 5 * BATCH,
+    )
+    # without a jump, after which stickers have to be searched
+    rounds = path(sensor, 9 * count).reshape(9, count, 6)
     sensor.measure_many(rounds[0, : 5 * BATCH]) if together else frame_seconds(sensor, rounds[0])
     piece, frame, processor = np.inf, np.inf, np.inf
     with OtherLoad() as load:
         for poses in rounds[1:]:
             piece = min(piece, seconds(plain_work))
             began, used = time.perf_counter(), time.process_time()
-            found = sensor.measure_many(poses).stickers if together else frame_seconds(sensor, poses)
+            found = (
+                sensor.measure_many(poses).stickers if together else frame_seconds(sensor, poses)
+            )
             frame = min(frame, (time.perf_counter() - began) / count)
             processor = min(processor, (time.process_time() - used) / count)
             assert np.min(found) >= 14 or not together
@@ -80,7 +91,11 @@ def test_frames_during_a_piece_of_plain_work(taught, kind, record_property):
     record_property(f"{name}_frames_a_second", 1.0 / frame)
     record_property(f"{name}_frames_a_processor_second", 1.0 / processor)
     record_property(f"{name}_frames_a_piece", piece / frame)
-    judge(piece / frame >= goal, f"{piece / frame:.3g} frames during {1e3 * piece:.0f} ms, goal {goal:g}", load)
+    judge(
+        piece / frame >= goal,
+        f"{piece / frame:.3g} frames during {1e3 * piece:.0f} ms, goal {goal:g}",
+        load,
+    )
 
 
 def test_images_many_at_once_against_one_by_one(taught, record_property):
@@ -98,14 +113,20 @@ def test_images_many_at_once_against_one_by_one(taught, record_property):
             together = min(together, (time.perf_counter() - began) / len(many))
     assert found.stickers.min() >= 17
     record_property("analytic_times_one_by_one", alone / together)
-    judge(alone / together >= TIMES_ONE_BY_ONE, f"{alone / together:.1f} times, goal {TIMES_ONE_BY_ONE:g}", load)
+    judge(
+        alone / together >= TIMES_ONE_BY_ONE,
+        f"{alone / together:.1f} times, goal {TIMES_ONE_BY_ONE:g}",
+        load,
+    )
 
 
 def test_against_a_straightforward_pipeline(sensor, record_property):
-    """Rounds alternate and the fastest of each counts. The other pipeline measures the same poses, only worse.
+    """Rounds alternate and the fastest of each counts. The other pipeline measures the same poses,
+    only worse.
 
-    20 times is the goal of the sensor and reached by the analytic renderer. Drawing finely with pyrender's meshes is
-    bound by the software rasteriser: a frame takes a 22nd of the other's processor time, but less of it on both cores.
+    20 times is the goal of the sensor and reached by the analytic renderer. Drawing finely with
+    pyrender's meshes is bound by the software rasteriser: a frame takes a 22nd of the other's
+    processor time, but less of it on both cores.
     """
     other = StraightforwardSensor(sensor)
     KEPT.append(other)
@@ -123,14 +144,19 @@ def test_against_a_straightforward_pipeline(sensor, record_property):
                 errors.append(found - pose)
     assert np.abs(errors)[:, :3].max() < 1e-3
     ratio, goal = theirs / ours, TIMES_STRAIGHTFORWARD[sensor.renderer]
-    figure = f"{ratio:.1f} times a straightforward pipeline ({1e3 * theirs:.0f} ms a frame) with {sensor.renderer}"
+    figure = (
+        f"{ratio:.1f} times a straightforward pipeline ({1e3 * theirs:.0f} ms a frame) with "
+        f"{sensor.renderer}"
+    )
     record_property(f"{sensor.renderer}_times_straightforward", ratio)
     record_property(f"{sensor.renderer}_frames_a_second", 1.0 / ours)
     judge(ratio >= goal, f"{figure}, goal {goal:g}", load)
 
 
 def test_memory_and_renderer_stay_over_many_frames(sensor, monkeypatch):
-    """Memory in use after all frames is that after the first tenth, and nothing of OpenGL is made anew."""
+    """Memory in use after all frames is that after the first tenth, and nothing of OpenGL is made
+    anew.
+    """
     import pyrender
     from pyrender.renderer import Renderer
 
@@ -148,23 +174,32 @@ def test_memory_and_renderer_stay_over_many_frames(sensor, monkeypatch):
 
 
 def test_kernels_compile_only_once(tmp_path, record_property):
-    """Processor time of a first measurement with an empty cache; another process needs a small part of it."""
+    """Processor time of a first measurement with an empty cache; another process needs a small part
+    of it.
+    """
     code = (
-        "import time, cmmsim; sensor = cmmsim.load_sensor('ctrack780', seed=0, renderer='analytic');"
-        "began = time.process_time(); sensor.measure(sensor.home); print(time.process_time() - began)"
+        "import time, cmmsim; sensor = cmmsim.load_sensor('ctrack780', seed=0, "
+        "renderer='analytic');"
+        "began = time.process_time(); sensor.measure(sensor.home); print(time.process_time() - "
+        "began)"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    cold, warm = (float(subprocess.check_output([sys.executable, "-c", code], env=environment)) for _ in range(2))
+    cold, warm = (
+        float(subprocess.check_output([sys.executable, "-c", code], env=environment))
+        for _ in range(2)
+    )
     record_property("compile_seconds", round(cold, 1))
     assert warm < 0.3 * cold
 
 
 class StraightforwardSensor:
-    """What one writes first: whole images by pyrender, OpenCV's blob detector, nearest blobs, triangulatePoints, a fit.
+    """What one writes first: whole images by pyrender, OpenCV's blob detector, nearest blobs,
+    triangulatePoints, a fit.
 
     Draws and measures the scene of a ``cmmsim.Sensor`` whose lenses are perfect.
 
-    Keep it as long as the process draws: pyrender closes the display for all when an OffscreenRenderer goes.
+    Keep it as long as the process draws: pyrender closes the display for all when an
+    OffscreenRenderer goes.
     """
 
     def __init__(self, sensor):
@@ -173,23 +208,36 @@ class StraightforwardSensor:
         self._sensor, self._rig = sensor, sensor.rig
         self._renderer = pyrender.OffscreenRenderer(self._rig.left.width, self._rig.left.height)
         self._scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 1.0))
-        self._bodies = [self._scene.add(pyrender.Mesh([self._primitive(body)])) for body in sensor.true_cameras.scene]
+        self._bodies = [
+            self._scene.add(pyrender.Mesh([self._primitive(body)]))
+            for body in sensor.true_cameras.scene
+        ]
         c = self._rig.left
         camera = pyrender.IntrinsicsCamera(
             c.focal_px, c.focal_px * c.aspect, c.centre_x_px + 0.5, c.centre_y_px + 0.5, 0.2, 10.0
         )
         self._camera = self._scene.add(camera)
         settings = cv2.SimpleBlobDetector_Params()
-        settings.blobColor, settings.filterByArea, settings.minArea, settings.maxArea = 255, True, 10.0, 400.0
+        settings.blobColor, settings.filterByArea, settings.minArea, settings.maxArea = (
+            255,
+            True,
+            10.0,
+            400.0,
+        )
         self._detector = cv2.SimpleBlobDetector_create(settings)
 
     def measure(self, pose):
-        """Pose (6,) measured of the platform that stands at ``pose``, which also says which blob is which."""
+        """Pose (6,) measured of the platform that stands at ``pose``, which also says which blob is
+        which.
+        """
         base_from_platform, taught = pose_to_transform(pose), self._sensor.taught
         self._scene.set_pose(self._bodies[0], base_from_platform)
         places, camera_from_base = taught.platform_places, np.linalg.inv(taught.base_from_camera)
         expected, _ = self._rig.project(apply(camera_from_base @ base_from_platform, places))
-        found = [self._nearest(self._blobs(move), at) for move, at in zip(self._rig.from_camera, expected, strict=True)]
+        found = [
+            self._nearest(self._blobs(move), at)
+            for move, at in zip(self._rig.from_camera, expected, strict=True)
+        ]
         seen = np.flatnonzero(np.isfinite(found[0][:, 0]) & np.isfinite(found[1][:, 0]))
         first, second = self._rig.projection_matrices
         points = cv2.triangulatePoints(first, second, found[0][seen].T, found[1][seen].T)
@@ -224,8 +272,12 @@ class StraightforwardSensor:
         grey = np.repeat(np.concatenate([p.levels for p in patches])[:, None], 3, axis=1)
         return Primitive(
             positions=np.concatenate([p.vertices for p in patches]).astype(np.float32),
-            indices=np.concatenate([p.faces + s for p, s in zip(patches, starts, strict=False)]).astype(np.uint32),
+            indices=np.concatenate(
+                [p.faces + s for p, s in zip(patches, starts, strict=False)]
+            ).astype(np.uint32),
             color_0=np.column_stack([grey, np.ones(len(grey))]).astype(np.float32),
             mode=4,
-            material=MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0), doubleSided=True),
+            material=MetallicRoughnessMaterial(
+                baseColorFactor=(1.0, 1.0, 1.0, 1.0), doubleSided=True
+            ),
         )

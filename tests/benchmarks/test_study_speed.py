@@ -1,7 +1,7 @@
 """What a study costs beside its rows, and what a second core brings.
 
-Starting the cluster and the first rows of each process, which load the libraries, are not in the figures: they are some
-seconds a study, however many rows it has.
+Starting the cluster and the first rows of each process, which load the libraries, are not in the
+figures: they are some seconds a study, however many rows it has.
 """
 
 import time
@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from identify.progress import SilentProgress
-from identify.studies.dask_cluster import local_cluster
+from identify.studies.processes import local_processes
 from identify.studies.runner import run_study
 from identify.studies.study_file import Range, Study, load_study
 from tests.benchmarks.timing import (
@@ -35,18 +35,20 @@ SENSOR_ROWS = 10_000
 IDENTIFICATIONS = 30
 
 FLAT_EMPTY_ROWS, FLAT_SENSOR_ROWS, FLAT_MB = 10_000, 600, 20.0
-"""Of sensor rows fewer will do: one that kept its pictures, or its sensor, would keep a megabyte or more."""
+"""Of sensor rows fewer will do: one that kept its pictures, or its sensor, would keep a megabyte or
+more.
+"""
 
 
 @pytest.fixture(scope="module")
 def one_core():
-    with local_cluster(1) as execute:
+    with local_processes(1) as execute:
         yield execute
 
 
 @pytest.fixture(scope="module")
 def two_cores():
-    with local_cluster(2) as execute:
+    with local_processes(2) as execute:
         yield execute
 
 
@@ -57,7 +59,9 @@ def run(tmp_path):
 
     def run(execute, study, progress=None):
         folder = tmp_path / f"{next(numbers)}"
-        outcome = run_study(study, folder, progress or SilentProgress(), lambda: nullcontext(execute))
+        outcome = run_study(
+            study, folder, progress or SilentProgress(), lambda: nullcontext(execute)
+        )
         assert not outcome.failures
         return outcome
 
@@ -72,12 +76,17 @@ def empty(scenario, seed, options):
 
 
 def empty_rows(rows):
-    factors = {"sensor.camera.dark_noise": [13.0, 26.0], "scenario.pose_method": ["registration", "planes"]}
+    factors = {
+        "sensor.camera.dark_noise": [13.0, 26.0],
+        "scenario.pose_method": ["registration", "planes"],
+    }
     return Study(name="empty", kind=f"{__name__}:empty", factors=factors, repeats=rows // 4)
 
 
 def sensor_rows(rows):
-    """The built-in study of pixel noise with so many rows: four pictures of a pose each, drawn without OpenGL."""
+    """The built-in study of pixel noise with so many rows: four pictures of a pose each, drawn
+    without OpenGL.
+    """
     study = load_study("pixel_noise")
     return study.model_copy(update={"repeats": max(1, rows // study.points)})
 
@@ -85,26 +94,38 @@ def sensor_rows(rows):
 def rows_of_many_sensors(rows):
     """The same rows, each of a sensor of its own: more sensors than a process keeps."""
     factors = {"sensor.camera.dark_noise": Range(low=800.0, high=6400.0)}
-    return load_study("pixel_noise").model_copy(update={"factors": factors, "sample": rows, "repeats": 1})
+    return load_study("pixel_noise").model_copy(
+        update={"factors": factors, "sample": rows, "repeats": 1}
+    )
 
 
 def rows_of_five_poses(rows):
-    """The same rows with five poses each. Rows of one pose are so short that the process which hands them out, with
-    2 ms a row, does a tenth of their work: it has a core of its own only where there is one worker."""
+    """The same rows with five poses each. Rows of one pose are so short that the process which
+    hands them out, with 2 ms a row, does a tenth of their work: it has a core of its own only where
+    there is one worker."""
     study = sensor_rows(rows)
     return study.model_copy(update={"options": {**study.options, "poses": 5}})
 
 
 def identifications(rows):
-    """Whole experiments with the scenario `quick`: teaching, record, identification with intervals, unseen motions."""
+    """Whole experiments with the scenario `quick`: teaching, record, identification with intervals,
+    unseen motions.
+    """
     changes, options = {"scenario.renderer": "statistical"}, {"sensor": "images"}
     return Study(
-        name="identifications", kind="identification", scenario="quick", changes=changes, options=options, repeats=rows
+        name="identifications",
+        kind="identification",
+        scenario="quick",
+        changes=changes,
+        options=options,
+        repeats=rows,
     )
 
 
 def test_second_core(one_core, two_cores, run, record_property):
-    """The fastest of up to three rounds, which end where the goal is reached or the second core is not whole."""
+    """The fastest of up to three rounds, which end where the goal is reached or the second core is
+    not whole.
+    """
     study = rows_of_five_poses(100)
     for execute in (one_core, two_cores):
         run(execute, sensor_rows(40))
@@ -117,14 +138,19 @@ def test_second_core(one_core, two_cores, run, record_property):
             gain, cores = min(ones) / min(twos), min(loops)
             if gain >= SECOND_CORE or cores < WHOLE_SECOND_CORE:
                 break
-    figure = f"two cores {gain:.2f} x one (goal {SECOND_CORE} x), {study.rows} sensor rows, a loop {cores:.2f} x"
+    figure = (
+        f"two cores {gain:.2f} x one (goal {SECOND_CORE} x), {study.rows} sensor rows, a "
+        f"loop {cores:.2f} x"
+    )
     record_property("figure", figure)
     disturbed = "" if cores > WHOLE_SECOND_CORE else f"the second core brings a loop {cores:.2f} x"
     judge(gain >= SECOND_CORE, figure, load, disturbed)
 
 
 def test_overhead_of_a_row(one_core, run, record_property):
-    """Wall time of a row on one core beyond what its function says it took: scenario, sending, journal, table."""
+    """Wall time of a row on one core beyond what its function says it took: scenario, sending,
+    journal, table.
+    """
     study, overheads = empty_rows(1000), []
     run(one_core, empty_rows(40))
     for _ in range(3):
@@ -134,7 +160,10 @@ def test_overhead_of_a_row(one_core, run, record_property):
         overheads.append(1e3 * (wall / study.rows - outcome.frame["row_s"].mean()))
     overhead = min(overheads)
     unit = 1e3 * fastest({"work": plain_work}, 15)["work"]
-    figure = f"{overhead:.2f} ms a row, {overhead / unit:.2f} of a piece of plain work, goal {OVERHEAD:g}"
+    figure = (
+        f"{overhead:.2f} ms a row, {overhead / unit:.2f} of a piece of plain work, goal "
+        f"{OVERHEAD:g}"
+    )
     record_property("figure", figure)
     assert overhead <= OVERHEAD * unit, figure
 
@@ -153,15 +182,23 @@ def test_rate_of_sensor_rows(two_cores, run, record_property):
     ],
     ids=["identifications", "leaderboard"],
 )
-def test_a_study_of_whole_experiments_is_done_before_lunch(two_cores, run, record_property, study, rows, minutes):
-    """A thousand identifications, and nine estimators on two hundred records, by the rate of some of their rows."""
+def test_a_study_of_whole_experiments_is_done_before_lunch(
+    two_cores, run, record_property, study, rows, minutes
+):
+    """A thousand identifications, and nine estimators on two hundred records, by the rate of some
+    of their rows.
+    """
     run(two_cores, study.model_copy(update={"repeats": 6}))
     some = study.model_copy(update={"repeats": IDENTIFICATIONS})
     with OtherLoad() as load:
         taken = seconds(lambda: run(two_cores, some)) / some.rows * rows / 60.0
     record_property("rows_per_second", rows / (60.0 * taken))
     record_property("minutes", taken)
-    judge(taken <= minutes, f"{rows} rows of {study.kind} in {taken:.1f} minutes, goal {minutes:g}", load)
+    judge(
+        taken <= minutes,
+        f"{rows} rows of {study.kind} in {taken:.1f} minutes, goal {minutes:g}",
+        load,
+    )
 
 
 @pytest.mark.parametrize(
@@ -179,7 +216,10 @@ def test_memory_is_flat(two_cores, run, record_property, study, warm):
     run(two_cores, warm)
     run(two_cores, study, at(lambda: found.append(memory_mb()), study.rows // 5, study.rows))
     here, largest = np.subtract(*reversed(found))
-    figure = f"{here:+.1f} MB here, {largest:+.1f} MB in the largest worker, over {study.rows * 4 // 5} rows"
+    figure = (
+        f"{here:+.1f} MB here, {largest:+.1f} MB in the largest worker, over "
+        f"{study.rows * 4 // 5} rows"
+    )
     record_property("figure", figure)
     assert max(here, largest) < FLAT_MB, figure
 

@@ -12,14 +12,24 @@ from tests.benchmarks.timing import FREE, CoreTime, OtherLoad, fastest, judge, s
 
 def test_fastest_takes_turns_and_keeps_the_best_round():
     called, naps = [], iter([0.1, 0.0, 0.1])
-    best = fastest({"a": lambda: (called.append("a"), time.sleep(next(naps))), "b": lambda: called.append("b")}, 3)
+    best = fastest(
+        {
+            "a": lambda: (called.append("a"), time.sleep(next(naps))),
+            "b": lambda: called.append("b"),
+        },
+        3,
+    )
     assert called == ["a", "b"] * 3
     assert best["a"] < 0.1
 
 
-@pytest.mark.parametrize(("busy", "own", "others"), [(3.0, 3.0, 0.0), (5.0, 3.0, 0.5), (2.9, 3.0, 0.0)])
+@pytest.mark.parametrize(
+    ("busy", "own", "others"), [(3.0, 3.0, 0.0), (5.0, 3.0, 0.5), (2.9, 3.0, 0.0)]
+)
 def test_load_of_others_leaves_the_own_out(busy, own, others):
-    assert CoreTime(10.0, 100.0, 50.0).others_until(CoreTime(14.0, 100.0 + busy, 50.0 + own)) == others
+    assert (
+        CoreTime(10.0, 100.0, 50.0).others_until(CoreTime(14.0, 100.0 + busy, 50.0 + own)) == others
+    )
 
 
 @pytest.mark.thorough
@@ -32,7 +42,9 @@ def test_a_child_is_the_own_load_and_a_stranger_is_seen_and_named():
     child.wait()
     own = load.cores
     with OtherLoad() as load:
-        pid = int(subprocess.check_output(["sh", "-c", '"$@" >/dev/null & echo $!', "sh", *command]))
+        pid = int(
+            subprocess.check_output(["sh", "-c", '"$@" >/dev/null & echo $!', "sh", *command])
+        )
         time.sleep(1.0)
     os.kill(pid, 9)
     assert load.cores > own + FREE
@@ -62,10 +74,18 @@ FAIL, SKIP = pytest.fail.Exception, pytest.skip.Exception
         (True, 1.4, "", SKIP, r"ratio 7: not judged .*, others took 1\.40 of 2 cores"),
         (False, 0.1, "", FAIL, "ratio 7"),
         (False, 0.5, "", SKIP, r"ratio 7: not judged .*, others took 0\.50 of 2 cores"),
-        (False, 0.0, "the second core is half a core", SKIP, "not judged .*, the second core is half a core"),
+        (
+            False,
+            0.0,
+            "the second core is half a core",
+            SKIP,
+            "not judged .*, the second core is half a core",
+        ),
     ],
 )
-def test_goals_are_judged_on_a_free_machine_alone(monkeypatch, reached, others, disturbed, outcome, words):
+def test_goals_are_judged_on_a_free_machine_alone(
+    monkeypatch, reached, others, disturbed, outcome, words
+):
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     load = OtherLoad()
     load.cores = others
