@@ -31,7 +31,7 @@ Faults of images
     fault_bodies()                                              the boxes that stand in the way
 
 Every error that a user can cause is a CmmError, but for OpenGLMissingError. Rooms of their own:
-`cmmsim.calibration` and `cmmsim.acceptance`; `cmmsim.plugins` for detectors and renderers
+`cmmsim.calibration` and `cmmsim.acceptance`; `cmmsim.allowed_plugins` for detectors and renderers
 of a user's own, which files may name once `allow_plugin(module)` allows it. Everything else is
 private. Names are imported on first use: the command `cmmsim`
 begins in this package and must not wait for OpenCV and OpenGL.
@@ -54,6 +54,7 @@ from cmmsim.errors import (
 )
 
 if TYPE_CHECKING:
+    from cmmsim.allowed_plugins import allow_plugin as allow_plugin
     from cmmsim.fault_images import Fault as Fault
     from cmmsim.fault_images import FaultyImages as FaultyImages
     from cmmsim.faults import FaultGenerator as FaultGenerator
@@ -71,7 +72,6 @@ if TYPE_CHECKING:
     from cmmsim.measuring.pose_estimator import PoseEstimator as PoseEstimator
     from cmmsim.measuring.pose_estimator import measure_frame as measure_frame
     from cmmsim.measuring.taught import Taught as Taught
-    from cmmsim.plugins import allow_plugin as allow_plugin
     from cmmsim.radiometry.stereo_images import StereoFrame as StereoFrame
     from cmmsim.sensor import Sensor as Sensor
     from cmmsim.tracker import Tracker as Tracker
@@ -95,7 +95,7 @@ _HOME = {
     "FaultGenerator": "cmmsim.faults",
     **dict.fromkeys(("Fault", "FaultyImages"), "cmmsim.fault_images"),
     "fault_bodies": "cmmsim.faults",
-    "allow_plugin": "cmmsim.plugins",
+    "allow_plugin": "cmmsim.allowed_plugins",
 }
 
 __all__ = [

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.allowed_plugins import DETECTORS
 from cmmsim.detection.cramer_rao import cramer_rao_bound
 from cmmsim.detection.detector import (
     DetectedCentres,
@@ -22,12 +23,11 @@ from cmmsim.detection.detector import (
     find_detector,
 )
 from cmmsim.errors import CmmError
+from cmmsim.files.rig_and_bodies import marked_body, rig_from_file
 from cmmsim.files.schema import NARROWEST_PSF, SensorFile
-from cmmsim.files.setup import marked_body, rig_from_file
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import coverage, project_discs
 from cmmsim.geometry.pose import Array, apply, pose_to_transform
-from cmmsim.plugins import DETECTORS
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.sensor import Sensor
 

@@ -11,11 +11,12 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
+from cmmsim.allowed_plugins import is_own, require_renderer
 from cmmsim.checks import checked_seed, finite_array, require_kind
 from cmmsim.detection.detector import find_detector
 from cmmsim.errors import CmmError, UnknownOptionError
+from cmmsim.files.rig_and_bodies import marked_body, require_corner
 from cmmsim.files.schema import SensorFile, Timing
-from cmmsim.files.setup import marked_body, require_corner
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, checked_pose
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
@@ -27,7 +28,6 @@ from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.observation import DetectionSettings, Observer
 from cmmsim.measuring.pose_estimator import METHODS, PoseEstimator
 from cmmsim.measuring.taught import Taught, require_taught_for, setup_of
-from cmmsim.plugins import is_own, require_renderer
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages
 from cmmsim.sticker_view import StickerView

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from cmmsim.detection.detector import FitLimits
+from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.files.schema import SensorFile
-from cmmsim.files.setup import MarkedBody
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, apply, pose_to_transform
 from cmmsim.geometry.stereo_rig import StereoRig

@@ -23,9 +23,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR
 from cmmsim.errors import LostError, TeachingError
+from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, rig_from_file
 from cmmsim.files.schema import SensorFile
-from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, apply_each, compose_covariance, invert
 from cmmsim.geometry.registration import register, register_sets
@@ -46,7 +47,6 @@ from cmmsim.measuring.pose_estimator import (
     frames_by_planes,
 )
 from cmmsim.measuring.taught import Taught, setup_of
-from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.radiometry.stereo_images import StereoImages
 
 Progress = Callable[[int, int], None]

@@ -15,8 +15,8 @@ import trimesh
 
 from cmmsim.checks import require_kind
 from cmmsim.errors import CmmError, UnknownBodyError
+from cmmsim.files.rig_and_bodies import MarkedBody, rig_from_file
 from cmmsim.files.schema import SensorFile
-from cmmsim.files.setup import MarkedBody, rig_from_file
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, all_rigid, apply, checked_transform, pose_to_transform
 from cmmsim.imaging.formation import ImageFormation
@@ -213,7 +213,8 @@ class TrueCameras:
             gone = np.argwhere(self.rig.project(points)[1] & ~shown)
             if len(gone):
                 side, sticker = gone[0]
-                camera, (x, y) = moved.cameras[side], there[side, sticker]
+                camera = moved.cameras[side]
+                x, y = there[side, sticker]
                 raise CmmError(
                     f"a drift of {what} takes sticker {body.sticker_ids[sticker]} of the "
                     f"{body.name} out of the "

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmmsim.errors import LostError
+from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
 from cmmsim.geometry.pose import (
     Array,
     apply,

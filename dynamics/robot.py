@@ -14,7 +14,7 @@ from dynamics.checks import check_choice, check_type, floats, shown
 from dynamics.errors import DynamicsError, RobotFileError, ShapeError, SingularPoseError
 from dynamics.geometry import RobotGeometry
 from dynamics.robot_dynamics import RobotDynamics
-from dynamics.robot_file import RobotDescription, read_robot_file
+from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
 from dynamics.robot_functions import CASADI, casadi_function
 
 StateToAcceleration = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -166,6 +166,37 @@ class Robot(RobotDynamics):
         count = len(self.geometry.number_names)
         geometry = self.geometry.moved(floats("deviations", deviations, (count,)))
         return Robot(RobotDescription(self.name, geometry, self.parameter_sets), self.functions_of)
+
+    def with_parameters(self, parameters: ArrayLike) -> Robot:
+        """Robot whose nominal parameters are others, such as identified ones.
+
+        Parameters
+        ----------
+        parameters : array_like, shape (p + 3,)
+            Dynamic parameters, then lp, li, ld of the joint controller.
+
+        Returns
+        -------
+        Robot
+            Robot of the same geometry with this one parameter set.
+
+        Raises
+        ------
+        ShapeError, ParameterError
+            If the parameters are not valid.
+
+        Examples
+        --------
+        >>> identified = robot.parameter_sets["identified"]
+        >>> other = robot.with_parameters(identified.vector)
+        >>> np.array_equal(other.nominal_parameters, identified.dynamic)
+        True
+        """
+        count = len(self.parameter_names)
+        values = floats("parameters", parameters, (len(self.layout.names),))
+        dynamic = self.layout.check(values[:count])
+        sets = {"initial": ParameterSet(dynamic, values[count:])}
+        return Robot(RobotDescription(self.name, self.geometry, sets), self.functions_of)
 
     def with_geometry(self, geometry: RobotGeometry) -> Robot:
         """Robot with another geometry of the same kinds of legs, and functions of its own.

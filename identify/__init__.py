@@ -1,28 +1,28 @@
-"""Identification of parallel robots from images: excitation, experiment, estimation, validation,
-reports.
+"""Identification of parallel robots from images: experiments, estimation, validation, reports.
 
 The one place where robots (`dynamics`) and the optical sensor (`cmmsim`) meet.
 
 Experiment
-    load_scenario(name_or_path) -> Scenario     built in (`scenario_names() -> list[str]`), or a
-    TOML file run_experiment(scenario, seed) -> Dataset   the record of a plant moved with images in
-    the loop
+    load_scenario(name_or_path, **entries) -> Scenario   built in (`scenario_names()`), or a file
+    set_up(scenario, seed) -> Setup             robot, plant, sensor; `setup.run()` makes a record
+    run_experiment(scenario, seed) -> Dataset   both in one call; `record.truth` is its truth
+
+Identification
+    identify(record) -> IdentificationResult    `result.table(truth=record.truth)`, `result.robot`
+    setup.unseen_errors(result) -> UnseenErrors model against plant on trajectories it never saw
+    unseen_errors(parameters, robot, scenario, seed) -> ndarray   the same for any parameters
+
+Studies
+    Study(scenario, vary={...}, repeats=N)      `study.run()` is a table with a row for each
 
 A record of your own
     build_record(*, time, ...) -> Dataset       from arrays over the frames
-    store_anchor(record, anchor)                what fixes the scale, a ScaleAnchor(name, value,
-    std) store_payload(record, payload, std)         a known load, `payload_vector(mass_kg,
-    inertia_kg_m2)`
-
-Identification
-    identify(record, robot, scenario) -> IdentificationResult
-    unseen_errors(parameters, robot, scenario, seed) -> ndarray   model against plant on
-    trajectories it never saw
+    store_anchor(record, anchor)                what fixes the scale: ScaleAnchor(name, value, std)
+    store_payload(record, payload, std)         a known load: payload_vector(mass_kg, inertia_kg_m2)
 
 Pictures
-    run_figures(folder) -> dict                 of a finished run, by name: functions that draw them
-    for print the room `identify.scene`                   draws robot, cameras and images, and the
-    page that replays a run
+    run_figures(folder) -> dict                 figures of a finished run, for print, by their names
+    identify.scene                              room that draws robot, cameras, images and replays
 
 Every error that a user can cause is an IdentifyError, a `cmmsim.CmmError` or a
 `dynamics.DynamicsError`. Names are imported on first use: CasADi and OpenGL take seconds to load,
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from identify.estimation.result import IdentificationResult as IdentificationResult
     from identify.estimation.scale_anchor import ScaleAnchor as ScaleAnchor
     from identify.estimation.scale_anchor import store_anchor as store_anchor
-    from identify.experiment.run import run_experiment as run_experiment
     from identify.record.payload import payload_vector as payload_vector
     from identify.record.payload import store_payload as store_payload
     from identify.record.recording import build_record as build_record
@@ -47,11 +46,15 @@ if TYPE_CHECKING:
     from identify.scenario import Scenario as Scenario
     from identify.scenario import load_scenario as load_scenario
     from identify.scenario import scenario_names as scenario_names
+    from identify.setup import run_experiment as run_experiment
+    from identify.setup import set_up as set_up
+    from identify.studies.in_python import Study as Study
     from identify.validation.unseen import unseen_errors as unseen_errors
 
 _HOME = {
     **dict.fromkeys(("Scenario", "load_scenario", "scenario_names"), "identify.scenario"),
-    "run_experiment": "identify.experiment.run",
+    **dict.fromkeys(("run_experiment", "set_up"), "identify.setup"),
+    "Study": "identify.studies.in_python",
     "build_record": "identify.record.recording",
     "ScaleAnchor": "identify.estimation.scale_anchor",
     "store_anchor": "identify.estimation.scale_anchor",

@@ -15,7 +15,7 @@ With as many columns as there are parameters, a block fits into a processor's ca
 
 
 def triangular_factor(*parts: Array) -> Array:
-    """Triangular factor R of the QR factorisation of a tall matrix (n, p).
+    """Return the triangular factor R of the QR factorisation of a tall matrix (n, p).
 
     The columns are given in one or more parts (n, q) or (n,) side by side. The signs of its rows
     are arbitrary. Factoring block by block takes half the time of a factorisation at once.

@@ -1,16 +1,17 @@
-"""The errors a user can cause or meet; each message carries the value, the limit and the valid
-names.
-"""
+"""Errors that a user can cause or meet, with the value, the limit and the valid names."""
 
 LONGEST = 4000
-"""Characters of a message."""
+"""Largest number of characters of a message."""
 
 
 class IdentifyError(Exception):
     """Base of every error that the command line shows as one line. The message is one line."""
 
     def __str__(self) -> str:
-        """Message on one line of at most `LONGEST` characters, whatever a file had in it."""
+        """Return the message on one line of at most `LONGEST` characters.
+
+        A file's content can be part of it.
+        """
         text = " ".join(super().__str__().splitlines())
         return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
@@ -48,9 +49,8 @@ class VerificationError(IdentifyError):
 
 
 class StudyError(IdentifyError):
-    """A study that contradicts itself, a folder of another one, or machines on which it cannot
-    run."""
+    """A study that contradicts itself, or a folder or machines on which it cannot run."""
 
 
 class StudyInterrupted(StudyError):
-    """A study that its user stopped; what is done is kept."""
+    """A study that its user stopped. Its finished part is kept."""

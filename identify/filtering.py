@@ -69,10 +69,11 @@ def zero_phase_filter(
 
 
 def padding_samples(rate_hz: float, cutoff_hz: float, order: int) -> int:
-    """Number of samples by which a record is extended at both ends.
+    """Return the number of samples by which a record is extended at both ends.
 
     They cover three time constants of the filter's slowest pole.
     """
+    # Butterworth poles lie on a circle; the slowest is nearest to the imaginary axis.
     slowest_decay = 2 * np.pi * cutoff_hz / rate_hz * np.sin(np.pi / (2 * order))
     return int(max(3 * (order + 1), np.ceil(3 / slowest_decay)))
 
@@ -80,7 +81,7 @@ def padding_samples(rate_hz: float, cutoff_hz: float, order: int) -> int:
 def filtered_derivatives(
     samples: ArrayLike, rate_hz: float, cutoff_hz: float, order: int = 8
 ) -> tuple[Array, Array, Array]:
-    """Filtered samples (N, ...) with their first and second time derivatives.
+    """Return filtered samples (N, ...) with their first and second time derivatives.
 
     A quintic spline interpolates the filtered samples and is then differentiated. The derivatives
     are less exact towards both ends, so leave the first and last few samples out of a fit.
@@ -95,7 +96,7 @@ def filtered_derivatives(
 
 
 def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array]:
-    """First and second time derivative of samples (N, ...) by a quintic spline.
+    """Return the first and second time derivative of samples (N, ...) by a quintic spline.
 
     Raises
     ------

@@ -1,5 +1,4 @@
-"""The closed loop of a scenario: its settings, its parameters, and those that a command line
-names."""
+"""Closed loop of a scenario: its settings and its parameters."""
 
 import json
 import sys
@@ -20,30 +19,34 @@ from identify.scenario.plant_sections import AUTO, FILTERED
 from identify.scenario.section import ACTUATOR_KEYS, Section
 
 NOMINAL = "initial"
-"""The parameter set that is meant where none is named."""
+"""Parameter set that is used if none is named."""
 
 
 def model_settings(robot: Robot, scenario: Scenario) -> LoopSettings:
-    """The loop around the estimator's model: of the latency it knows the mean, where no record says
-    when commands acted. Raises as `loop_settings`."""
+    """Return the settings of the loop around the estimator's model.
+
+    The latency is the mean one where no record says when commands acted. Raises the errors of
+    `loop_settings`.
+    """
     return loop_settings(robot, scenario, scenario.model)
 
 
 def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> LoopSettings:
-    """The scenario's servo, timing and torque limit, with the laws of friction and of the drives
-    and the steps of the plant or of the model.
+    """Return the settings of the loop around the plant or the model.
 
-    Raises ScenarioError for a constant that is one of the other kind of actuators.
+    Servo, timing and torque limit are the scenario's. Friction law, drive law and integration steps
+    are those of the plant or the model.
+
+    Raises ScenarioError for a constant of the other kind of actuators.
     """
     servo = scenario.servo
     timing = scenario.timing
-    velocities = [
-        of_actuators(robot, side, name) for name in ("smoothing_velocity", "stribeck_velocity")
-    ]
+    smoothing = of_actuators(robot, side, "smoothing_velocity")
+    stribeck = of_actuators(robot, side, "stribeck_velocity")
     return LoopSettings(
         servo=ServoGains(servo.kp, servo.kd, servo.ki),
         timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
-        friction=FrictionLaw(side.friction, velocities[0], side.static_ratio, velocities[1]),
+        friction=FrictionLaw(side.friction, smoothing, side.static_ratio, stribeck),
         steps_per_frame=side.steps_per_frame,
         drives=Drives(
             torque_limit=of_actuators(robot, scenario.control, "torque_limit"),
@@ -54,25 +57,21 @@ def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> Loop
 
 
 def with_drive(scenario: Scenario, law: DriveName) -> Scenario:
-    """The scenario with the law of the drives that an identification settled, where it leaves that
-    to the record.
-    """
-    return (
-        scenario.with_overrides(drive_settings(law)) if scenario.model.drive == AUTO else scenario
-    )
+    """Return the scenario with an identified drive law, if its model leaves it to the record."""
+    if scenario.model.drive != AUTO:
+        return scenario
+    return scenario.with_overrides(drive_settings(law))
 
 
 def drive_settings(law: DriveName) -> dict[str, str | None]:
-    """Settings of a model whose drives have a law, where the scenario leaves it to the record, by
-    dotted path.
-    """
+    """Return the settings, by dotted path, of a model with this drive law."""
     return {"model.drive": law} | ({} if law == FILTERED else {"model.derivative_filter_s": None})
 
 
 def settled_drive(identification: Any) -> DriveName:
-    """The law of the drives of an identification entry of a result: the PID where it says none.
+    """Return the drive law of an identification entry of a result; PID if it has none.
 
-    Raises RecordError: an unknown one.
+    Raises RecordError for an unknown law.
     """
     drive = identification.get("drive") if isinstance(identification, dict) else None
     law = drive.get("law") if isinstance(drive, dict) else "pid"
@@ -82,7 +81,7 @@ def settled_drive(identification: Any) -> DriveName:
 
 
 def check_parameter_set(robot: Robot, set_name: str) -> None:
-    """Raise ScenarioError, with the valid names, when the robot file has no such parameter set."""
+    """Raise ScenarioError, with the valid names, if the robot file has no such parameter set."""
     if set_name not in robot.parameter_sets:
         valid = ", ".join(sorted(robot.parameter_sets))
         raise ScenarioError(
@@ -93,9 +92,9 @@ def check_parameter_set(robot: Robot, set_name: str) -> None:
 
 
 def of_actuators(robot: Robot, section: Section, name: str) -> Any:
-    """The value of a setting that has one key for actuators that turn and one for those that slide.
+    """Return the value of a setting whose key depends on the kind of actuators, turning or sliding.
 
-    Raises ScenarioError where only the key of the other kind is set, with both.
+    Raises ScenarioError, naming both keys, if only the other kind's is set.
     """
     turning, sliding = ACTUATOR_KEYS[name]
     own, other = (sliding, turning) if robot.layout.prismatic else (turning, sliding)
@@ -106,28 +105,25 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
     ):
         raise ScenarioError(
             f"{type(section).__name__.lower()}.{other} = {getattr(section, other):g} is of "
-            "actuators that "
-            f"{'turn' if robot.layout.prismatic else 'slide'}; those of {robot.name} "
-            f"{'slide' if robot.layout.prismatic else 'turn'}: set {own}"
+            f"actuators that {'turn' if robot.layout.prismatic else 'slide'}; those of "
+            f"{robot.name} {'slide' if robot.layout.prismatic else 'turn'}: set {own}"
         )
     return getattr(section, own)
 
 
 @dataclass(frozen=True)
 class ParameterChoice:
-    """Dynamic parameters (p,) [SI] and, in words, where they come from."""
+    """Dynamic parameters (p,) [SI] and, in words, their source."""
 
     values: Array
     source: str
 
 
 def choose_parameters(robot: Robot, choice: str | None = None) -> ParameterChoice:
-    """Parameters by the name of a set, or the estimates of a result file; the nominal set when
-    nothing is named.
+    """Return the parameters of a named set or of a result file; by default the nominal set.
 
-    Raises ScenarioError: neither a set of the robot (with the valid names) nor a file. Raises
-    RecordError: a result file without a complete set of estimates, or one that is no number in its
-    range.
+    Raises ScenarioError, with the valid names, if there is neither such a set nor such a file.
+    Raises RecordError if a result file lacks estimates, or if one is not a number in its range.
     """
     name = NOMINAL if choice is None else choice
     if name in robot.parameter_sets:
@@ -148,8 +144,9 @@ def choose_parameters(robot: Robot, choice: str | None = None) -> ParameterChoic
 
 
 def parameter_entries(identification: Any) -> dict[str, Any]:
-    """The parameters of an identification entry of a result, by name. Raises RecordError: there are
-    none.
+    """Return the parameters of an identification entry of a result, by name.
+
+    Raises RecordError if there are none.
     """
     entries = identification.get("parameters") if isinstance(identification, dict) else None
     if not isinstance(entries, dict):
@@ -158,9 +155,9 @@ def parameter_entries(identification: Any) -> dict[str, Any]:
 
 
 def parameter_column(identification: Any, column: str, names: Sequence[str]) -> list[float]:
-    """Parameters of one column ("initial", "estimate", ...) of an identification entry.
+    """Return the parameters of one column ("initial", "estimate", ...) of an identification entry.
 
-    Raises RecordError: naming those that are missing, or one that is no finite number.
+    Raises RecordError if a parameter is missing or is not a finite number. The message names it.
     """
     entries = parameter_entries(identification)
     found: dict[str, Any] = {
@@ -171,6 +168,7 @@ def parameter_column(identification: Any, column: str, names: Sequence[str]) -> 
         more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
         raise RecordError(f"there is no {column} of {', '.join(absent[:3])}{more}")
     for name, value in found.items():
+        # bool is a subclass of int.
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and abs(value) <= sys.float_info.max):
             raise RecordError(

@@ -1,6 +1,7 @@
 """The stages of a run, each reading what the one before wrote into the run folder."""
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import cmmsim
@@ -10,7 +11,7 @@ from identify.experiment.sensor_in_loop import with_renderer
 from identify.files.run_folder import (
     RunFolder,
     load_result,
-    save_result,
+    result_json,
 )
 from identify.progress import Progress
 from identify.record import recording
@@ -45,8 +46,7 @@ def run(
         identify(folder, progress)
     if "validation" not in load_result(run_folder.result):
         validate(folder, progress, workers, taught)
-    report(folder, progress)
-    _add_seconds(run_folder, **seconds, total=time.perf_counter() - began)
+    report(folder, progress, began, seconds)
 
 
 def record(
@@ -78,18 +78,30 @@ def record(
     return sensor.taught
 
 
-def report(folder: Path, progress: Progress) -> None:
-    """Draw the figures and write report.html."""
+def report(
+    folder: Path,
+    progress: Progress,
+    run_began: float | None = None,
+    seconds: Mapping[str, float] | None = None,
+) -> None:
+    """Draw the figures, and write report.html with them, and result.json with the seconds.
+
+    run_began: when a whole run began. seconds: further ones of it.
+    """
     from identify.reporting.report import (
         write_report,
     )  # imports Matplotlib, for which no other stage waits
 
     began = time.perf_counter()
-    write_report(folder, progress)
-    _add_seconds(RunFolder(folder), report=time.perf_counter() - began)
+    path = RunFolder(folder).result
 
+    # A run with a report is finished, so that its last result must not come after the report.
+    def timed_result() -> dict[Path, bytes]:
+        result = load_result(path)
+        now = time.perf_counter()
+        result["seconds"] |= {**(seconds or {}), "report": now - began}
+        if run_began is not None:
+            result["seconds"]["total"] = now - run_began
+        return {path: result_json(result)}
 
-def _add_seconds(run_folder: RunFolder, **seconds: float) -> None:
-    result = load_result(run_folder.result)
-    result["seconds"].update(seconds)
-    save_result(run_folder.result, result)
+    write_report(folder, progress, timed_result)

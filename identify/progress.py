@@ -106,7 +106,7 @@ class RichProgress:
 
 
 def terminal_progress(quiet: bool, rate: str = "") -> Progress:
-    """Progress that a command shows: bars with a `rate` in that unit, or nothing if quiet."""
+    """Return a command's progress: bars with a `rate` in that unit, or nothing if quiet."""
     return SilentProgress() if quiet else RichProgress(rate=rate)
 
 
@@ -150,6 +150,7 @@ def print_table(
         Lines above and below the table.
     """
     table = RichTable(title=title, caption=note, box=SIMPLE_HEAD, show_edge=False, padding=0)
+    # The first column names the row, and is never broken into lines.
     for place, name in enumerate(header):
         table.add_column(name, justify="left" if name in words else "right", no_wrap=not place)
     for row in rows:

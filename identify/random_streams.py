@@ -49,7 +49,7 @@ RESAMPLING = 301  # with a sensor's seed: resampled frames of the moving bar
 
 
 def child(seed: int | np.random.SeedSequence, *stream: int) -> np.random.SeedSequence:
-    """Sequence of a stream, independent of all others of the seed.
+    """Return the sequence of a stream, independent of all others of the seed.
 
     Parameters
     ----------
@@ -73,10 +73,23 @@ def child(seed: int | np.random.SeedSequence, *stream: int) -> np.random.SeedSeq
 
 
 def stream_seed(seed: int | np.random.SeedSequence, *stream: int) -> int:
-    """Integer seed of a stream."""
+    """Return the integer seed of a stream."""
     return int(child(seed, *stream).generate_state(1)[0])
 
 
+def integer_seed(seed: int | np.random.SeedSequence) -> int:
+    """Return the integer seed of an experiment, also from the sequence of a study's row.
+
+    Examples
+    --------
+    >>> integer_seed(7), integer_seed(np.random.SeedSequence(7))
+    (7, 2083679832)
+    """
+    if isinstance(seed, np.random.SeedSequence):
+        return int(seed.generate_state(1)[0])
+    return seed
+
+
 def mixed_generator(stream: int, *seed: int) -> np.random.Generator:
-    """Generator of a stream beside an experiment, for one seed or the same for all."""
+    """Return the generator of a stream beside an experiment, for one seed or the same for all."""
     return np.random.default_rng([*seed, stream])

@@ -1,6 +1,4 @@
-"""The machine under a run: its cores, and Ctrl-C, which neither is lost nor leaves anything half
-done.
-"""
+"""Cores of the machine, and a Ctrl-C that is neither lost nor leaves work half done."""
 
 import os
 import signal
@@ -12,12 +10,11 @@ from multiprocessing import parent_process
 from multiprocessing.process import BaseProcess
 from typing import ParamSpec, TypeVar, cast
 
-import typer
 from threadpoolctl import OpenBLASController, register, threadpool_limits
 
 
 class _CasadiBlas(OpenBLASController):
-    """The BLAS that CasADi brings for IPOPT, under a name that threadpoolctl does not look for."""
+    """BLAS that CasADi brings for IPOPT. Its name is one that threadpoolctl does not look for."""
 
     filename_prefixes = ("libcasadi-tp-openblas",)
 
@@ -30,17 +27,20 @@ _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 def one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: every BLAS that is loaded by now uses one thread.
+    """Decorate a function so that every BLAS loaded by now uses one thread.
 
-    The many small matrices of a search lose by a second one (a fifth of the time on free cores,
-    half on busy ones), and with one the rounding does not depend on the machine's cores or on its
+    A second thread slows the many small matrices of a search down: by a fifth on free cores, by
+    half on busy ones. With one thread, rounding depends neither on the cores nor on the
     environment.
     """
     return cast(Callable[P, R], _one_thread(function))
 
 
 def cores() -> int:
-    """Cores that this process may use; where only Linux can say so, all of the machine."""
+    """Return the number of cores that this process may use.
+
+    Only Linux tells it. On other systems it is the number of cores of the machine.
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -49,9 +49,11 @@ STOPPED = 130
 
 
 class Noting:
-    """A handler of Ctrl-C that raises KeyboardInterrupt, and keeps in mind that it came: an import
-    may swallow the exception, or make another error of it, and so may CasADi where it turns a
-    matrix into an array."""
+    """Handler of Ctrl-C that raises KeyboardInterrupt and remembers that it came.
+
+    It must remember, because an import may swallow the exception or turn it into another error. So
+    may CasADi where it turns a matrix into an array.
+    """
 
     def __init__(self) -> None:
         self.came = False
@@ -64,7 +66,10 @@ class Noting:
 
 @contextmanager
 def noted() -> Iterator[Noting]:
-    """Ctrl-C is noted in the block, for `raise_noted`; in a block inside another, for both."""
+    """Note Ctrl-C while the block runs, for `raise_noted`.
+
+    A block inside another uses the handler of the outer one, so both know of it.
+    """
     old = signal.getsignal(signal.SIGINT)
     noting = old if isinstance(old, Noting) else Noting()
     if not _is_ours():
@@ -78,8 +83,9 @@ def noted() -> Iterator[Noting]:
 
 
 def raise_noted() -> None:
-    """Raise KeyboardInterrupt once more if there was one since `noted`; call it before long work
-    begins.
+    """Raise KeyboardInterrupt again if Ctrl-C came since the `noted` block began.
+
+    Call it before long work begins.
     """
     handler = signal.getsignal(signal.SIGINT)
     if isinstance(handler, Noting) and handler.came:
@@ -88,8 +94,9 @@ def raise_noted() -> None:
 
 @contextmanager
 def honoured() -> Iterator[None]:
-    """Ctrl-C leaves the block as KeyboardInterrupt, also where foreign code swallowed it or made
-    another error.
+    """Leave the block with KeyboardInterrupt after Ctrl-C, even if foreign code swallowed it.
+
+    Foreign code may also have turned it into another error.
     """
     with noted() as noting:
         try:
@@ -103,7 +110,7 @@ def honoured() -> Iterator[None]:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Ctrl-C waits until the block has ended."""
+    """Delay Ctrl-C until the block has ended."""
     if not _is_ours():
         yield
         return
@@ -118,14 +125,17 @@ def held() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, old)
-        if came:
+        if came:  # the handler from before the block gets it now
             signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager
 def deaf_offspring() -> Iterator[None]:
-    """Threads and processes that are started in the block, and those that they start, never hear
-    Ctrl-C: it is for the main process, which ends them. Windows knows no such mask."""
+    """Hide Ctrl-C from the threads and processes that start in the block, and from their own.
+
+    Ctrl-C is for the main process, which ends them. Windows has no such signal mask, and there the
+    block changes nothing.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -137,9 +147,9 @@ def deaf_offspring() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """Have this process end when the one that started it is gone, also in the middle of work.
+    """End this process when its parent is gone, even in the middle of work.
 
-    A process of `multiprocessing` would otherwise wait for work, or do it, without end.
+    Without this, a process of `multiprocessing` would wait or compute without end.
     """
     threading.Thread(target=_end_after, args=(parent_process(),), daemon=True).start()
 
@@ -147,20 +157,25 @@ def end_with_parent() -> None:
 def _end_after(parent: BaseProcess | None) -> None:
     if parent is not None:
         parent.join()
-        os._exit(1)
+        os._exit(1)  # sys.exit would end this thread alone
 
 
 def _is_ours() -> bool:
-    """Whether Ctrl-C may be handled here: in the main thread, and where nobody, such as nohup, has
-    turned it off.
+    """Tell whether Ctrl-C may be handled here.
+
+    It may in the main thread, unless something such as nohup has turned it off.
     """
     in_main = threading.current_thread() is threading.main_thread()
     return in_main and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None)
 
 
 def stoppable(command: Callable[P, None]) -> Callable[P, None]:
-    """The command, which says in one line that Ctrl-C stopped it where it does not say so
-    itself."""
+    """Decorate a command so that Ctrl-C ends it with one line and the exit status `STOPPED`.
+
+    A command that reports Ctrl-C itself, by typer.Exit, is left alone.
+    """
+
+    import typer  # late: Ctrl-C while it is loaded is to be heard by `honoured`
 
     @wraps(command)
     def run(*arguments: P.args, **options: P.kwargs) -> None:
@@ -170,6 +185,7 @@ def stoppable(command: Callable[P, None]) -> Callable[P, None]:
             except typer.Exit:
                 raise
             except (KeyboardInterrupt, Exception) as error:
+                # An error after Ctrl-C is most likely what foreign code made of it.
                 if isinstance(error, Exception) and not interrupt.came:
                     raise
                 typer.echo(

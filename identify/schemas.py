@@ -1,5 +1,6 @@
-"""The JSON schemas of all files that a user writes, for editors; `python -m identify.schemas`
-writes them anew.
+"""JSON schemas of all files that a user writes, for editors.
+
+`python -m identify.schemas` writes them anew.
 """
 
 import json
@@ -23,7 +24,7 @@ SCHEMAS: dict[Path, Callable[[], dict[str, Any]]] = {
     ROOT / "identify/studies/built_in/study.schema.json": study_schema,
     ROOT / "identify/record/record.schema.json": record_schema,
 }
-"""Where each is kept, and what it is made by: from the models that read the files."""
+"""File of each schema, and the function that makes it from the models that read such files."""
 
 
 if __name__ == "__main__":

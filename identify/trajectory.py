@@ -53,6 +53,7 @@ class FourierTrajectory:
     def __post_init__(self) -> None:
         for name in ("sine", "cosine", "offset"):
             value = np.array(getattr(self, name), dtype=float)
+            # A frozen trajectory must not change through its arrays.
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         m = len(self.chart.freedoms)
@@ -79,17 +80,17 @@ class FourierTrajectory:
         return int(self.sine.shape[1])
 
     def pose(self, t: ArrayLike) -> Array:
-        """Poses (N, 6) [m, rad] at times ``t`` (N,) [s]; one pose (6,) for a single time."""
+        """Return poses (N, 6) [m, rad] at times ``t`` (N,) [s]; one pose (6,) for a single time."""
         w, sin, cos = self._waves(t)
         return self.chart.pose(self.offset + sin @ (self.sine / w).T - cos @ (self.cosine / w).T)
 
     def pose_rate(self, t: ArrayLike) -> Array:
-        """Time derivative of the pose, (N, 6) [m/s, rad/s]."""
+        """Return the time derivative of the pose, (N, 6) [m/s, rad/s]."""
         _, sin, cos = self._waves(t)
         return self.chart.lifted(cos @ self.sine.T + sin @ self.cosine.T)
 
     def pose_acceleration(self, t: ArrayLike) -> Array:
-        """Second time derivative of the pose, (N, 6) [m/s², rad/s²].
+        """Return the second time derivative of the pose, (N, 6) [m/s², rad/s²].
 
         This is eq. 36 without its stray factor t.
         """
@@ -97,7 +98,7 @@ class FourierTrajectory:
         return self.chart.lifted(cos @ (self.cosine * w).T - sin @ (self.sine * w).T)
 
     def reference(self, times: ArrayLike) -> Reference:
-        """Desired poses and pose rates at the frames ``times`` (N,) [s]."""
+        """Return the desired poses and pose rates at the frames ``times`` (N,) [s]."""
         return Reference(self.pose(times), self.pose_rate(times))
 
     def _waves(self, t: ArrayLike) -> tuple[Array, Array, Array]:
@@ -107,7 +108,7 @@ class FourierTrajectory:
 
 
 def box_of(chart: Chart, position_m: float, orientation_rad: float) -> Array:
-    """Largest distances (m,) of the coordinates from home, m and rad."""
+    """Return the largest distances (m,) of the coordinates from home, m and rad."""
     return np.array([position_m if unit == "m" else orientation_rad for unit in chart.units])
 
 
@@ -119,7 +120,7 @@ def random_trajectory(
     position_amplitude_m: float,
     orientation_amplitude_rad: float,
 ) -> FourierTrajectory:
-    """Random trajectory with a smooth start that fills the box about home in every coordinate.
+    """Draw a trajectory with a smooth start that fills the box about home in every coordinate.
 
     Normal coefficients are projected onto the conditions of a smooth start, then scaled axis by
     axis.
@@ -160,17 +161,20 @@ def random_trajectory(
         raise TrajectoryError(f"a smooth start needs at least 2 harmonics, got {harmonics}")
     order = np.arange(1, harmonics + 1)
     freedoms = len(chart.freedoms)
+    # Conditions of a smooth start: sum_l s_l = 0 and sum_l l c_l = 0.
     sine = _without(rng.standard_normal((freedoms, harmonics)), np.ones(harmonics))
     cosine = _without(rng.standard_normal((freedoms, harmonics)), order.astype(float))
+    # With a home of zero, poses are distances from home.
     shape = from_home(replace(chart, home=(0.0,) * 6), fundamental_hz, sine, cosine)
     box = box_of(chart, position_amplitude_m, orientation_amplitude_rad)
+    # At 200 samples a period of the highest harmonic, its peak is found to about 1e-4.
     period = np.linspace(0.0, 1.0 / fundamental_hz, 200 * harmonics, endpoint=False)
     scale = (box / np.abs(chart.coordinates(shape.pose(period))).max(axis=0))[:, None]
     return from_home(chart, fundamental_hz, scale * sine, scale * cosine)
 
 
 def from_home(chart: Chart, fundamental_hz: float, sine: Array, cosine: Array) -> FourierTrajectory:
-    """Trajectory with given coefficients (m, n) [m/s, rad/s] that is at home at t = 0."""
+    """Return the trajectory with coefficients (m, n) [m/s, rad/s] that is at home at t = 0."""
     w = 2 * np.pi * fundamental_hz * np.arange(1, sine.shape[1] + 1)
     home = chart.coordinates(np.array(chart.home))
     return FourierTrajectory(chart, fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
@@ -232,16 +236,16 @@ def _without(rows: Array, direction: Array) -> Array:
     return rows - np.outer(rows @ unit, unit)
 
 
-FREE, HOME = "free", (0.0,) * 6
-"""Chart and home of files that state none.
+FREE = "free"
+"""Chart of files that state none."""
 
-Their platforms move freely, and such a chart does not use its home.
-"""
+HOME = (0.0,) * 6
+"""Home of files that state none. A chart that is free does not use it."""
 
 FORMAT = "cmmsim trajectories, version 1"
 EQUATION = (
-    "pose(t) = offset + sum_l sine_l sin(w t)/w - cosine_l cos(w t)/w with w = 2 pi fundamental_hz "
-    "l"
+    "pose(t) = offset + sum_l sine_l sin(w t)/w - cosine_l cos(w t)/w "
+    "with w = 2 pi fundamental_hz l"
 )
 UNITS = {
     "fundamental_hz": "Hz",
@@ -308,6 +312,7 @@ def load_trajectories(path: Path | str) -> TrajectorySet:
         if data["format"] != FORMAT:
             raise TrajectoryError(f"{path} has format {data['format']!r}, expected {FORMAT!r}")
         index = data["observability_index"]
+        # Older files state neither chart nor home.
         chart = Chart(data.get("chart", FREE), tuple(data.get("home_pose", HOME)))
         return TrajectorySet(
             seed=int(data["seed"]),

@@ -23,7 +23,7 @@ import identify
 from identify.accuracy.saved import read_saved
 from identify.commands import app as command_line
 from identify.files.run_folder import load_result
-from identify.plugins import ESTIMATORS
+from identify.own_parts import ESTIMATORS
 from identify.reporting.goals import check_goals
 from tests.identify.synthetic import SIGMA, quick, run_plant, truth
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmmsim.errors import AcceptanceError, LostError
+from cmmsim.files.rig_and_bodies import MarkedBody, rig_from_file
 from cmmsim.files.schema import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
-from cmmsim.files.setup import MarkedBody, rig_from_file
 from cmmsim.geometry.pose import Array, frozen, invert, rigid
 from cmmsim.imaging.pyrender_renderer import require_opengl
 from cmmsim.imaging.renderer import choose_renderer

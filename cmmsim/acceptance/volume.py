@@ -16,8 +16,8 @@ from itertools import product
 import numpy as np
 
 from cmmsim.errors import AcceptanceError
+from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.files.schema import Rig
-from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import Array, apply, frozen, invert, rigid, transform_to_pose
 from cmmsim.geometry.stereo_rig import StereoRig
 

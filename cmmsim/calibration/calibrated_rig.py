@@ -18,8 +18,8 @@ from cmmsim.calibration.adjustment import Adjustment
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.sightings import SIDES, Sightings
 from cmmsim.errors import CalibrationError
+from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.files.sensor_file import built_in_names, read_sensor_file, sensor_text
-from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import Array, skew, transform_to_pose
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 from cmmsim.uncertainty.known_rig import KnownRig

@@ -60,7 +60,8 @@ def plate_corners(board: Board) -> Array:
     """Corners (4,3) of the plate's front, m."""
     points = board.points
     rim = board.spacing * (MARGIN + (RIM if board.kind == "chessboard" else 0.0))
-    (x0, y0), (x1, y1) = points[:, :2].min(axis=0) - rim, points[:, :2].max(axis=0) + rim
+    x0, y0 = points[:, :2].min(axis=0) - rim
+    x1, y1 = points[:, :2].max(axis=0) + rim
     return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
 
 

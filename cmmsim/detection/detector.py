@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.allowed_plugins import DETECTORS, find
 from cmmsim.checks import finite_array, require_kind
 from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
-from cmmsim.plugins import DETECTORS, find
 from cmmsim.radiometry.noise import CameraNoise
 
 

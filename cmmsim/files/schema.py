@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
+from cmmsim.allowed_plugins import AUTO, DEFAULT_DETECTOR, require_detector, require_renderer
 from cmmsim.checks import Section, check_name
 from cmmsim.errors import SensorFileError
 from cmmsim.geometry.pose import Array
-from cmmsim.plugins import AUTO, DEFAULT_DETECTOR, require_detector, require_renderer
 from cmmsim.quantities import (
     Angle,
     Component,
@@ -203,7 +203,7 @@ class Lens(Section):
 
 class Detection(Section):
     """detector: which one finds the centres of stickers in windows when poses are measured, see
-    :mod:`cmmsim.plugins`.
+    :mod:`cmmsim.allowed_plugins`.
 
     Teaching always takes the maximum-likelihood one, whichever is named here; see
     :mod:`cmmsim.teaching`.
@@ -298,7 +298,8 @@ class SensorFile(Section):
 
     based_on: a built-in sensor, or a file beside this one, whose entries hold where this file has
     none; note: what a user must know of the figures, such as that they are assumed; renderer: which
-    one draws, see :mod:`cmmsim.plugins`; "auto" takes pyrender where OpenGL works, else analytic.
+    one draws, see :mod:`cmmsim.allowed_plugins`; "auto" takes pyrender where OpenGL works, else
+    analytic.
     """
 
     name: Annotated[str, AfterValidator(check_name)] = quantity(..., "", "name of the sensor")

@@ -153,7 +153,8 @@ class PinholeCamera:
     @property
     def matrix(self) -> Array:
         """Camera matrix K (3,3)."""
-        (focal_x, focal_y), (x, y) = self.focal_lengths, self.centre
+        focal_x, focal_y = self.focal_lengths
+        x, y = self.centre
         return np.array([[focal_x, 0.0, x], [0.0, focal_y, y], [0.0, 0.0, 1.0]])
 
     @property

@@ -74,7 +74,8 @@ def straighten_all(lens: Array, points: Array, reach: float, straight: Array, fo
     over. The values of the others are finite and mean nothing.
     """
     for n in range(len(points)):
-        x, y = points[n, 0], points[n, 1]
+        x = points[n, 0]
+        y = points[n, 1]
         gap = np.inf
         determinant = 0.0
         for _ in range(MOST_STEPS + 1):
@@ -83,7 +84,8 @@ def straighten_all(lens: Array, points: Array, reach: float, straight: Array, fo
                 x *= reach / radius
                 y *= reach / radius
             u, v, xx, xy, yy = bend(x, y, lens[0], lens[1], lens[2], lens[3], lens[4])
-            gap_x, gap_y = points[n, 0] - u, points[n, 1] - v
+            gap_x = points[n, 0] - u
+            gap_y = points[n, 1] - v
             gap = max(abs(gap_x), abs(gap_y))
             determinant = xx * yy - xy * xy
             if gap <= 0.1 * CONVERGED:
@@ -134,7 +136,8 @@ def light_at(camera: Array, size: Array, u: float, v: float, vignetting: float) 
     """Return the relative illumination of a pixel of a camera with an image size (2,)."""
     if vignetting == 0.0:
         return 1.0
-    x, y = camera[2], camera[3]
+    x = camera[2]
+    y = camera[3]
     farthest_x = max(x + 0.5, size[0] - 0.5 - x)
     farthest_y = max(y + 0.5, size[1] - 0.5 - y)
     share = ((u - x) ** 2 + (v - y) ** 2) / (farthest_x**2 + farthest_y**2)

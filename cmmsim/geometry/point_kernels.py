@@ -51,8 +51,13 @@ def pull(
     yy = spread[1, 1] + parted
     share = 1.0 / (xx * yy - xy * xy)
     near = 1.0 / z
-    w_xx, w_xy, w_yy = share * yy, -share * xy, share * xx
-    f_x, f_y, t_x, t_y = near * camera[0], near * camera[1], near * x, near * y
+    w_xx = share * yy
+    w_xy = -share * xy
+    w_yy = share * xx
+    f_x = near * camera[0]
+    f_y = near * camera[1]
+    t_x = near * x
+    t_y = near * y
     along = w_xx * r + w_xy * s
     down = w_xy * r + w_yy * s
     first_0, first_1, first_2 = slope_by(move, a, b, f_x, f_y, t_x, t_y)
@@ -60,9 +65,12 @@ def pull(
     right[0] += first_0 * along + second_0 * down
     right[1] += first_1 * along + second_1 * down
     right[2] += first_2 * along + second_2 * down
-    pushed_0, pulled_0 = w_xx * first_0 + w_xy * second_0, w_xy * first_0 + w_yy * second_0
-    pushed_1, pulled_1 = w_xx * first_1 + w_xy * second_1, w_xy * first_1 + w_yy * second_1
-    pushed_2, pulled_2 = w_xx * first_2 + w_xy * second_2, w_xy * first_2 + w_yy * second_2
+    pushed_0 = w_xx * first_0 + w_xy * second_0
+    pulled_0 = w_xy * first_0 + w_yy * second_0
+    pushed_1 = w_xx * first_1 + w_xy * second_1
+    pulled_1 = w_xy * first_1 + w_yy * second_1
+    pushed_2 = w_xx * first_2 + w_xy * second_2
+    pulled_2 = w_xy * first_2 + w_yy * second_2
     normal[0] += pushed_0 * first_0 + pulled_0 * second_0
     normal[1] += pushed_0 * first_1 + pulled_0 * second_1
     normal[2] += pushed_0 * first_2 + pulled_0 * second_2
@@ -84,7 +92,9 @@ def triangulate(
     ``spreads`` alone. Steps of Gauss-Newton end below ``settled`` m. ``scratch`` (3,6) is filled
     with the entries of the point's information and of its covariance.
     """
-    normal, inverse, right = scratch[0], scratch[1], scratch[2]
+    normal = scratch[0]
+    inverse = scratch[1]
+    right = scratch[2]
     gap = 0.0
     for _ in range(MOST_STEPS):
         for k in range(6):

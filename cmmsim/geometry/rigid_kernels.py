@@ -29,7 +29,9 @@ def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array)
     ``info`` (3,3) is the inverse covariance W of the point. ``normal`` (6,6), lower triangle, has
     J' W J, and ``change`` (6,) J' W gap.
     """
-    x, y, z = arm[0], arm[1], arm[2]
+    x = arm[0]
+    y = arm[1]
+    z = arm[2]
     squared = 0.0
     for i in range(3):
         push = info[i, 0] * gap[0] + info[i, 1] * gap[1] + info[i, 2] * gap[2]
@@ -110,7 +112,8 @@ def rigid_fits(
     change = np.empty(6)
     normal = np.empty((6, 6))
     for f in range(len(transforms)):
-        first, last = starts[f], starts[f + 1]
+        first = starts[f]
+        last = starts[f + 1]
         for _ in range(steps if last > first else 0):
             normal[:] = 0.0
             change[:] = 0.0
@@ -134,7 +137,9 @@ def left_noise(arm: Array, noise: Array, covariance: Array, half: Array, entries
     ``noise`` (3,3) is the point's covariance, ``covariance`` (6,6) the pose's; ``half`` (3,6) is
     overwritten.
     """
-    x, y, z = arm[0], arm[1], arm[2]
+    x = arm[0]
+    y = arm[1]
+    z = arm[2]
     for b in range(6):
         half[0, b] = covariance[0, b] + z * covariance[4, b] - y * covariance[5, b]
         half[1, b] = covariance[1, b] - z * covariance[3, b] + x * covariance[5, b]

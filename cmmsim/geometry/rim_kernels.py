@@ -67,7 +67,9 @@ def add_arcs(count: int, arcs: Arcs, centre_x: float, shape: Array, cover: Cover
     c = shape[1, 0]
     d = shape[1, 1]
     for k in range(count):
-        row, column, (u_0, v_0, u_1, v_1) = arcs.rows[k], arcs.columns[k], arcs.ends[k]
+        row = arcs.rows[k]
+        column = arcs.columns[k]
+        u_0, v_0, u_1, v_1 = arcs.ends[k]
         rise = c * (u_1 - u_0) + d * (v_1 - v_0)
         cover.past[row, column] += rise
         if column == width:
@@ -121,12 +123,15 @@ def follow_quarter(
     (w + 1, 2) and rows (h + 1, 2): ``crossings`` of the lines between pixels. Arcs above, below and
     left of the window are left out, those right of it stand in the column behind the last.
     """
-    (x_u, x_v), (y_u, y_v) = ends[0], ends[1]
-    (u, v), (last_u, last_v) = ends[quarter], ends[(quarter + 1) % 4]
-    (centre_x, centre_y), (a, b, c, d) = (
-        centre,
-        (shape[0, 0], shape[0, 1], shape[1, 0], shape[1, 1]),
-    )
+    x_u, x_v = ends[0]
+    y_u, y_v = ends[1]
+    u, v = ends[quarter]
+    last_u, last_v = ends[(quarter + 1) % 4]
+    centre_x, centre_y = centre
+    a = shape[0, 0]
+    b = shape[0, 1]
+    c = shape[1, 0]
+    d = shape[1, 1]
     way_x = 1 if quarter >= 2 else -1
     way_y = 1 if quarter == 0 or quarter == 3 else -1
     width = len(columns) - 1

@@ -12,9 +12,12 @@ from cmmsim.compilation import Array, compiled
 @compiled
 def pose_transform(pose: Array, transform: Array) -> None:
     """Fill the transform (4,4) of a pose (6,)."""
-    ca, sa = math.cos(pose[3]), math.sin(pose[3])
-    cb, sb = math.cos(pose[4]), math.sin(pose[4])
-    cg, sg = math.cos(pose[5]), math.sin(pose[5])
+    ca = math.cos(pose[3])
+    sa = math.sin(pose[3])
+    cb = math.cos(pose[4])
+    sb = math.sin(pose[4])
+    cg = math.cos(pose[5])
+    sg = math.sin(pose[5])
     transform[0, 0] = cb * cg
     transform[0, 1] = -cb * sg
     transform[0, 2] = sb
@@ -58,7 +61,10 @@ def transform_poses(transforms: Array, poses: Array) -> None:
 def multiply(first: Array, second: Array, product: Array) -> None:
     """Fill the product of two transforms (4,4)."""
     for i in range(4):
-        a, b, c, d = first[i, 0], first[i, 1], first[i, 2], first[i, 3]
+        a = first[i, 0]
+        b = first[i, 1]
+        c = first[i, 2]
+        d = first[i, 3]
         for j in range(4):
             product[i, j] = (
                 a * second[0, j] + b * second[1, j] + c * second[2, j] + d * second[3, j]
@@ -68,7 +74,9 @@ def multiply(first: Array, second: Array, product: Array) -> None:
 @compiled
 def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
     """Fill a point (3,), or with ``shift`` 0 a direction, carried by a transform (4,4)."""
-    x, y, z = point[0], point[1], point[2]
+    x = point[0]
+    y = point[1]
+    z = point[2]
     for i in range(3):
         carried[i] = shift * move[i, 3] + move[i, 0] * x + move[i, 1] * y + move[i, 2] * z
 
@@ -146,8 +154,10 @@ def farthest_from_rigid(transforms: Array) -> float:
 @compiled
 def angle_rates(pose: Array, rates: Array) -> None:
     """Fill the slopes (3,3) of a pose's angles by a rotation vector, in the output's axes."""
-    ca, sa = math.cos(pose[3]), math.sin(pose[3])
-    cb, sb = math.cos(pose[4]), math.sin(pose[4])
+    ca = math.cos(pose[3])
+    sa = math.sin(pose[3])
+    cb = math.cos(pose[4])
+    sb = math.sin(pose[4])
     rates[0, 0] = 1.0
     rates[0, 1] = sa * sb / cb
     rates[0, 2] = -ca * sb / cb

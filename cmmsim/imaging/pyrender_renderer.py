@@ -188,7 +188,8 @@ class _Atlas:
         """The patches shown in a cell, the nearest of which is seen; matrices: addresses of theirs
         by their numbers.
         """
-        gl, (triangles, unsigned) = self._gl, self._constants
+        gl = self._gl
+        triangles, unsigned = self._constants
         gl.glEnable(gl.GL_DEPTH_TEST)
         for p, matrix in matrices.items():
             self._set_matrix(self._matrix_location, 1, True, matrix)

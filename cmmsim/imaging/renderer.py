@@ -14,13 +14,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.allowed_plugins import AUTO, RENDERERS, find
 from cmmsim.checks import finite_array
 from cmmsim.errors import CmmError, OpenGLMissingError
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene_bodies import Patch
 from cmmsim.imaging.views import NEAR, View, Views
-from cmmsim.plugins import AUTO, RENDERERS, find
 
 _WARNED: dict[
     str | tuple[str, type[Warning], int], int

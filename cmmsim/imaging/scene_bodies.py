@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from cmmsim.checks import finite_array
 from cmmsim.errors import CmmError, SensorFileError
+from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.files.schema import Body, Stickers, unit
-from cmmsim.files.setup import MarkedBody
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, invert
 

@@ -54,7 +54,8 @@ def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) ->
         after = (aside + 1) % 3
         before = (aside + 2) % 3
         across = math.sqrt(move[after, 2] ** 2 + move[before, 2] ** 2)
-        move[after, 0], move[before, 0] = move[before, 2] / across, -move[after, 2] / across
+        move[after, 0] = move[before, 2] / across
+        move[before, 0] = -move[after, 2] / across
         for i in range(3):
             j = (i + 1) % 3
             m = (i + 2) % 3

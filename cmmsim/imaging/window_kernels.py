@@ -45,10 +45,8 @@ def boxes_reaching(
             farthest = max(farthest, point[2])
             if point[2] > near:
                 for i in range(2):
-                    box[i], box[2 + i] = (
-                        min(box[i], point[i] / point[2]),
-                        max(box[2 + i], point[i] / point[2]),
-                    )
+                    box[i] = min(box[i], point[i] / point[2])
+                    box[2 + i] = max(box[2 + i], point[i] / point[2])
         for n in range(len(windows)):
             if nearest <= near:
                 reaching[n, p] = farthest > 0.0

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from cmmsim.errors import LostError
-from cmmsim.files.setup import MarkedBody
+from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.registration import SMALLEST_SPREAD, require_spread
 from cmmsim.geometry.stereo_rig import StereoRig
@@ -205,7 +205,8 @@ def _outlines(seen: StickerObservation, observer: Observer, normals: Array) -> O
     known = no_outlines(observer.rig)
     if seen.outlines is None:
         return known
-    rows, columns = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
+    rows = [0, 0, 0, 1, 1, 2]
+    columns = [0, 1, 2, 1, 2, 2]
     entries = seen.outlines.shapes[..., [0, 0, 1], [0, 1, 1]]
     inverse = np.linalg.inv(seen.outlines.covariances)[..., rows, columns]
     return known._replace(

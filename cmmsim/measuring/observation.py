@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR
 from cmmsim.detection.detector import (
     DetectedCentres,
     Detector,
@@ -28,7 +29,6 @@ from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply_each
 from cmmsim.geometry.stereo_rig import StereoRig, triangulate
-from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoImages, Windows
 

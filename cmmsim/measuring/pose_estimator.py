@@ -11,7 +11,7 @@ from cmmsim.checks import finite_array, require_kind
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError, ShapeError, UnknownOptionError
-from cmmsim.files.setup import MarkedBody
+from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points, frames_of_points
 from cmmsim.geometry.pose import (
     Array,

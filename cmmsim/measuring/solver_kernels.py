@@ -26,7 +26,11 @@ from cmmsim.geometry.rigid_kernels import (
 from cmmsim.geometry.transform_kernels import carry, make_rigid, move_by
 
 MOST_STEPS = 8
-MEASURED, TOO_FEW, ON_A_LINE = 0, 1, 2  # states of a frame
+
+# States of a frame.
+MEASURED = 0
+TOO_FEW = 1
+ON_A_LINE = 2
 
 # Columns of a verdict, a row of numbers for each frame: its state, its stickers to begin with and
 # in the end, the one that was left out first (-1: none) with the squared misfits of its place and
@@ -91,7 +95,7 @@ def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
     """
     first = np.argmax(used)
     count = 0
-    x, y, z, xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    x = y = z = xx = xy = xz = yy = yz = zz = 0.0
     for n in range(len(used)):
         if used[n]:
             count += 1
@@ -143,7 +147,8 @@ def fit(
         move_by(place, change)
         if max(abs(change[3]), abs(change[4]), abs(change[5])) < settled:
             for n in range(len(seen.used)):
-                arm, gap = seen.arms[n], seen.gaps[n]
+                arm = seen.arms[n]
+                gap = seen.gaps[n]
                 gap[0] -= change[0] + change[4] * arm[2] - change[5] * arm[1]
                 gap[1] -= change[1] + change[5] * arm[0] - change[3] * arm[2]
                 gap[2] -= change[2] + change[3] * arm[1] - change[4] * arm[0]
@@ -164,9 +169,12 @@ def excess_of(total: float, freedom: int, totals: Array) -> float:
 @compiled
 def outline_misfit(outlines: Outlines, n: int, side: int, place: Array, taught: Array) -> float:
     """Return the squared difference of an ellipse from that of a whole sticker ``taught`` (3,)."""
-    camera, move = outlines.cameras.figures[side], outlines.cameras.moves[side]
-    point, centre = np.empty(3), np.empty(3)
-    turned, normal = np.empty(3), np.empty(3)
+    camera = outlines.cameras.figures[side]
+    move = outlines.cameras.moves[side]
+    point = np.empty(3)
+    centre = np.empty(3)
+    turned = np.empty(3)
+    normal = np.empty(3)
     carry(place, taught, 1.0, point)
     carry(move, point, 1.0, centre)
     carry(place, outlines.normals[n], 0.0, turned)
@@ -277,7 +285,8 @@ def solve_frames(
     Moves (f,4,4) are camera_from_body, from near to result; fills covariances (f,6,6).
     """
     for f in range(len(moves)):
-        first, last = starts[f], starts[f + 1]
+        first = starts[f]
+        last = starts[f + 1]
         own = Seen(
             seen.used[first:last],
             seen.points[first:last],

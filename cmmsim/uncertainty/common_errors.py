@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from cmmsim.checks import finite_array
-from cmmsim.files.setup import MarkedBody
+from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.pose import (
     Array,
     apply,

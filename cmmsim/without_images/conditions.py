@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR
 from cmmsim.detection.ellipse_fit import RING_REACH
 from cmmsim.errors import CmmError
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.camera import Optics
-from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.radiometry.noise import NO_SWING, CameraNoise
 
 NAME = "statistical"

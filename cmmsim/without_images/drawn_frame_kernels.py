@@ -213,10 +213,13 @@ def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
     The others are triangulated.
     """
     seen = frame.stickers
-    expected, direction = np.empty(3), np.empty(3)
-    point, normal = np.empty(3), np.empty(3)
+    expected = np.empty(3)
+    direction = np.empty(3)
+    point = np.empty(3)
+    normal = np.empty(3)
     scratch = np.empty((3, 6))
-    cameras, limits = eyes.measuring, eyes.limits
+    cameras = eyes.measuring
+    limits = eyes.limits
     for n in range(len(seen.used)):
         if not seen.used[n]:
             continue
@@ -256,7 +259,8 @@ def measure_frame(
     The parameters are those of ``look``. The ``verdict`` says what became of it.
     """
     look(eyes, poses, bodies, noise, kept, frame)
-    platform, place = np.empty((4, 4)), np.empty((4, 4))
+    platform = np.empty((4, 4))
+    place = np.empty((4, 4))
     covariance = np.empty((6, 6))
     pose_transform(poses[0], platform)
     multiply(eyes.camera_from_base, platform, place)

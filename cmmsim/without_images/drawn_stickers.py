@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.allowed_plugins import RENDERERS
 from cmmsim.detection.detector import DetectedCentres
 from cmmsim.detection.ellipse_fit import SMALLEST_RADIUS_PX, EllipseFits, fit_settings
 from cmmsim.errors import CmmError
@@ -26,7 +27,6 @@ from cmmsim.imaging.renderer import Renderer
 from cmmsim.imaging.scene_bodies import PlacedBodies
 from cmmsim.imaging.stereo_camera import Quality
 from cmmsim.measuring.observation import Observer
-from cmmsim.plugins import RENDERERS
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.without_images.conditions import NAME, Light, require_short
 from cmmsim.without_images.sticker_scene import StickerScene
@@ -34,9 +34,14 @@ from cmmsim.without_images.sticker_scene import StickerScene
 if TYPE_CHECKING:
     from cmmsim.without_images.drawn_window_kernels import Ellipses, Windows
 
-THIN_PX, THIN_STD_PX = 0.885, 0.055
-"""Half of an ellipse's width at which half of the fits end at the smallest one, and how softly that
-sets in: measured in images, whose fits err by more than to first order there."""
+THIN_PX = 0.885
+"""Half width of an ellipse at which half of the fits end at the smallest ellipse.
+
+It is measured in images. The errors of such fits are not of first order.
+"""
+
+THIN_STD_PX = 0.055
+"""Standard deviation of the half width at which fits begin to end there, also measured."""
 
 
 def refuse_images(*_: object, **__: object) -> NoReturn:

@@ -265,7 +265,7 @@ class Accuracy:
 
 
 def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, float]]:
-    """Mean of values (n,), n >= 2, and the interval that contains the true mean.
+    """Return the mean of values (n,), n >= 2, and the interval that contains the true mean.
 
     The probability of the interval is CONFIDENCE. An end beyond the largest float is infinite.
     """
@@ -273,7 +273,7 @@ def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, floa
     from scipy.special import stdtrit
 
     count = len(values)
-    # a power of two scales exactly; within +-1 no square overflows
+    # A power of two scales without rounding, and within +-1 no square overflows.
     exponent = np.frexp(np.abs(values).max())[1]
     scaled = np.ldexp(values, -exponent)
     mean = np.mean(scaled)

@@ -1,4 +1,4 @@
-"""The pytest plugin: its options, its marker, and the fixtures that record figures.
+"""Plugin of pytest: its options, its marker, and the fixtures that record figures.
 
 A test chooses a scenario, robot or sensor of its own by `@pytest.mark.cmmsim(sensor="mine.toml")`.
 The option `--accuracy-sensor mine.toml` chooses it for all other tests. Pytest imports this module
@@ -110,7 +110,7 @@ def accuracy(request: pytest.FixtureRequest) -> Accuracy:
     ...     accuracy.record("centre error", 0.013, unit="px", limit=0.02)
     """
     properties = request.node.user_properties
-    # plugins that repeat a failed test keep the figures of the earlier try
+    # Plugins that repeat a failed test keep the figures of the earlier try.
     properties[:] = [entry for entry in properties if entry[0] != PROPERTY]
     return Accuracy(_node_id(request.node), properties)
 
@@ -198,11 +198,12 @@ def _check_options(config: pytest.Config) -> None:
 
 
 def _choices(request: pytest.FixtureRequest) -> dict[str, str]:
-    """Names or files that this test uses.
+    """Return the names or files that this test uses.
 
-    Markers replace the choices of the command line; the closest marker wins.
+    Markers replace the choices of the command line, and the closest marker wins.
     """
     chosen = _from_options(request.config)
+    # Pytest gives the closest marker first, and the last one here replaces the others.
     for mark in reversed(list(request.node.iter_markers(MARKER))):
         unknown = [repr(key) for key in mark.kwargs if key not in CHOICES] + [
             repr(value) for value in mark.args
@@ -229,18 +230,18 @@ def _from_options(config: pytest.Config) -> dict[str, str]:
 
 
 def _file_or_name(folder: Path, name: str | PathLike[str]) -> str:
-    """Path of the file with that name in the folder, or the name if there is no such file."""
+    """Return the path of the file with that name in the folder, or the name if there is none."""
     path = folder / name
     return str(path) if path.is_file() else str(name)
 
 
 def _node_id(item: pytest.Item) -> str:
-    """Node id of a test, without the group that pytest-xdist appends with --dist loadgroup."""
+    """Return a test's node id without the group that pytest-xdist appends with --dist loadgroup."""
     return f"{item.parent.nodeid}::{item.name}" if item.parent else item.nodeid
 
 
 def ratio(text: str) -> float:
-    """Convert the value of --accuracy-fail. The parser reports what is no number."""
+    """Convert the value of --accuracy-fail. The parser reports text that is not a number."""
     value = float(text)
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(

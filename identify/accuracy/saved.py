@@ -51,10 +51,10 @@ class Comparison:
 
     @property
     def evidence_change(self) -> str:
-        """One line where the value rests on something else, or on fewer values, than the saved one.
+        """One line where the value rests on other evidence than the saved one; empty otherwise.
 
-        Empty otherwise. An interval of fewer values is wider, so it could hide a change for the
-        worse.
+        Other evidence is one number in place of a sample or the other way round, or fewer values.
+        An interval of fewer values is wider, so it could hide a change for the worse.
         """
         now = self.now
         saved = self.saved
@@ -71,6 +71,7 @@ class Comparison:
         grown = self.now.value - self.saved.value
         if not grown:
             return 0.0
+        # The infinite change keeps the sign of the growth.
         return grown / abs(self.saved.value) if self.saved.value else float("inf") * grown
 
     def worse_by_more_than(self, ratio: float) -> bool:
@@ -108,7 +109,7 @@ def compare(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[Key, 
 
 
 def missing(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[str, list[str]]:
-    """Names of the saved figures that are not among the given ones, by their test."""
+    """Return the names of the saved figures that are not among the given ones, by their test."""
     measured = {figure.key for figure in figures}
     gone: dict[str, list[str]] = {}
     for figure in saved:
@@ -154,7 +155,7 @@ class SavedSession:
 
 
 def saved_path(folder: Path, name: str) -> Path:
-    """Path of the file of a name in a folder.
+    """Return the path of the file of a name in a folder.
 
     Raises
     ------
@@ -232,6 +233,7 @@ def check_writable(path: Path) -> None:
         Nothing can be written there, or the file that would be replaced holds no figures.
     """
     try:
+        # The folder may not exist yet. Then its nearest parent must be writable.
         with TemporaryFile(dir=next(place for place in path.parents if place.exists())):
             pass
         if path.exists():

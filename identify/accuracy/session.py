@@ -25,7 +25,7 @@ def terminal_table(
     comparisons: Mapping[saved.Key, saved.Comparison],
     compared_with: str | None,
 ) -> list[str]:
-    """Aligned lines of the table, the figures of each test under its node id.
+    """Return the aligned lines of the table, the figures of each test under its node id.
 
     With `compared_with`, the name of a saved session, two columns show its values and the change.
     """
@@ -57,7 +57,7 @@ def terminal_table(
 
 
 def markdown_table(figures: Sequence[Figure]) -> str:
-    """Markdown table of figures. The parameters of a parametrised test follow the name."""
+    """Return figures as a Markdown table. The parameters of a parametrised test follow the name."""
     rows = [(_full_name(figure), *_cells(figure)) for figure in figures]
     lines: list[Row] = [HEADER, ("---", "--:", "--:", "---", "--:", "--:"), *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
@@ -87,7 +87,7 @@ def _compared(comparison: saved.Comparison | None) -> Row:
 
 
 def _aligned(row: Row, widths: Sequence[int]) -> str:
-    """Row with names and units flush left, all else flush right."""
+    """Join a row with names and units flush left, all else flush right."""
     left = (0, 3)
     cells = (
         c.ljust(w) if i in left else c.rjust(w)
@@ -226,9 +226,9 @@ class AccuracySession:
             self._tell(session, line, guarded=outcome is not None)
 
     def _outcome(self, test: str) -> str | None:
-        """Outcome of a test or of its module; None if it did not run."""
+        """Return the outcome of a test or of its module, or None if it did not run."""
         for node, outcome in self._outcomes.items():
-            # with --dist loadgroup the reports name the group behind an @
+            # With --dist loadgroup, the reports name the group behind an @.
             if node == test or node.startswith(f"{test}@") or test.startswith(f"{node}::"):
                 return outcome
         return None
@@ -240,7 +240,8 @@ class AccuracySession:
             self._remark(f"not saved as {self._save}: {why}")
             return
         beyond = [f"{figure.test}: {figure.name}" for figure in self.figures if figure.beyond_limit]
-        if beyond:  # a test that may fail, such as one marked xfail, passes in spite of them
+        # A test that may fail, such as one marked xfail, passes in spite of them.
+        if beyond:
             self._fail(
                 session, f"not saved as {self._save}: beyond their limits are {'; '.join(beyond)}"
             )
@@ -252,10 +253,8 @@ class AccuracySession:
         except AccuracyError as error:
             self._fail(session, str(error))
         else:
-            self._remark(
-                "saved: "
-                f"{path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}"
-            )
+            here = Path.cwd()
+            self._remark(f"saved: {path.relative_to(here) if path.is_relative_to(here) else path}")
 
     def _tell(self, session: pytest.Session, text: str, guarded: bool) -> None:
         """Report a finding of the comparison.

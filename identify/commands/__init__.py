@@ -1,3 +1,4 @@
-"""Subcommands of ``cmmsim``. Heavy imports are late: ``--help`` must not wait for CasADi and
-OpenGL.
+"""Subcommands of ``cmmsim``.
+
+Heavy modules are imported inside functions, because ``--help`` must not wait for CasADi and OpenGL.
 """

@@ -1,4 +1,4 @@
-"""The command ``cmmsim``: its commands by group, its first help, and what an error becomes."""
+"""Command ``cmmsim``: its commands by group, its first help, and its handling of errors."""
 
 import warnings
 from collections.abc import Callable
@@ -7,19 +7,19 @@ from typing import Annotated
 
 import typer
 
-from identify.commands.calibrate import calibrate
+from identify.commands.camera_calibration import calibrate
 from identify.commands.check import check
 from identify.commands.comparisons import estimators, variation
-from identify.commands.experiment import excite, identify, record, report, run, validate, warm_up
-from identify.commands.geometry import geometry
+from identify.commands.geometry_run import geometry
 from identify.commands.help import BEYOND_LIMIT, NOT_DONE, Command, Commands, Judging, StudyCommand
 from identify.commands.importing import imports
 from identify.commands.new import new
-from identify.commands.robot import base_parameters, export, verify_model, workspace
+from identify.commands.robot_pages import base_parameters, export, verify_model, workspace
+from identify.commands.run_stages import excite, identify, record, report, run, validate, warm_up
 from identify.commands.scene import replay, show
-from identify.commands.sensor import acceptance, detectors
+from identify.commands.sensor_tests import acceptance, detectors
 from identify.commands.study import study
-from identify.commands.track import track
+from identify.commands.tracking_runs import track
 from identify.errors import IdentifyError, VerificationError
 from identify.runtime import stoppable
 
@@ -53,16 +53,20 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command; a known error is one line on standard error and an exit status of
-    `identify.commands.help`.
+    """Run the command.
+
+    A known error becomes one line on standard error and an exit status of `identify.commands.help`.
     """
     warnings.showwarning = _show_warning
     try:
         app()
     except Exception as error:
-        if not is_known(error):
+        # An unknown error is a defect, whose traceback is wanted.
+        if not (is_known(error) or _is_full_output(error)):
             raise
-        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        said = "cannot write standard output: " if _is_full_output(error) else ""
+        reason = (error.strerror if said and isinstance(error, OSError) else None) or str(error)
+        typer.echo(f"error: {said}{' '.join(reason.split())}", err=True)
         raise SystemExit(
             BEYOND_LIMIT if isinstance(error, VerificationError) else NOT_DONE
         ) from None
@@ -71,12 +75,12 @@ def main() -> None:
 def _show_warning(
     message: Warning | str, category: type[Warning], *place: object, **more: object
 ) -> None:
-    """A warning as one line, without the place in the code that gave it."""
+    """Print a warning as one line, without the place in the code that gave it."""
     typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 def is_known(error: Exception) -> bool:
-    """Whether an error is one that a user can cause or meet, of any of the three packages."""
+    """Tell whether an error is one that a user can cause or meet, in any of the three packages."""
     if isinstance(error, IdentifyError) or (
         isinstance(error, OSError) and error.filename is not None
     ):

@@ -1,6 +1,4 @@
-"""The command ``check``: a robot file judged before anything is built or run. Heavy imports are
-late.
-"""
+"""Command ``check``: a robot file judged before anything is built or run."""
 
 from textwrap import shorten
 from typing import Annotated
@@ -21,7 +19,10 @@ from identify.errors import VerificationError
 from identify.progress import print_table, terminal_progress
 
 LONGEST = 160
-"""Characters of a finding in the line of the error; the table and the JSON have all of it."""
+"""Largest number of characters of a finding in the error message.
+
+The table and the JSON have all of it.
+"""
 
 
 def check(
@@ -90,11 +91,8 @@ def check(
     entry = {"ok": not failed, "findings": [finding.entry() for finding in findings]}
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
-        told = (
-            shorten(f"{finding.check}: {finding.text}", LONGEST, placeholder=" …")
-            for finding in failed
-        )
-        said = "; ".join(told)
+        lines = [f"{finding.check}: {finding.text}" for finding in failed]
+        said = "; ".join(shorten(line, LONGEST, placeholder=" …") for line in lines)
         raise VerificationError(
             f"{len(failed)} of {len(findings)} findings about {chosen.name} fail: {said}"
         )

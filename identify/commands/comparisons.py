@@ -1,8 +1,4 @@
-"""Commands that compare: estimators on one record, estimates from run to run, and methods of
-excitation.
-
-Heavy imports are late.
-"""
+"""Commands that compare estimators on one record, estimates of several runs, or excitations."""
 
 import math
 from dataclasses import asdict
@@ -122,6 +118,7 @@ def estimators(
     from dynamics import load_robot
     from identify.estimators.estimator import find_estimators
     from identify.experiment.joint_instruments import instruments_of
+    from identify.files.dataset import netcdf
     from identify.record.provenance import RunFiles
     from identify.validation.estimator_comparison import compare_on_run, estimators_figure
 
@@ -134,20 +131,23 @@ def estimators(
     robot = load_robot(load_scenario(folder.whole_scenario).robot)
     instruments = instruments_of(robot, torque_noise, encoder_noise, encoder_bits)
     chosen = find_estimators(only) | (find_estimators(add) if add else {})
-    scores = compare_on_run(files, instruments, chosen, seed, terminal_progress(quiet))
+    scores, channels = compare_on_run(files, instruments, chosen, seed, terminal_progress(quiet))
     entry = {
         "seed": seed,
         "instruments": instruments.figures,
         "estimators": {s.name: _entry(s) for s in scores},
     }
-    save_files(
-        folder.path, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)}
-    )
+    made = {
+        "instruments.nc": netcdf({"": channels}),
+        "estimators.json": entry,
+        "figures/estimators.png": estimators_figure(scores),
+    }
+    save_files(folder.path, made)
     tell(entry, json, quiet, lambda: _print_scores(scores, out))
 
 
 def _entry(score: "Score") -> dict[str, Any]:
-    """A score with its parameters by name."""
+    """Return a score as JSON has it, with its parameters by name."""
     entry = asdict(score)
     estimate = entry.pop("parameters")
     std = entry.pop("std")
@@ -167,10 +167,9 @@ def _print_scores(scores: list["Score"], out: Path) -> None:
         ("estimator",),
         "estimators on one record, against one truth",
         "groups: RMS and median relative error of the base parameters that the record shows; "
-        "gains: RMS relative error "
-        "of those of the joint controller; position, angle: model against true plant on unseen "
-        "trajectories, RMS of "
-        "the worst axis and run; runs: how often the model was simulated",
+        "gains: RMS relative error of those of the joint controller; position, angle: model "
+        "against true plant on unseen trajectories, RMS of the worst axis and run; runs: how often "
+        "the model was simulated",
     )
     for score in scores:
         if score.note:
@@ -179,7 +178,8 @@ def _print_scores(scores: list["Score"], out: Path) -> None:
 
 
 def _score_row(score: "Score") -> list[str]:
-    """A row of the table; a dash where there is nothing, such as the error of an unstable model."""
+    """Return a row of the table, with a dash for what is not finite, as for an unstable model."""
+    # An estimator that was given the true gains has no error of them.
     gains = "given" if "gains" in score.uses else _short(100 * score.gain_distance)
     groups = [_short(100 * value) for value in (score.group_distance, score.group_median)]
     poses = [_short(value) for value in (score.position_um, score.orientation_urad, score.seconds)]
@@ -189,6 +189,7 @@ def _score_row(score: "Score") -> list[str]:
 def _short(value: float) -> str:
     if not math.isfinite(value):
         return "-"
+    # From 999.5 on, three digits would be written with a power of ten.
     return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
 
 
@@ -201,9 +202,8 @@ def variation(
             "--designed",
             min=3,
             metavar="COUNT",
-            help="Record this many new runs, each on an exciting trajectory designed for it by "
-            "the scenario's method, "
-            "instead of taking the unseen runs.",
+            help="Record this many new runs, each on an exciting trajectory designed for it by the "
+            "scenario's method, instead of taking the unseen runs.",
         ),
     ] = None,
     workers: Annotated[
@@ -235,8 +235,9 @@ def variation(
       cmmsim variation --out fast --designed 10
     """
     from dynamics import load_robot
-    from identify.record import recording
+    from identify.files.dataset import netcdf
     from identify.record.provenance import RunFiles
+    from identify.record.recording import run_groups
     from identify.reporting import variation_tables as tables
     from identify.trajectory import load_trajectories
     from identify.validation.variation import designed_runs, identify_each
@@ -248,10 +249,12 @@ def variation(
     context.with_resource(working_in(folder.path))
     scenario = load_scenario(folder.whole_scenario)
     robot = load_robot(scenario.robot)
+    recorded: dict[str, bytes] = {}
     if designed:
         seed = load_trajectories(folder.trajectories).seed
         runs = designed_runs(scenario, robot, seed, designed, workers, progress)
-        recording.write_runs(out / "variation.nc", [(run.record, run.truth) for run in runs])
+        groups = run_groups([(run.record, run.truth) for run in runs])
+        recorded = {"variation.nc": netcdf(groups)}
         records = [run.record for run in runs]
         origin = f"designed: {scenario.excitation.method}"
     else:
@@ -263,6 +266,7 @@ def variation(
     table = tables.variation_table(found)
     entry = tables.variation_entry(found, origin)
     files = {
+        **recorded,
         "variation.json": entry,
         "variation.md": f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n",
         "figures/variation.png": tables.variation_figure(found),
@@ -280,7 +284,7 @@ def variation(
 def compare_excitation(
     scenario: Scenario, seed: int, folder: Path, progress: Progress, json: Path | None, quiet: bool
 ) -> None:
-    """Search with every method: writes comparison.json and comparison.png into `folder`."""
+    """Search with every method, and write comparison.json and comparison.png into `folder`."""
     from dynamics import load_robot
     from identify.excitation.comparison import compare_methods, comparison_figure
 
@@ -294,7 +298,7 @@ def compare_excitation(
 
 
 def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:
-    """One row a method, and what is nearest to its limit."""
+    """Print one row for each method, and its shares of the limits."""
     title = f"criterion {found.criterion}, seed {found.seed}, {found.candidates} random candidates"
     print_table(METHODS_HEADER, map(_method_row, found.entries), ("method", "stopped"), title, note)
     for entry in found.entries:
@@ -303,11 +307,9 @@ def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:
         typer.echo(f"{entry.method}: share of each limit used: {used}")
     typer.echo(
         "maximised: the criterion (information: of the linearised loop). index: the paper's "
-        "observability index, eq. "
-        "39. narrows: factor by which a run narrows what is known before of the parameters, with "
-        "the simulated loop; "
-        f"- where that is unstable. Candidates and functions took {found.preparation_seconds:.1f} "
-        f"s. Files: {folder}"
+        "observability index, eq. 39. narrows: factor by which a run narrows what is known before "
+        "of the parameters, with the simulated loop; - where that is unstable. Candidates and "
+        f"functions took {found.preparation_seconds:.1f} s. Files: {folder}"
     )
 
 

@@ -1,6 +1,4 @@
-"""How the command line explains itself: commands first, by group and in whole sentences, and the
-exit statuses.
-"""
+"""Help of the command line, with commands first and by group, and the exit statuses."""
 
 from typing import Any, ClassVar
 
@@ -23,14 +21,14 @@ STATUSES = {
     BEYOND_LIMIT: "It is done, and what it judges is beyond its limit, which one line names.",
     STOPPED: "Ctrl-C has ended it.",
 }
-"""What every exit status means, in all commands alike."""
+"""Meaning of every exit status, the same in all commands."""
 
 OTHERS = "Further commands"
-"""The group of commands that name none."""
+"""Group of the commands that name none."""
 
 
 class Command(TyperCommand):
-    """A command whose help ends with the exit statuses that it may have."""
+    """Command whose help ends with the exit statuses that it may have."""
 
     statuses: ClassVar[tuple[int, ...]] = (DONE, NOT_DONE, MISUSED, STOPPED)
 
@@ -41,20 +39,21 @@ class Command(TyperCommand):
 
 
 class Judging(Command):
-    """A command that holds something against a limit."""
+    """Command that compares something with a limit."""
 
     statuses: ClassVar[tuple[int, ...]] = (DONE, NOT_DONE, MISUSED, BEYOND_LIMIT, STOPPED)
 
 
 class StudyCommand(Command):
-    """The command of studies, whose rows may fail and whose laws are limits."""
+    """Command of studies, whose rows may fail and whose laws are limits."""
 
     statuses: ClassVar[tuple[int, ...]] = tuple(STATUSES)
 
 
 class Commands(TyperGroup):
-    """A group of commands: help lists these first. Says when Ctrl-C has ended one; typer alone
-    would say nothing.
+    """Group of commands, which help lists before its options.
+
+    It also reports that Ctrl-C has ended a command, where typer alone would print nothing.
     """
 
     def invoke(self, ctx: Any) -> Any:
@@ -66,7 +65,7 @@ class Commands(TyperGroup):
             raise typer.Exit(STOPPED) from None
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write what it is for, its commands, examples, and the options."""
+        """Write the purpose of the group, its commands, examples, and the options."""
         self.format_usage(ctx, formatter)
         self.format_help_text(ctx, formatter)
         self.format_commands(ctx, formatter)
@@ -74,7 +73,7 @@ class Commands(TyperGroup):
         self.format_options(ctx, formatter)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands by their groups, each with the first paragraph of its help, whole."""
+        """Write the commands by their groups, each with the whole first paragraph of its help."""
         groups: dict[str, list[tuple[str, str]]] = {}
         for name in self.list_commands(ctx):
             command = self.get_command(ctx, name)
@@ -84,12 +83,13 @@ class Commands(TyperGroup):
                     (name, sentence)
                 )
         widest = max((len(name) for rows in groups.values() for name, _ in rows), default=0)
+        # The sort is stable: groups stay in their order, and commands without one come last.
         for group, rows in sorted(groups.items(), key=lambda one: one[0] == OTHERS):
             with formatter.section(group if len(groups) > 1 else "Commands"):
                 formatter.write_dl([(name.ljust(widest), sentence) for name, sentence in rows])
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the options alone; commands stand before them."""
+        """Write the options alone, because the commands stand before them."""
         options = [
             record
             for one in self.get_params(ctx)
@@ -99,7 +99,7 @@ class Commands(TyperGroup):
             formatter.write_dl(options)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the examples as they stand."""
+        """Write the examples unchanged."""
         if self.epilog:
             formatter.write_paragraph()
             formatter.write(self.epilog.strip("\n") + "\n")

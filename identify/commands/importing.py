@@ -1,4 +1,4 @@
-"""The command ``import``: robots from files of other programs. Heavy imports are late."""
+"""Command ``import``: robots from files of other programs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

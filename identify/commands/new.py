@@ -1,8 +1,4 @@
-"""The command ``new``: starting files that work as they are, with comments, and with a schema for
-editors.
-
-Heavy imports are late.
-"""
+"""Command ``new``: commented starting files that work as they are, with a schema for editors."""
 
 import json
 import re
@@ -170,6 +166,7 @@ def record(
         raise OutputFolderError(f"cannot write {file}: the name of a record's table ends in .csv")
     chosen = load_robot(robot)
     beside = description_file(file)
+    # The path is absolute, because the description may be read from another folder.
     named = robot if robot in built_in_names("robot") else str(Path(robot).resolve())
     description = _with_schema(SCHEMA, description_text(chosen, named, file.name))
     _write({file: table_text(chosen), beside: description}, lambda path: read_own_records([path]))
@@ -185,20 +182,16 @@ def _known(kind: str, like: str) -> str:
 
 
 def _copy(kind: str, like: str, file: Path) -> str:
-    """The text of a built-in file, under the name of another."""
+    """Return the text of a built-in file under the name of another file."""
     text = (built_in_folder(kind) / f"{_known(kind, like)}.toml").read_text(encoding="utf-8")
     return _with_schema(_schema(kind), _named(text, file))
 
 
 def _named(text: str, file: Path) -> str:
-    """A TOML text whose name is that of its file."""
-    return re.sub(
-        r"^name = .*$",
-        lambda _: f"name = {json.dumps(file.stem)}",
-        text,
-        count=1,
-        flags=re.MULTILINE,
-    )
+    """Replace the name in a TOML text by that of its file."""
+    line = f"name = {json.dumps(file.stem)}"
+    # A function, because re.sub would take backslashes in a text for references to groups.
+    return re.sub(r"^name = .*$", lambda _: line, text, count=1, flags=re.MULTILINE)
 
 
 def _schema(kind: str) -> Path:
@@ -206,7 +199,7 @@ def _schema(kind: str) -> Path:
 
 
 def _with_schema(schema: Path, text: str) -> str:
-    """A TOML text that tells editors its schema, that of this installation."""
+    """Put a line before a TOML text that tells editors its schema, that of this installation."""
     return f"#:schema {schema.resolve().as_uri()}\n{text}"
 
 
@@ -220,11 +213,10 @@ def _toml(file: Path) -> Path:
 
 
 def _write(texts: Mapping[Path, str], read: Callable[[Path], Any]) -> None:
-    """Write files of one folder that are not there yet and of which the first can be read: all of
-    them, or none.
+    """Write files of one folder that are not there yet: all of them, or none.
 
-    Raises OutputFolderError: one is there. Raises what `read` does, such as for a name that cannot
-    be.
+    The first one must be readable by `read`. Raises OutputFolderError if a file is there, and the
+    errors of `read`, such as for an impossible name.
     """
     for path in texts:
         if path.exists():

@@ -1,6 +1,4 @@
-"""Arguments and options that several commands share, what a shell completes of them, and how
-figures are handed out.
-"""
+"""Arguments and options shared by several commands, shell completion, and output of figures."""
 
 import tomllib
 from collections.abc import Callable
@@ -10,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cmmsim.plugins import ALLOWED, allow_plugin, is_own
+from cmmsim.allowed_plugins import ALLOWED, allow_plugin, is_own
 from identify.errors import ScenarioError
 from identify.files.atomic import write_text
 from identify.files.run_folder import as_json
@@ -25,12 +23,13 @@ BUILT_IN = {
 """Package and folder of the built-in files of each kind."""
 
 STANDARD_OUTPUT = "-"
-"""What stands for standard output in place of a file."""
+"""Name that stands for standard output in place of a file."""
 
 
 def built_in_folder(kind: str) -> Path:
-    """Folder of the built-in files of a kind; its package is not imported, since a shell waits for
-    completions.
+    """Return the folder of the built-in files of a kind.
+
+    Its package is not imported, since a shell waits for completions.
     """
     package, folder = BUILT_IN[kind]
     spec = find_spec(package)
@@ -38,13 +37,14 @@ def built_in_folder(kind: str) -> Path:
 
 
 def built_in_names(kind: str) -> list[str]:
-    """Names of the built-in files of a kind, sorted."""
+    """Return the names of the built-in files of a kind, sorted."""
     return sorted(path.stem for path in built_in_folder(kind).glob("*.toml"))
 
 
 def completion(kind: str) -> Callable[[str], list[str]]:
-    """What a shell offers for a name or path of this kind: built-in names, TOML files, and folders
-    to look into.
+    """Return the completion of a name or path of this kind for a shell.
+
+    It offers built-in names, TOML files, and folders to look into.
     """
 
     def offered(incomplete: str) -> list[str]:
@@ -62,7 +62,7 @@ def completion(kind: str) -> Callable[[str], list[str]]:
 
 
 def named(kind: str, help_: str | None = None, **more: Any) -> Any:
-    """The argument that is a built-in name of a kind or the path of a TOML file."""
+    """Return the argument for a built-in name of a kind or the path of a TOML file."""
     said = (
         help_ or f"Built-in {kind} ({', '.join(built_in_names(kind))}), or the path of a TOML file."
     )
@@ -70,15 +70,12 @@ def named(kind: str, help_: str | None = None, **more: Any) -> Any:
 
 
 def new_folder(default: str) -> Any:
-    """The option of a folder to write into; default: how the help calls the one that is taken where
-    it is left out.
-    """
+    """Return the option of a folder to write into. `default` is the default's name in help."""
     return typer.Option("--out", help="Output folder, new or empty.", show_default=default)
 
 
 def repeatable(what: str, default: str) -> Any:
-    """An option that may be given several times; default: how the help calls what holds
-    without it."""
+    """Return an option that may be given several times. `default` is the default's name in help."""
     return typer.Option(help=f"{what}; repeatable.", show_default=default)
 
 
@@ -112,8 +109,7 @@ Settings = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable. What cmmsim "
-        "new scenario FILE "
-        "writes has all keys.",
+        "new scenario FILE writes has all keys.",
     ),
 ]
 EstimatorSettings = Annotated[
@@ -150,7 +146,7 @@ Plugins = Annotated[
         f"repeatable. {ALLOWED} names such modules for all commands.",
     ),
 ]
-"""Modules that parts of a user's own may come from; allowed as soon as they are read."""
+"""Modules that parts of a user's own may come from. They are allowed as soon as they are read."""
 
 
 def allow_named(names: list[str] | None) -> None:
@@ -172,10 +168,9 @@ JsonFile = Annotated[
 def tell(
     entry: dict[str, Any], json_file: Path | None, quiet: bool, say: Callable[[], None]
 ) -> None:
-    """Hand out a command's figures: as JSON where that is asked for, and in words unless it is to
-    be quiet.
+    """Hand out a command's figures: as JSON if it is asked for, and in words unless `quiet`.
 
-    Raises WriteError: the file cannot be written.
+    `say` prints the words. Raises WriteError if the file cannot be written.
     """
     if str(json_file) == STANDARD_OUTPUT:
         typer.echo(as_json(entry), nl=False)
@@ -187,9 +182,9 @@ def tell(
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:
-    """Overrides from ``KEY=VALUE`` texts; a value is TOML, and what is no TOML is a string.
+    """Return overrides from ``KEY=VALUE`` texts. A value is TOML, or else a string.
 
-    Raises ScenarioError: a text without ``=``.
+    Raises ScenarioError for a text without ``=``.
     """
     overrides = {}
     for text in settings or []:
@@ -203,10 +198,9 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
 
 
 def chosen_scenario(name: str, settings: list[str] | None, robot: str | None) -> Scenario:
-    """The scenario of a name or path with values replaced, and with another robot where one is
-    named.
+    """Load the scenario of a name or path, with values replaced, and with another robot if named.
 
-    Raises ScenarioError: no such scenario, or a setting that it cannot have.
+    Raises ScenarioError if there is no such scenario, or for a setting that it cannot have.
     """
     chosen = {} if robot is None else {"robot": robot}
     return load_scenario(name).with_overrides(chosen | parse_settings(settings))
@@ -215,5 +209,6 @@ def chosen_scenario(name: str, settings: list[str] | None, robot: str | None) ->
 def _toml_or_text(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
+    # Deeply nested brackets exceed the recursion limit of the parser.
     except (ValueError, RecursionError):
         return text

@@ -1,6 +1,4 @@
-"""Commands that show: a run as a page that replays it, and a robot or a sensor as it stands. Heavy
-imports are late.
-"""
+"""Commands that show: a run as a page that replays it, and a robot or a sensor as it stands."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,7 +13,7 @@ if TYPE_CHECKING:
     from identify.scene import Workcell
 
 PICTURES = (".png", ".pdf", ".svg")
-SENSOR = "ctrack780"
+SENSOR = "ctrack780"  # shown with a robot that is named alone
 ROBOT_KEYS = {"parameters", "legs", "family"}
 SENSOR_KEYS = {"rig", "stickers", "based_on"}
 
@@ -116,7 +114,7 @@ def show(
 
 
 def write_picture(path: Path, cell: "Workcell", renderer: str) -> None:
-    """Draw the scene, beside it what the cameras see, into a file. Raises WriteError."""
+    """Draw the scene, and the cameras' images beside it, into a file. Raises WriteError."""
     from identify.files.atomic import check_writable, figure_bytes, write_bytes
     from identify.scene import overview_figure, scene_figure, stereo_view
 
@@ -129,10 +127,15 @@ def write_picture(path: Path, cell: "Workcell", renderer: str) -> None:
 
 
 def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
-    """Robot and sensor of one or two names or files, and what is to be said of them.
+    """Return the robot and sensor of one or two names or files, and notes for the user.
 
-    Raises ScenarioError: two robots, two sensors, or what is neither; and for two that do not fit
-    each other. Raises dynamics.RobotFileError, cmmsim.CmmError for files that cannot be used.
+    Raises
+    ------
+    ScenarioError
+        There are two robots, two sensors, or something that is neither, or two that do not fit
+        each other.
+    RobotFileError, CmmError
+        A file cannot be used.
     """
     from cmmsim.files import read_sensor_file
     from dynamics import load_robot
@@ -149,6 +152,7 @@ def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
     named = next((name for name, kind in zip(names, kinds, strict=True) if kind == "sensor"), None)
     if robot is None or named is not None:
         return workcell(robot, None if named is None else read_sensor_file(named)), []
+    # No sensor was asked for, so a robot that does not fit the usual one is shown alone.
     try:
         return workcell(robot, read_sensor_file(SENSOR)), []
     except ScenarioError as error:
@@ -159,8 +163,9 @@ def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
 
 
 def kind_of(name: str) -> str:
-    """Whether a built-in name or a file is a "robot" or a "sensor". Raises ScenarioError with the
-    valid names.
+    """Tell whether a built-in name or a file is a "robot" or a "sensor".
+
+    Raises ScenarioError with the valid names.
     """
     from cmmsim.files import built_in_names
     from dynamics import built_in_robots
@@ -180,6 +185,5 @@ def kind_of(name: str) -> str:
         return "sensor"
     raise ScenarioError(
         f"{name} is neither a robot nor a sensor: a robot has {', '.join(sorted(ROBOT_KEYS))}, a "
-        "sensor "
-        f"{', '.join(sorted(SENSOR_KEYS))}; it has {', '.join(content) or 'nothing'}"
+        f"sensor {', '.join(sorted(SENSOR_KEYS))}; it has {', '.join(content) or 'nothing'}"
     )

@@ -1,4 +1,4 @@
-"""The command ``cmmsim study``. Heavy imports are late."""
+"""Command ``cmmsim study``."""
 
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from identify.studies.study_file import Study
 
 MANY_ROWS = 100_000
-"""Rows of a study above which it must be confirmed."""
+"""Number of rows above which a study must be confirmed."""
 
 
 def study(
@@ -54,8 +54,7 @@ def study(
             "--set",
             metavar="KEY=VALUE",
             help="Replace an entry of the study: repeats=5, or scenario.timing.latency_s=0.01 in "
-            "every row, or, with a "
-            "list, a factor: 'sensor.rig.baseline=[0.5,1.0]'; repeatable.",
+            "every row, or, with a list, a factor: 'sensor.rig.baseline=[0.5,1.0]'; repeatable.",
         ),
     ] = None,
     seed: Annotated[
@@ -172,12 +171,14 @@ def study(
     from identify.studies.table import rows_beside
 
     count = cores() if workers is None else workers
+    # The memory of other machines is not known here.
     if scheduler is None:
         check_memory(chosen, max(count, 1))
     others = rows_beside(chosen, beside or ())
     folder = out or Path("runs") / f"study-{chosen.name}"
     try:
         progress = terminal_progress(quiet, rate="rows/s")
+        # Figures are drawn at the end only, because drawing takes seconds.
         so_far = partial(_summary, chosen, folder, figures=False)
         outcome = run_study(chosen, folder, progress, _workers(scheduler, count, insecure), so_far)
     except StudyInterrupted as stopped:
@@ -218,7 +219,6 @@ def _summary(study: "Study", folder: Path, frame: "pd.DataFrame", **how: Any) ->
 
 
 def _say(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
-    """What came out."""
     for law in laws:
         typer.echo(_law_line(law))
     again = f", {outcome.found} of them from before" if outcome.found else ""
@@ -228,7 +228,7 @@ def _say(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
 
 
 def _judge(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
-    """An exit status of its own, and a line on standard error, where rows or laws failed."""
+    """Exit with a status of its own, and a line on standard error, if rows or laws failed."""
     broken = [law for law in laws if law["verdict"] == "failed"]
     if broken:
         typer.echo(f"{len(broken)} of {len(laws)} laws failed; {_law_line(broken[0])}", err=True)
@@ -261,9 +261,9 @@ def _list() -> None:
 
 
 def _list_kinds() -> None:
-    from identify.studies.design import valid_keys
     from identify.studies.labels import factor_unit
     from identify.studies.rows import KINDS
+    from identify.studies.study_design import valid_keys
 
     for kind in KINDS.values():
         typer.echo(

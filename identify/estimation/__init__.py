@@ -1,1 +1,1 @@
-"""From records to parameters with intervals; nothing here sees the sensor's inside or the truth."""
+"""Parameters with intervals from records. Nothing here sees the sensor's inside or the truth."""

@@ -1,12 +1,11 @@
-"""Base parameters: the combinations of dynamic parameters that a motion can tell apart (section
-4.2).
+"""Base parameters: combinations of dynamic parameters that a motion can tell apart (section 4.2).
 
 The wrench is H Xi (eq. 26). Where columns of H depend on each other, only combinations of their
-parameters act: H = H_1 (1 | beta) P, so that H Xi = H_1 (xi_1 + beta xi_2), and the base parameters
-are xi_1 + beta xi_2, one for each pivot column. Columns are scaled to length one, so that the
-choice does not depend on units. Pivots are deterministic: of all columns that are long enough, the
-first in a stated order is taken (threshold pivoting), so that the groups are the same whatever
-motion shows them.
+parameters act. With H = H_1 (1 | beta) P, the wrench is H Xi = H_1 (xi_1 + beta xi_2). The base
+parameters are xi_1 + beta xi_2, one for each pivot column. Columns are scaled to length one, so
+that the choice does not depend on units. Pivots are deterministic: of all columns that are long
+enough, the first in a stated order is taken (threshold pivoting). The groups are therefore the
+same, whatever motion shows them.
 """
 
 from dataclasses import dataclass
@@ -26,32 +25,44 @@ from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
 
 DEPENDENT = 1e-8
-"""A column of length one whose part outside the pivots is shorter than this depends on them."""
+"""Length outside the pivots below which a column of length one depends on them."""
 
 LONG_ENOUGH = 1e-3
-"""A column may be a pivot when what is left of it is at least this fraction of the longest one."""
+"""Least remainder of a column that may be a pivot, as a fraction of the longest one."""
 
 NEGLIGIBLE = 1e-7
-"""Coefficients below this fraction of a group's largest contribution are rounding."""
+"""Coefficient that counts as rounding, as a fraction of a group's largest contribution."""
 
 MOTIONS = 200
-"""Random motions that excite whatever can be excited."""
+"""Number of random motions. They excite whatever can be excited."""
 
-REACH_SHARES, TURN = (0.03, 0.01, 0.003, 0.001), 0.05
-"""Random poses lie within a share of the largest distance between joints (m) and a turn (rad) about
-home.
+REACH_SHARES = (0.03, 0.01, 0.003, 0.001)
+"""Range of random positions about home, as a share of the platform's size.
+
+The first share is taken with which the robot reaches all poses.
 """
+
+TURN = 0.05
+"""Range of random angles about home, rad, with the first of these shares."""
 
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """Base parameters of a regression matrix with columns `names`, the dynamic parameters of a
-    robot.
+    """Base parameters of a regression matrix.
 
-    combinations (rank, p): base = combinations @ parameters; pivots (rank,): the parameter that
-    each group is named after, with coefficient 1; unseen: names of the parameters with no effect at
-    all; gap: largest column remainder that was taken as dependent and smallest that was taken as
-    independent.
+    Attributes
+    ----------
+    names : tuple of str
+        Names of its columns, the p dynamic parameters of a robot.
+    combinations : ndarray, shape (rank, p)
+        Matrix with base parameters = combinations @ parameters.
+    pivots : tuple of int
+        Parameter after which each group is named, with coefficient 1.
+    unseen : tuple of str
+        Names of the parameters without any effect.
+    gap : tuple of float
+        Largest remainder of a column that was taken as dependent, and smallest of an independent
+        one.
     """
 
     names: tuple[str, ...]
@@ -67,15 +78,16 @@ class BaseParameters:
 
     @cached_property
     def rigid_groups(self) -> RigidGroups:
-        """Those of the inertial parameters, which stand first, without friction: that is in no
-        group with others.
+        """Groups of the inertial parameters, which stand first.
+
+        Friction is left out, as it is in no group with others.
         """
         inertial = np.flatnonzero([name.split(".")[1] in INERTIAL for name in self.names])
         rows = np.flatnonzero(np.isin(self.pivots, inertial))
         return RigidGroups(np.array(self.pivots)[rows], self.combinations[np.ix_(rows, inertial)])
 
     def group_names(self) -> tuple[str, ...]:
-        """Name of each group: its pivot's, with a plus where other parameters belong to it."""
+        """Return the name of each group: its pivot's, with a plus if it has other members."""
         lone = (np.abs(self.combinations) > 0).sum(axis=1) == 1
         return tuple(
             self.names[p] + ("" if alone else " +")
@@ -83,7 +95,7 @@ class BaseParameters:
         )
 
     def expressions(self) -> tuple[str, ...]:
-        """Each group as a sum, such as ``crank1.Izz + 0.0009 crank1.mass``."""
+        """Return each group as a sum, such as ``crank1.Izz + 0.0009 crank1.mass``."""
         return tuple(
             self._expression(row, pivot)
             for row, pivot in zip(self.combinations, self.pivots, strict=True)
@@ -99,7 +111,7 @@ class BaseParameters:
 
 
 def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
-    """Base parameters of a regression matrix (rows, p) of a robot with this layout by pivoted QR.
+    """Return the base parameters of a regression matrix (rows, p), by pivoted QR.
 
     Among the columns of which enough is left, pivots go to friction first, then to the platform,
     the moments of the legs' bodies, and their masses, those nearest to the platform first. Raises
@@ -119,6 +131,7 @@ def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
     beta[np.abs(beta) < NEGLIGIBLE] = 0.0
     combinations = np.zeros((len(pivots), len(names)))
     combinations[np.arange(len(pivots)), seen[pivots]] = 1.0
+    # columns had length one: back to the parameters' own units
     combinations[:, seen[others]] = beta * lengths[seen[others]] / lengths[seen[pivots]][:, None]
     order = np.argsort(seen[pivots])
     unseen = tuple(name for k, name in enumerate(names) if k not in seen)
@@ -129,18 +142,19 @@ def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
 
 @lru_cache(maxsize=8)
 def structure(robot: Robot) -> BaseParameters:
-    """Base parameters of a robot, whatever moves it, found once. Raises EstimationError as
-    `structural_regressor`.
+    """Return the base parameters of a robot, whatever moves it. They are found once.
+
+    Raises EstimationError as `structural_regressor` does.
     """
     return base_parameters(structural_regressor(robot), robot.layout)
 
 
 def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) -> Array:
-    """Regression matrix (m motions, p) of random poses about home, twists and accelerations: what
-    can be excited is. Rows are wrenches along the platform's m coordinates: what the chart forbids
-    moves nothing.
+    """Return the regression matrix (m motions, p) of random motions about home.
 
-    Raises EstimationError, with the last reason, where no neighbourhood of home is in reach.
+    Random poses, twists and accelerations excite whatever can be excited. Rows are wrenches along
+    the platform's m coordinates, since what the chart forbids moves nothing. Raises
+    EstimationError, with the last reason, if no neighbourhood of home is in reach.
     """
     rng = np.random.default_rng(seed)
     chart = robot.geometry.chart
@@ -148,9 +162,8 @@ def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) ->
     draws = chart.lifted(rng.uniform(-1.0, 1.0, (3, motions, len(chart.freedoms))))
     reason: Exception | None = None
     for share in REACH_SHARES:
-        poses = robot.home_pose + draws[0] * np.repeat(
-            [share * size, TURN * share / REACH_SHARES[0]], 3
-        )
+        ranges = [share * size, TURN * share / REACH_SHARES[0]]
+        poses = robot.home_pose + draws[0] * np.repeat(ranges, 3)
         try:
             robot.inverse_kinematics(poses)
         except DynamicsError as error:
@@ -163,43 +176,42 @@ def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) ->
 
 
 def rank_by_singular_values(matrix: Array) -> int:
-    """Rank of a regression matrix whose columns are scaled to length one, from its singular
-    values."""
+    """Return the rank of a regression matrix, with columns of length one, by singular values."""
     lengths = np.linalg.norm(matrix, axis=0)
     singular = np.linalg.svd(matrix / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
     return int(np.sum(singular > DEPENDENT * singular[0]))
 
 
 def angle_to_singular_vectors(matrix: Array, found: BaseParameters) -> float:
-    """Largest angle [rad] between what the groups span and the row space of a regression matrix
-    (rows, p) by its singular vectors, with columns of length one; pi / 2 where one has a direction
-    more than the other."""
+    """Return the largest angle, rad, between the groups and the row space of a regression matrix.
+
+    The row space of the matrix (rows, p), with columns of length one, is that of its singular
+    vectors. The angle is pi / 2 where one of the two has a direction more than the other.
+    """
     lengths = np.linalg.norm(matrix, axis=0)
     scale = np.where(lengths > DEPENDENT * lengths.max(), lengths, 1.0)
     groups = found.combinations / scale
     rows = orth((matrix / scale).T, rcond=DEPENDENT)
-    return (
-        float(subspace_angles(groups.T, rows).max()) if len(groups) == rows.shape[1] else np.pi / 2
-    )
+    if len(groups) != rows.shape[1]:
+        return np.pi / 2
+    return float(subspace_angles(groups.T, rows).max())
 
 
 def rank_by_threshold(matrix: Array, threshold: float) -> int:
-    """The paper's count: diagonal entries of R above `threshold` in the pivoted QR of the unscaled
-    H (section 4.2).
+    """Return the paper's count of base parameters (section 4.2).
 
-    The entries have the regressor's units (N, N m per unit of a parameter) and grow with the root
-    of the number of samples, so the count depends on both; where it exceeds the rank, the threshold
-    lies below rounding.
+    It is the number of diagonal entries of R above `threshold`, in the pivoted QR of the unscaled
+    H. The entries have the regressor's units (N, N m per unit of a parameter) and grow with the
+    root of the number of samples, so that the count depends on both. Where it exceeds the rank, the
+    threshold lies below rounding.
     """
-    return int(
-        np.sum(
-            np.abs(np.diag(qr(triangular_factor(matrix), mode="r", pivoting=True)[0])) > threshold
-        )
-    )
+    # the triangular factor has the same R, and far fewer rows
+    entries = np.diag(qr(triangular_factor(matrix), mode="r", pivoting=True)[0])
+    return int(np.sum(np.abs(entries) > threshold))
 
 
 def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> Array:
-    """Regression matrix H (m n, p) of a reference motion sampled at `rate_hz`."""
+    """Return the regression matrix H (m n, p) of a reference motion sampled at `rate_hz`."""
     acceleration, _ = spline_derivatives(reference.rates, rate_hz)
     twist = robot.twist(reference.poses, reference.rates)
     twist_dot = robot.twist_dot(reference.poses, reference.rates, acceleration)
@@ -208,7 +220,7 @@ def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> A
 
 
 def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[float, float]]:
-    """Indices of independent columns, and the remainders on both sides of the limit."""
+    """Return the indices of independent columns, and the remainders on both sides of the limit."""
     left = columns.copy()
     smallest = 1.0
     chosen: list[int] = []
@@ -218,6 +230,7 @@ def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[
         if longest <= DEPENDENT:
             return np.array(chosen), (longest, smallest)
         able = np.flatnonzero(lengths >= LONG_ENOUGH * longest)
+        # not the longest, which depends on the motion
         pivot = int(able[np.argmin(preference[able])])
         smallest = min(smallest, float(lengths[pivot]))
         chosen.append(pivot)
@@ -228,13 +241,14 @@ def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[
 
 
 def _preferences(layout: ParameterLayout) -> NDArray[np.intp]:
-    """Place (p,) of each dynamic parameter among columns that are long enough."""
+    """Return the place (p,) of each dynamic parameter among columns that are long enough."""
     friction, platform, moment, mass = range(4)
     kinds = np.full(len(layout.dynamic_names), friction)
     rigid = layout.bodies_of(kinds)
     rigid[:] = moment
     places = {body: place for bodies in layout.of_leg for place, body in enumerate(bodies)}
     last = max(places.values())
+    # the nearer a body is to the platform, the sooner its mass may be a pivot
     rigid[:, 0] = [mass + last - places.get(body, last) for body in range(len(rigid))]
     rigid[0] = platform
     return np.asarray(kinds * len(kinds) + np.arange(len(kinds)))

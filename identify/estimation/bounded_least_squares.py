@@ -1,9 +1,9 @@
 """Bounded Gauss-Newton with a trust region for nonlinear least squares (eq. 32-35).
 
-Minimises |r(p)|^2 with r' = J. The paper's update (eq. 33, with the residual in place of its
-square) solves the linear problem without limits; here the step stays inside the parameters' bounds
-and inside a box that shrinks when the model of the cost was wrong, which keeps it from stalling
-near unstable loops.
+It minimises |r(p)|^2 with the Jacobian J of r. The paper's update (eq. 33, with the residual in
+place of its square) solves the linear problem without limits. Here the step stays inside the
+parameters' bounds and inside a box that shrinks when the model of the cost was wrong, which keeps
+it from stalling near unstable loops.
 """
 
 from collections.abc import Callable
@@ -17,34 +17,41 @@ from scipy.optimize import lsq_linear
 from dynamics import DynamicsError
 from identify.arrays import Array
 
+# factors of the trust region's radius
 SHRINK = 0.25
 GROW = 2.0
+
+# ratios of the gain to the predicted one, below or above which the radius changes
 POOR = 0.25
 GOOD = 0.75
-SMALLEST_RADIUS = 1e-10
-AT_BOUND = 1e-12  # of the parameter's scale: what rounding may leave
 
+SMALLEST_RADIUS = 1e-10
+AT_BOUND = 1e-12  # share of the parameter's scale that rounding may leave
 
 Linearisation = tuple[float, Array, Array]
 
 
 class Problem(Protocol):
-    """What the solver minimises."""
+    """Problem that the solver minimises."""
 
     def cost(self, parameters: Array) -> float:
-        """|r|^2; infinite where the model cannot run."""
+        """Return |r|^2, which is infinite where the model cannot run."""
         ...
 
     def linearise(self, parameters: Array) -> Linearisation:
-        """|r|^2, and a factor R (p, p) with a vector d (p,): |r + J step|^2 = |d + R step|^2 +
-        constant. Raises DynamicsError where the model cannot run."""
+        """Return |r|^2, and a factor R (p, p) with a vector d (p,) of the linearised problem.
+
+        For these, |r + J step|^2 = |d + R step|^2 + constant. Raises DynamicsError where the model
+        cannot run.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class StopCriteria:
-    """Eq. 35: tol1 on the relative change of the cost, tol2 on the relative change of every
-    parameter.
+    """Criteria of eq. 35 by which a search stops.
+
+    The tolerances, tol1 and tol2, are relative changes of the cost and of every parameter.
     """
 
     cost_tolerance: float
@@ -54,8 +61,11 @@ class StopCriteria:
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters (p,), which are at their bounds (p,), cost after each iteration, evaluations of
-    the model and why it stopped."""
+    """Parameters (p,) that a search found, and the reason why it stopped.
+
+    at_bound (p,): which parameters are at their bounds. costs: at the start and after each
+    iteration. evaluations: number of those of the model.
+    """
 
     parameters: Array
     at_bound: NDArray[np.bool_]
@@ -65,7 +75,7 @@ class Solution:
 
     @property
     def iterations(self) -> int:
-        """Steps taken."""
+        """Number of steps taken."""
         return len(self.costs) - 1
 
 
@@ -78,11 +88,23 @@ def minimise(
     on_iteration: Callable[[int, float], None] = lambda iteration, cost: None,
     ahead: bool = True,
 ) -> Solution:
-    """Minimise from `start` (p,) with p >= lower; `scale` (p,) is the size of a large change of
-    each parameter.
+    """Minimise a least-squares problem within lower bounds.
 
-    ahead: whether the problem may be linearised at a trial that is then not taken: not where it
-    follows its own steps.
+    Parameters
+    ----------
+    problem : Problem
+        Problem to minimise.
+    start, lower : ndarray, shape (p,)
+        Parameters at the start, and their lower bounds.
+    scale : ndarray, shape (p,)
+        Size of a large change of each parameter.
+    criteria : StopCriteria
+        Criteria by which the search stops.
+    on_iteration : callable
+        Function (number of the iteration, cost) that is called after each.
+    ahead : bool
+        True allows linearising the problem at a trial that is then not taken. A problem that
+        follows its own steps does not allow it.
     """
     parameters = start.copy()
     radius = 1.0
@@ -123,8 +145,10 @@ def minimise(
 
 
 def _tried(problem: Problem, trial: Array, goes_on: bool) -> tuple[float, Linearisation | None]:
-    """The cost of a trial (p,), and where the search is expected to go on from there at once its
-    linearisation, which the cost alone would be spent on twice."""
+    """Return the cost of a trial (p,) and, if the search may go on there, its linearisation.
+
+    The linearisation gives the cost as well, which would be computed twice otherwise.
+    """
     if not goes_on:
         return problem.cost(trial), None
     try:
@@ -137,15 +161,11 @@ def _tried(problem: Problem, trial: Array, goes_on: bool) -> tuple[float, Linear
 def _box_step(
     factor: Array, residual: Array, parameters: Array, lower: Array, scale: Array, radius: float
 ) -> tuple[Array, float]:
-    """Minimiser of the linearised cost in the box, and the gain it predicts."""
+    """Return the minimiser of the linearised cost in the box, and the gain that it predicts."""
     low = np.maximum((lower - parameters) / scale, -radius)
     scaled = factor * scale
-    solved = lsq_linear(
-        scaled,
-        -residual,
-        bounds=(np.minimum(low, -1e-15), np.full(len(scale), radius)),
-        method="bvls",
-    )
+    box = (np.minimum(low, -1e-15), np.full(len(scale), radius))
+    solved = lsq_linear(scaled, -residual, bounds=box, method="bvls")
     gain = residual @ residual - np.sum((residual + scaled @ solved.x) ** 2)
     return solved.x * scale, float(gain)
 
@@ -159,7 +179,7 @@ def _new_radius(radius: float, ratio: float, largest: float) -> float:
 
 
 def _relative_change(step: Array, parameters: Array, scale: Array) -> float:
-    """max |step_i / p_i| of eq. 35; a parameter at zero counts by its size."""
+    """Return max |step_i / p_i| of eq. 35. A parameter near zero counts by its scale."""
     return float(np.max(np.abs(step) / np.maximum(np.abs(parameters), 1e-3 * scale)))
 
 
@@ -169,7 +189,7 @@ def _converged(cost: float, new_cost: float, change: float, criteria: StopCriter
         return f"cost changed by {gain:.2e} <= tol1 = {criteria.cost_tolerance:g} (eq. 35)"
     if change <= criteria.parameter_tolerance:
         return (
-            f"parameters changed by {change:.2e} <= tol2 = {criteria.parameter_tolerance:g} "
-            "(eq. 35)"
+            f"parameters changed by {change:.2e} <= tol2 = {criteria.parameter_tolerance:g} (eq. "
+            "35)"
         )
     return ""

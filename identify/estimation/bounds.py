@@ -1,27 +1,27 @@
-"""Bounds: where a search may go, and the 95 % intervals of what is estimated within them.
+"""Bounds of a search, and the 95 % intervals of what is estimated within them.
 
-No parameter is negative, and on demand bodies are such as can exist: a rigid body has a positive
+No parameter is negative. On demand, bodies must be such as can exist: a rigid body has a positive
 mass, and none of its principal moments of inertia exceeds the sum of the other two. With the second
 moments of its mass along its axes, J_x = integral of x^2 dm and so on,
 
     Ixx = J_y + J_z,    Iyy = J_x + J_z,    Izz = J_x + J_y,
 
-and the triangle inequality of the moments is nothing but J >= 0: a search in J instead of I needs
-bounds only, see Traversaro et al., "Identification of fully physical consistent inertial
-parameters" (IROS 2016).
+and the triangle inequality of the moments is the same as J >= 0. A search in J instead of I
+therefore needs bounds only, see Traversaro et al., "Identification of fully physical consistent
+inertial parameters" (IROS 2016).
 
-The covariance of an estimate is that of the problem without bounds. Where bounds hold the estimate
-back, they pull all of it from where the record and the starting guess alone would have it.
-Linearised about the estimate, that is
+The covariance of an estimate is that of the problem without bounds. Bounds that hold the estimate
+back pull all of it from where the record and the starting guess alone would have it. Linearised
+about the estimate, that is
 
     unheld = estimate - W^-1 g,
 
-with the information W and that part g of the cost's gradient which the active bounds balance. The
-interval of the unheld estimate, cut to what is allowed, holds the truth as often as it says; but it
-may be empty, or leave the estimate outside. The interval given spans that of the unheld and that of
-the held estimate, cut at the least allowed value: it is never empty, holds the estimate, and covers
-at least as often. (The interval of the held estimate alone, cut there, would not: a sum of many
-quantities near their bounds is estimated too high by more than its standard deviation.)
+with the information W and the part g of the cost's gradient that the active bounds balance. The
+interval of the unheld estimate, cut to what is allowed, holds the truth as often as it says. But it
+may be empty, or leave the estimate outside. The interval given spans those of the unheld and of the
+held estimate, cut at the least allowed value. It is never empty, holds the estimate, and covers at
+least as often. The interval of the held estimate alone, cut there, would not: a sum of many
+quantities near their bounds is estimated too high by more than its standard deviation.
 """
 
 from dataclasses import dataclass
@@ -38,28 +38,30 @@ from identify.estimation.prior import StartingGuess
 
 
 def combined_std(rows: Array, covariance: Array) -> Array:
-    """Standard deviations (n,) of the combinations rows (n, p) @ parameters, from the parameters'
-    covariance (p, p).
+    """Return the standard deviations (n,) of the combinations rows (n, p) @ parameters.
+
+    covariance (p, p): that of the parameters.
     """
     return np.asarray(np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows)))
 
 
 SMALLEST_SHARE = 1e-3
-"""Lower bound of platform mass and integral gain, as a share of the starting guess: the model needs
-both.
+"""Lower bound of parameters without which there is no model, as a share of the starting guess.
+
+Examples are the platform's mass and the integral gain.
 """
 
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
-"""(Ixx, Iyy, Izz) from (J_x, J_y, J_z)."""
+"""Matrix that takes (J_x, J_y, J_z) to (Ixx, Iyy, Izz)."""
 
 
 @dataclass(frozen=True)
 class ParameterBounds:
-    """Coordinates (p,) of a search and their lower bounds (p,), with parameters = matrix (p, p) @
-    coordinates.
+    """Coordinates (p,) of a search, and their lower bounds.
 
-    layout: of the parameters; statements: what each bound says of them; physical: only bodies that
-    can exist.
+    matrix (p, p): parameters = matrix @ coordinates. lower (p,): bounds of the coordinates.
+    statements: what each bound says of the parameters. physical: only bodies that can exist are
+    allowed.
     """
 
     layout: ParameterLayout
@@ -69,8 +71,11 @@ class ParameterBounds:
     physical: bool
 
     def nearest(self, parameters: Array) -> Array:
-        """Parameters (p,) within the bounds: negative ones raised, and bodies changed where they
-        cannot exist, if it can be in what the motion does not feel."""
+        """Return parameters (p,) within the bounds.
+
+        Negative ones are raised. Bodies that cannot exist are changed, if it can be in what the
+        motion does not feel.
+        """
         allowed = np.maximum(parameters, 0.0)
         if self.physical:
             bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
@@ -78,23 +83,23 @@ class ParameterBounds:
         return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
 
     def coordinates(self, parameters: Array) -> Array:
-        """Coordinates (p,) of parameters (p,)."""
+        """Return the coordinates (p,) of parameters (p,)."""
         return np.asarray(np.linalg.solve(self.matrix, parameters), dtype=float)
 
     def parameters(self, coordinates: Array) -> Array:
-        """Parameters (p,) of coordinates (p,)."""
+        """Return the parameters (p,) of coordinates (p,)."""
         return np.asarray(self.matrix @ coordinates, dtype=float)
 
     def least(self, rows: Array) -> Array:
-        """Least values (n,) that rows (n, p) @ parameters take within the bounds; -inf where there
-        is none.
-        """
+        """Return the least values (n,) of rows (n, p) @ parameters in the bounds, or -inf."""
         weights = rows @ self.matrix
+        # with a negative weight the value falls without end, as nothing is bounded above
         return np.where((weights >= 0).all(axis=1), weights @ self.lower, -np.inf)
 
     def balanced(self, gradient: Array, at_bound: NDArray[np.bool_]) -> Array:
-        """The part (p,) of a cost's gradient (p,) that the coordinates (p,) at their bounds
-        balance.
+        """Return the part (p,) of a cost's gradient (p,) that active bounds balance.
+
+        at_bound (p,): which coordinates are at their bounds.
         """
         multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
         return np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
@@ -102,32 +107,33 @@ class ParameterBounds:
 
 @dataclass(frozen=True)
 class InCoordinates:
-    """A least-squares problem as a function of the coordinates; see
-    `bounded_least_squares.Problem`.
-    """
+    """Least-squares problem in the coordinates, see `bounded_least_squares.Problem`."""
 
     problem: Problem
     bounds: ParameterBounds
 
     def cost(self, parameters: Array) -> float:
-        """Cost at coordinates (p,)."""
+        """Return the cost at coordinates (p,)."""
         return self.problem.cost(self.bounds.parameters(parameters))
 
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
-        """Cost and linearisation at coordinates (p,)."""
+        """Return cost and linearisation at coordinates (p,)."""
         cost, factor, residual = self.problem.linearise(self.bounds.parameters(parameters))
         return cost, factor @ self.bounds.matrix, residual
 
 
 def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
-    """Bounds of all parameters; physical: only masses and inertias that a rigid body can have."""
+    """Return the bounds of all parameters.
+
+    With `physical` they allow only masses and inertias that a rigid body can have.
+    """
     layout = guess.layout
     names = guess.layout.names
     matrix = np.eye(len(names))
     lower = np.zeros(len(names))
     for place in (names.index(name) for name in guess.above_zero):
         lower[place] = SMALLEST_SHARE * guess.values[place]
-    lower[guess.fixed] = -1.0  # they stay at zero by what is known of them, not by a bound
+    lower[guess.fixed] = -1.0  # the prior keeps them at zero, so that no bound holds them
     if physical:
         lower[layout.rigid] = np.maximum(lower[layout.rigid], SMALLEST)
     statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]
@@ -141,15 +147,15 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
 
 
 HALF_WIDTH = float(norm.ppf(0.975))
-"""Of a 95 % interval, in standard deviations."""
+"""Half the width of a 95 % interval, in standard deviations."""
 
 
 @dataclass(frozen=True)
 class BoundedEstimate:
-    """An estimate (p,) within bounds, and where it is at them (p,) bool, in the order of the
-    bounds' coordinates.
+    """Estimate (p,) within bounds.
 
-    unheld (p,): where record and starting guess alone would have it; covariance (p, p): of that.
+    at_bound (p,): which coordinates of the bounds are at their bounds. unheld (p,): estimate by
+    record and starting guess alone. covariance (p, p): that of the unheld estimate.
     """
 
     estimate: Array
@@ -159,38 +165,36 @@ class BoundedEstimate:
     bounds: ParameterBounds
 
     def intervals(self, rows: Array) -> Array:
-        """95 % intervals (n, 2) of the quantities rows (n, p) @ parameters, cut at the least value
-        allowed.
+        """Return the 95 % intervals (n, 2) of the quantities rows (n, p) @ parameters.
+
+        They are cut at the least values allowed.
         """
         half = HALF_WIDTH * combined_std(rows, self.covariance)
+        # the interval spans those of both estimates, see above
         centres = np.stack([rows @ self.estimate, rows @ self.unheld])
         low = np.maximum(centres.min(axis=0) - half, self.bounds.least(rows))
         return np.stack([low, centres.max(axis=0) + half], axis=1)
 
     @property
     def active_bounds(self) -> tuple[str, ...]:
-        """What the bounds that hold the estimate say of the parameters, as "platform.Izz <= Ixx +
-        Iyy".
-        """
+        """Statements of the bounds that hold the estimate, as "platform.Izz <= Ixx + Iyy" is."""
         return tuple(self.bounds.statements[k] for k in np.flatnonzero(self.at_bound))
 
     def warnings(self) -> tuple[str, ...]:
-        """One line where bounds hold the estimate: which, and how far beyond them it would go."""
+        """Return a warning if bounds hold the estimate, with how far beyond them it would go."""
         if not self.at_bound.any():
             return ()
         beyond = self.bounds.lower - self.bounds.coordinates(self.unheld)
-        std = combined_std(
-            np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float), self.covariance
-        )
+        to_coordinates = np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float)
+        std = combined_std(to_coordinates, self.covariance)
         said = ", ".join(
             f"{self.bounds.statements[k]} ({max(beyond[k] / std[k], 0):.2g})"
             for k in np.flatnonzero(self.at_bound)
         )
         return (
             f"the estimate is held at {self.at_bound.sum()} bounds, beyond which no robot is: "
-            f"{said}; in brackets how "
-            "far record and starting values would go beyond, in standard deviations; the "
-            "intervals allow for it",
+            f"{said}; in brackets how far record and starting values would go beyond, in standard "
+            "deviations; the intervals allow for it",
         )
 
 
@@ -202,8 +206,10 @@ def bounded_estimate(
     covariance: Array,
     bounds: ParameterBounds,
 ) -> BoundedEstimate:
-    """The estimate (p,) of a search within bounds, where J^T r is `gradient` (p,) and J^T J is
-    `information` (p, p).
+    """Return the estimate (p,) of a search within bounds.
+
+    gradient (p,) is J^T r, and information (p, p) is J^T J. The others are as for
+    `BoundedEstimate`.
     """
     unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
     return BoundedEstimate(estimate, at_bound, unheld, covariance, bounds)

@@ -1,17 +1,16 @@
-"""Which law the drives have: the evidence of a record for each of those that are known, and how
-sure it makes one.
+"""Choice of the drives' law, by the evidence of a record for each law that is known.
 
-Each law is a model of its own: warm start, then the search for the optimum of the output error
-under the logged commands, whose residuals are white. About the optimum the cost is a parabola, so
-that the evidence, the probability of the record with all parameters integrated out over what was
-known of them before, is (Laplace's method)
+Each law is a model of its own: a warm start, then the search for the optimum of the output error
+under the logged commands, whose residuals are white. The evidence is the probability of the record
+with all parameters integrated out, over what was known of them before. About the optimum the cost
+is a parabola, so that by Laplace's method
 
     ln p(record | law) = -(cost + ln det W - ln det P) / 2 + the same for all,
 
-W the information of poses and prior at the optimum, P that of the prior: a gain that a law has and
-the record does not need costs what it could have been. Before the record all laws are as probable.
-Where the best of them misses the record by more than noise explains, all costs are divided by its
-share: what no law explains rules none out.
+with W the information of poses and prior at the optimum, and P that of the prior. A law has less
+evidence if the record excludes much of what its gains could have been. Before the record all laws
+are equally probable. Where the best of them misses the record by more than noise explains, all
+costs are divided by its misfit, so that a record that no law explains rules none out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,15 +33,23 @@ from identify.scenario.plant_sections import AUTO
 SURE = 0.95
 """Probability from which on a record tells the law."""
 
-FIRST, HOPELESS = 4, 10.0
-"""Iterations for every law at first, and how many times the best cost they may leave for it to go
-on: laws that the record shows are there by then, while others may search for long."""
+FIRST = 4
+"""Number of iterations for every law at first.
+
+Laws that fit the record are near their optimum by then, while others may search for long.
+"""
+
+HOPELESS = 10.0
+"""Factor of the best cost above which a law is not searched any further."""
 
 
 @dataclass(frozen=True)
 class DriveChoice:
-    """The law of the drives, and how probable each is: 1 for one that the scenario names; in_loop:
-    whether it acted as the record was made, which it does not where the drives took torques."""
+    """Law of the drives, and how probable each law is.
+
+    A law that the scenario names has the probability 1. in_loop: False if the drives took torques,
+    so that no law acted as the record was made.
+    """
 
     law: DriveName
     probabilities: Mapping[str, float]
@@ -50,21 +57,20 @@ class DriveChoice:
 
     @property
     def asked(self) -> bool:
-        """Whether the record was asked."""
+        """True if the record was asked for the law."""
         return len(self.probabilities) > 1
 
     @property
     def sure(self) -> bool:
-        """Whether the record tells the law."""
+        """True if the record tells the law."""
         return self.probabilities[self.law] >= SURE
 
     def warnings(self) -> tuple[str, ...]:
-        """One line where the record cannot tell the law, or says nothing of it."""
+        """Return a warning if the record cannot tell the law, or says nothing of it."""
         if not self.in_loop:
             return (
                 "the drives took torques: the law by which they follow joint commands is not in "
-                "this record, and its "
-                "gains are those of the starting values",
+                "this record, and its gains are those of the starting values",
             )
         if self.sure:
             return ()
@@ -73,8 +79,7 @@ class DriveChoice:
         )
         return (
             f"the record cannot tell the law of the drives ({said}): the gains are those of "
-            f"{self.law}; move the robot "
-            "faster or longer, or state the law in model.drive",
+            f"{self.law}; move the robot faster or longer, or state the law in model.drive",
         )
 
 
@@ -84,11 +89,10 @@ def choose_drive(
     progress: Progress,
     in_loop: bool = True,
 ) -> DriveChoice:
-    """The law that a scenario names or, where it leaves that to the record, the most probable;
-    problem_of: the output error of a scenario that names one; in_loop: whether the law acted in the
-    record.
+    """Return the law that a scenario names or, if it leaves that open, the most probable one.
 
-    Raises EstimationError: no law gives a model that runs; and as `problem_of` does.
+    problem_of: returns the output-error problem of a scenario that names a law. in_loop: False if
+    no law acted in the record. Raises EstimationError if no law gives a model that runs.
     """
     law = scenario.model.drive_law
     if not in_loop:
@@ -104,6 +108,7 @@ def choose_drive(
             try:
                 problem = problem_of(own)
                 first[law] = _searched(problem, own, linear_warm_start(problem, own))
+            # a law under which no model runs is out, and the others decide
             except (EstimationError, DynamicsError) as error:
                 failed.append(f"{law}: {error}")
             advance()
@@ -117,11 +122,13 @@ def choose_drive(
             if one.solution.costs[-1] <= limit:
                 own = _asking(scenario, law, scenario.identification.max_iterations)
                 found[law] = evidence(_searched(problem_of(own), own, one.solution.parameters))
+        # laws that were left out count as searched
         advance(len(laws))
     return DriveChoice(*_weighed(found, laws))
 
 
 def _asking(scenario: Scenario, law: DriveName, iterations: int) -> Scenario:
+    """Return the scenario of the search for one law, under the logged commands."""
     searched = {
         "identification.method": "command_driven",
         "identification.max_iterations": iterations,
@@ -130,16 +137,20 @@ def _asking(scenario: Scenario, law: DriveName, iterations: int) -> Scenario:
 
 
 def _searched(problem: OutputErrorProblem, scenario: Scenario, start: Array) -> Search:
-    """The search for the optimum under the logged commands. Raises EstimationError: no model that
-    runs.
+    """Search for the optimum under the logged commands.
+
+    Raises EstimationError if no model runs.
     """
     return output_error_searches(problem, scenario, start, SilentProgress())["command_driven"]
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a record says of a law: cost at the optimum, that of the poses alone over their number,
-    and ln det W - ln det P."""
+    """Evidence of a record for a law.
+
+    cost: at the optimum. misfit: that of the poses alone, over the number of their components.
+    narrowed: ln det W - ln det P.
+    """
 
     cost: float
     misfit: float
@@ -147,25 +158,28 @@ class Evidence:
 
 
 def evidence(found: Search) -> Evidence:
-    """What a finished search says of its law. Raises LoopFailure."""
+    """Return the evidence for the law of a finished search. Raises LoopFailure."""
     parameters = found.solution.parameters
     judged = found.linearised()
     cost, factor, _ = judged.linearise(parameters)
     known, _ = judged.known(parameters)
     poses = 6 * sum(int(np.count_nonzero(run.ok)) for run in judged.runs)
-    narrowed = (
-        2 * np.log(np.abs(np.diag(factor))).sum() - np.linalg.slogdet(judged.known_information())[1]
-    )
+    of_prior = np.linalg.slogdet(judged.known_information())[1]
+    narrowed = 2 * np.log(np.abs(np.diag(factor))).sum() - of_prior
     return Evidence(cost, (cost - float(known @ known)) / poses, float(narrowed))
 
 
 def _weighed(
     found: Mapping[DriveName, Evidence], laws: Sequence[DriveName]
 ) -> tuple[DriveName, dict[str, float]]:
-    """The most probable law, and the probability of each; a law that gives no model has none."""
+    """Return the most probable law, and the probability of each.
+
+    A law that gives no model has the probability zero.
+    """
     misfit = max(1.0, min(one.misfit for one in found.values()))
     logarithms = {law: -(one.cost / misfit + one.narrowed) / 2 for law, one in found.items()}
     best = max(logarithms, key=lambda law: logarithms[law])
+    # relative to the best one, as the evidence itself is too small for a floating-point number
     weights = {
         law: float(np.exp(logarithms[law] - logarithms[best])) if law in found else 0.0
         for law in laws

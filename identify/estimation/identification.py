@@ -16,7 +16,7 @@ from dynamics.closed_loop.start_state import (
 )
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.base_parameters import structure
-from identify.estimation.common_errors import common_error_estimates
+from identify.estimation.common_error_estimates import common_error_estimates
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.explanation import explanation
@@ -33,8 +33,9 @@ from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.command_times import command_time_warnings
 from identify.record.drift import drift_warnings
-from identify.record.law import SERVO, recorded_law
-from identify.record.provenance import recorded_seed
+from identify.record.known_geometry import known_geometry
+from identify.record.provenance import recorded_scenario, recorded_seed
+from identify.record.recorded_law import SERVO, recorded_law
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 
@@ -42,23 +43,57 @@ from identify.scenario import Scenario
 @one_thread
 def identify(
     record: xr.Dataset | Sequence[xr.Dataset],
-    robot: Robot,
-    scenario: Scenario,
+    robot: Robot | None = None,
+    scenario: Scenario | None = None,
     progress: Progress | None = None,
 ) -> IdentificationResult:
-    """Estimate the parameters of robot and joint PID from one or several records by closed-loop
-    output error.
+    """Estimate the parameters of robot and joint PID from records by closed-loop output error.
 
-    Raises RecordError: the record misses something, such as its scenario or its scale anchor, or
-    states what is none, such as a seed that is no whole number. Raises EstimationError: no robot or
-    scenario; a record of another robot, timing or servo, or one that cannot carry an
-    identification; no model that runs from the starting guess or the warm start, or that bears the
-    noise. Raises ScenarioError: a parameter set that the robot does not have, or a starting guess
-    that no model has. Raises dynamics.DynamicsError: poses that the robot cannot reach.
+    Parameters
+    ----------
+    record : xarray.Dataset or sequence of them
+        One or several records of the same robot. The first brings the scale anchor.
+    robot : Robot, optional
+        Robot as it is known. The default is the robot of the scenario.
+    scenario : Scenario, optional
+        Settings of the estimator. The default is the scenario that the first record carries.
+    progress : Progress, optional
+        Where the progress is shown.
+
+    Returns
+    -------
+    IdentificationResult
+        Estimates with their uncertainty, and what the record says of the model.
+
+    Raises
+    ------
+    RecordError
+        A record misses something, such as its scenario or its scale anchor, or states a value
+        that cannot be, such as a seed that is no whole number.
+    EstimationError
+        An argument is no robot or scenario, a record is of another robot, timing or servo or
+        cannot carry an identification, or no model runs from the starting guess or the warm start.
+    ScenarioError
+        The robot has no such parameter set, or no model has the starting guess.
+    dynamics.DynamicsError
+        The robot cannot reach a pose of the record.
+
+    Examples
+    --------
+    >>> import identify
+    >>> record = identify.run_experiment(identify.load_scenario("quick", renderer="statistical"))
+    >>> result = identify.identify(record)
+    >>> result.robot.name, bool(result.identifiable.any())
+    ('rss6', True)
     """
     progress = progress or SilentProgress()
     began = time.perf_counter()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
+    if not records:
+        raise EstimationError("no record to identify from")
+    scenario = recorded_scenario(records[0]) if scenario is None else scenario
+    if robot is None and isinstance(scenario, Scenario):
+        robot = known_geometry(scenario).robot
     scenario = under_its_law(scenario, records)
     problem = output_error_problem(records, robot, scenario)
     in_loop = not any(run.settings.drives.torques for run in problem.runs)
@@ -87,6 +122,7 @@ def identify(
     ended = time.perf_counter()
     return IdentificationResult(
         layout=robot.layout,
+        nominal=robot,
         drive=drive,
         initial=problem.guess.values,
         warm_start=warm,
@@ -139,8 +175,6 @@ def output_error_problem(
             raise EstimationError(
                 f"{given!r} is no {kind.__name__}: {loader}(name or path) gives one"
             )
-    if not records:
-        raise EstimationError("no record to identify from")
     found = [identified_model(record, robot, scenario) for record in records]
     runs = tuple(replace(run, groups=structure(robot).rigid_groups) for run in found)
     anchor = read_anchor(records[0], robot.layout)

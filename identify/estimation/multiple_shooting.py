@@ -1,16 +1,15 @@
-"""Multiple shooting: the record in short segments, for models that do not run through the whole of
-it.
+"""Multiple shooting: fits to short segments, for models that do not run through a whole record.
 
 A model that is unstable, or that leaves the reachable set, has no output error over a record.
 Driven by the logged commands it has one over half a second, where each segment starts from a state
-of its own: coordinates of the platform, their rates and joint PID integral, s = 2 m + n numbers of
-m coordinates and n joints. These states are unknowns beside the parameters, and each segment must
-end where the next starts, up to what the sensor can see, so that in the optimum the segments make
-up one run.
+of its own. A state holds coordinates of the platform, their rates, and the joint PID's integrals.
+For m coordinates and n joints these are s = 2 m + n numbers, unknown as the parameters are.
+Each segment must end where the next starts, up to what the sensor can see, so that at the optimum
+the segments make up one run.
 
 In the linearised problem the states form a chain. They are eliminated one after the other by QR,
 which leaves a problem in the parameters alone (condensing; Bock and Plitt, "A multiple shooting
-algorithm for direct solution of optimal control problems", IFAC 1984); the step of the states
+algorithm for direct solution of optimal control problems", IFAC 1984). The step of the states
 follows from that of the parameters.
 """
 
@@ -37,18 +36,24 @@ from identify.model.loop_model import LoopModel
 from identify.scenario import Scenario
 
 SEGMENT_S = 0.5
-"""Length of a segment: a few periods of the joint loop, in which an unstable one does not leave the
-reachable set.
+"""Length of a segment, s.
+
+It is a few periods of the joint loop, in which an unstable one does not leave the reachable set.
 """
 
 BANDWIDTH = 20.0
-"""rad/s, of the joint loop: turns the sensor's noise into a deviation of rates and integrals."""
+"""Bandwidth of the joint loop, rad/s.
+
+It turns the sensor's noise into a standard deviation of rates and integrals.
+"""
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Frames first to last of a run; the last one is the next segment's first. state_std (s,): what
-    the sensor's noise is in a state."""
+    """Frames `first` to `last` of a run, the last of which is the next segment's first.
+
+    state_std (s,): standard deviation that the sensor's noise makes in a state.
+    """
 
     run: LoopModel
     reference: Reference
@@ -58,12 +63,12 @@ class Segment:
 
     @property
     def ends_the_run(self) -> bool:
-        """Whether no segment follows."""
+        """True if no segment follows."""
         return self.last == len(self.run.ok) - 1
 
     @property
     def chart(self) -> Chart:
-        """Of the platform."""
+        """Coordinates of the platform."""
         return self.run.robot.geometry.chart
 
     @property
@@ -74,16 +79,16 @@ class Segment:
     def simulate(
         self, parameters: Array, state: Array, sensitivities: bool = False
     ) -> ClosedLoopRun:
-        """The model's run from a state (s,); the first segment starts in equilibrium. Raises
-        LoopFailure.
+        """Simulate the model from a state (s,). The first segment starts in equilibrium.
+
+        Raises LoopFailure if the segment does not run.
         """
         run = self.run
         chart = self.chart
-        coordinates, rates, integral = np.split(
-            state, [len(chart.freedoms), 2 * len(chart.freedoms)]
-        )
+        count = len(chart.freedoms)
+        coordinates, rates, integral = np.split(state, [count, 2 * count])
         pose = chart.pose(coordinates)
-        at_rest = np.zeros(len(chart.freedoms))
+        at_rest = np.zeros(count)
         start = None
         if self.first:
             before, latencies = run.commands_before(self.first)
@@ -99,8 +104,9 @@ class Segment:
         return simulate_commands(*given, start=start, latencies=late)
 
     def whitened(self, values: Array) -> Array:
-        """Pose values (frames, 6, ...) whitened and stacked (n, ...), without lost frames and the
-        next segment's.
+        """Return pose values (frames, 6, ...) whitened and stacked, (n, ...).
+
+        Lost frames, and the frame that belongs to the next segment, are left out.
         """
         count = self.last - self.first + self.ends_the_run
         rows = values[:count][self.run.ok[self.first : self.first + count]]
@@ -108,7 +114,7 @@ class Segment:
 
 
 def segments(run: LoopModel) -> list[Segment]:
-    """The segments of a run, all of about the same length."""
+    """Return the segments of a run, all of about the same length."""
     frames = len(run.ok)
     count = max(1, round((frames - 1) / (SEGMENT_S * run.settings.timing.frame_rate_hz)))
     edges = np.linspace(0, frames - 1, count + 1).round().astype(int)
@@ -120,22 +126,19 @@ def segments(run: LoopModel) -> list[Segment]:
     std = np.concatenate([place, BANDWIDTH * place, joint / BANDWIDTH])
     poses = run.reference.poses
     rates = run.reference.rates
-    return [
-        Segment(
-            run,
-            Reference(poses[first : last + 1], rates[first : last + 1]),
-            int(first),
-            int(last),
-            std,
-        )
-        for first, last in pairwise(edges)
-    ]
+    found = []
+    for first, last in pairwise(edges):
+        reference = Reference(poses[first : last + 1], rates[first : last + 1])
+        found.append(Segment(run, reference, int(first), int(last), std))
+    return found
 
 
 def measured_states(chain: list[Segment], parameters: Array, scenario: Scenario) -> Array:
-    """States (segments, s) at the starts of a run's segments: filtered poses and rates, and what
-    the joint PID has integrated since the start, where it held the model of parameters (p,) at
-    rest."""
+    """Return the states (segments, s) at the starts of a run's segments.
+
+    They are filtered poses and rates, and what the joint PID has integrated since the start, where
+    it held the model with parameters (p,) at rest.
+    """
     run = chain[0].run
     rate_hz = scenario.timing.frame_rate_hz
     filtering = scenario.filter
@@ -153,18 +156,18 @@ def measured_states(chain: list[Segment], parameters: Array, scenario: Scenario)
 
 
 def end_state(run: ClosedLoopRun, chart: Chart) -> Array:
-    """State (s,) at the last frame of a run of a robot with this chart."""
-    return np.concatenate(
-        [*(chart.coordinates(of[-1]) for of in (run.pose, run.pose_rate)), run.joint_integral[-1]]
-    )
+    """Return the state (s,) at the last frame of a run of a robot with this chart."""
+    place = chart.coordinates(run.pose[-1])
+    rate = chart.coordinates(run.pose_rate[-1])
+    return np.concatenate([place, rate, run.joint_integral[-1]])
 
 
 @dataclass
 class MultipleShooting:
     """Least-squares problem in a robot's p parameters, for `bounded_least_squares.minimise`.
 
-    chains: the segments of each record; states: a (segments, s) for each record. The states follow
-    the parameters by the latest linearisation, and are moved with each new one.
+    chains: segments of each record. states: those (segments, s) of each record, which follow the
+    parameters by the latest linearisation and are moved with each new one.
     """
 
     problem: OutputErrorProblem
@@ -174,8 +177,9 @@ class MultipleShooting:
     _eliminated: list[list[Array]] = field(default_factory=list)
 
     def cost(self, parameters: Array) -> float:
-        """Sum of squared residuals of poses, continuity and what is known; infinite where a segment
-        does not run.
+        """Return the sum of squared residuals of poses, continuity and what is known.
+
+        It is infinite where a segment does not run.
         """
         known, _ = self.problem.known(parameters)
         total = float(known @ known)
@@ -192,8 +196,7 @@ class MultipleShooting:
         return total
 
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
-        """Cost and the condensed linearisation in the parameters, see
-        `bounded_least_squares.Problem`.
+        """Return cost and condensed linearisation, see `bounded_least_squares.Problem`.
 
         Raises LoopFailure where a segment does not run.
         """
@@ -206,12 +209,12 @@ class MultipleShooting:
         condensed = np.column_stack([known_rows, known])
         for chain, states in zip(self.chains, self.states, strict=True):
             state = states.shape[1]
+            # nothing depends on the first state: rows of one keep it where it is
             carried = np.eye(state, state + size + 1)
-            eliminated = []  # nothing depends on the first state: it stays
+            eliminated = []
             for k, part in enumerate(chain):
-                rows = _linearised(
-                    part, parameters, states[k], None if part.ends_the_run else states[k + 1]
-                )
+                following = None if part.ends_the_run else states[k + 1]
+                rows = _linearised(part, parameters, states[k], following)
                 cost += float(np.sum(rows[:, -1] ** 2))
                 # columns of the next state
                 carried = np.insert(carried, [state] * state, 0.0, axis=1)
@@ -224,7 +227,7 @@ class MultipleShooting:
         return cost, triangle[:size, :size], triangle[:size, size]
 
     def _moved(self, parameters: Array) -> list[Array]:
-        """The states after the step from the latest linearisation to parameters (p,)."""
+        """Return the states after the step from the latest linearisation to parameters (p,)."""
         if not self._eliminated:
             return self.states
         step = np.append(parameters - self._at, 1.0)
@@ -233,19 +236,17 @@ class MultipleShooting:
 
 
 def _linearised(part: Segment, parameters: Array, state: Array, following: Array | None) -> Array:
-    """Rows of a segment's residuals and of its continuity with the `following` state, in the
-    columns of its state, the following one, the parameters, and the value. The first segment starts
-    in equilibrium: its state does not count."""
+    """Return the linearised residuals of a segment, and of its continuity with the next one.
+
+    The next one begins at the state `following`. Columns are those of the segment's state, of the
+    following one and of the parameters, and the value. The first segment starts in equilibrium, so
+    that its state does not count.
+    """
     run = part.simulate(parameters, state, sensitivities=True)
-    by_state, by_parameters, end_by_state, end_by_parameters = (
-        np.asarray(one)
-        for one in (
-            run.start_sensitivity,
-            run.pose_sensitivity,
-            run.end_start_sensitivity,
-            run.end_sensitivity,
-        )
-    )
+    by_state = np.asarray(run.start_sensitivity)
+    by_parameters = np.asarray(run.pose_sensitivity)
+    end_by_state = np.asarray(run.end_start_sensitivity)
+    end_by_parameters = np.asarray(run.end_sensitivity)
     counts = float(part.first > 0)
     size = len(part.state_std)
     values = part.whitened(run.pose - part.measured)
@@ -255,13 +256,15 @@ def _linearised(part: Segment, parameters: Array, state: Array, following: Array
         return rows
     own = counts * end_by_state[:size, :size]
     gap = end_state(run, part.chart) - following
+    # continuity, in standard deviations of what the sensor can see of a state
     joint = np.column_stack([own, -np.eye(size), end_by_parameters[:size], gap])
     return np.vstack([rows, joint / part.state_std[:, None]])
 
 
 def _moved_chain(states: Array, eliminated: list[Array], step: Array) -> Array:
-    """States (segments, s) after a step (p + 1,) of the parameters (its last entry 1), by the
-    triangles of their QR.
+    """Return the states (segments, s) after a step (p + 1,) of the parameters.
+
+    The last entry of the step is 1. eliminated: triangles of the QR of each state.
     """
     moved = states.copy()
     size = states.shape[1]

@@ -1,10 +1,9 @@
-"""Output error: measured poses against those of the model under the same excitation (eq. 32, figure
-3).
+"""Output error: measured poses against the model's under the same excitation (eq. 32, figure 3).
 
-Two ways to drive the model. Closed loop, as in the paper: the model has the servo around it and
-follows the reference with an ideal sensor of the same sampling, delay and hold, which loses the
-frames that the real one lost. Command driven: the joints get the logged commands, so the model
-feels what the sensor's noise did to the plant.
+There are two ways to drive the model. In the closed loop, as in the paper, the model has the servo
+around it and follows the reference. Its ideal sensor has the same sampling, delay and hold, and
+loses the frames that the real one lost. Driven by commands, the model's joints get the logged
+commands, so that it feels what the sensor's noise did to the plant.
 
 The residuals are the pose differences of all records, whitened by the sensor's covariance, and one
 row for each thing known beside the poses (`prior`).
@@ -25,8 +24,11 @@ from identify.model.loop_model import LoopModel
 
 @dataclass(frozen=True)
 class OutputErrorProblem:
-    """Least-squares problem in a robot's parameters over one or several records, for
-    `bounded_least_squares.minimise`; physical: whether only bodies that can exist are allowed."""
+    """Least-squares problem in a robot's parameters over one or several records.
+
+    It is solved by `bounded_least_squares.minimise`. With `physical` only bodies that can exist are
+    allowed.
+    """
 
     runs: tuple[LoopModel, ...]
     guess: StartingGuess
@@ -35,17 +37,19 @@ class OutputErrorProblem:
 
     @property
     def bounds(self) -> ParameterBounds:
-        """Where a search may go."""
+        """Bounds of a search."""
         return parameter_bounds(self.guess, self.physical)
 
     def driven_by_commands(self) -> "OutputErrorProblem":
-        """The same problem with the joints driven by the logged commands."""
+        """Return the same problem with the joints driven by the logged commands."""
         return replace(self, runs=tuple(run.driven_by_commands() for run in self.runs))
 
     @property
     def bends(self) -> bool:
-        """Whether the model is not linear in what the poses have in common: within a servo, or
-        where latency is part of it."""
+        """True if the model is not linear in the common errors of the poses.
+
+        It is not within a servo, or where the latency is one of them.
+        """
         return any(
             run.common.latency_std or (run.common.names and not run.driven)
             for run in self.runs
@@ -53,8 +57,10 @@ class OutputErrorProblem:
         )
 
     def has(self, errors: Sequence[Array], within: float) -> bool:
-        """Whether the model of each run has these common errors (k,), as far as it can, but for so
-        many standard deviations."""
+        """Tell whether the model of each run contains these common errors (k,), as far as it can.
+
+        It may differ from them by `within` standard deviations.
+        """
         pairs = zip(self.runs, errors, strict=True)
         return all(
             np.abs(run.errors_had - run.having(own).errors_had).max(initial=0.0) <= within
@@ -62,19 +68,24 @@ class OutputErrorProblem:
         )
 
     def having(self, errors: Sequence[Array]) -> "OutputErrorProblem":
-        """The same problem, the model of each run with these common errors (k,)."""
+        """Return the same problem with these common errors (k,) in the model of each run."""
         return replace(
             self, runs=tuple(run.having(own) for run, own in zip(self.runs, errors, strict=True))
         )
 
     def with_common_errors(self, parameters: Array) -> "OutputErrorProblem":
-        """The same problem, which knows what the poses of each record have in common, as a model
-        with these parameters (p,) shows it. Raises LoopFailure where that is unstable."""
+        """Return the same problem with residuals that are whitened for common errors, too.
+
+        The modes of each record are those of a model with these parameters (p,). Raises LoopFailure
+        if it is unstable.
+        """
         return replace(self, runs=tuple(run.with_common_errors(parameters) for run in self.runs))
 
     def cost(self, parameters: Array, ahead: bool = False) -> float:
-        """Sum of squared whitened residuals; infinite where the model cannot run. ahead: from the
-        runs that `linearise` will need, if it is asked next."""
+        """Return the sum of squared whitened residuals, infinite where the model cannot run.
+
+        With `ahead` it comes from the runs that `linearise` will need, if that is asked next.
+        """
         known, _ = self.known(parameters)
         total = float(known @ known)
         try:
@@ -85,8 +96,10 @@ class OutputErrorProblem:
         return total
 
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
-        """Cost and the triangular form of its linearisation, see
-        `bounded_least_squares.Problem`."""
+        """Return the cost and the triangular form of its linearisation.
+
+        See `bounded_least_squares.Problem`.
+        """
         known, known_jacobian = self.known(parameters)
         size = len(parameters)
         cost = float(known @ known)
@@ -94,16 +107,17 @@ class OutputErrorProblem:
         for run in self.runs:
             residual, shown = run.shown_residuals(parameters)
             cost += float(np.sum(residual**2))
+            # factored with the few columns of the groups, and extended to all parameters then
             rows = triangular_factor(shown.reshape(residual.size, -1), residual.ravel())
             rows = np.column_stack([run.of_all(rows[:, :-1]), rows[:, -1]])
             triangle = triangular_factor(np.vstack([triangle, rows]))
         return cost, triangle[:size, :size], triangle[:size, size]
 
     def known_information(self) -> Array:
-        """Information (p, p) of what is known beside the poses."""
+        """Return the information (p, p) of what is known beside the poses."""
         _, rows = self.known(self.guess.values)
         return np.asarray(rows.T @ rows, dtype=float)
 
     def known(self, parameters: Array) -> tuple[Array, Array]:
-        """Residuals (k,) of what is known beside the poses, and their rows (k, p)."""
+        """Return residuals (k,) of what is known beside the poses, and their rows (k, p)."""
         return prior_residuals(parameters, self.guess, self.anchor)

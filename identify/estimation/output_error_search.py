@@ -1,10 +1,10 @@
-"""The searches for the optimum of the output error, one after the other.
+"""Searches for the optimum of the output error, one after the other.
 
-From the linear warm start through the command-driven output error, which has few local minima, to
-the closed-loop output error, whose stick-slip events make narrow ones. Errors that all poses have
-in common are left to the noise at first: what they hide, far from the optimum, is the way there.
-Where neither the warm start nor the starting guess gives a model that runs, multiple shooting finds
-one that does.
+They go from the linear warm start through the command-driven output error, which has few local
+minima, to the closed-loop output error, whose stick-slip events make narrow ones. Errors that all
+poses have in common are left to the noise at first, since far from the optimum they would hide the
+residuals that show the way. Where neither the warm start nor the starting guess gives a model that
+runs, multiple shooting finds one that does.
 """
 
 from dataclasses import dataclass, replace
@@ -16,34 +16,39 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Problem, Solution, StopCriteria, minimise
 from identify.estimation.bounds import InCoordinates
-from identify.estimation.common_errors import most_likely_errors
+from identify.estimation.common_error_estimates import most_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.progress import Advance, Progress
 from identify.scenario import Scenario
 
-LINEARISATIONS, SETTLED = 6, 0.02
-"""Of the common errors, at most, and how near the last ones the most likely must be, in standard
-deviations.
-"""
+LINEARISATIONS = 6
+"""Largest number of linearisations in the common errors."""
+
+SETTLED = 0.02
+"""Largest step of the most likely common errors, in standard deviations, after which they stay."""
 
 CLOSE_ENOUGH = 1e-2
-"""Relative change of the cost at which multiple shooting ends: the searches after it go on from
-there.
+"""Relative change of the cost at which multiple shooting ends.
+
+The searches after it go on from there.
 """
 
 
 @dataclass(frozen=True)
 class Search:
-    """A problem, with what its poses have in common where that is most likely, and what the search
-    for its optimum found."""
+    """Problem, and what the search for its optimum found.
+
+    The problem contains the common errors that are most likely at the optimum.
+    """
 
     problem: OutputErrorProblem
     solution: Solution
 
     def linearised(self) -> OutputErrorProblem:
-        """The problem with the common errors as the model shows them at the optimum. Raises
-        LoopFailure.
+        """Return the problem with the modes of the common errors at the optimum.
+
+        Raises LoopFailure if the model is unstable there.
         """
         return self.problem.with_common_errors(self.solution.parameters)
 
@@ -51,10 +56,9 @@ class Search:
 def output_error_searches(
     problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
 ) -> dict[str, Search]:
-    """The searches by name, in their order, from the warm start (p,); the last is that of the
-    scenario's method.
+    """Search from the warm start (p,), and return the searches by name in their order.
 
-    Raises EstimationError: no model that runs.
+    The last one is that of the scenario's method. Raises EstimationError if no model runs.
     """
     found = {}
     driven = problem.driven_by_commands()
@@ -74,6 +78,7 @@ def output_error_searches(
             driven, starts, scenario, advance
         )
         if closed_loop:
+            # the closed loop begins with the errors that the commands have shown
             problem = problem.having(
                 most_likely_errors(searched.problem, searched.solution.parameters)
             )
@@ -85,9 +90,11 @@ def output_error_searches(
 def search_with_common_errors(
     problem: OutputErrorProblem, starts: list[Array], scenario: Scenario, advance: Advance
 ) -> Search:
-    """Minimise a problem from the best of some parameters (p,) with what its poses have in common,
-    time and again until the most likely errors, about which the model is taken as linear in them,
-    settle."""
+    """Minimise a problem with its common errors, from the best of some parameters (p,).
+
+    The model is taken as linear in the common errors about the most likely ones. The search is
+    repeated until these settle.
+    """
     problem, start = _with_common_errors(problem, starts)
     solution = search(problem, start, scenario, advance)
     for _ in range(LINEARISATIONS if problem.bends else 0):
@@ -95,6 +102,7 @@ def search_with_common_errors(
         if problem.has(errors, SETTLED):
             break
         problem = problem.having(errors).with_common_errors(solution.parameters)
+        # the progress was told of one search only
         again = search(problem, solution.parameters, scenario, lambda n=1: None)
         counted = solution.evaluations + again.evaluations
         solution = replace(again, costs=solution.costs + again.costs[1:], evaluations=counted)
@@ -115,11 +123,10 @@ def search(
 def shoot(
     problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
 ) -> Solution:
-    """Parameters with which the command-driven model runs, by multiple shooting from warm start or
-    starting guess.
+    """Find parameters with which the command-driven model runs, by multiple shooting.
 
-    Raises EstimationError: no segment-wise model that runs, or none that does over the whole
-    records.
+    It starts from warm start or starting guess. Raises EstimationError if no model runs segment by
+    segment, or none that does so runs over the whole records.
     """
     settings = scenario.identification
     criteria = StopCriteria(CLOSE_ENOUGH, settings.parameter_tolerance, settings.max_iterations)
@@ -135,40 +142,37 @@ def shoot(
             return solution
     raise EstimationError(
         "neither the warm start nor the starting guess gives a model that runs, nor does multiple "
-        "shooting from them: "
-        f"{_why(problem, warm)}"
+        f"shooting from them: {_why(problem, warm)}"
     )
 
 
 def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
-    """The better of warm start and starting guess (p,), within the bounds; None where the model
-    runs with neither.
+    """Return the better of warm start and starting guess (p,), within the bounds.
+
+    It is None if the model runs with neither.
     """
     first, second = _candidates(problem, warm)
-    costs = [
-        (problem.cost(first, ahead=_begins_there(problem)), first),
-        (problem.cost(second), second),
-    ]
+    ahead = _begins_there(problem)
+    costs = [(problem.cost(first, ahead=ahead), first), (problem.cost(second), second)]
     cost, start = min(costs, key=lambda entry: entry[0])
     return start if np.isfinite(cost) else None
 
 
 def _begins_there(problem: OutputErrorProblem) -> bool:
-    """Whether a search linearises this very problem at just the parameters that it is given: not
-    where it is whitened otherwise first, or goes through other coordinates."""
+    """Tell whether a search linearises this very problem at just the parameters that it is given.
+
+    It does not if the problem is whitened for common errors first, or has other coordinates.
+    """
     return not problem.physical and not any(run.common.all_names for run in problem.runs)
 
 
 def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
-    """The better of what the command-driven search found (p,) and the starting guess, for the
-    closed loop.
-    """
+    """Return the better of the command-driven solution (p,) and the guess, in the closed loop."""
     start = runnable_start(problem, driven)
     if start is None:
         raise EstimationError(
             "the closed loop runs neither with what the command-driven search found nor with the "
-            "starting guess: "
-            f"{_why(problem, driven)}"
+            f"starting guess: {_why(problem, driven)}"
         )
     return start
 
@@ -176,8 +180,11 @@ def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
 def _with_common_errors(
     problem: OutputErrorProblem, starts: list[Array]
 ) -> tuple[OutputErrorProblem, Array]:
-    """The problem that knows what poses have in common, as a model shows it that runs with the best
-    of some parameters (p,); and these. A single start is known to run."""
+    """Return the problem with its common errors, and the best of some parameters (p,).
+
+    The modes of the errors are those of the model with these parameters. A single start is known to
+    run.
+    """
     if len(starts) == 1 and not any(run.common.all_names for run in problem.runs):
         return problem, problem.bounds.nearest(starts[0])
     inside = [
@@ -199,8 +206,9 @@ def _within_bounds(
     criteria: StopCriteria,
     advance: Advance,
 ) -> Solution:
-    """Solution in the parameters of a search in the coordinates of their bounds; `advance` reaches
-    all iterations.
+    """Search in the coordinates of the bounds, and return the solution in the parameters.
+
+    In the end `advance` has counted all iterations that the criteria allow.
     """
     bounds = problem.bounds
     found = minimise(

@@ -1,7 +1,7 @@
-"""The prior: what is known beside the poses, as residuals that join theirs.
+"""Prior: what is known beside the poses, as residuals that join theirs.
 
-That is the starting guess, each parameter with its standard deviation (wide, but for single ones of
-which a scenario's `[identification.prior]` knows more), and the scale anchor.
+It is the scale anchor and the starting guess, each parameter with its standard deviation. That is
+wide, but for parameters of which a scenario's `[identification.prior]` knows more.
 """
 
 from collections.abc import Mapping
@@ -22,8 +22,10 @@ from identify.scenario import PriorValue, Scenario
 
 @dataclass(frozen=True)
 class StartingGuess:
-    """What is known before the experiment of a robot's parameters: values (p,) and standard
-    deviations (p,), SI; the law of its drives, which fixes the gains that it does not read at zero.
+    """Knowledge of a robot's parameters before the experiment.
+
+    values, std (p,): values and their standard deviations, SI. drive: law of the drives, whose
+    unread gains are fixed at zero.
     """
 
     layout: ParameterLayout
@@ -35,9 +37,8 @@ class StartingGuess:
     def fixed(self) -> NDArray[np.bool_]:
         """Gains (p,) that the law of the drives does not read."""
         read = [f"joint_pid.{gain}" for gain in READS[self.drive]]
-        return np.isin(self.layout.names, self.layout.joint_pid_names) & ~np.isin(
-            self.layout.names, read
-        )
+        names = self.layout.names
+        return np.isin(names, self.layout.joint_pid_names) & ~np.isin(names, read)
 
     @property
     def above_zero(self) -> tuple[str, ...]:
@@ -46,12 +47,15 @@ class StartingGuess:
 
     @property
     def rows(self) -> Array:
-        """What it says as equations of the parameters, in standard deviations (p, p)."""
+        """Rows (p, p) of the guess as equations of the parameters, in standard deviations."""
         return np.diag(1 / self.std)
 
 
 FIXED = 1e-9
-"""Standard deviation of a gain that the law of the drives does not read, in those of the others."""
+"""Standard deviation of a gain that the law of the drives does not read.
+
+It is a share of the one that the gain would have otherwise.
+"""
 
 
 def starting_guess(
@@ -61,10 +65,11 @@ def starting_guess(
     known: Mapping[str, PriorValue] = MappingProxyType({}),
     drive: DriveName = "pid",
 ) -> StartingGuess:
-    """The named parameter set of the robot file, uncertain by a fraction of each parameter's size,
-    but for those of which a value and its standard deviation are known.
+    """Return the starting guess that follows from a parameter set of the robot file.
 
-    Raises ScenarioError: no such set (with the valid names).
+    relative_std: standard deviation of each parameter, as a fraction of its size. known: values and
+    standard deviations of parameters of which more is known, by name. Raises ScenarioError, with
+    the valid names, if there is no such set.
     """
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
@@ -76,13 +81,14 @@ def starting_guess(
         values[place] = prior.value
         std[place] = prior.std
     guess = StartingGuess(robot.layout, values, std, drive)
+    # the guess holds these very arrays, and changes with them
     values[guess.fixed] = 0.0
     std[guess.fixed] = FIXED * std[guess.fixed]
     return guess
 
 
 def model_guess(robot: Robot, scenario: Scenario) -> StartingGuess:
-    """The starting guess of a scenario's model. Raises as `starting_guess`."""
+    """Return the starting guess of a scenario's model. Raises ScenarioError as `starting_guess`."""
     settings = scenario.identification
     model = scenario.model
     return starting_guess(
@@ -91,19 +97,18 @@ def model_guess(robot: Robot, scenario: Scenario) -> StartingGuess:
 
 
 WEIGHTLESS = 0.01
-"""Share of the torque for an acceleration of GRAVITY that joints must hold for their load to count
-as held by them.
+"""Share of the torque for an acceleration of GRAVITY up to which joints count as holding no load.
 """
 
 GRAVITY = 9.81  # m/s^2
 
 
 def holding_torque(robot: Robot, dynamic: Array) -> float:
-    """Mean torque [N m] or force [N] that the joints hold at the home pose, with dynamic parameters
-    (p,).
+    """Return the mean torque, N m, or force, N, that the joints hold at the home pose.
 
-    Where they hold next to nothing, as those of a robot that lies flat, it is the mean of what they
-    need to accelerate the platform by that of gravity along each axis.
+    dynamic (p,): dynamic parameters. If the joints hold next to nothing, as those of a robot that
+    lies flat, it is the mean of what they need to accelerate the platform by GRAVITY along each
+    axis.
     """
     home = robot.home_pose
     axes = robot.geometry.chart.basis.T
@@ -117,25 +122,25 @@ def holding_torque(robot: Robot, dynamic: Array) -> float:
 
 
 def typical_sizes(layout: ParameterLayout, values: Array, torque: float) -> Array:
-    """Size (p,) of each parameter: its own value, and for friction the torque [N m] or force [N]
-    that the joints hold.
+    """Return the size (p,) of each parameter: its own value or, for friction, the holding torque.
 
-    A specification says little about friction; a joint that rubs more than it carries would be
-    called broken.
+    The torque is in N m, or N. A specification says little about friction, but a joint that rubs
+    more than it carries would be called broken.
     """
     return np.where(friction(layout), torque, np.where(values > 0, values, 1.0))
 
 
 def friction(layout: ParameterLayout) -> NDArray[np.bool_]:
-    """Whether each parameter (p,) is one of friction."""
+    """Return which parameters (p,) are those of friction."""
     return np.isin(layout.names, layout.coulomb_names + layout.viscous_names)
 
 
 def prior_residuals(
     parameters: Array, guess: StartingGuess, anchor: ScaleAnchor
 ) -> tuple[Array, Array]:
-    """Residuals (k,) of what is known beside the poses, in standard deviations, and their rows (k,
-    p).
+    """Return residuals (k,) of what is known beside the poses, and their rows (k, p).
+
+    They are in standard deviations.
     """
     place, measured = anchor.row(guess.layout)
     rows = np.vstack([guess.rows, place])

@@ -1,20 +1,25 @@
-"""What an identification says: estimates with their uncertainty and judgement, as a table, as JSON,
-and in one line.
+"""Result of an identification: estimates with their uncertainty and judgement.
+
+It shows itself as a table, as JSON, in one line, and in a notebook.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
+from dynamics import Robot
 from dynamics.closed_loop.drives import READS, cascade_gains
 from dynamics.parameters import JOINT_PID, ParameterLayout
 from identify.arrays import Array
-from identify.estimation.common_errors import CommonErrorEstimates
+from identify.errors import EstimationError
+from identify.estimation.common_error_estimates import CommonErrorEstimates
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.drive_choice import DriveChoice
 from identify.estimation.explanation import MISFIT, Misfit, Whiteness
@@ -32,22 +37,49 @@ STRONGEST = 10
 
 @dataclass(frozen=True)
 class IdentificationResult:
-    """What one record says about the parameters of a robot, in the order of its `layout`; SI.
+    """Parameters of a robot that one or several records show, in the order of `layout`; SI units.
 
-    drive: the law of the drives; initial, warm_start, estimate, std (p,), covariance (p, p), the
-    last two as they were without bounds; intervals (p, 2): 95 %, cut at the bounds; identifiable
-    (p,) bool; prior_share (p,): of the variance, what errors of the starting guess make, and
-    common_share (p,) by kind: what those that all poses of a record have in common; groups,
-    group_intervals: what the record says of the base parameters; base_rank: independent groups that
-    the trajectory excites by the paper's rule; iterations and evaluations: of all searches;
-    stop_reason: of the last; searches: their names in order, and costs: after each iteration, one
-    tuple a search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
-    noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the
-    sensor's noise alone would leave, give or take noise_ratio_std; whiteness: test of the residuals
-    of the model driven by the logged commands.
+    Attributes
+    ----------
+    layout : ParameterLayout
+        Names, places and units of the p parameters.
+    nominal : Robot
+        The robot as it was known before.
+    drive : DriveChoice
+        Law of the drives.
+    initial, warm_start, estimate : ndarray, shape (p,)
+        Starting guess, linear estimate, and final estimate.
+    std, covariance : ndarray, shapes (p,) and (p, p)
+        Uncertainty of the estimate as it was without bounds.
+    intervals : ndarray, shape (p, 2)
+        95 % intervals, cut at the bounds.
+    identifiable : ndarray of bool, shape (p,)
+        True where the record shows the parameter.
+    prior_share : ndarray, shape (p,)
+        Share of the variance that errors of the starting guess make.
+    common_share : dict of ndarray, shape (p,)
+        Share of the variance by each kind of error that all poses of a record have in common.
+    groups, group_intervals
+        Estimates of the base parameters, and their 95 % intervals.
+    base_rank : int
+        Number of independent groups that the trajectory excites by the paper's rule.
+    iterations, evaluations : int
+        Counts over all searches.
+    stop_reason : str
+        Reason why the last search ended.
+    searches, costs : tuple
+        Names of the searches in their order, and the cost after each iteration of each.
+    active_bounds : tuple of str
+        Bounds that hold the estimate back, such as "platform.Izz <= Ixx + Iyy".
+    noise_ratio, expected_noise_ratio, noise_ratio_std : float
+        Mean squared whitened residual, its expectation under the sensor's noise alone, and the
+        standard deviation of that.
+    whiteness : Whiteness
+        Test of the residuals of the model that the logged commands drive.
     """
 
     layout: ParameterLayout
+    nominal: Robot
     drive: DriveChoice
     initial: Array
     warm_start: Array
@@ -78,10 +110,13 @@ class IdentificationResult:
     seconds: dict[str, float]
 
     @property
+    def robot(self) -> Robot:
+        """The identified robot, whose nominal parameters are the estimate."""
+        return self.nominal.with_parameters(self.estimate)
+
+    @property
     def rests_on_prior(self) -> NDArray[np.bool_]:
-        """Whether each parameter (p,) is identified only with what the starting guess says of
-        others.
-        """
+        """True for each parameter (p,) that is identified only with a guess of others."""
         return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
     @property
@@ -91,7 +126,7 @@ class IdentificationResult:
 
     @property
     def misfit(self) -> Misfit:
-        """Whether the model explains the record."""
+        """Comparison of the residual with what noise alone would leave."""
         return Misfit(self.noise_ratio, self.expected_noise_ratio, self.noise_ratio_std)
 
     def __repr__(self) -> str:
@@ -104,8 +139,32 @@ class IdentificationResult:
         )
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row a parameter: unit, initial, estimate, std, the interval from low to high,
-        identifiable.
+        """Table without the truth, see `table`."""
+        return self.table()
+
+    def table(self, truth: xr.Dataset | Mapping[str, float] | None = None) -> pd.DataFrame:
+        """Table with a row for each parameter.
+
+        Parameters
+        ----------
+        truth : xarray.Dataset or mapping, optional
+            True values: ``record.truth`` of a simulated record, or numbers by name.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns unit, initial, estimate, std, low and high of the 95 % interval, identifiable.
+            With the truth also true, and holds: whether the interval holds it.
+
+        Raises
+        ------
+        EstimationError
+            The truth lacks a parameter.
+
+        Examples
+        --------
+        >>> result.table(truth=record.truth).query("identifiable")["holds"].mean()  # doctest: +SKIP
+        0.95
         """
         import pandas as pd
 
@@ -118,13 +177,29 @@ class IdentificationResult:
             "high": self.intervals[:, 1],
             "identifiable": self.identifiable,
         }
+        if truth is not None:
+            true = self._true_values(truth)
+            columns["true"] = true
+            columns["holds"] = (self.intervals[:, 0] <= true) & (true <= self.intervals[:, 1])
         return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
+
+    def _true_values(self, truth: xr.Dataset | Mapping[str, float]) -> Array:
+        if isinstance(truth, xr.Dataset):
+            pairs = zip(truth["parameter"].values, truth["parameter_value"].values, strict=True)
+            truth = {str(name): float(value) for name, value in pairs}
+        missing = [name for name in self.names if name not in truth]
+        if missing:
+            raise EstimationError(f"the truth has no {missing[0]}; {len(missing)} are missing")
+        return np.array([float(truth[name]) for name in self.names])
+
+    def _repr_html_(self) -> str:
+        from identify.estimation.notebook import result_html  # draws, which takes time to import
+
+        return result_html(self)
 
     @property
     def whole_covariance(self) -> Array:
-        """Covariance (p + k, p + k) of the estimates, and behind them of what all poses have in
-        common.
-        """
+        """Covariance (p + k, p + k) of the p parameters and the k common errors of all poses."""
         common = self.common_errors
         return np.block(
             [
@@ -134,15 +209,11 @@ class IdentificationResult:
         )
 
     def save(self, path: Path | str) -> None:
-        """Write a JSON file whose "identification" is that of a run's result.json; commands take
-        its estimates.
-        """
+        """Write the entry "identification" of a run's result.json, which commands take."""
         save_result(path, {"identification": self.to_dict()})
 
     def to_dict(self) -> dict[str, Any]:
-        """Estimates with their uncertainty, for a JSON file; the true values, where known, are for
-        others to add.
-        """
+        """Return the estimates with their uncertainty for JSON, the true values left open."""
         common = self.common_errors
         anchor = self.scale_anchor
         whiteness = self.whiteness
@@ -175,9 +246,7 @@ class IdentificationResult:
         }
 
     def _drive(self) -> dict[str, Any]:
-        """The law of the drives, how probable each is, and which gains it has not; of a cascade its
-        own gains.
-        """
+        """Return the law of the drives with its probability, and the gains of a cascade."""
         law = self.drive.law
         gains = self.layout.joint_pid
         entry: dict[str, Any] = {

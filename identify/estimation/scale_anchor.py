@@ -1,14 +1,13 @@
-"""The scale anchor: poses alone leave one common factor of all parameters free, and something known
-fixes it.
+"""Scale anchor: what fixes the common factor of all parameters, which poses alone leave free.
 
 Multiplying every dynamic parameter and the three PID gains by the same number changes no pose of
-the closed loop (eq. 17 and 31). What fixes the factor is one of
+the closed loop (eq. 17 and 31). The factor is fixed by one of
 
     platform_mass   the platform was weighed
     joint_gain      the proportional gain of the joint PID is known
     payload         a second run with a known load on the platform (`identify.record.payload`); the
                     standard deviations of the load stand with that run, and widen the intervals
-                    (`load_error`)
+                    (`covariance`)
     prior           nothing but the starting guess, with its standard deviations
 """
 
@@ -23,25 +22,27 @@ from identify.errors import RecordError
 from identify.files.dataset import as_number, shown
 
 MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
-"""Anchors that measure a parameter."""
+"""Parameter that an anchor measures, by the anchor's name."""
 
 ANCHORS = (*MEASURED_PARAMETER, "payload", "prior")
 
 DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 5.0}
-"""Standard deviation of an ordinary platform balance [kg], and of a gain read from the controller's
-data, by units.
+"""Standard deviation of an ordinary instrument, by units.
+
+It is that of a platform balance, kg, or of a gain read from the controller's data.
 """
 
 
 def default_std(name: str, layout: ParameterLayout) -> float:
-    """Standard deviation [SI] of an ordinary instrument for what an anchor measures of a robot."""
+    """Return the standard deviation, SI, of an ordinary instrument for an anchor of a robot."""
     return DEFAULT_STD[layout.unit(MEASURED_PARAMETER[name])]
 
 
 @dataclass(frozen=True)
 class ScaleAnchor:
-    """What fixes the scale; value and std (SI) where it is a parameter measured on its own, else
-    None.
+    """Measurement that fixes the scale.
+
+    value and std are those of a parameter that was measured on its own, SI, or else None.
     """
 
     name: str
@@ -49,8 +50,10 @@ class ScaleAnchor:
     std: float | None = None
 
     def row(self, layout: ParameterLayout) -> tuple[Array, Array]:
-        """What was measured as equations: rows (k, p) and right side (k,), in standard deviations;
-        k is 0 or 1.
+        """Return the measurement as equations, in standard deviations.
+
+        They are rows (k, p) and a right side (k,), with k = 0 if no parameter was measured, or else
+        1.
         """
         if self.value is None or self.std is None:
             return np.zeros((0, len(layout.names))), np.zeros(0)
@@ -62,8 +65,11 @@ class ScaleAnchor:
 def measured_anchor(
     name: str, std: float | None, layout: ParameterLayout, true: Array, rng: np.random.Generator
 ) -> ScaleAnchor:
-    """The anchor as an experimenter with an instrument of standard deviation `std` (or the usual
-    one) brings it, of a robot whose true parameters (p,) are `true`."""
+    """Return the anchor as an experimenter measures it.
+
+    std: standard deviation of the instrument, None for the usual one. true (p,): true parameters of
+    the robot.
+    """
     if name not in MEASURED_PARAMETER:
         return ScaleAnchor(name)
     spread = default_std(name, layout) if std is None else std
@@ -72,24 +78,23 @@ def measured_anchor(
 
 
 def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
-    """Keep the anchor's measurement with the record."""
+    """Store the anchor's measurement with the record."""
     record.attrs["scale_anchor"] = anchor.name
     if anchor.value is not None and anchor.std is not None:
         record.attrs |= {"scale_anchor_value": anchor.value, "scale_anchor_std": anchor.std}
 
 
 def read_anchor(record: xr.Dataset, layout: ParameterLayout) -> ScaleAnchor:
-    """The anchor's measurement of a record of a robot.
+    """Return the anchor's measurement of a robot's record.
 
-    Raises RecordError: the record has none, so that the scale of its parameters is free; or a
-    measured value or standard deviation that is no finite number > 0.
+    Raises RecordError if the record has none, so that the scale of its parameters is free, or if
+    its value or standard deviation is no finite number > 0.
     """
     name = record.attrs.get("scale_anchor")
     if name not in ANCHORS:
         raise RecordError(
             "the record holds no scale anchor (attributes scale_anchor, scale_anchor_value, "
-            "scale_anchor_std), found "
-            f"{shown(name)}; valid anchors: {', '.join(ANCHORS)}"
+            f"scale_anchor_std), found {shown(name)}; valid anchors: {', '.join(ANCHORS)}"
         )
     if name not in MEASURED_PARAMETER:
         return ScaleAnchor(str(name))
@@ -98,7 +103,7 @@ def read_anchor(record: xr.Dataset, layout: ParameterLayout) -> ScaleAnchor:
 
 
 def _positive(record: xr.Dataset, attribute: str, layout: ParameterLayout) -> float:
-    """A record's attribute that must be a finite number > 0."""
+    """Return a record's attribute, which must be a finite number > 0."""
     value = record.attrs.get(attribute)
     number = as_number(value)
     if not 0 < number < np.inf:

@@ -1,25 +1,25 @@
-"""Linear warm start: the closed-loop equation is linear in everything unknown, so one fit starts
-the search close by.
+"""Linear warm start, by which the search starts close to the optimum.
 
-With the logged commands U and the joint coordinates theta of the measured poses, at every instant
+The closed-loop equation is linear in everything unknown, so that one fit is enough. With the logged
+commands U and the joint coordinates theta of the measured poses, at every instant
 
-    J_ad^-T Gamma(pose, twist, twist_dot) Xi - lp (U - theta) - ld (U_dot - theta_dot) - li
-    integral(U - theta) = z
+    J_ad^-T Gamma(pose, twist, twist_dot) Xi
+        - lp (U - theta) - ld (U_dot - theta_dot) - li integral(U - theta) = z
 
-with z the torque the integrators held at the start (n,). Poses are filtered and differentiated, and
-of those of a platform with fewer freedoms its coordinates count, along which the wrench Gamma Xi is
-balanced. Each row is the balance of one joint, whose dry friction is known only while it slips:
-rows of joints near rest are left out. The equation is homogeneous: the scale anchor, and weakly the
-starting guess, decide the common factor.
+with z (n,) the torque that the integrators held at the start. Poses are filtered and
+differentiated. For a platform with fewer freedoms, its coordinates count, and the wrench Gamma Xi
+is balanced along these. Each row is the balance of one joint, whose dry friction is known only
+while it slips: rows of joints near rest are left out. The equation is homogeneous. The scale anchor
+and, weakly, the starting guess decide the common factor.
 
 That is the PID. In other laws of the drives the torque is in proportion to the gains, too, and so
-the sum of its derivatives by these, times these; those of a cascade depend on ratios of the gains,
-for which the latest fit stands.
+it is the sum of its derivatives with respect to the gains, times the gains. The derivatives of a
+cascade depend on ratios of the gains, for which the latest fit stands.
 
-What all poses of a run have in common, or a geometry that is known only so well, moves theta by e
-d, with d of standard deviation one; an error of the latency moves U by the way that it makes in
-that time. That stands in the equation with lp and with li: as errors of the rows that go on along a
-run, lp0 e and li0 integral(e) with the gains of the starting guess, they are marginalised
+A common error of the poses of a run, or of a geometry that is known only so well, moves theta by e
+for each standard deviation. An error of the latency moves U by the way that it makes in that time.
+In the equation these errors stand with lp and with li. They are errors of the rows that go on along
+a run, lp0 e and li0 integral(e) with the gains of the starting guess, and they are marginalised
 (`record.common_errors`).
 """
 
@@ -39,23 +39,23 @@ from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.model.loop_model import LoopModel
-from identify.record.common_errors import Marginal
+from identify.record.stored_common_errors import Marginal
 from identify.scenario import Scenario
 
 EDGE_FRACTION = 0.02
 """Share of the record left out at either end, where filtered derivatives are poor."""
 
 SLIPPING_SHARE = 0.5
-"""A joint counts as slipping above this share of its RMS velocity."""
+"""Share of its RMS velocity above which a joint counts as slipping."""
 
 REWEIGHTINGS = 3
-"""Solutions of the fit: each takes the size of the residual from the one before."""
+"""Number of solutions of a fit. Each takes the size of the residual from the one before."""
 
 
 def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
-    """Parameters (p,) fitted to the measured poses and commands of the problem's runs.
+    """Fit parameters (p,) to the measured poses and commands of the problem's runs.
 
-    Each run has its own starting torques; what a known payload adds stands on the right side, as do
+    Each run has its own starting torques. What a known payload adds stands on the right side, as do
     torques that were commanded. The residual's size is estimated from the fit itself, so that the
     starting guess counts as much as it should.
     """
@@ -73,12 +73,9 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
         if common.shape[1]:
             whitened = Marginal.of(common / noise).whiten(whitened)
         solution = bounded_fit(whitened[:, :-1], whitened[:, -1], guess, problem.anchor, lower)
-        noise = max(
-            noise
-            * float(np.sqrt(np.sum((whitened @ np.append(solution, -1.0)) ** 2) / len(right))),
-            1e-9,
-        )
-        if law.lx:
+        left = whitened @ np.append(solution, -1.0)
+        noise = max(noise * float(np.sqrt(np.sum(left**2) / len(right))), 1e-9)
+        if law.lx:  # the columns of a cascade depend on its gains
             law = drives.joint_law(np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
             matrix, right, common = _stacked(problem, scenario, law)
             rows = _condensed(matrix, right, common)
@@ -86,16 +83,19 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
 
 
 def _condensed(matrix: Array, right: Array, common: Array) -> Array:
-    """Equations with their right side behind them (rows, u + 1); where errors are independent,
-    their triangular factor, which says the same at any noise."""
+    """Return equations with their right side behind them, (rows, u + 1).
+
+    If errors are independent it is their triangular factor, which says the same at any noise.
+    """
     return np.column_stack([matrix, right]) if common.shape[1] else triangular_factor(matrix, right)
 
 
 def _stacked(
     problem: OutputErrorProblem, scenario: Scenario, law: JointLaw
 ) -> tuple[Array, Array, Array]:
-    """Equations of all runs: matrix (rows, p + n runs), right side (rows,) and common errors (rows,
-    k), N m or N.
+    """Return the equations of all runs, N m or N.
+
+    They are the matrix (rows, p + n runs), the right side (rows,), and the common errors (rows, k).
     """
     matrices = []
     right = []
@@ -111,6 +111,7 @@ def _stacked(
         )
         columns = balance[slipping]
         if run.settings.drives.torques:
+            # torques that were commanded need no gains: they stand on the right side
             columns[:, layout.joint_pid] = 0.0
             matrices.append(columns[:, :count])
             felt = effective_command(run.logged, scenario, latencies)[0][slipping]
@@ -127,29 +128,26 @@ def _stacked(
 
 
 def _common_torques(run: LoopModel, guess: StartingGuess, scenario: Scenario) -> Array:
-    """What common errors of the poses and errors of geometry and latency, each of one standard
-    deviation, add to the balance of every joint (N, n, k), N m or N, with the gains of the starting
-    guess."""
-    poses, (lp, li, _) = run.without_gaps(), guess.values[guess.layout.joint_pid]
-    by_pose = (
-        run.robot.pose_jacobian(run.reference.poses) @ run.common.modes
-        if run.common.names
-        else None
-    )
-    by_geometry = run.common.geometry.joints(poses) if run.common.geometry else None
-    latency_std = run.common.latency_std
-    by_latency = None
-    if latency_std:
-        by_latency = (
-            latency_std * effective_command(run.logged, scenario, run.latencies)[1][:, :, None]
-        )
-    moved = [part for part in (by_pose, by_geometry, by_latency) if part is not None]
+    """Return the torques (N, n, k), N m or N, that common errors add to the balance of every joint.
+
+    They are those of one standard deviation of each error of poses, geometry and latency, with the
+    gains of the starting guess.
+    """
+    common = run.common
+    moved = []
+    if common.names:
+        moved.append(run.robot.pose_jacobian(run.reference.poses) @ common.modes)
+    if common.geometry:
+        moved.append(common.geometry.joints(run.without_gaps()))
+    if common.latency_std:
+        _, rate, _ = effective_command(run.logged, scenario, run.latencies)
+        moved.append(common.latency_std * rate[:, :, None])
     if not moved:
         return np.zeros((*run.logged.shape, 0))
+    lp, li, _ = guess.values[guess.layout.joint_pid]
     angle = np.concatenate(moved, axis=2)
-    return np.concatenate(
-        [lp * angle, li * running_integral(angle, scenario.timing.frame_rate_hz)], axis=2
-    )
+    integral = running_integral(angle, scenario.timing.frame_rate_hz)
+    return np.concatenate([lp * angle, li * integral], axis=2)
 
 
 def joint_balance(
@@ -160,23 +158,34 @@ def joint_balance(
     law: JointLaw,
     latencies: Array | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Torque balance of every joint (N, n, p + n) of poses (N, 6) and commands (N, n), and where it
-    slips (N, n).
+    """Return the torque balance of every joint, and where joints slip.
 
-    law: of the drives; latencies (N,): of the commands, s, None: that of the timing.
+    Parameters
+    ----------
+    measured, commands : ndarray, shapes (N, 6) and (N, n)
+        Poses and commands.
+    law : JointLaw
+        Law of the drives.
+    latencies : ndarray, shape (N,), optional
+        Latencies of the commands, s. The default is that of the timing.
 
-    Columns: the dynamic parameters, which give the joint's torque, then lp, li, ld and the starting
-    torques, which give the controller's with the opposite sign; N m or N per unit of each.
+    Returns
+    -------
+    columns : ndarray, shape (N, n, p + n)
+        Columns of the balance, N m or N per unit of each unknown. Those of the dynamic parameters
+        give the joint's torque. Those of lp, li, ld and of the starting torques come after them,
+        and give the controller's torque with the opposite sign.
+    slipping : ndarray of bool, shape (N, n)
+        Frames at which a joint slips.
     """
     rate_hz = scenario.timing.frame_rate_hz
     cutoff_hz = scenario.filter.cutoff_hz
     order = scenario.filter.order
     chart = robot.geometry.chart
     coordinates = filtered_derivatives(chart.coordinates(measured), rate_hz, cutoff_hz, order)
-    pose, pose_rate, acceleration = (
-        chart.pose(coordinates[0]),
-        *(chart.lifted(rows) for rows in coordinates[1:]),
-    )
+    pose = chart.pose(coordinates[0])
+    pose_rate = chart.lifted(coordinates[1])
+    acceleration = chart.lifted(coordinates[2])
     twist = robot.twist(pose, pose_rate)
     twist_dot = robot.twist_dot(pose, pose_rate, acceleration)
     regressor = chart.projected(robot.regressor(pose, twist, twist_dot))
@@ -194,19 +203,19 @@ def joint_balance(
     columns = np.concatenate([torque_map @ regressor, -by_gains, start], axis=2)
     slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
     edge = max(1, round(EDGE_FRACTION * count))
-    slipping[:edge] = slipping[count - edge :] = False
+    slipping[:edge] = False
+    slipping[count - edge :] = False
     return columns, slipping
 
 
 def effective_command(
     commands: Array, scenario: Scenario, latencies: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Filtered command as the joints feel it, its rate as the joint PID sees it, and its integral,
-    at the frames.
+    """Return the filtered command as the joints feel it, its rate, and its integral, at the frames.
 
-    A held command lags by half a frame, a ramped one by a whole frame; U_dot is the difference of
-    two commands, held. latencies (N,): of the commands, s, where they have not all that of the
-    timing.
+    The rate is that which the joint PID sees: the difference of two commands, held. A held command
+    lags by half a frame, a ramped one by a whole frame. latencies (N,): those of the commands, s,
+    if not all have that of the timing.
     """
     if latencies is not None:
         return _acted(commands, scenario, latencies)
@@ -217,6 +226,7 @@ def effective_command(
     smooth = zero_phase_filter(commands, rate_hz, filtering.cutoff_hz, filtering.order)
     times = np.arange(len(commands)) * period
     spline = make_interp_spline(times, smooth, k=5)
+    # mean lag of what acts, over the period that follows a command
     lag = timing.latency_s + (period if timing.hold == "linear" else period / 2)
     felt = spline(np.clip(times - lag, 0.0, None))
     rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
@@ -224,8 +234,11 @@ def effective_command(
 
 
 def _acted(commands: Array, scenario: Scenario, latencies: Array) -> tuple[Array, Array, Array]:
-    """`effective_command` of commands that each arrive after a latency of its own: filtered rates
-    of the integrals of what acts from one arrival to the next."""
+    """Return `effective_command` of commands that each arrive after a latency of its own.
+
+    What acts from one arrival to the next is integrated, and the filtered rates of the integrals
+    are returned.
+    """
     timing = scenario.timing
     filtering = scenario.filter
     rate_hz = timing.frame_rate_hz
@@ -237,9 +250,8 @@ def _acted(commands: Array, scenario: Scenario, latencies: Array) -> tuple[Array
 
     def felt(values: Array, ramped: float) -> Array:
         def since(which: NDArray[np.intp] | slice, duration: Array) -> Array:
-            """Integral of what acts since its arrival: under a ramp of one frame, of so much, it is
-            behind at first.
-            """
+            """Return the integral of what acts, over a duration since its arrival."""
+            # at first a ramp of one frame stays behind the command
             behind = np.minimum(duration, period)
             behind = behind - behind**2 / (2 * period)
             return (
@@ -258,18 +270,21 @@ def _acted(commands: Array, scenario: Scenario, latencies: Array) -> tuple[Array
 
 
 def low_pass(samples: Array, time_constant: float, rate_hz: float) -> Array:
-    """Samples (N, ...) through a filter of first order (s; 0: none), which knows the first of them
-    from before.
+    """Filter samples (N, ...) by a low-pass filter of first order, with its time constant in s.
+
+    A time constant of zero changes nothing. The filter has held the value of the first sample
+    before.
     """
     if not time_constant:
         return samples
+    # trapezoidal rule
     half = 0.5 / (rate_hz * time_constant)
     rest = samples[:1]
     return rest + lfilter([half, half], [1 + half, half - 1], samples - rest, axis=0)
 
 
 def running_integral(samples: Array, rate_hz: float) -> Array:
-    """Integral from the first frame to each of samples (N, ...), by a quintic spline."""
+    """Return the integral from the first frame to each of samples (N, ...), by a quintic spline."""
     spline = make_interp_spline(np.arange(len(samples)) / rate_hz, samples, k=5)
     integral = spline.antiderivative()
     return integral(np.arange(len(samples)) / rate_hz)
@@ -278,10 +293,9 @@ def running_integral(samples: Array, rate_hz: float) -> Array:
 def bounded_fit(
     matrix: Array, right: Array, guess: StartingGuess, anchor: ScaleAnchor, lower: Array
 ) -> Array:
-    """Unknowns (u,) >= lower of whitened equations (rows, u), beside the starting guess and the
-    anchor.
+    """Return the unknowns (u,) >= lower of whitened equations (rows, u), with guess and anchor.
 
-    The first p unknowns are the parameters; of those after them nothing is known beforehand.
+    The first p unknowns are the parameters. Of those after them nothing is known beforehand.
     """
     size = matrix.shape[1]
     known_size = len(guess.values)

@@ -1,21 +1,25 @@
-"""Inverse dynamics where the regression matrix has errors, too: instrumental variables and total
-least squares.
+"""Inverse dynamics where the regression matrix has errors, too.
 
-Instrumental variables Z are the same matrix built from a simulated run of the present model, which
-is free of the measurement's noise and correlated with the true motion: Z^T (W x - tau) = 0 is not
-biased where least squares is (Janot, Vandanjon, Gautier, "A generic instrumental variable approach
-for industrial robot identification", IEEE TCST 22(1), 2014). The model closes its own loop: logged
-commands would carry the sensor's noise into the instruments.
+The two methods are instrumental variables and total least squares.
 
-Plain total least squares takes the errors of all columns as alike and independent; here they come
+Instrumental variables Z are the same matrix built from a simulated run of the present model. It is
+free of the measurement's noise and correlated with the true motion. The solution of Z^T (W x - tau)
+= 0 is therefore not biased where least squares is (Janot, Vandanjon, Gautier, "A generic
+instrumental variable approach for industrial robot identification", IEEE TCST 22(1), 2014). The
+model closes its own loop, since logged commands would carry the sensor's noise into the
+instruments.
+
+Plain total least squares takes the errors of all columns as alike and independent. Here they come
 from the same poses through derivatives. So their second moments are drawn: the poses are disturbed
 by the sensor's noise, and the columns follow. Of all x~ = (x, -1) the estimate minimises |A x~|^2 /
-|E x~|^2, with A = (W | tau) and E the drawn errors of A: with A = Q R, the last right singular
-vector of E R^-1 turned round (generalised total least squares, Van Huffel and Vandewalle, "The
-total least squares problem", SIAM 1991, chapter 10). Directions that the motion does not show
-better than the starting guess are left there first (truncation), for the noise would otherwise rule
-them. All this removes the bias, not the spread: where the errors are large the normal matrix less
-theirs is nearly singular, and the deviations say so.
+|E x~|^2, with A = (W | tau) and E the drawn errors of A. With A = Q R, it is R^-1 times the first
+right singular vector of E R^-1 (generalised total least squares, Van Huffel and Vandewalle, "The
+total least squares problem", SIAM 1991, chapter 10).
+
+Directions that the motion does not show better than the starting guess are first left there
+(truncation), since the noise would otherwise rule them. All this removes the bias, but not the
+spread. Where the errors are large, the normal matrix less that of the errors is nearly singular,
+and the standard deviations say so.
 """
 
 import time
@@ -43,17 +47,17 @@ from identify.estimators.least_squares import (
 from identify.random_streams import DISTURBED_COPIES, mixed_generator
 
 MAX_ITERATIONS = 10
+"""Largest number of simulated runs."""
 
 SETTLED = 0.05
-"""The iteration ends when no parameter moves by more than this share of its standard deviation."""
+"""Share of its standard deviation below which every parameter must move at the end."""
 
 
 @estimator("torque, IV", uses="poses, torque")
 def instrumental_variables(evidence: Evidence) -> Estimate:
-    """Instruments from the simulated run of the present estimate, starting at weighted least
-    squares.
+    """Estimate with instruments from simulated runs, starting at weighted least squares.
 
-    Raises EstimationError where the model of an estimate does not run.
+    Each run is that of the present estimate. Raises EstimationError if its model does not run.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)
@@ -78,16 +82,16 @@ def instrumental_variables(evidence: Evidence) -> Estimate:
 def iv_fit(
     equations: TorqueEquations, instruments: Array, noise: Array, guess: StartingGuess
 ) -> tuple[Array, Array]:
-    """Unknowns (u,) with Z^T (W x - tau) = 0 in whitened rows, beside the starting guess, and their
-    covariance.
+    """Solve Z^T (W x - tau) = 0 in whitened rows, beside the starting guess.
 
-    instruments: Z (2 n, u); noise (2 n,): standard deviations of the rows, N m or N.
+    instruments: Z (2 n, u). noise (2 n,): standard deviations of the rows, N m or N. Returns the
+    unknowns x (u,) and their covariance (u, u).
     """
     values, std = prior_of(guess)
     rows = equations.whitened(noise)
     z = instruments / noise[:, None]
     prior = np.eye(len(std))
-    # In units of the starting guess's deviations, so that the prior is the identity.
+    # in units of the starting guess's standard deviations the prior is the identity
     normal = (z.T @ rows.matrix) * np.outer(std, std) + prior
     moment = std * (z.T @ (rows.right - rows.matrix @ values))
     inverse = np.linalg.inv(normal)
@@ -98,7 +102,7 @@ def iv_fit(
 
 
 def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters: Array) -> Array:
-    """Regression matrix (2 n, u) of the model's own closed loop, at the rows of the equations."""
+    """Return the regression matrix (2 n, u) of the model's own loop, at the equations' rows."""
     try:
         simulated = evidence.run.simulate(parameters)
     except DynamicsError as error:
@@ -112,22 +116,23 @@ def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters
 
 
 DRAWS = 4
-"""Disturbed copies of a record: each has thousands of rows to average the errors over."""
+"""Number of disturbed copies of a record. Each has thousands of rows to average the errors over."""
 
 SHOWN = 3.0
-"""A direction counts as shown by the motion when it is known this many times better than before."""
+"""Factor by which the motion must show a direction better than it was known before."""
 
 NOT_GENERIC = 1e-12
-"""Part of the right side in the singular vector, relative to its largest entry, below which there
-is no solution.
+"""Smallest part of the right side in the singular vector with which there is a solution.
+
+It is relative to the largest entry of the vector.
 """
 
 
 @estimator("torque, total LS", uses="poses, torque")
 def total_least_squares(evidence: Evidence) -> Estimate:
-    """Total least squares with drawn errors of the columns.
+    """Estimate by total least squares with drawn errors of the columns.
 
-    Raises EstimationError where a solution is not generic: the torque column has no part in it.
+    Raises EstimationError if the solution is not generic: the torque column has no part in it.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)
@@ -141,10 +146,9 @@ def total_least_squares(evidence: Evidence) -> Estimate:
     deviations = std.copy()
     dynamic = guess.layout.dynamic
     count = len(guess.values)
-    for block, columns in (
-        (slice(0, half), dynamic),
-        (slice(half, None), slice(dynamic.stop, len(std))),
-    ):
+    # the rows of the dynamics and those of the controller have no unknown in common
+    blocks = ((slice(0, half), dynamic), (slice(half, None), slice(dynamic.stop, len(std))))
+    for block, columns in blocks:
         matrix = rows.matrix[block, columns]
         right = rows.right[block]
         solution, covariance = _fit_block(matrix, right, errors[:, block], columns, values, std)
@@ -156,12 +160,26 @@ def total_least_squares(evidence: Evidence) -> Estimate:
 
 
 def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Array]:
-    """x (p,) of matrix (n, p) x = right (n,) by generalised total least squares in the directions
-    shown, and its covariance (p, p) to first order.
+    """Solve matrix x = right by generalised total least squares in the directions shown.
 
-    Rows have the standard deviation 1, and nothing beyond 0 with deviation 1 is known of x
-    beforehand. errors (draws, n, p + 1): drawn errors of (matrix | right). Raises EstimationError
-    where the right side has no part in the smallest singular vector.
+    Parameters
+    ----------
+    matrix : ndarray, shape (n, p)
+        Matrix, whose rows have the standard deviation 1.
+    right : ndarray, shape (n,)
+        Right side. Beforehand x is known to be 0 with standard deviation 1.
+    errors : ndarray, shape (draws, n, p + 1)
+        Drawn errors of (matrix | right).
+
+    Returns
+    -------
+    tuple of ndarray, shapes (p,) and (p, p)
+        Solution x, and its covariance to first order.
+
+    Raises
+    ------
+    EstimationError
+        The right side has no part in the singular vector.
     """
     size = matrix.shape[1]
     _, singular, directions = np.linalg.svd(matrix, full_matrices=False)
@@ -175,13 +193,13 @@ def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Ar
     vector = np.linalg.solve(triangle, vectors[0])
     if abs(vector[-1]) < NOT_GENERIC * np.abs(vector).max():
         raise EstimationError(
-            f"total least squares is not generic: the right side has a part of {vector[-1]:.1e} "
-            "in a solution of size "
-            f"{np.abs(vector).max():.1e}"
+            f"total least squares is not generic: the right side has a part of {vector[-1]:.1e} in "
+            f"a solution of size {np.abs(vector).max():.1e}"
         )
     solution = -shown.T @ (vector[:-1] / vector[-1])
     normal = joined[:, :-1].T @ joined[:, :-1]
     inverse = np.linalg.inv(normal - drawn[:, :-1].T @ drawn[:, :-1] / largest[0] ** 2)
+    # along directions that are left out, the variance of one remains
     covariance = shown.T @ (inverse @ normal @ inverse) @ shown + np.eye(size) - shown.T @ shown
     return np.asarray(solution, dtype=float), np.asarray(covariance, dtype=float)
 
@@ -189,7 +207,7 @@ def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Ar
 def _fit_block(
     matrix: Array, right: Array, errors: Array, columns: slice, values: Array, std: Array
 ) -> tuple[Array, Array]:
-    """Fit of one block of unknowns, counted from the starting guess in its standard deviations."""
+    """Fit one block of unknowns, counted from the starting guess in its standard deviations."""
     block = errors[..., [*range(len(std))[columns], -1]]
     block[..., -1] -= block[..., :-1] @ values[columns]
     scale = std[columns]
@@ -199,8 +217,9 @@ def _fit_block(
 
 
 def _drawn_errors(evidence: Evidence, equations: TorqueEquations, noise: Array) -> Array:
-    """Errors (draws, 2 n, u + 1) of the whitened columns and right side, from drawn noise of poses
-    and torques.
+    """Draw errors (draws, 2 n, u + 1) of the whitened columns and right side.
+
+    They follow from drawn noise of poses and torques.
     """
     rng = mixed_generator(DISTURBED_COPIES)
     run = evidence.run

@@ -1,7 +1,7 @@
-"""What an estimator is: what it is given, what it gives back, and all of them by name.
+"""Interface of an estimator: what it is given, what it gives back, and finding all of them by name.
 
-An estimator is a function (evidence) -> Estimate, named in `identify.plugins` or given as
-``module:function``; the decorator `estimator` says in words what it is.
+An estimator is a function (evidence) -> Estimate, named in `identify.own_parts` or given as
+``module:function``. The decorator `estimator` says in words what it is.
 """
 
 import functools
@@ -17,14 +17,16 @@ from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
-from identify.plugins import ESTIMATORS, Telling, check_choice, chosen, is_own
+from identify.own_parts import ESTIMATORS, Telling, check_choice, chosen, is_own
 from identify.scenario import Scenario
 
 
 @dataclass(frozen=True)
 class JointChannels:
-    """Channels of n joints: torque (N, n) in N m or N, mean over a frame, and encoder angle (N, n)
-    in rad or m.
+    """Measured channels of n joints.
+
+    torque (N, n): means over a frame, N m or N, with standard deviation torque_std. angle (N, n):
+    those of the encoders, rad or m.
     """
 
     torque: Array
@@ -34,9 +36,12 @@ class JointChannels:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that an estimator may use: the record as an output-error problem, with starting guess and
-    scale anchor; channels of the joints where there are any; gains of the joint PID (lp, li, ld)
-    where they are known."""
+    """All that an estimator may use.
+
+    problem: the record as an output-error problem, with starting guess and scale anchor. channels:
+    those of the joints, if there are any. known_gains (3,): lp, li and ld of the joint PID, if
+    known.
+    """
 
     problem: OutputErrorProblem
     scenario: Scenario
@@ -45,11 +50,11 @@ class Evidence:
 
     @property
     def run(self) -> LoopModel:
-        """The record. The estimators of this package that use the joints take one only."""
+        """First record. The estimators of this package that use the joints take one record only."""
         return self.problem.runs[0]
 
     def joint_channels(self) -> JointChannels:
-        """The channels. Raises EstimationError where the record has none."""
+        """Return the joint channels. Raises EstimationError if the record has none."""
         if self.channels is None:
             raise EstimationError(
                 "the record has no joint channels: this estimator needs a measured torque"
@@ -59,9 +64,12 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters (p,) with standard deviations (p,) (None: the method states none), seconds without
-    those of the standard deviations, iterations (searches: steps; linear fits: solutions),
-    evaluations: simulated runs of the model, those with sensitivities counted once."""
+    """Parameters (p,) that an estimator found, with their standard deviations if it states any.
+
+    seconds: time without that of the standard deviations. iterations: steps of a search, or
+    solutions of a linear fit. evaluations: simulated runs of the model, of which one with
+    sensitivities counts once.
+    """
 
     parameters: Array
     std: Array | None
@@ -73,8 +81,9 @@ class Estimate:
 
 @dataclass(eq=False)
 class Estimator:
-    """An estimator: what it is in words, what it uses beside the commands, and the function, as
-    which it is called.
+    """Function that estimates, with a description: its title, and what it uses beside the commands.
+
+    It is called as the function is.
     """
 
     title: str
@@ -85,38 +94,39 @@ class Estimator:
         functools.update_wrapper(self, self.estimate)
 
     def __call__(self, evidence: Evidence) -> Estimate:
-        """The function's estimate. Raises EstimationError, or dynamics.DynamicsError, where there
-        is none.
+        """Return the function's estimate.
+
+        Raises EstimationError or dynamics.DynamicsError if there is none.
         """
         return self.estimate(evidence)
 
 
 def estimator(title: str, uses: str) -> Callable[[Callable[[Evidence], Estimate]], Estimator]:
-    """Decorator that makes an estimator of a function."""
+    """Return a decorator that makes an estimator of a function."""
     return functools.partial(Estimator, title, uses)
 
 
 def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
-    """The built-in estimators of these names, or all, in the order of their table; then those of a
-    user's own.
+    """Return the built-in estimators of these names, or all, and then those of a user's own.
 
-    Raises ScenarioError for one that does not exist, with the valid names, or cannot be imported.
+    Built-in ones are in the order of their table. Raises ScenarioError, with the valid names, for
+    one that does not exist or cannot be imported.
     """
     for name in names or ():
         check_choice(name, "estimator", ESTIMATORS)
-    wanted = [name for name in ESTIMATORS if not names or name in names] + [
-        name for name in names or () if is_own(name)
-    ]
-    return {name: _found(name) for name in wanted}
+    built_in = [name for name in ESTIMATORS if not names or name in names]
+    own = [name for name in names or () if is_own(name)]
+    return {name: _found(name) for name in built_in + own}
 
 
 def _found(name: str) -> Estimator:
     found = chosen(name, "estimator", ESTIMATORS)
+    # a built-in one fails as it should by itself
     return found if isinstance(found, Estimator) and not is_own(name) else _own(name, found)
 
 
 def _own(name: str, function: Callable[..., Any]) -> Estimator:
-    """Estimator of a user's own, of which all that goes wrong is an EstimationError in a line."""
+    """Return a user's own estimator, whose failures are all an EstimationError in a line."""
     known = (EstimationError, DynamicsError)
     told = Telling(f"estimator {name!r}", function, EstimationError, known, _check_estimate)
     title = getattr(function, "title", name)
@@ -124,7 +134,7 @@ def _own(name: str, function: Callable[..., Any]) -> Estimator:
 
 
 def _check_estimate(part: str, found: object, evidence: Evidence) -> None:
-    """Raise EstimationError unless an estimator of a user's own has returned what it should."""
+    """Raise EstimationError unless a user's own estimator has returned what it should."""
     if not isinstance(found, Estimate):
         raise EstimationError(f"{part} must return an Estimate, returned {type(found).__name__}")
     shape = np.shape(evidence.problem.guess.values)
@@ -137,27 +147,23 @@ def _check_estimate(part: str, found: object, evidence: Evidence) -> None:
 
 
 TORQUE_NOISE = ("torque_noise_N_m", "force_noise_N")
-"""Attribute of joint channels with the standard deviation of a measured torque, or of a force."""
+"""Attributes of joint channels with the standard deviation of a measured torque or force."""
 
 
 def joint_channels(channels: xr.Dataset, record: xr.Dataset) -> JointChannels:
-    """Channels of a dataset that belongs to the record.
+    """Return the channels of a dataset that belongs to the record.
 
-    Raises RecordError where the two were not recorded at the same instants.
+    Raises RecordError if the two were not recorded at the same instants.
     """
     ours = record["time"].values
     theirs = channels["time"].values
     if len(ours) != len(theirs) or np.abs(ours - theirs).max() > 1e-9:
         raise RecordError(
             f"the joint channels have {len(theirs)} frames up to t = {theirs[-1]:.3f} s, the "
-            f"record {len(ours)} up to "
-            f"{ours[-1]:.3f} s: they are of another run"
+            f"record {len(ours)} up to {ours[-1]:.3f} s: they are of another run"
         )
     torque, angle = (
         np.asarray(channels[name].values, dtype=float) for name in ("joint_torque", "joint_angle")
     )
-    return JointChannels(
-        torque,
-        angle,
-        next(float(channels.attrs[name]) for name in TORQUE_NOISE if name in channels.attrs),
-    )
+    noise = next(float(channels.attrs[name]) for name in TORQUE_NOISE if name in channels.attrs)
+    return JointChannels(torque, angle, noise)

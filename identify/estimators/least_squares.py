@@ -1,5 +1,4 @@
-"""Inverse dynamics by least squares: measured torque, ordinary and weighted; or joint coordinates
-from encoders.
+"""Inverse dynamics by least squares, from measured torques and either poses or encoders.
 
 With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 25; eq. 31)
 
@@ -7,12 +6,12 @@ With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 2
     lp (U - theta)_j + li integral(U - theta)_j + ld (U_dot - theta_dot)_j + z_j = tau_j
 
 Both stand in one system with the unknowns Xi, lp, li, ld and the starting torques z (n,). The
-measured torque gives the scale: no anchor is needed. What the motion does not show is left to the
-starting guess with its deviations.
+measured torque gives the scale, so that no anchor is needed. What the motion does not show is left
+to the starting guess with its standard deviations.
 
-Noise in the poses gets into the regression matrix through both derivatives, which draws the
-estimates towards zero: no number of samples removes that bias. Weights, from what each joint leaves
-unexplained: Gautier, "Dynamic identification of robots with power model", ICRA 1997.
+Noise in the poses gets into the regression matrix through both derivatives, and draws the estimates
+towards zero. No number of samples removes that bias. The weights of the rows follow from what each
+joint leaves unexplained (Gautier, "Dynamic identification of robots with power model", ICRA 1997).
 """
 
 import time
@@ -35,23 +34,36 @@ from identify.model.loop_model import LoopModel
 from identify.scenario import Scenario
 
 FREE_TORQUE = {False: 1e3, True: 1e6}
-"""Standard deviation of a starting torque [N m], or of a force [N] of prismatic joints, before the
-experiment: nothing is known of it."""
+"""Standard deviation of a starting torque, N m, or of a force of prismatic joints (True), N.
+
+It is so large that before the experiment nothing is known of it.
+"""
 
 
 @dataclass(frozen=True)
 class TorqueEquations:
-    """matrix (2 n, u) times the u unknowns = right (2 n,), N m or N: n rows of the dynamics, then
-    the same of the controller.
+    """Linear equations matrix @ unknowns = right, in N m or N.
 
-    layout: of the parameters, the first unknowns; after them come the starting torques of the
-    joints. kind (2 n,): number of the joint for its dynamics, and that after all joints for its
-    controller; correlation: samples to one independent sample, because a low-pass filter of cutoff
-    f leaves 2 f independent ones a second; slipping (N, joints): which rows stand here.
+    The first n rows are those of the dynamics, and the others those of the controller.
+
+    Attributes
+    ----------
+    layout : ParameterLayout
+        Layout of the parameters, which are the first of the u unknowns. The starting torques of the
+        joints come after them.
+    matrix, right : ndarray, shapes (2 n, u) and (2 n,)
+        Coefficients and right side.
+    kind : ndarray of int, shape (2 n,)
+        Number of the joint in rows of its dynamics. In rows of its controller the number of joints
+        is added.
+    correlation : float
+        Number of samples for each independent one. A low-pass filter of cutoff f leaves 2 f
+        of these a second.
+    slipping : ndarray of bool, shape (N, joints)
+        Frames and joints that the rows are of.
     """
 
     layout: ParameterLayout
-
     matrix: Array
     right: Array
     kind: NDArray[np.intp]
@@ -59,11 +71,11 @@ class TorqueEquations:
     slipping: NDArray[np.bool_]
 
     def residual(self, unknowns: Array) -> Array:
-        """Torques (2 n,) that the equations leave unexplained."""
+        """Return the torques (2 n,) that the equations leave unexplained."""
         return np.asarray(self.matrix @ unknowns - self.right, dtype=float)
 
     def whitened(self, noise: Array) -> "TorqueEquations":
-        """Rows divided by their standard deviations (2 n,)."""
+        """Return the equations with rows divided by their standard deviations (2 n,)."""
         return replace(self, matrix=self.matrix / noise[:, None], right=self.right / noise)
 
 
@@ -74,8 +86,11 @@ def torque_equations(
     scenario: Scenario,
     slipping: NDArray[np.bool_] | None = None,
 ) -> TorqueEquations:
-    """Equations of poses (N, 6) and torques (N, n) of a run with its logged commands; those of the
-    joints that slip, or of the ones given (N, n)."""
+    """Return the equations of poses (N, 6) and torques (N, n) of a run with its logged commands.
+
+    The torques are in N m or N. slipping (N, n): frames and joints of the rows. The default is
+    those at which a joint slips.
+    """
     timing = scenario.timing
     filtering = scenario.filter
     layout = run.robot.layout
@@ -84,28 +99,28 @@ def torque_equations(
     balance, found = joint_balance(run.robot, poses, run.logged, scenario, law, run.latencies)
     rows = found if slipping is None else slipping
     columns = balance[rows]
-    smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)[
-        rows
-    ]
+    smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)
+    felt = smooth[rows]
     dynamic = layout.dynamic
     others = slice(layout.dynamic.stop, None)
     matrix = np.zeros((2 * len(columns), columns.shape[1]))
     matrix[: len(columns), dynamic] = columns[:, dynamic]
     matrix[len(columns) :, others] = -columns[:, others]
     joint = np.nonzero(rows)[1]
-    right = np.concatenate([smooth - columns[:, dynamic] @ run.payload[dynamic], smooth])
+    # the torque of a known payload stands on the right side
+    right = np.concatenate([felt - columns[:, dynamic] @ run.payload[dynamic], felt])
     correlation = max(1.0, timing.frame_rate_hz / (2 * filtering.cutoff_hz))
     kind = np.concatenate([joint, joint + layout.joints])
     return TorqueEquations(layout, matrix, right, kind, correlation, rows)
 
 
 def lower_bounds(layout: ParameterLayout) -> Array:
-    """Bounds (u,): parameters and gains are not negative, starting torques are free."""
+    """Return lower bounds (u,): zero for parameters and gains, none for starting torques."""
     return np.concatenate([np.zeros(len(layout.names)), np.full(layout.joints, -np.inf)])
 
 
 def prior_of(guess: StartingGuess) -> tuple[Array, Array]:
-    """Values (u,) and standard deviations (u,) of the unknowns before the experiment."""
+    """Return values (u,) and standard deviations (u,) of the unknowns before the experiment."""
     joints = guess.layout.joints
     free = FREE_TORQUE[guess.layout.prismatic]
     return np.append(guess.values, np.zeros(joints)), np.append(guess.std, np.full(joints, free))
@@ -114,12 +129,14 @@ def prior_of(guess: StartingGuess) -> tuple[Array, Array]:
 def nearest_admissible(
     layout: ParameterLayout, unknowns: Array, information: Array, scale: Array
 ) -> Array:
-    """Unknowns (u,) within their bounds that are nearest in the metric of the information matrix
-    (u, u).
+    """Return the unknowns (u,) within their bounds that are nearest to given ones.
+
+    The metric is that of the information matrix (u, u). scale (u,): sizes of the unknowns.
     """
     lower = lower_bounds(layout)
     if (unknowns >= lower).all():
         return unknowns
+    # least squares with |factor x|^2 as the metric
     factor = np.linalg.cholesky(information * np.outer(scale, scale)).T
     solved = lsq_linear(
         factor, factor @ (unknowns / scale), bounds=(lower / scale, np.inf), method="bvls"
@@ -128,29 +145,29 @@ def nearest_admissible(
 
 
 SMALLEST_NOISE_N_M = 1e-9
+"""Least standard deviation of a row, by which residuals of zero can be divided."""
 
 
 @estimator("torque, LS", uses="poses, torque")
 def least_squares(evidence: Evidence) -> Estimate:
-    """Ordinary least squares: all joints count alike."""
+    """Estimate by ordinary least squares, in which all joints count alike."""
     return _solved(evidence, time.perf_counter(), weighted=False)
 
 
 @estimator("torque, weighted LS", uses="poses, torque")
 def weighted_least_squares(evidence: Evidence) -> Estimate:
-    """Least squares weighted by the residual of each joint."""
+    """Estimate by least squares weighted by the residual of each joint."""
     return _solved(evidence, time.perf_counter(), weighted=True)
 
 
 @estimator("encoders, weighted LS", uses="encoders, torque")
 def encoder_route(evidence: Evidence) -> Estimate:
-    """Weighted least squares on the poses that the encoders give, by forward kinematics: the
-    conventional route.
+    """Estimate by weighted least squares on poses from encoders and forward kinematics.
 
-    Forward kinematics of a parallel robot has no closed form: Newton's method solves all instants
-    at once, each from the desired pose there, which the robot is never far from. Knows nothing of
-    the camera. The note says what it took. Raises EstimationError where the angles belong to no
-    pose near the desired one.
+    This is the conventional route, which knows nothing of the camera. Forward kinematics of a
+    parallel robot has no closed form. Newton's method solves all instants at once, each from the
+    desired pose there, which the robot is never far from. The note says how long that took. Raises
+    EstimationError if the angles belong to no pose near the desired one.
     """
     began = time.perf_counter()
     run = evidence.run
@@ -165,8 +182,9 @@ def encoder_route(evidence: Evidence) -> Estimate:
 def _solved(
     evidence: Evidence, began: float, weighted: bool, poses: Array | None = None
 ) -> Estimate:
-    """The estimate of a fit that began at `began` (`time.perf_counter`), from the measured poses or
-    others (N, 6).
+    """Return the estimate of a fit to the measured poses, or to others (N, 6).
+
+    began: time, from `time.perf_counter`, at which the estimation began.
     """
     equations = measured_equations(evidence, poses)
     guess = evidence.problem.guess
@@ -180,26 +198,26 @@ def _solved(
 
 
 def measured_equations(evidence: Evidence, poses: Array | None = None) -> TorqueEquations:
-    """Equations of the measured torque and poses, or of other poses (N, 6).
+    """Return the equations of the measured torque and poses, or of other poses (N, 6).
 
-    Raises EstimationError where the record has no torque.
+    Raises EstimationError if the record has no torque.
     """
     run = evidence.run
     torque = evidence.joint_channels().torque
-    return torque_equations(
-        run, run.without_gaps() if poses is None else poses, torque, evidence.scenario
-    )
+    moved = run.without_gaps() if poses is None else poses
+    return torque_equations(run, moved, torque, evidence.scenario)
 
 
 def fit_equations(
     equations: TorqueEquations, guess: StartingGuess, weighted: bool
 ) -> tuple[Array, Array]:
-    """Unknowns (u,) of the equations, and the standard deviation (2 n,) of the rows, N m or N.
+    """Return the unknowns (u,) of the equations, and the standard deviations (2 n,) of the rows.
 
-    The deviations come from the residuals, of a joint or of all, and count the filter's
-    correlation.
+    The standard deviations, N m or N, come from the residuals of each joint, if weighted, or else
+    of all joints. They account for the correlation by the filter.
     """
     groups = equations.kind if weighted else equations.kind // equations.layout.joints
+    # N m or N: a first value, which weighs the starting guess only
     noise = np.full(len(equations.right), 0.1)
     for _ in range(REWEIGHTINGS):
         rows = equations.whitened(noise)
@@ -211,8 +229,9 @@ def fit_equations(
 
 
 def row_noise(equations: TorqueEquations, unknowns: Array, groups: NDArray[np.intp]) -> Array:
-    """Standard deviation (2 n,) of each row: the RMS residual of its group, as if all samples were
-    independent.
+    """Return standard deviations (2 n,) with which rows may be taken as independent.
+
+    They are the RMS residual of each row's group, times the root of the samples' correlation.
     """
     squares = equations.residual(unknowns) ** 2
     rms = np.sqrt(np.bincount(groups, squares) / np.maximum(np.bincount(groups), 1))
@@ -220,13 +239,11 @@ def row_noise(equations: TorqueEquations, unknowns: Array, groups: NDArray[np.in
 
 
 def information(rows: TorqueEquations, guess: StartingGuess) -> Array:
-    """Information (u, u) of whitened rows and the starting guess."""
+    """Return the information (u, u) of whitened rows and the starting guess."""
     _, std = prior_of(guess)
     return np.asarray(rows.matrix.T @ rows.matrix + np.diag(1 / std**2), dtype=float)
 
 
 def standard_deviations(covariance: Array, count: int) -> Array:
-    """Standard deviations (p,) of the first `count` unknowns, the parameters, from a covariance (u,
-    u) of all.
-    """
+    """Return the standard deviations (p,) of the first `count` unknowns of a covariance (u, u)."""
     return np.asarray(np.sqrt(np.diag(covariance))[:count], dtype=float)

@@ -1,6 +1,4 @@
-"""The methods of excitation side by side: same criterion, same seed, same random candidates; with a
-figure.
-"""
+"""Comparison of the excitation methods with the same criterion, seed and random candidates."""
 
 import time
 from dataclasses import dataclass
@@ -24,15 +22,34 @@ from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
 COMPARISON_REFINEMENT = 10
-"""How much finer the margins are reported than constraints are seen by a search."""
+"""Factor by which margins are sampled more finely than constraints during a search."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What one method found: trajectory, value of the criterion that it maximised, the index of eq.
-    39, D of the simulated loop (None where it is unstable at the starting guess), seconds of the
-    search, counts of the criterion and of its gradient, iterations, why it stopped, and where it
-    comes nearest to each limit."""
+    """Result of one method.
+
+    Attributes
+    ----------
+    method : str
+        Name of the method.
+    trajectory : FourierTrajectory
+        Trajectory that was found.
+    value : float
+        Value of the criterion that the method maximised.
+    observability : float
+        Observability index (eq. 39).
+    information : float or None
+        D of the simulated loop; None if the loop is unstable at the starting guess.
+    seconds : float
+        Duration of the search.
+    evaluations, gradients, iterations : int
+        Evaluations of the criterion and of its gradient, and iterations.
+    reason : str
+        Reason why the search stopped.
+    worst : tuple of Worst
+        Instants at which the trajectory comes nearest to each limit.
+    """
 
     method: str
     trajectory: FourierTrajectory
@@ -49,9 +66,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The entries of all methods; the seconds that making candidates and functions took once for
-    all of them.
-    """
+    """Entries of all methods, with the time [s] to make the candidates and functions they share."""
 
     criterion: str
     seed: int
@@ -61,9 +76,14 @@ class Comparison:
 
 
 def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progress) -> Comparison:
-    """Search with every method. Raises what `design_trajectories` raises."""
+    """Search with every method.
+
+    Raises the errors of `design_trajectories`.
+    """
     settings = scenario.excitation
+    # The evolutionary method needs a population.
     count = max(settings.candidates, FEWEST_MEMBERS)
+    # Compiled first, so that no method's time contains it.
     with progress.stage("compile the robot", 1) as advance:
         prepare(robot)
         advance()
@@ -92,20 +112,18 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
             information = float(np.exp(log_information(robot, scenario, known, trajectory)))
         except TrajectoryError:
             information = None
-        value = float(np.exp(found.log_value))
-        observability = observability_index(index, found.z)
-        counts = found.evaluations, found.gradients, found.iterations
-        worst = tuple(problem.constraints.worst(trajectory, times))
         entry = Entry(
-            method,
-            trajectory,
-            value,
-            observability,
-            information,
-            seconds,
-            *counts,
-            found.reason,
-            worst,
+            method=method,
+            trajectory=trajectory,
+            value=float(np.exp(found.log_value)),
+            observability=observability_index(index, found.z),
+            information=information,
+            seconds=seconds,
+            evaluations=found.evaluations,
+            gradients=found.gradients,
+            iterations=found.iterations,
+            reason=found.reason,
+            worst=tuple(problem.constraints.worst(trajectory, times)),
         )
         entries.append(entry)
     return Comparison(settings.criterion, seed, count, prepared, tuple(entries))
@@ -116,7 +134,7 @@ POINTS = 1000
 
 
 def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) -> Figure:
-    """One column a method: position, orientation and joints over one period, limits dashed."""
+    """Draw position, orientation and joints over one period, one column a method, limits dashed."""
     settings = scenario.excitation
     figure = Figure(figsize=(5 * len(comparison.entries), 9), layout="constrained")
     panels = figure.subplots(3, len(comparison.entries), sharex=True, sharey="row", squeeze=False)

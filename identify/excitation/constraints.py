@@ -1,19 +1,18 @@
-"""What an exciting trajectory has to keep, as CasADi expressions of pose and pose rate.
+"""Constraints on an exciting trajectory, as CasADi expressions of pose and pose rate.
 
-Every constraint is written as the share of its limit that is used; the trajectory is admissible
-while all shares are within -1 and +1:
+Every constraint is written as the share of its limit that is used. A trajectory is admissible if
+all shares lie between -1 and 1.
 
-    box           distance from home over the amplitude that the scenario allows, a coordinate
-    travel        joint coordinate over the travel limit less the margin, a leg
-    velocity      joint velocity over the largest allowed, a leg
-    leverage      least leverage of J_a1 over the leverage, a leg (see `dynamics.workspace`)
-    conditioning  condition number of the scaled J_a2 over its limit, of the 2-norm as everywhere;
-                  expressions have that of a Schatten norm near it, which is smooth, never below,
-                  and at most 3 % above
-    visibility    angle to grazing and place in the image of four stickers a plane and both cameras;
-                  left out where the whole box is proved to be in sight
+    box           distance from home over the amplitude that the scenario allows, by coordinate
+    travel        joint coordinate over the travel limit less the margin, by leg
+    velocity      joint velocity over the largest allowed, by leg
+    leverage      least leverage of J_a1 over the leverage, by leg (see `dynamics.workspace`)
+    conditioning  2-norm condition number of the scaled J_a2 over its limit. The expressions
+                  have that of a Schatten norm, which is smooth and 0 to 3 % above
+    visibility    angle to grazing, and place in the image, of four stickers a plane and both
+                  cameras; left out if the whole box is proved to be in sight
 
-The start at home and at rest holds by the form of the trajectory, the end because the run lasts
+The form of the trajectory makes it start at home and at rest. It ends there because the run lasts
 whole periods.
 """
 
@@ -39,8 +38,9 @@ from identify.scenario import Excitation, Scenario
 from identify.trajectory import FourierTrajectory, box_of
 
 STICKERS_A_PLANE = 4
-"""Stickers of each plane that both cameras must be able to look for at every pose; all where it has
-fewer.
+"""Number of stickers of each plane that both cameras can look for at every pose.
+
+A plane that has fewer needs all of them.
 """
 
 PLANES = "ABC"
@@ -49,10 +49,9 @@ CONDITIONING = "conditioning"
 
 
 def required_stickers(sight: SightLines, home: Array) -> list[int]:
-    """The stickers, STICKERS_A_PLANE a plane, that are to stay visible: those that face both
-    cameras best at home.
+    """Return the stickers of each plane that must stay visible: those that face both cameras best.
 
-    Raises TrajectoryError, naming the plane, where not so many can be looked for even at home.
+    Raises TrajectoryError, naming the plane, if too few can be looked for even at home.
     """
     uses = np.array(_functions(sight, range(len(sight.platform.sticker_ids)))(home)).reshape(
         -1, 2, 3
@@ -67,18 +66,18 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
         if len(able) < needed:
             raise TrajectoryError(
                 f"visibility: both cameras can look for {len(able)} stickers of plane {plane} at "
-                "the home pose, "
-                f"{needed} are needed"
+                f"the home pose, {needed} are needed"
             )
+        # A stable sort chooses the same of equally good stickers on every machine.
         chosen += able[np.argsort(worst[able], kind="stable")][:needed].tolist()
     return chosen
 
 
 def sight_uses(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
-    """Six rows a sticker, for each camera: share used of grazing incidence, and of the image across
-    and up.
+    """Return the shares of visibility that stickers use at a pose.
 
-    Beyond +-1 the camera cannot look for the sticker. Lens distortion is left out.
+    Each sticker has six rows, three for each camera: grazing incidence, and the image across and
+    up. Beyond +-1 the camera cannot look for the sticker. Lens distortion is left out.
     """
     platform = sight.platform
     rows = []
@@ -96,11 +95,10 @@ def sight_uses(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
 
 
 def within_sight(sight: SightLines, stickers: list[int], home: Array, box: Array) -> bool:
-    """Whether the stickers stay in sight wherever the platform goes within the box (6,) [m, rad]
-    about home.
+    """Tell whether the stickers stay in sight in a whole box (6,) [m, rad] about home.
 
-    By bounds on how far a sticker moves and turns, so that no pose has to be tried; False where
-    they do not tell.
+    The proof bounds how far a sticker moves and turns, so that no pose has to be tried. False means
+    that the bounds do not suffice.
     """
     turn = float(box[3:].sum())
     uses = np.array(_functions(sight, stickers)(home)).reshape(-1, 2, 3)
@@ -112,6 +110,7 @@ def within_sight(sight: SightLines, stickers: list[int], home: Array, box: Array
         sight.rig.cameras, sight.cameras_from_base, uses.swapaxes(0, 1), strict=True
     ):
         seen = apply(move, places)
+        # The sticker may come this near to the camera, where a shift moves its image most.
         nearest = seen[:, 2] - shifts
         if (nearest <= 0).any():
             return False
@@ -134,19 +133,22 @@ def _functions(sight: SightLines, stickers: range | list[int]) -> ca.Function:
 
 
 SQUARINGS = 6
-"""Of J^T J: the Schatten norm that stands for the 2-norm is that of p = 2^(SQUARINGS + 1)."""
+"""Number of squarings of J^T J. The Schatten norm near the 2-norm has p = 2^(SQUARINGS + 1)."""
 
 
 def condition_number(matrix: ca.SX) -> ca.SX:
-    """Condition number of a square matrix in a norm near the 2-norm: never below that one, and for
-    six rows at most 3 % above."""
+    """Return the condition number of a square matrix in a norm near the 2-norm.
+
+    It is never below that of the 2-norm, and for six rows at most 3 % above it.
+    """
     inverse = ca.solve(matrix, ca.SX.eye(matrix.rows()))
     return _schatten_norm(matrix) * _schatten_norm(inverse)
 
 
 def _schatten_norm(matrix: ca.SX) -> ca.SX:
-    """(sum of sigma^p)^(1/p) over the singular values; powers of a matrix whose trace is one cannot
-    overflow.
+    """Schatten norm (sum of sigma^p)^(1/p) over the singular values.
+
+    Every power is scaled to trace one, so it cannot overflow.
     """
     power = ca.densify(matrix.T @ matrix)
     logarithm = 0
@@ -160,9 +162,23 @@ def _schatten_norm(matrix: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class Limit:
-    """One constraint: name, share of it that is used, the limit itself in its unit and whom it
-    concerns (an entry a row each), and whether it bounds from below (a share is then limit /
-    value)."""
+    """One constraint.
+
+    Attributes
+    ----------
+    name : str
+        Name of the constraint.
+    share : casadi.SX
+        Shares of the limit that are used, one row an entry of ``limit``.
+    limit : tuple of float
+        Limits in their unit.
+    unit : str
+        Unit, with a space before it.
+    who : tuple of str
+        Legs, coordinates or stickers of the rows.
+    lower : bool
+        True for a lower bound. A share is then limit / value.
+    """
 
     name: str
     share: ca.SX
@@ -174,8 +190,10 @@ class Limit:
 
 @dataclass(frozen=True)
 class Worst:
-    """Where a trajectory comes nearest to a limit: value and limit in `unit`, share used, whom, and
-    time [s].
+    """Instant at which a trajectory comes nearest to a limit.
+
+    Value and limit are in ``unit``. ``share`` is the share of the limit that is used, ``who`` the
+    leg, coordinate or sticker, and ``time_s`` the time [s].
     """
 
     name: str
@@ -187,21 +205,21 @@ class Worst:
     time_s: float
 
     def excess(self) -> float:
-        """The share used, infinite where a leg is out of reach."""
+        """Return the share used, infinite if a leg is out of reach."""
         return np.inf if np.isnan(self.share) else self.share
 
     def __str__(self) -> str:
         who = f" of {self.who}" if self.who else ""
         return (
             f"{self.name}{who} is {self.value:.4g}{self.unit} at t = {self.time_s:.3f} s, limit "
-            f"{self.limit:.4g}" + (self.unit)
+            f"{self.limit:.4g}{self.unit}"
         )
 
 
 class MotionConstraints:
-    """The constraints of a scenario on the motion of a robot.
+    """Constraints of a scenario on the motion of a robot.
 
-    Raises TrajectoryError, with value, limit and leg, where not even the home pose keeps them, and
+    Raises TrajectoryError, with value, limit and leg, if even the home pose breaks them. Raises
     ScenarioError for settings of another kind of actuators.
     """
 
@@ -217,8 +235,7 @@ class MotionConstraints:
         if travel <= 0:
             raise TrajectoryError(
                 f"excitation.travel_margin_{unit} = {margin:g} {unit} leaves nothing of the "
-                "travel limit "
-                f"{robot.travel_limit:g} {unit} of {robot.name}"
+                f"travel limit {robot.travel_limit:g} {unit} of {robot.name}"
             )
         _check_home(robot, settings, margin)
         sight = sight or sight_lines(scenario.sensor, scenario.sensor_changes)
@@ -265,17 +282,19 @@ class MotionConstraints:
 
     @cached_property
     def shares(self) -> ca.Function:
-        """(pose, pose rate) (6,) -> shares used of all limits, in the order of `limits`."""
+        """Function (pose, pose rate) (6,) -> shares used of all limits, in their order."""
         return self.shares_of([limit.name for limit in self.limits])
 
     def shares_of(self, names: Collection[str]) -> ca.Function:
-        """As `shares`, of some limits only."""
+        """Return the function `shares` for some of the limits."""
         rows = ca.vertcat(*[limit.share for limit in self.limits if limit.name in names])
+        # The limits share most of the kinematics, which is then evaluated once.
         return ca.Function("shares", [self._pose, self._rate], ca.cse([rows]))
 
     def worst(self, trajectory: FourierTrajectory, times: Array) -> list[Worst]:
-        """Where a trajectory, sampled at `times` (N,) [s], comes nearest to each limit; share NaN:
-        out of reach.
+        """Return where a trajectory, sampled at `times` (N,) [s], comes nearest to each limit.
+
+        A share of NaN means out of reach.
         """
         poses = trajectory.pose(times)
         rates = trajectory.pose_rate(times)
@@ -286,8 +305,9 @@ class MotionConstraints:
         for limit in self.limits:
             block = np.abs(used[:, first : first + len(limit.who)])
             if limit.name == CONDITIONING:
+                # The exact 2-norm replaces the smooth norm that a search needs.
                 block = condition[:, None] / limit.limit[0]
-            # the first NaN counts as the largest
+            # argmax takes the first NaN for the largest: a pose out of reach is the worst.
             row, who = np.unravel_index(np.argmax(block), block.shape)
             share = float(block[row, who])
             bound = limit.limit[who]
@@ -302,10 +322,10 @@ class MotionConstraints:
     def check(
         self, trajectory: FourierTrajectory, times: Array, tolerance: float = 1e-9
     ) -> list[Worst]:
-        """`worst` of an admissible trajectory.
+        """Return `worst` of an admissible trajectory.
 
-        Raises TrajectoryError naming constraint, leg, value, limit and time of the one that is
-        broken most.
+        Raises TrajectoryError otherwise. It names constraint, leg, value, limit and time of the
+        worst violation.
         """
         found = self.worst(trajectory, times)
         broken = [w for w in found if not w.share <= 1 + tolerance]
@@ -317,7 +337,7 @@ class MotionConstraints:
 
 
 def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:
-    """Raise TrajectoryError where the home pose breaks a limit that the robot has."""
+    """Raise TrajectoryError if the home pose breaks a limit of the robot."""
     try:
         check_motion(robot, robot.home_pose, travel_margin=margin, **settings.singularity_limits)
     except DynamicsError as error:
@@ -325,16 +345,15 @@ def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:
 
 
 def check_periods(scenario: Scenario) -> None:
-    """Raise TrajectoryError where a run is no whole number of periods, so that it cannot end at
-    home and at rest.
+    """Raise TrajectoryError if a run is not a whole number of periods.
+
+    It could not end at home and at rest.
     """
     settings = scenario.excitation
     if not is_whole_periods(settings.duration_s, settings.fundamental_hz):
         periods = settings.duration_s * settings.fundamental_hz
         raise TrajectoryError(
             f"end at rest: excitation.duration_s = {settings.duration_s:g} s is {periods:.4g} "
-            "periods of "
-            f"excitation.fundamental_hz = {settings.fundamental_hz:g} Hz; excitation.method = "
-            f"{settings.method!r} "
-            "needs a whole number of periods, at least 1"
+            f"periods of excitation.fundamental_hz = {settings.fundamental_hz:g} Hz; "
+            f"excitation.method = {settings.method!r} needs a whole number of periods, at least 1"
         )

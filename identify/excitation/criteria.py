@@ -1,25 +1,26 @@
-"""Criteria of exciting trajectories: what one is, and the paper's, the observability index (eq.
-39).
+"""Criteria of exciting trajectories, and that of the paper, the observability index (eq. 39).
 
 A criterion is a function (robot, scenario, unknowns, typical) -> Criterion, named in
-`identify.plugins` or given as ``module:function``. `typical` is the z of a trajectory that excites
-everything, from which it may take its scale.
+`identify.own_parts` or given as ``module:function``. `typical` is the z of a trajectory that
+excites all parameters. A criterion may take its scale from it.
 
 The observability index is the geometric mean of the singular values of H over sqrt(m). Of the p
-columns of H only those of the base parameters are independent: H = H_1 C with H_1 the pivot columns
-and C the base combinations (rank, p), so the product of the singular values that are not zero is
-sqrt(det(H_1^T H_1) det(C C^T)), whichever pivots were chosen:
+columns of H only those of the base parameters are independent: H = H_1 C with the pivot columns H_1
+and the base combinations C (rank, p). The product of the nonzero singular values is therefore
+sqrt(det(H_1^T H_1) det(C C^T)), whichever pivots were chosen, and
 
     ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(m) / 2.
 
-The rank, the paper's zeta, is that of the robot and not of a trajectory, so that all trajectories
-are judged on the same subspace. H is not scaled by columns, as in the paper, and like there only
-the dynamic parameters count, not the gains of the joint controller.
+The rank (zeta in the paper) is that of the robot and not of a trajectory, so all trajectories are
+judged on the same subspace. As in the paper, the columns of H are not scaled, and only the dynamic
+parameters count, not the gains of the joint controller.
 
-H_1 is divided by the triangular factor R of one trajectory, which takes out the units of the
-parameters and keeps H_1^T H_1 well conditioned. Its inverse is rounded to what all processors agree
-on; the constant is that of the rounded one. One period is sampled where a run plays whole ones: the
-index does not depend on their number. Another run is sampled from its start to its end.
+H_1 is divided by the triangular factor R of one trajectory. This takes out the units of the
+parameters and keeps H_1^T H_1 well conditioned. The inverse of R is rounded to numbers on which all
+processors agree, and the constant belongs to the rounded inverse.
+
+A run of whole periods is sampled over one period, because the index does not depend on their
+number. Any other run is sampled from start to end.
 """
 
 from collections.abc import Callable
@@ -35,28 +36,36 @@ from identify.arrays import Array, agreed
 from identify.errors import ScenarioError, TrajectoryError
 from identify.estimation.base_parameters import structure
 from identify.excitation.motion import Unknowns, log_determinant, motion, played_times, regressor
-from identify.plugins import CRITERIA, Telling, chosen, is_own
+from identify.own_parts import CRITERIA, Telling, chosen, is_own
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
-SMOOTHING_RAD_S, SMOOTHING_M_S = 0.02, 0.002
-"""v_s in tanh(theta_dot / v_s) where derivatives are asked for: as much as a velocity changes
-between two samples.
+SMOOTHING_RAD_S = 0.02
+SMOOTHING_M_S = 0.002
+"""Velocity v_s in tanh(theta_dot / v_s), which replaces the sign where derivatives are needed.
+
+A velocity changes by about this much between two samples.
 """
 
 
 def smoothing_of(robot: Robot) -> float:
-    """v_s for a robot's actuators, rad/s or m/s."""
+    """Return v_s for a robot's actuators, rad/s or m/s."""
     return SMOOTHING_M_S if robot.layout.prismatic else SMOOTHING_RAD_S
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """What searches maximise: value, z -> its logarithm; smooth, as value, but with derivatives
-    everywhere.
+    """Objective of a search.
 
-    judge: what ranks the few trajectories that a gradient search ends in, where there is something
-    better than value; larger is better, and TrajectoryError where a trajectory cannot be judged.
+    Attributes
+    ----------
+    value : casadi.Function
+        Function z -> logarithm of the criterion.
+    smooth : casadi.Function
+        The same with derivatives everywhere.
+    judge : callable, optional
+        Better measure by which the few results of a gradient search are ranked; larger is better.
+        It raises TrajectoryError for a trajectory that cannot be judged.
     """
 
     value: ca.Function
@@ -65,8 +74,9 @@ class Criterion:
 
 
 def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
-    """The scenario's criterion. Raises ScenarioError, with the valid names, where there is none of
-    its name.
+    """Return the scenario's criterion.
+
+    Raises ScenarioError, with the valid names, if there is none of its name.
     """
     name = scenario.excitation.criterion
     make = chosen(name, "excitation.criterion", CRITERIA)
@@ -85,7 +95,7 @@ def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: 
 def _check_made(
     part: str, made: object, robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array
 ) -> None:
-    """Raise ScenarioError unless a criterion of a user's own is one of these unknowns."""
+    """Raise ScenarioError if the object made by a user's own function is not a criterion of z."""
     if not isinstance(made, Criterion):
         raise ScenarioError(f"{part} must return a Criterion, returned {type(made).__name__}")
     for name in ("value", "smooth"):
@@ -103,7 +113,7 @@ def _check_made(
 
 
 def _judged(part: str, value: object, trajectory: FourierTrajectory) -> None:
-    """Raise ScenarioError unless a judgement is a number."""
+    """Raise ScenarioError if the value of a user's own judge is not a finite number."""
     if not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
         raise ScenarioError(f"{part} must return a finite number, returned {value!r}")
 
@@ -111,7 +121,7 @@ def _judged(part: str, value: object, trajectory: FourierTrajectory) -> None:
 def observability(
     robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array
 ) -> Criterion:
-    """The observability index (eq. 39) of the run that the scenario plays."""
+    """Return the observability index (eq. 39) of the run that the scenario plays."""
     duration_s = scenario.excitation.duration_s
     value, smooth = (
         log_observability(robot, unknowns, duration_s, typical, v)
@@ -127,15 +137,16 @@ def log_observability(
     typical: Array,
     smoothing: float | None = None,
 ) -> ca.Function:
-    """z -> ln O_in (eq. 39) of a run of `duration_s`; -inf or NaN where it is too short to show
-    every base parameter.
+    """Return the function z -> ln O_in (eq. 39) of a run of `duration_s`.
 
-    `typical` is the z of a trajectory that excites everything; it only sets the scale. `smoothing`
-    [rad/s or m/s] smooths the sign of Coulomb friction, which makes the function differentiable.
+    Its value is -inf or NaN if the run is too short to show every base parameter. `typical` is the
+    z of a trajectory that excites all parameters, and only sets the scale. `smoothing` [rad/s or
+    m/s] smooths the sign of Coulomb friction, which makes the function differentiable.
     """
     base = structure(robot)
     times = played_times(unknowns.fundamental_hz, unknowns.harmonics, duration_s)
     z = ca.MX.sym("z", unknowns.size)
+    # Fewer equations than base parameters make the determinant zero.
     if unknowns.coordinates * len(times) < base.rank:
         return ca.Function("log_observability", [z], [ca.MX(-np.inf)], ["z"], ["value"])
     sampled = regressor(robot, smoothing, "wrench").map(len(times))(*motion(unknowns, z, times))
@@ -145,12 +156,13 @@ def log_observability(
 
 
 def log_index(columns: ca.MX, combinations: Array, typical: Array, samples: int) -> ca.MX:
-    """ln O_in (eq. 39) of H = columns^T combinations over `samples` poses.
+    """Return ln O_in (eq. 39) of H = columns^T combinations over `samples` poses.
 
-    `columns` (rank, rows) is H_1 transposed, `combinations` (rank, p) is C; `typical` is as
-    `columns`, of full rank.
+    `columns` (rank, rows) is H_1 transposed, `combinations` (rank, p) is C. `typical` has the shape
+    of `columns` and full rank.
     """
     rank = len(combinations)
+    # Powers of two scale without rounding.
     lengths = 2.0 ** np.rint(np.log2(np.linalg.norm(typical, axis=1)))
     factor = qr((typical / lengths[:, None]).T, mode="r")[0][:rank]
     inverse = agreed(solve_triangular(factor, np.eye(rank))) / lengths[:, None]
@@ -162,8 +174,9 @@ def log_index(columns: ca.MX, combinations: Array, typical: Array, samples: int)
 
 
 def observability_index(logarithm: ca.Function, z: Array) -> float:
-    """O_in (eq. 39) of a trajectory's z by `log_observability`; 0 where a base parameter does not
-    show.
+    """Return O_in (eq. 39) of a trajectory's z from the function of `log_observability`.
+
+    It is 0 if a base parameter does not show.
     """
     value = float(logarithm(z))
     return 0.0 if np.isnan(value) else float(np.exp(value))

@@ -1,6 +1,4 @@
-"""The trajectories of a run: the exciting one by the scenario's method and criterion, and unseen
-random ones.
-"""
+"""Design of a run's trajectories: the exciting one, and unseen random ones."""
 
 from collections.abc import Callable
 
@@ -21,17 +19,18 @@ from identify.scenario import Excitation, Scenario
 from identify.trajectory import FourierTrajectory, TrajectorySet, check_travel, random_trajectory
 
 ATTEMPTS = 50
-"""Random trajectories tried, on the average, for each one that has to be admissible."""
+"""Average number of random trajectories that are tried for each admissible one."""
 
 Check = Callable[[FourierTrajectory, Array], object]
-"""Raises TrajectoryError for a trajectory that is not admissible at some instants (N,) [s]."""
+"""Function that raises TrajectoryError for a trajectory that breaks a limit at times (N,) [s]."""
 
 
 def drawn_trajectory(
     rng: np.random.Generator, chart: Chart, settings: Excitation
 ) -> FourierTrajectory:
-    """A random trajectory that fills the box of a scenario's excitation about home, whatever else
-    limits it.
+    """Draw a random trajectory that fills the box of a scenario's excitation about home.
+
+    Other limits are not considered.
     """
     box = (settings.position_amplitude_m, settings.orientation_amplitude_rad)
     return random_trajectory(rng, chart, settings.fundamental_hz, settings.harmonics, *box)
@@ -45,12 +44,14 @@ def admissible_trajectories(
     seed: np.random.SeedSequence,
     check: Check = lambda trajectory, times: None,
 ) -> list[FourierTrajectory]:
-    """Random trajectories that stay inside the travel less the margin, off singularities, and pass
-    `check`.
+    """Draw random trajectories that keep the travel, avoid singularities and pass `check`.
 
-    Raises TrajectoryError, with the last reason, when too few of them do.
+    The travel is that of the robot less the scenario's margin.
+
+    Raises TrajectoryError, with the last reason, if too few of them do.
     """
     rng = np.random.default_rng(seed)
+    # Denser than a search samples, as limits can be broken between its instants.
     rate_hz = 4 * SAMPLES_PER_HARMONIC * settings.harmonics * settings.fundamental_hz
     t = np.arange(round(duration_s * rate_hz) + 1) / rate_hz
     accepted: list[FourierTrajectory] = []
@@ -71,26 +72,27 @@ def admissible_trajectories(
         f"only {len(accepted)} of {ATTEMPTS * count} random trajectories of "
         f"±{settings.position_amplitude_m:g} m and "
         f"±{settings.orientation_amplitude_rad:g} rad stay inside the travel and the other "
-        f"limits, {count} are needed; "
-        f"the last: {reason}"
+        f"limits, {count} are needed; the last: {reason}"
     )
 
 
 RANDOM_TOLERANCE = 1e-3
-"""Share by which random trajectories may go over a limit: they fill the box as closely as they were
-sampled for it.
+"""Share by which random trajectories may exceed a limit.
+
+They fill the box only as closely as they were sampled for it.
 """
 
 
 def design_trajectories(
     robot: Robot, scenario: Scenario, seed: int, progress: Progress | None = None
 ) -> TrajectorySet:
-    """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream
-    of the seed.
+    """Design the exciting trajectory and the validation trajectories of a scenario.
 
-    Raises ScenarioError: no such criterion. Raises TrajectoryError: no random trajectory of this
-    amplitude keeps the limits; no whole number of periods where a search needs it; a search that
-    finds nothing.
+    Each kind has its own stream of the seed.
+
+    Raises ScenarioError if there is no such criterion. Raises TrajectoryError if no random
+    trajectory of this amplitude keeps the limits, if a search needs a whole number of periods and
+    has none, or if a search finds nothing.
     """
     progress = progress or SilentProgress()
     settings = scenario.excitation
@@ -118,14 +120,15 @@ def design_trajectories(
 def unseen_trajectories(
     robot: Robot, scenario: Scenario, seed: int
 ) -> tuple[FourierTrajectory, ...]:
-    """The validation trajectories of a scenario alone, the same as `design_trajectories` gives,
-    without its search.
+    """Return the validation trajectories of a scenario without a search.
+
+    They are the same as those of `design_trajectories`.
     """
     return _unseen(robot, scenario, seed, motion_check(robot, scenario))
 
 
 def motion_check(robot: Robot, scenario: Scenario) -> Check:
-    """What refuses a trajectory that breaks a limit beside the travel."""
+    """Return the check of all limits of the motion of a scenario."""
     constraints = MotionConstraints(robot, scenario)
     return lambda trajectory, times: constraints.check(trajectory, times, RANDOM_TOLERANCE)
 
@@ -133,7 +136,7 @@ def motion_check(robot: Robot, scenario: Scenario) -> Check:
 def random_candidates(
     robot: Robot, scenario: Scenario, count: int, seed: int, check: Check
 ) -> list[FourierTrajectory]:
-    """The random trajectories among which, or from which, a search goes."""
+    """Draw the random trajectories from which a search starts or chooses."""
     settings = scenario.excitation
     return admissible_trajectories(
         robot, settings, settings.duration_s, count, child(seed, EXCITATION), check
@@ -146,10 +149,10 @@ def search_problem(
     candidates: list[FourierTrajectory],
     advance: Advance = lambda n=1: None,
 ) -> SearchProblem:
-    """The search of a scenario among, or from, admissible random trajectories.
+    """Set up the search of a scenario with admissible random trajectories.
 
-    Raises ScenarioError: no such criterion. Raises TrajectoryError: no whole number of periods for
-    a method that needs it.
+    Raises ScenarioError if there is no such criterion. Raises TrajectoryError if the method needs a
+    whole number of periods and the run has none.
     """
     settings = scenario.excitation
     if settings.method != "random":
@@ -161,6 +164,7 @@ def search_problem(
     for z in pool:
         values.append(-float(criterion.value(z)))
         advance()
+    # A stable order keeps the result the same where values are equal.
     best_first = [pool[k] for k in np.argsort(values, kind="stable")]
     return SearchProblem(settings, free, MotionConstraints(robot, scenario), criterion, best_first)
 

@@ -1,36 +1,39 @@
-"""D-optimality of the output error's information: in the simulated closed loop, and in the loop
-linearised at home.
+"""D-optimality of the output error, in the simulated closed loop and in its linearisation.
 
-With J = d(poses)/d(p parameters) of the closed loop at the starting guess, Sigma the covariance
-that the sensor states, and what is known before (starting guess, the scenario's prior of single
-parameters, scale anchor),
+Let J = d(poses)/d(p parameters) be the sensitivities of the closed loop at the starting guess and
+Sigma the covariance that the sensor states. With the prior knowledge (starting guess, the
+scenario's prior of single parameters, scale anchor),
 
-    W = sum over frames J^T Sigma^-1 J + prior,      D = (det(S W S))^(1 / (2 p)),      S =
-    diag(prior deviations).
+    W = sum over frames J^T Sigma^-1 J + prior,
+    D = (det(S W S))^(1 / (2 p)),    S = diag(prior deviations).
 
-D is the factor by which the experiment narrows the prior, the geometric mean over all directions of
-the parameter space; it has no unit. That the sensor's noise also moves the plant (through the
-servo) is left out.
+D is the factor by which the experiment narrows the prior, as a geometric mean over all directions
+of the parameter space. It has no unit. The motion that the sensor's noise causes through the servo
+is left out.
 
-The simulation gives D of a trajectory, but no exact derivative by it. Searches go by D in the loop
-linearised about rest at home. With s = i omega, C = kp + kd s + ki / s the servo, L = lp + ld s +
-li / s the joint PID and t_d the latency plus half a frame of hold, the pose x follows a torque
-error d (Nm, joints) as
+The simulation gives D of a trajectory, but no exact derivative with respect to it. Searches
+therefore use D in the loop linearised about rest at home. Let s = i omega, C = kp + kd s + ki / s
+the servo, L = lp + ld s + li / s the joint PID, and t_d the latency plus half a frame of hold. The
+pose x follows a torque error d (joints) as
 
-    x = -S d,   S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C
-    exp(-s t_d)))^-1,
+    x = -S d,
+    S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C exp(-s t_d)))^-1,
 
-E from pose rates to twists, and follows a reference x_d as x = T x_d with T = S L J_theta C exp(-s
-t_d). Friction counts with its viscous part only. Poses, wrenches and Jacobians are those along the
-platform's coordinates. So the robot follows each harmonic of the trajectory with a known lag, and
-the sensitivities are filtered columns of the torque regressor along that motion: with Y its Fourier
-coefficients at a harmonic, tau = Y Xi the torques and e = tau / L the joint error that the PID
-needs for them,
+where E maps pose rates to twists. It follows a reference x_d as
+
+    x = T x_d,    T = S L J_theta C exp(-s t_d).
+
+Friction counts with its viscous part only. Poses, wrenches and Jacobians are those along the
+platform's coordinates.
+
+The robot thus follows each harmonic of the trajectory with a known lag, and the sensitivities are
+filtered columns of the torque regressor along that motion. Let Y be its Fourier coefficients at a
+harmonic, tau = Y Xi the torques, and e = tau / L the joint error that the PID needs for them. Then
 
     d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
 
-One period in the steady state counts for all, so the start of the run is left out, as are what the
-drives of a cascade have beside a PID's terms.
+One steady-state period stands for all, so the start of the run is left out. So are the terms of
+cascaded drives beyond those of a PID.
 """
 
 from dataclasses import dataclass
@@ -62,8 +65,9 @@ from identify.trajectory import FourierTrajectory
 
 
 def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
-    """D in the linearised loop, by which searches go; what they end in is judged by that of the
-    simulated loop.
+    """Return D as a criterion.
+
+    Searches use D of the linearised loop. Their results are judged by that of the simulated loop.
     """
     known = knowledge(robot, scenario)
     value, smooth = (
@@ -75,8 +79,17 @@ def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: A
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known before the run: starting guess, covariance (6, 6) of a measured pose [m, rad],
-    and the prior's information (p, p) in units of its own standard deviations."""
+    """Knowledge before the run.
+
+    Attributes
+    ----------
+    guess : StartingGuess
+        Starting guess of the parameters.
+    covariance : ndarray, shape (6, 6)
+        Covariance of a measured pose, m and rad.
+    scaled_prior : ndarray, shape (p, p)
+        Information of the prior in units of its standard deviations.
+    """
 
     guess: StartingGuess
     covariance: Array
@@ -84,7 +97,7 @@ class Knowledge:
 
 
 def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
-    """The scenario's starting guess with its prior, anchor and sensor."""
+    """Return the scenario's starting guess with its prior, scale anchor and sensor."""
     settings = scenario.identification
     guess = model_guess(robot, scenario)
     prior = np.eye(len(robot.layout.names))
@@ -92,6 +105,7 @@ def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
     if anchor in MEASURED_PARAMETER:
         place = robot.layout.names.index(MEASURED_PARAMETER[anchor])
         std = settings.anchor_std or default_std(anchor, robot.layout)
+        # In units of the prior's deviation, as all of this matrix.
         prior[place, place] += (guess.std[place] / std) ** 2
     covariance = expected_covariance(
         scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes
@@ -102,9 +116,9 @@ def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
 def log_information(
     robot: Robot, scenario: Scenario, known: Knowledge, trajectory: FourierTrajectory
 ) -> float:
-    """ln D of a trajectory run for `excitation.duration_s`.
+    """Return ln D of a trajectory run for `excitation.duration_s`.
 
-    Raises TrajectoryError where the model with the starting guess is unstable on it.
+    Raises TrajectoryError if the model with the starting guess is unstable on it.
     """
     times = scenario.timing.frame_times(scenario.excitation.duration_s)
     try:
@@ -133,7 +147,7 @@ STEP = 1e-5
 
 
 def pid_response(robot: Robot, parameters: Array, s: ComplexArray) -> ComplexArray:
-    """L (K,) [N m/rad or N/m] of the joint PID of `parameters` (p,) at s (K,) [1/s]."""
+    """Return L (K,) [N m/rad or N/m] of the joint PID with `parameters` (p,) at s (K,) [1/s]."""
     lp, li, ld = parameters[robot.layout.joint_pid]
     return np.asarray(lp + ld * s + li / s)
 
@@ -141,8 +155,10 @@ def pid_response(robot: Robot, parameters: Array, s: ComplexArray) -> ComplexArr
 def torque_response(
     robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray
 ) -> ComplexArray:
-    """S (K, m, n), coordinates per torque or force, for `parameters` (p,) at s = i omega (K,)
-    [1/s], none of them zero."""
+    """Return S (K, m, n), coordinates per torque or force, at s = i omega (K,) [1/s].
+
+    The parameters have shape (p,). No s may be zero.
+    """
     home = robot.home_pose
     xi = parameters[robot.layout.dynamic]
     free = robot.geometry.chart.basis
@@ -155,6 +171,7 @@ def torque_response(
     stiffness = (
         robot.static_torque(home + steps, xi) - robot.static_torque(home - steps, xi)
     ).T / (2 * STEP)
+    # The last digits of the quotient are noise, which differs between processors.
     stiffness = agreed(stiffness, RESPONSE_BITS)
     damping = parameters[robot.layout.viscous][:, None] * joint_rates
     loop = pid_response(robot, parameters, s) * (1 + servo_response(scenario, s))
@@ -165,14 +182,14 @@ def torque_response(
 def tracking_response(
     robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray
 ) -> ComplexArray:
-    """T (K, m, m) from desired to actual coordinates, as `torque_response`."""
+    """Return T (K, m, m) from desired to actual coordinates, as `torque_response`."""
     gain = pid_response(robot, parameters, s) * servo_response(scenario, s)
     drive = np.multiply.outer(gain, robot.coordinate_jacobian(robot.home_pose))
     return np.asarray(torque_response(robot, parameters, scenario, s) @ drive)
 
 
 def servo_response(scenario: Scenario, s: ComplexArray) -> ComplexArray:
-    """C exp(-s t_d) (K,) of the visual servo at s (K,) [1/s]."""
+    """Return C exp(-s t_d) (K,) of the visual servo at s (K,) [1/s]."""
     servo = scenario.servo
     timing = scenario.timing
     delay = np.exp(-s * (timing.latency_s + timing.frame_period_s / 2))
@@ -180,7 +197,7 @@ def servo_response(scenario: Scenario, s: ComplexArray) -> ComplexArray:
 
 
 HARMONICS_SEEN = 8
-"""Sensitivities count up to this multiple of the highest harmonic of the trajectory."""
+"""Multiple of the trajectory's highest harmonic up to which sensitivities count."""
 
 
 def log_linear_information(
@@ -190,7 +207,10 @@ def log_linear_information(
     known: Knowledge,
     smoothing: float | None = None,
 ) -> ca.Function:
-    """z -> ln D in the linearised loop; `smoothing` as in `log_observability`."""
+    """Return the function z -> ln D in the linearised loop.
+
+    `smoothing` is as in `log_observability`.
+    """
     z = ca.MX.sym("z", unknowns.size)
     rows = sensitivity_spectrum(robot, unknowns, scenario, known.guess.values, z, smoothing)
     count = len(known.guess.std)
@@ -200,13 +220,14 @@ def log_linear_information(
         np.kron(np.eye(2 * len(harmonics(unknowns))), agreed(whitener.T, RESPONSE_BITS))
     )
     frames = scenario.timing.frames(scenario.excitation.duration_s)
+    # A harmonic of amplitude x has the mean square |x|^2 / 2 over the frames.
     scaled = ca.diag(known.guess.std * np.sqrt(frames / 2)) @ rows
     determinant = log_determinant(count)(scaled @ scaled.T + ca.DM(known.scaled_prior))
     return ca.Function("log_linear_information", [z], [determinant / (2 * count)], ["z"], ["value"])
 
 
 def harmonics(unknowns: Unknowns) -> ComplexArray:
-    """s = i omega (K,) [1/s] of the harmonics that count."""
+    """Return s = i omega (K,) [1/s] of the harmonics that count."""
     order = np.arange(1, HARMONICS_SEEN * unknowns.harmonics + 1)
     return np.asarray(2j * np.pi * unknowns.fundamental_hz * order, dtype=complex)
 
@@ -219,10 +240,9 @@ def sensitivity_spectrum(
     z: ca.MX,
     smoothing: float | None = None,
 ) -> ca.MX:
-    """Fourier coefficients of d(coordinates)/d(p parameters), (p, 2 m K): m real and m imaginary
-    parts a harmonic.
+    """Return the Fourier coefficients of d(coordinates)/d(p parameters), (p, 2 m K).
 
-    A coefficient x_k means Re(x_k exp(s_k t)).
+    Each harmonic has m real and m imaginary parts. A coefficient x_k means Re(x_k exp(s_k t)).
     """
     times = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
     s = harmonics(unknowns)
@@ -246,8 +266,9 @@ def sensitivity_spectrum(
 
 
 def _real_filter(response: ComplexArray) -> ca.DM:
-    """Block-diagonal (2 n K, 2 m K): rows (Re y_k, Im y_k) times it are (Re x_k, Im x_k) of x_k =
-    response_k y_k.
+    """Block-diagonal matrix (2 n K, 2 m K) that applies a complex response to real rows.
+
+    It maps rows (Re y_k, Im y_k) to (Re x_k, Im x_k) with x_k = response_k y_k.
     """
     blocks = [
         agreed(np.block([[r.real.T, r.imag.T], [-r.imag.T, r.real.T]]), RESPONSE_BITS)

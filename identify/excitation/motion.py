@@ -1,14 +1,13 @@
-"""The unknowns of a smooth-start trajectory (eq. 37), and motion and regressors as CasADi
-expressions of them.
+"""Unknowns of a smooth-start trajectory (eq. 37), with its motion and regressors in CasADi.
 
 The conditions of a smooth start leave 2 (n - 1) free directions a coordinate: n - 1 combinations of
-the sines with sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. With Z (m, 2 (n - 1)),
-without unit, and a box (m,) the m coordinates q are
+the sines with sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. With dimensionless Z
+(m, 2 (n - 1)) and a box (m,) the m coordinates q are
 
-    q(t) = home + box Z B_0(t)^T,    q_dot(t) = box Z B_1(t)^T,    q_ddot(t) = box Z B_2(t)^T,
+    q(t) = home + box Z B_0(t)^T,    q_dot(t) = box Z B_1(t)^T,    q_ddot(t) = box Z B_2(t)^T.
 
-so that every trajectory that starts smoothly at home is one vector z of 2 m (n - 1) numbers, and
-each z one trajectory.
+Every trajectory that starts smoothly at home is thus one vector z of 2 m (n - 1) numbers, and each
+z is one trajectory.
 """
 
 from dataclasses import dataclass
@@ -32,7 +31,10 @@ from identify.trajectory import FourierTrajectory, box_of, from_home
 
 @dataclass(frozen=True)
 class Unknowns:
-    """chart with home, box (m,) [m, rad] of its coordinates, fundamental_hz, harmonics n."""
+    """Unknowns of a trajectory on a chart, whose home is the start.
+
+    ``box`` (m,) [m, rad] scales the coordinates, and ``harmonics`` is n.
+    """
 
     chart: Chart
     box: Array
@@ -51,7 +53,7 @@ class Unknowns:
 
     @property
     def columns(self) -> int:
-        """Free directions a coordinate, 2 (n - 1)."""
+        """Number of free directions a coordinate, 2 (n - 1)."""
         return 2 * (self.harmonics - 1)
 
     @property
@@ -60,8 +62,10 @@ class Unknowns:
         return self.coordinates * self.columns
 
     def basis(self, t: ArrayLike) -> tuple[Array, Array, Array]:
-        """B_0 (N, k) without unit, B_1 [1/s], B_2 [1/s²] at times ``t`` (N,) [s]; k =
-        ``columns``."""
+        """Return the bases (N, k) at times ``t`` (N,) [s], where k = ``columns``.
+
+        They are B_0 without unit, B_1 [1/s] and B_2 [1/s²].
+        """
         order = np.arange(1, self.harmonics + 1, dtype=float)
         w0 = 2 * np.pi * self.fundamental_hz
         phase = np.asarray(t, dtype=float)[:, None] * w0 * order
@@ -75,7 +79,7 @@ class Unknowns:
         )
 
     def trajectory(self, z: ArrayLike) -> FourierTrajectory:
-        """The trajectory of z (2 m (n - 1),)."""
+        """Return the trajectory of z (2 m (n - 1),)."""
         matrix = np.asarray(z, dtype=float).reshape(self.coordinates, self.columns)
         speed = (self.box * 2 * np.pi * self.fundamental_hz)[:, None]
         half = self.columns // 2
@@ -85,7 +89,7 @@ class Unknowns:
         return from_home(self.chart, self.fundamental_hz, sine, cosine)
 
     def of(self, trajectory: FourierTrajectory) -> Array:
-        """z (2 m (n - 1),) of a trajectory with a smooth start."""
+        """Return z (2 m (n - 1),) of a trajectory with a smooth start."""
         speed = (self.box * 2 * np.pi * self.fundamental_hz)[:, None]
         sines, cosines = self._directions()
         return np.hstack(
@@ -99,32 +103,38 @@ class Unknowns:
 
 
 def unknowns(chart: Chart, settings: Excitation) -> Unknowns:
-    """The unknowns of a scenario's excitation about a chart's home; the box is what its amplitudes
-    allow.
+    """Return the unknowns of a scenario's excitation about a chart's home.
+
+    The box has the amplitudes of the scenario.
     """
     box = box_of(chart, settings.position_amplitude_m, settings.orientation_amplitude_rad)
     return Unknowns(chart, box, settings.fundamental_hz, settings.harmonics)
 
 
 SAMPLES_PER_HARMONIC = 20
-"""Poses sampled in a period of the highest harmonic when a criterion is computed."""
+"""Number of poses in a period of the highest harmonic that a criterion samples."""
 
 
 def sample_times(fundamental_hz: float, harmonics: int, refinement: int = 1) -> Array:
-    """Instants (N,) [s] over one period of the fundamental, off its ends, where the robot rests."""
+    """Return instants (N,) [s] over one period of the fundamental.
+
+    They avoid its ends, where the robot rests.
+    """
     count = refinement * SAMPLES_PER_HARMONIC * harmonics
     return np.asarray((np.arange(count) + 0.5) / (count * fundamental_hz), dtype=float)
 
 
 def is_whole_periods(duration_s: float, fundamental_hz: float) -> bool:
-    """Whether a run is a whole number of periods, at least one, to rounding."""
+    """Tell whether a run is a whole number of periods, at least one, up to rounding."""
     periods = duration_s * fundamental_hz
     return round(periods) >= 1 and abs(periods - round(periods)) <= 1e-9 * periods
 
 
 def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Array:
-    """Instants (N,) [s] as dense as `sample_times`, over what a run plays of a trajectory: one
-    period where it plays whole ones, over which the motion repeats, else all of it."""
+    """Return instants (N,) [s], as dense as `sample_times`, over the played part of a trajectory.
+
+    For whole periods this is one period, since the motion repeats. Otherwise it is the whole run.
+    """
     if is_whole_periods(duration_s, fundamental_hz):
         return sample_times(fundamental_hz, harmonics)
     count = max(1, round(SAMPLES_PER_HARMONIC * harmonics * fundamental_hz * duration_s))
@@ -132,10 +142,10 @@ def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Ar
 
 
 def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """Poses, pose rates and pose accelerations, each (6, N), of z at `times` (N,) [s].
+    """Return poses, pose rates and pose accelerations, each (6, N), of z at `times` (N,) [s].
 
-    The basis is rounded to what all processors agree on, which moves the platform by less than a
-    nanometre.
+    The basis is rounded to numbers on which all processors agree. This moves the platform by less
+    than a nanometre.
     """
     matrix = ca.reshape(z, unknowns.columns, unknowns.coordinates).T
     scale = ca.sparsify(ca.DM(unknowns.chart.basis @ np.diag(unknowns.box)))
@@ -146,16 +156,19 @@ def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca
 
 
 RESPONSE_BITS = 16
-"""Bits of a linearised loop's response on which processors agree: it stands on difference
-quotients.
+"""Bits of a linearised loop's response on which processors agree.
+
+They are few because the response rests on difference quotients.
 """
 
 
 def tracked_motion(
     unknowns: Unknowns, z: ca.MX, times: Array, tracking: NDArray[np.complex128]
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """As `motion`, of a robot that follows harmonic k of the trajectory with `tracking` (harmonics,
-    m, m), and its mean exactly; in the steady state."""
+    """Return the steady-state motion, as `motion`, of a robot that follows z with a lag.
+
+    It follows harmonic k with `tracking` (harmonics, m, m), and the mean exactly.
+    """
     speeds = 2j * np.pi * unknowns.fundamental_hz * np.arange(1, unknowns.harmonics + 1)
     period = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
     basis = unknowns.basis(period)[0]
@@ -163,35 +176,28 @@ def tracked_motion(
     maps = [np.zeros((len(times), unknowns.coordinates, unknowns.size)) for _ in range(3)]
     maps[0] += np.kron(box, basis.mean(axis=0))
     for s, followed in zip(speeds, tracking, strict=True):
+        # Fourier coefficient of the basis at this harmonic.
         coefficient = 2 / len(period) * np.exp(-s * period) @ basis
         amplitude = np.exp(s * times)[:, None, None] * np.kron(followed @ box, coefficient)
         for derivative, total in enumerate(maps):
             total += (s**derivative * amplitude).real
-    offset, rate, acceleration = (
-        ca.reshape(
-            ca.DM(
-                agreed(unknowns.chart.lifted(total, axis=1), RESPONSE_BITS).reshape(
-                    -1, unknowns.size
-                )
-            )
-            @ z,
-            6,
-            len(times),
-        )
-        for total in maps
-    )
+    moved = []
+    for total in maps:
+        lifted = agreed(unknowns.chart.lifted(total, axis=1), RESPONSE_BITS)
+        moved.append(ca.reshape(ca.DM(lifted.reshape(-1, unknowns.size)) @ z, 6, len(times)))
+    offset, rate, acceleration = moved
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
 
 
 def regressor(
     robot: Robot, smoothing: float | None, of: Literal["wrench", "torque"]
 ) -> ca.Function:
-    """(pose, rate, acceleration) (6,) -> regressor of wrench (eq. 25), along the m coordinates, or
-    of the n actuators' torques, transposed (p, m) or (p, n).
+    """Return the function (pose, rate, acceleration) (6,) -> transposed regressor (p, m) or (p, n).
 
-    The former is J_ad^T times the latter, projected on the chart. The sign of Coulomb friction has
-    no derivative: `smoothing` replaces it by tanh(theta_dot / v_s), v_s in rad/s, or m/s where
-    actuators slide; None keeps it.
+    It is the regressor of the wrench (eq. 25) along the m coordinates, or of the n actuators'
+    torques. The former is J_ad^T times the latter, projected on the chart. The sign of Coulomb
+    friction has no derivative: `smoothing` replaces it by tanh(theta_dot / v_s) with v_s in rad/s,
+    or m/s where actuators slide. None keeps the sign.
     """
     pose, rate, acceleration = (ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration"))
     to_twist = pose_rate_to_twist(pose)
@@ -213,8 +219,9 @@ def regressor(
 
 @lru_cache(maxsize=4)
 def log_determinant(size: int) -> ca.Function:
-    """Matrix (size, size), of which the upper triangle is read -> ln det, by LDL^T; NaN where it is
-    not positive.
+    """Return the function of a matrix (size, size) -> ln det, by LDL^T.
+
+    Only the upper triangle is read. The value is NaN if the matrix is not positive definite.
     """
     matrix = ca.SX.sym("matrix", size, size)
     upper = ca.triu(matrix)

@@ -1,5 +1,4 @@
-"""Searches for the trajectory that excites most: the best of random ones, differential evolution,
-and IPOPT.
+"""Searches for the most exciting trajectory: best random one, differential evolution, and IPOPT.
 
 All maximise a criterion within the constraints of the motion, and begin with the same random
 candidates. To add one, write a function of the form `Search` and name it in `SEARCHES`.
@@ -24,18 +23,20 @@ from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
 
 CHECK_REFINEMENT = 8
-"""How much finer constraints are checked in the end than while a search runs."""
+"""Factor by which constraints are sampled more finely in the final check than during a search."""
 
 CLEARANCE = (np.pi / (SAMPLES_PER_HARMONIC * CHECK_REFINEMENT)) ** 2 / 2
-"""Share of every limit that is kept: by so much the highest harmonic can rise between the instants
-of the check.
+"""Share of every limit that stays unused.
+
+The highest harmonic can rise by this much between the instants of the check.
 """
 
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """Maximise a criterion of the unknowns z under constraints; candidates: z of random
-    trajectories, best first.
+    """Maximisation of a criterion of the unknowns z under constraints.
+
+    ``candidates`` are the z of random trajectories, best first.
     """
 
     settings: Excitation
@@ -45,32 +46,33 @@ class SearchProblem:
     candidates: list[Array]
 
     def value(self, z: Array) -> float:
-        """Logarithm of the criterion."""
+        """Return the logarithm of the criterion."""
         return float(self.criterion.value(z))
 
     @property
     def times(self) -> Array:
-        """Instants (N,) [s] at which a search looks at the constraints."""
+        """Instants (N,) [s] at which a search evaluates the constraints."""
         return sample_times(self.unknowns.fundamental_hz, self.unknowns.harmonics)
 
     @property
     def check_times(self) -> Array:
-        """Instants (N,) [s] at which its result is checked."""
+        """Instants (N,) [s] at which the result of a search is checked."""
         return sample_times(self.unknowns.fundamental_hz, self.unknowns.harmonics, CHECK_REFINEMENT)
 
     def worst(self, z: Array) -> list[Worst]:
-        """Where z comes nearest to each limit, at the instants of the check."""
+        """Return where z comes nearest to each limit, at the instants of the check."""
         return self.constraints.worst(self.unknowns.trajectory(z), self.check_times)
 
     def is_admissible(self, z: Array) -> bool:
-        """Whether z keeps all limits with the clearance."""
+        """Tell whether z keeps all limits with the clearance."""
         return all(w.share <= 1 - CLEARANCE for w in self.worst(z))
 
     def drawn_in(self, z: Array) -> Array:
-        """The largest share of z that is admissible: the home pose itself is, so shrinking the
-        motion leads there.
+        """Return the largest multiple of z, at most z itself, that is admissible.
 
-        Raises TrajectoryError, naming the constraint, where not even a thousandth of it is.
+        The home pose is admissible, and z shrinks towards it.
+
+        Raises TrajectoryError, naming the constraint, if not even a thousandth of z is admissible.
         """
         if self.is_admissible(z):
             return z
@@ -78,9 +80,10 @@ class SearchProblem:
         outside = 1.0
         while outside - inside > 1e-6:
             middle = (inside + outside) / 2
-            inside, outside = (
-                (middle, outside) if self.is_admissible(middle * z) else (inside, middle)
-            )
+            if self.is_admissible(middle * z):
+                inside = middle
+            else:
+                outside = middle
             if outside < 1e-3:
                 worst = max(self.worst(middle * z), key=Worst.excess)
                 raise TrajectoryError(f"no start is admissible, not even close to home: {worst}")
@@ -89,8 +92,21 @@ class SearchProblem:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The z that a search found, logarithm of its criterion, evaluations of the criterion (and of
-    its gradient), iterations or generations, and why the search stopped."""
+    """Result of a search.
+
+    Attributes
+    ----------
+    z : ndarray
+        Unknowns of the trajectory.
+    log_value : float
+        Logarithm of its criterion.
+    evaluations, gradients : int
+        Evaluations of the criterion and of its gradient.
+    iterations : int
+        Iterations or generations.
+    reason : str
+        Reason why the search stopped.
+    """
 
     z: Array
     log_value: float
@@ -100,7 +116,7 @@ class SearchResult:
     reason: str
 
     def trajectory(self, problem: SearchProblem) -> FourierTrajectory:
-        """The trajectory that was found."""
+        """Return the trajectory that was found."""
         return problem.unknowns.trajectory(self.z)
 
 
@@ -110,41 +126,42 @@ Search = Callable[[SearchProblem, np.random.SeedSequence, Progress], SearchResul
 def best_of(
     problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress
 ) -> SearchResult:
-    """The best random trajectory."""
+    """Return the best random trajectory."""
     best = problem.candidates[0]
     count = len(problem.candidates)
     return SearchResult(best, problem.value(best), count, 0, 0, f"best of {count}")
 
 
 STALLED = 1e-10
-"""The paper's stop criterion: spread of the population's values, relative."""
+"""Relative spread of the population's values at which evolution stops, as in the paper."""
 
-FEWEST_MEMBERS, MOST_MEMBERS = 5, 32
-"""Differential evolution combines members with others; more of them converge more slowly than they
-find better.
-"""
+FEWEST_MEMBERS = 5
+"""Least size of the population: differential evolution combines members with others."""
+
+MOST_MEMBERS = 32
+"""Largest size of the population. More members cost more convergence than they improve."""
 
 RECOMBINATION = 0.9
-"""Share of the unknowns that a trial takes from its mutant; the best of what was tried, with
-MOST_MEMBERS.
+"""Share of the unknowns that a trial takes from its mutant.
+
+It is the best of those tried with MOST_MEMBERS.
 """
 
 NOT_ADMISSIBLE = 1e6
-"""Added to the cost of a member that breaks a limit, beyond any value of a criterion."""
+"""Cost of a member that breaks a limit, beyond any value of a criterion."""
 
 
 def evolve(
     problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress
 ) -> SearchResult:
-    """What the generations of differential evolution find that begin with the best of the
-    candidates.
+    """Search by differential evolution from the best candidates.
 
-    A member of the population is scaled, a coordinate at a time, until it fills the box, as a
-    random trajectory is: its size is then no unknown any more, and no limit on the amplitude has to
-    be found by chance. Among two members the admissible one wins, among two that are not the one
-    that breaks its limits less.
+    Each coordinate of a member is scaled until it fills the box, as in a random trajectory. The
+    size is then no unknown, and no limit on the amplitude has to be found by chance. An admissible
+    member beats one that is not. Of two members that are not admissible, the one with the smaller
+    violation wins.
 
-    Raises TrajectoryError where the candidates are too few.
+    Raises TrajectoryError if there are too few candidates.
     """
     generations = problem.settings.generations
     candidates = problem.candidates
@@ -172,7 +189,7 @@ def evolve(
 
 
 class _Filling:
-    """The cost of members of the population."""
+    """Cost of the members of a population, each scaled to fill the box."""
 
     def __init__(self, problem: SearchProblem) -> None:
         self._problem = problem
@@ -180,18 +197,18 @@ class _Filling:
         self._shares = problem.constraints.shares.map(len(problem.times))
 
     def member(self, z: Array) -> Array:
-        """The member that z is, within -1 and 1."""
+        """Return the member, within -1 and 1, of a z."""
         matrix = z.reshape(self._problem.unknowns.coordinates, -1)
         return np.asarray((matrix / np.abs(matrix).max(axis=1, keepdims=True)).ravel())
 
     def fill(self, member: Array) -> Array:
-        """z of a member: each coordinate scaled to fill the box."""
+        """Return z of a member: each coordinate scaled to fill the box."""
         matrix = member.reshape(self._problem.unknowns.coordinates, -1)
         largest = np.abs(matrix @ self._offset.T).max(axis=1)
         return np.asarray((matrix / np.where(largest > 0, largest, 1.0)[:, None]).ravel())
 
     def cost(self, member: Array) -> float:
-        """Minus the logarithm of the criterion, or what is broken."""
+        """Return minus the logarithm of the criterion, or a large cost if a limit is broken."""
         z = self.fill(member)
         unknowns = self._problem.unknowns
         matrix = z.reshape(unknowns.coordinates, -1)
@@ -200,8 +217,10 @@ class _Filling:
             unknowns.box[:, None] * (matrix @ self._offset.T), axis=0
         )
         rates = lifted(unknowns.box[:, None] * (matrix @ self._rate.T), axis=0)
+        # The first rows are the box, which members fill exactly.
         shares = np.array(self._shares(poses, rates))[unknowns.coordinates :]
         worst = float(np.abs(shares).max())
+        # Out of reach (NaN) costs most, and a larger violation costs more than a smaller one.
         if not worst <= 1:
             return NOT_ADMISSIBLE * (2 if np.isnan(worst) else 2 - 1 / worst)
         value = self._problem.value(z)
@@ -211,39 +230,39 @@ class _Filling:
 MOST_ITERATIONS = 150  # of IPOPT
 
 TOLERANCE = 1e-4
-"""IPOPT's, relative: further digits of an optimum do not excite more."""
+"""Relative tolerance of IPOPT. Further digits of an optimum do not excite more."""
 
 INTERIOR = 0.98
-"""A start is drawn in to this share of the limits, where the interior-point method can move."""
+"""Share of the limits to which a start is drawn in, so that the interior-point method can move."""
 
 FAR = 0.5
-"""A limit of which a start uses less than this share is left out at first."""
+"""Share of a limit below which a start does not yet count it."""
 
 ALWAYS = "box"
-"""The limit that always counts: without it a criterion grows without end."""
+"""Limit that always counts. Without it a criterion grows without end."""
 
 
 STARTS = 3
-"""Candidates from which IPOPT climbs."""
+"""Number of candidates from which IPOPT starts."""
 
 
 @honoured()
 def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
-    """The best of what IPOPT finds from the best candidates, with exact derivatives of criterion
-    and constraints.
+    """Return the best result of IPOPT from the best candidates.
 
-    The Hessian is approximated from gradients (limited memory): a criterion with 48 unknowns
-    converges with it in some tens of iterations, and an exact Hessian of a regressor costs more
-    than it saves. Several starts, because the criterion has many local optima. Limits that a start
-    is far from are left out at first; those that the result breaks are put in, and IPOPT climbs on.
-    What goes over a limit between the instants of the constraints is drawn in towards home until it
-    is admissible at the finer instants of the check.
+    Criterion and constraints have exact derivatives. The Hessian is approximated from gradients
+    (limited memory): a criterion with 48 unknowns then converges in some tens of iterations, and an
+    exact Hessian of a regressor costs more than it saves. There are several starts because the
+    criterion has many local optima.
 
-    Starts and problem are rounded to what all processors agree on, and IPOPT's own linear algebra
-    is the same on all. So are its steps and the trajectory at which it ends.
+    Limits that a start is far from are left out at first. Those that the result breaks are added,
+    and IPOPT continues. A trajectory that exceeds a limit between the instants of the constraints
+    is drawn in towards home until it is admissible at the finer instants of the check.
 
-    Raises TrajectoryError where no start is admissible, or IPOPT finds nothing from any of them,
-    with its reasons.
+    Starts and problem are rounded to numbers on which all processors agree, and IPOPT's own linear
+    algebra is the same on all. So are its steps and its result.
+
+    Raises TrajectoryError if no start is admissible, or with IPOPT's reasons if it finds nothing.
     """
     starts = problem.candidates[:STARTS]
     found = []
@@ -259,20 +278,21 @@ def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progre
         raise TrajectoryError(
             f"IPOPT found no trajectory from any of {len(starts)} starts: {', '.join(reasons)}"
         )
+    # The climb may maximise an approximation. The judge ranks by the real criterion.
     judge = problem.criterion.judge
     return max(found, key=lambda one: judge(one.trajectory(problem)) if judge else one.log_value)
 
 
 def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
-    """One climb; its value is -inf where IPOPT came to nothing."""
+    """Result of IPOPT from one start. Its value is -inf if IPOPT failed."""
     counted = {ALWAYS} | _used(problem, z, FAR)
     values = gradients = iterations = 0
     while True:
         solver = _solver(problem, counted)
         done, stats = _solve(solver, z)
-        values = values + int(stats["n_call_nlp_f"])
-        gradients = gradients + int(stats["n_call_nlp_grad_f"])
-        iterations = iterations + int(stats["iter_count"])
+        values += int(stats["n_call_nlp_f"])
+        gradients += int(stats["n_call_nlp_grad_f"])
+        iterations += int(stats["iter_count"])
         reason = str(stats["return_status"])
         found = np.array(done["x"]).ravel()
         if not np.isfinite(found).all() or not np.isfinite(float(done["f"])):
@@ -283,13 +303,14 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
             return SearchResult(
                 admissible, problem.value(admissible), values, gradients, iterations, reason
             )
+        # Climb on with the broken limits, from a point inside all of them.
         counted = counted | broken
         z = INTERIOR * admissible
 
 
 @one_thread
 def _solve(solver: ca.Function, z: Array) -> tuple[dict[str, ca.DM], dict[str, Any]]:
-    """What IPOPT finds from z, and its statistics."""
+    """Solution of IPOPT from z, and its statistics."""
     done = solver(x0=z, lbg=-1.0, ubg=1.0)
     raise_noted()  # IPOPT takes Ctrl-C for an evaluation that failed
     return done, solver.stats()
@@ -301,7 +322,7 @@ def _used(problem: SearchProblem, z: Array, share: float) -> set[str]:
 
 
 def _solver(problem: SearchProblem, counted: set[str]) -> ca.Function:
-    """IPOPT for the problem with the limits `counted`, whose shares stay within -1 and 1."""
+    """IPOPT solver that keeps the shares of the limits `counted` between -1 and 1."""
     z = ca.MX.sym("z", problem.unknowns.size)
     poses, rates, _ = motion(problem.unknowns, z, problem.times)
     shares = problem.constraints.shares_of(counted).map(len(problem.times))(poses, rates)
@@ -309,6 +330,7 @@ def _solver(problem: SearchProblem, counted: set[str]) -> ca.Function:
         "print_time": False,
         "ipopt": {
             "print_level": 0,
+            # No banner.
             "sb": "yes",
             "hessian_approximation": "limited-memory",
             "max_iter": MOST_ITERATIONS,
@@ -322,4 +344,4 @@ def _solver(problem: SearchProblem, counted: set[str]) -> ca.Function:
 
 
 SEARCHES: dict[str, Search] = {"random": best_of, "evolutionary": evolve, "gradient": climb}
-"""The methods of a scenario, see `excitation.method`."""
+"""Methods of a scenario, see `excitation.method`."""

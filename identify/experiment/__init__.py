@@ -1,3 +1,4 @@
-"""The simulated experiment: true plant, images in the loop, and the truth that only validation and
-reports open.
+"""Simulated experiment: the true plant, the sensor in its loop, and the truth.
+
+Only validation and reports open the truth.
 """

@@ -1,11 +1,12 @@
-"""Optional instruments at the joints, simulated from the truth of a run: a torque sensor and an
-encoder in each joint.
+"""Simulated torque sensors and encoders at the joints, an optional addition to the experiment.
 
-The visual experiment does without them; they are what the estimators of the literature need.
-Channels stand in a file of their own beside the record. The torque is the mean over one frame
-around the instant of exposure: with a held command the joint controller's torque is a sawtooth, and
-a sample at the frames would always see the same tooth (off by half a jump, which looks like viscous
-friction). An anti-aliasing filter does the same in a real instrument.
+The visual experiment does without them. The estimators of the literature need them. Their channels
+have a file of their own beside the record.
+
+The torque is the mean over one frame around the instant of exposure. Under a held command the joint
+controller's torque is a sawtooth. A sample at each frame would always see the same tooth, half a
+jump off the mean, which looks like viscous friction. A real instrument has an anti-aliasing filter
+for this.
 """
 
 from dataclasses import dataclass
@@ -45,21 +46,36 @@ ATTRIBUTES = {
     False: ("torque_noise_N_m", "encoder_noise_rad", "encoder_resolution_rad"),
     True: ("force_noise_N", "encoder_noise_m", "encoder_resolution_m"),
 }
-"""Names of the instruments' figures where actuators turn, and where they slide."""
+"""Names of the instruments' figures: False where actuators turn, True where they slide."""
 
 SAME_INSTANT = 1e-9
-"""Frames by which a command that arrives with an exposure may be off; the plant's torque is
-recorded after it.
+"""Tolerance, in frames, within which a command counts as arriving with an exposure.
+
+The torque of the plant is recorded after such a command has acted.
 """
 
 
 @dataclass(frozen=True)
 class JointInstruments:
-    """Standard deviations of one sample of torque (N m) and angle (rad); the encoder's step (rad,
-    0: none). N and m of actuators that slide, `prismatic`.
+    """Torque sensor and encoder of each joint. The units are N and m if the actuators slide.
 
-    Defaults: 1 % of the holding torque of 2 to 3 N m of `rss6`, and an encoder of 17 bits.
-    Raises ScenarioError for one that is negative or no finite number.
+    The defaults are 1 % of the holding torque of 2 to 3 N m of `rss6`, and an encoder of 17 bits.
+
+    Attributes
+    ----------
+    torque_noise : float
+        Standard deviation of one sample of torque, N m.
+    encoder_noise : float
+        Standard deviation of one reading of the angle, rad.
+    encoder_resolution : float
+        Step of the encoder, rad; 0 for none.
+    prismatic : bool
+        True if the actuators slide.
+
+    Raises
+    ------
+    ScenarioError
+        If a figure is negative or not finite.
     """
 
     torque_noise: float = 0.02
@@ -74,14 +90,16 @@ class JointInstruments:
 
     @property
     def figures(self) -> dict[str, float]:
-        """The figures by names that end in their units."""
+        """Figures by names that end in their units."""
         values = self.torque_noise, self.encoder_noise, self.encoder_resolution
         return dict(zip(ATTRIBUTES[self.prismatic], values, strict=True))
 
 
 TURNING = JointInstruments()
 SLIDING = JointInstruments(0.5, 1e-6, 1e-6, prismatic=True)
-"""Of actuators that slide: 1 % of a holding force of some 50 N, and scales that read a micrometre.
+"""Instruments of actuators that slide.
+
+They have 1 % of a holding force of some 50 N, and scales that read a micrometre.
 """
 
 
@@ -91,8 +109,11 @@ def instruments_of(
     encoder_noise: float | None = None,
     bits: int | None = None,
 ) -> JointInstruments:
-    """The usual instruments of a robot's joints; others where a noise (N m and rad, or N and m) or
-    the bits of an encoder are given, a turn or the travel."""
+    """Return the instruments of a robot's joints.
+
+    Noises (N m and rad, or N and m) and the number of bits of the encoder replace the usual figures
+    where they are given. The bits divide a turn, or the whole travel.
+    """
     usual = SLIDING if robot.layout.prismatic else TURNING
     whole = 2 * (robot.travel_limit if robot.layout.prismatic else pi)
     return JointInstruments(
@@ -111,9 +132,20 @@ def measure_joints(
     rng: np.random.Generator,
     latencies: Array | None = None,
 ) -> xr.Dataset:
-    """What the instruments read during a run, `joint_torque` and `joint_angle` (N, n).
+    """Return the readings of the instruments during a run, `joint_torque` and `joint_angle` (N, n).
 
-    latencies (N,): of each frame's command, s, where they differ from the timing's.
+    Parameters
+    ----------
+    record, truth : xarray.Dataset
+        Record and truth of the run.
+    timing : Timing
+        Timing of the scenario.
+    instruments : JointInstruments
+        Instruments at the joints.
+    rng : numpy.random.Generator
+        Source of the noise.
+    latencies : ndarray, shape (N,), optional
+        Latency of each frame's command, s. The default is that of the timing.
     """
     at_encoder = "motor_angle" if "motor_angle" in truth else "joint_angle"
     angle = truth[at_encoder].values
@@ -125,6 +157,7 @@ def measure_joints(
     )
     each = np.full(len(command), timing.latency_s) if latencies is None else latencies
     sampled = truth["joint_torque"].values
+    # A filtered derivative does not jump with the rate of the command.
     at_jump = np.array([law.lp, 0.0 if law.filter_time else law.rate_weight * law.ld])
     torque = frame_mean(sampled, command, law.held(sampled[0], angle[0])[0], at_jump, timing, each)
     torque = torque + instruments.torque_noise * rng.standard_normal(torque.shape)
@@ -142,13 +175,26 @@ def measure_joints(
 def frame_mean(
     torque: Array, command: Array, start: Array, gains: Array, timing: Timing, latencies: Array
 ) -> Array:
-    """Torque (N, n) averaged over one frame around each sample, from samples of a torque that jumps
-    with each command.
+    """Return the torque (N, n) averaged over one frame around each sample.
 
-    The jump is lp dU + ld dU_dot, without lp dU where commands (N, n) ramp; before the first one
-    the command is `start` (n,). gains: lp, ld; latencies (N,), s, of the frames' commands. A jump s
-    before or after a sample is in it or not, and in the mean over a frame T for T/2 - s: the
-    difference is taken off the sample.
+    The sampled torque jumps with each command by lp dU + ld dU_dot, or by ld dU_dot where commands
+    ramp. A jump at a time s from a sample, within half a frame T, acts for T/2 - s of the mean,
+    while the sample has it whole or not at all. The difference is taken off the sample.
+
+    Parameters
+    ----------
+    torque : ndarray, shape (N, n)
+        Samples.
+    command : ndarray, shape (N, n)
+        Commands of the frames.
+    start : ndarray, shape (n,)
+        Command before the first one.
+    gains : ndarray, shape (2,)
+        Gains lp and ld.
+    timing : Timing
+        Frame rate, and whether commands are held or ramp.
+    latencies : ndarray, shape (N,)
+        Latencies of the commands, s.
     """
     issued = np.vstack([start, start, command])
     step = np.diff(issued, axis=0)
@@ -166,10 +212,10 @@ def frame_mean(
 
 
 def read_channels(path: Path) -> xr.Dataset:
-    """Read the channels of a file, checked.
+    """Read and check the channels of a file.
 
-    Raises RecordError: truncated, a channel or a standard deviation missing, or values that are not
-    finite.
+    Raises RecordError if it is truncated, lacks a channel or a standard deviation, or has values
+    that are not finite.
     """
     channels = read_group(path)
     check_variables(channels, VARIABLES, str(path))

@@ -1,4 +1,4 @@
-"""A control law with a model of the robot, made ready to follow a motion of a scenario's plant."""
+"""Control laws with a model of the robot, prepared to follow a motion of a scenario's plant."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,23 +17,27 @@ from identify.errors import ScenarioError, TrajectoryError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop
 from identify.loop_parameters import model_settings
-from identify.plugins import LAWS, Telling, chosen, is_own
+from identify.own_parts import LAWS, Telling, chosen, is_own
 from identify.scenario import Scenario
 from identify.scenario.plant_sections import FILTERED
 
 FASTEST = 1.0
-"""Bandwidth of computed_torque with an observer, times the time between two frames: its gains may
-then double before the loop is lost. At the noise of the sensors here a slower loop is further from
-the motion."""
+"""Bandwidth of computed_torque with an observer, times the time between two frames.
+
+Its gains may then double before the loop is lost. At the noise of the present sensors, a slower
+loop is further from the motion.
+"""
 
 FASTEST_UNSEEN = 0.5
-"""The same without, times the delay from the motion to its torque: the latency, half a frame of
-hold, one frame of difference."""
+"""Bandwidth of computed_torque without an observer, times the delay from the motion to its torque.
+
+The delay is the latency, half a frame of hold, and one frame of difference quotient.
+"""
 
 
 @dataclass(frozen=True)
 class NamedMotion:
-    """A motion, how it is called, and how long it takes, s."""
+    """Motion with its name in messages and its duration, s."""
 
     name: str
     motion: Motion
@@ -42,8 +46,17 @@ class NamedMotion:
 
 @dataclass(frozen=True)
 class Seen:
-    """By what the loop sees: measure(frame, t, pose, rate) as `SensorInLoop` does; the covariance
-    (6, 6) of the noise of a frame's pose, and that of what all poses have in common."""
+    """Measurement in the loop.
+
+    Attributes
+    ----------
+    measure : callable
+        ``measure(frame, t, pose, rate)``, as `SensorInLoop.measure`.
+    noise : callable
+        Covariance (6, 6) of the noise of a frame's pose.
+    common : ndarray, shape (6, 6)
+        Covariance of the error that all poses have in common.
+    """
 
     measure: Callable[[int, float, Array, Array], Array | None]
     noise: Callable[[int], Array]
@@ -52,8 +65,17 @@ class Seen:
 
 @dataclass(frozen=True)
 class KnownModel:
-    """What a law knows: parameters (p,), the law of the drives, None: the scenario's model's; and
-    how far the torques may be from the true ones (`inverse_dynamics.Model`)."""
+    """Knowledge of a control law.
+
+    Attributes
+    ----------
+    parameters : ndarray, shape (p,)
+        Parameters of its model, SI.
+    drive : DriveName, optional
+        Law of the drives. The default is that of the scenario's model.
+    doubt : float
+        Uncertainty of the torques, see `inverse_dynamics.Model`.
+    """
 
     parameters: Array
     drive: DriveName | None = None
@@ -61,7 +83,7 @@ class KnownModel:
 
 
 def by_images(eye: SensorInLoop) -> Seen:
-    """By the sensor."""
+    """Return the measurement by a sensor with images."""
     return Seen(eye.measure, lambda frame: eye.covariances[frame], eye.common)
 
 
@@ -73,12 +95,32 @@ def prepared(
     seen: Seen,
     latencies: Array | None = None,
 ) -> LawInLoop:
-    """A law ready to follow a motion.
+    """Prepare a law to follow a motion.
 
-    Raises ScenarioError: a law that is none, or needs torques which the drives do not take, or
-    actuators that cannot hold the platform. Raises TrajectoryError: a motion beyond reach or
-    travel, with time and leg. Raises SimulationError: gains that are unstable with this model, or a
-    law of one's own that fails.
+    Parameters
+    ----------
+    plant : Plant
+        Plant that is to follow.
+    law : str
+        Name of the law, or ``module:function``.
+    known : KnownModel
+        Model of the law.
+    motion : NamedMotion
+        Motion to follow.
+    seen : Seen
+        Measurement in the loop.
+    latencies : ndarray, shape (frames,), optional
+        Latencies of the commands, s, as the law knows them. The default is that of the timing.
+
+    Raises
+    ------
+    ScenarioError
+        If the law is unknown or needs torques that the drives do not take, or if the actuators
+        cannot hold the platform.
+    TrajectoryError
+        If the motion leaves reach or travel. The message names time and leg.
+    SimulationError
+        If the gains are unstable with this model, or a user's own law fails.
     """
     scenario = plant.scenario
     robot = plant.nominal
@@ -117,8 +159,7 @@ def prepared(
     if found.drives.torques and not scenario.control.torque_access:
         raise ScenarioError(
             f"law {law} sets torques, which the drives of {robot.name} do not take: "
-            "control.torque_access = false; "
-            "feedforward needs joint commands only"
+            "control.torque_access = false; feedforward needs joint commands only"
         )
     if law == "computed_torque":
         check_torque_gains(model, settings, desired[0], asked)
@@ -128,15 +169,16 @@ def prepared(
 
 
 def _telling(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of a law; one of a user's own tells in one line what it raises."""
+    """A function of a law. A user's own function reports its errors in one line."""
     return Telling(f"law {law!r}", asked, SimulationError) if is_own(law) else asked
 
 
 def feedback(scenario: Scenario) -> Feedback:
-    """What a scenario asks of the loop of computed_torque."""
+    """Return the loop gains that a scenario asks of computed_torque."""
     control = scenario.control
     timing = scenario.timing
     period = timing.frame_period_s
+    # Latency, half a frame of hold, and one frame of difference quotient.
     delay = timing.latency_s + 1.5 * period
     fastest = FASTEST / period if control.observer else FASTEST_UNSEEN / delay
     return Feedback(control.bandwidth_rad_s or fastest, control.damping, control.observer)

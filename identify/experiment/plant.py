@@ -1,5 +1,6 @@
-"""The simulated real robot of a scenario: what it is, does and carries, and where it is not the
-robot that is known.
+"""True robot of a scenario in its simulated loop, and the load that it carries.
+
+Its geometry, friction law and drives may differ from those that the estimator knows.
 """
 
 from dataclasses import dataclass, replace
@@ -29,21 +30,31 @@ from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import loop_settings, of_actuators
 from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
-from identify.record.covariance import factor
 from identify.record.known_geometry import KnownGeometry, known_geometry
 from identify.record.payload import payload_vector
+from identify.record.pose_covariance import factor
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario
 
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """The true robot in its loop, made once by `build_plant`.
+    """The true robot in its loop, made by `build_plant`.
 
-    nominal: the robot that servo and estimator know; robot: the true one, the same object where
-    there is no geometry error; parameters (p,): the true ones; settings: of its loop, whose joints
-    may be elastic; geometry_covariance (g, g): of the true geometry about the known one, where that
-    is calibrated.
+    Attributes
+    ----------
+    scenario : Scenario
+        Scenario that describes the plant.
+    nominal : Robot
+        Robot that servo and estimator know.
+    robot : Robot
+        True robot. It is the same object as `nominal` if the geometry has no error.
+    parameters : ndarray, shape (p,)
+        True parameters, SI.
+    settings : LoopSettings
+        True loop, whose joints may be elastic.
+    geometry_covariance : ndarray, shape (g, g), optional
+        Covariance of the true geometry about the known one, where that is calibrated.
     """
 
     scenario: Scenario
@@ -54,15 +65,17 @@ class Plant:
     geometry_covariance: Array | None = None
 
     def check(self) -> None:
-        """Raise dynamics.DynamicsError, with the evidence, where it cannot be simulated, and as
-        `holding` at home.
+        """Raise an error, with the evidence, if the plant cannot be simulated or stay at home.
+
+        The error is a dynamics.DynamicsError, or the ScenarioError of `holding`.
         """
         self._settings_at(self.parameters, self.nominal.home_pose)
         self.holding(self.nominal.home_pose)
 
     def holding(self, pose: Array) -> Array:
-        """Torques or forces (n,) at rest at a pose (6,). Raises ScenarioError where the actuators
-        do not have them.
+        """Return the actuators' torques or forces (n,) at rest at a pose (6,).
+
+        Raises ScenarioError if one exceeds the torque limit.
         """
         robot = self.robot
         limit = self.settings.drives.torque_limit
@@ -87,16 +100,38 @@ class Plant:
     ) -> ClosedLoopRun:
         """Follow a reference under a servo that knows the nominal robot.
 
-        load (p,): what the platform carries, as it adds to the parameters; law: None for the servo
-        alone. Raises what `dynamics.closed_loop.simulate_servo` raises; a LoopFailure says in
-        addition what the linear map of the loop says.
+        Parameters
+        ----------
+        reference : Reference
+            Desired motion, one row a frame.
+        sensor : Sensor
+            Source of the measured poses.
+        latencies : ndarray, shape (frames,), optional
+            Latency of each frame's command, s. The default is that of the timing.
+        load : ndarray, shape (p,), optional
+            Change of the parameters by the load on the platform.
+        law : LawInLoop, optional
+            Control law. The default is the servo alone.
+
+        Returns
+        -------
+        ClosedLoopRun
+            One row a frame.
+
+        Raises
+        ------
+        LoopFailure
+            If the robot leaves its reach. Under the servo, the message adds the verdict of the
+            linear map of the loop.
+        DynamicsError
+            As for `dynamics.closed_loop.simulate_servo`.
         """
         parameters = self.parameters if load is None else self.parameters + load
         settings = self._settings_at(parameters, reference.poses[0])
         known = None if self.robot is self.nominal else self.nominal
         law = law or LawInLoop()
         settings = replace(settings, drives=replace(settings.drives, torques=law.drives.torques))
-        given = self.robot, parameters, reference, settings
+        given = (self.robot, parameters, reference, settings)
         try:
             if law.controller is not None:
                 return simulate_controller(*given, law.controller, sensor, latencies=latencies)
@@ -108,15 +143,14 @@ class Plant:
                 latencies=latencies,
             )
         except LoopFailure as error:
+            # The linear map describes the servo alone.
             if law.controller is not None and not law.by_servo:
                 raise
             said = stability.verdict(self.nominal, parameters, settings, reference.poses[0])
             raise LoopFailure(f"{error}; {said}", error.frame, error.saturated) from None
 
     def truth(self, run: ClosedLoopRun) -> xr.Dataset:
-        """The truth of a run: what it did, the parameters without a load, and what the model has no
-        place for.
-        """
+        """Return the truth of a run: motion, parameters without a load, and model mismatch."""
         truth = build_truth(
             time=run.time,
             pose=run.pose,
@@ -130,7 +164,7 @@ class Plant:
             mismatch=self._mismatch(run),
             prismatic=self.robot.layout.prismatic,
         )
-        # parameters hold them
+        # The drive gains are among the parameters already.
         switches = self.scenario.plant.model_dump(exclude_none=True, exclude={"drive_gains"})
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 
@@ -146,8 +180,7 @@ class Plant:
         return found
 
     def _settings_at(self, parameters: Array, pose: Array) -> LoopSettings:
-        """The settings, with more steps a frame where elastic joints vibrate too fast for
-        theirs."""
+        """Settings with enough steps a frame for the vibration of elastic joints."""
         settings = self.settings
         springs = self.settings.elasticity
         if springs is None:
@@ -163,11 +196,24 @@ def build_plant(
     seed: int = 0,
     known: KnownGeometry | None = None,
 ) -> Plant:
-    """The plant of a scenario; nominal: its robot, where it is at hand; seed: of the run, which
-    decides what is true of a geometry that is calibrated; known: what is known of it, where that is
-    at hand.
+    """Build the plant of a scenario.
 
-    Raises ScenarioError: no such parameter set (with the valid names), or as `known_geometry`.
+    Parameters
+    ----------
+    scenario : Scenario
+        Scenario that describes the plant.
+    nominal : Robot, optional
+        Robot of the scenario. The default loads it.
+    seed : int
+        Seed of the run. The true values of a calibrated geometry are drawn from it.
+    known : KnownGeometry, optional
+        Geometry that the estimator knows. The default is that of the scenario.
+
+    Raises
+    ------
+    ScenarioError
+        If there is no such parameter set (the message lists the valid names), or as for
+        `known_geometry`.
     """
     nominal = nominal or load_robot(scenario.robot)
     switches = scenario.plant
@@ -190,8 +236,7 @@ def build_plant(
 
 
 def true_parameters(nominal: Robot, switches: PlantSwitches) -> Array:
-    """The true parameters (p,): of a named set, with the gains of the drives that the plant
-    states."""
+    """Return the true parameters (p,): those of a named set, with the drive gains of the plant."""
     values = starting_guess(nominal, switches.parameters, 1.0, drive=switches.drive).values
     layout = nominal.layout
     for name, gain in switches.drive_gains.items():
@@ -200,8 +245,14 @@ def true_parameters(nominal: Robot, switches: PlantSwitches) -> Array:
 
 
 def true_robot(nominal: Robot, scenario: Scenario, seed: int, known: KnownGeometry) -> Robot:
-    """The true robot: off the scenario's by the errors of its plant, or, where a calibration done
-    before says what is known, drawn about that with its covariance."""
+    """Return the robot with its true geometry.
+
+    A geometry that no calibration covers has the errors that the plant states. If this run
+    calibrates it, the offsets of the encoders are added. If it was calibrated before, the true
+    geometry is drawn about the calibrated one with its covariance.
+
+    Raises ScenarioError if the plant states errors for a geometry that was calibrated before.
+    """
     if known.covariance is None:
         return misplaced(nominal, scenario.plant)
     if scenario.geometry.known == "calibrated":
@@ -210,25 +261,27 @@ def true_robot(nominal: Robot, scenario: Scenario, seed: int, known: KnownGeomet
         if getattr(scenario.plant, name):
             raise ScenarioError(
                 f"plant.{name} = {getattr(scenario.plant, name):g} with geometry.known = "
-                f"{scenario.geometry.known!r}: "
-                "the true geometry is drawn from the covariance of that calibration; set one of "
-                "both"
+                f"{scenario.geometry.known!r}: the true geometry is drawn from the covariance of "
+                "that calibration; set one of both"
             )
     drawn = np.random.default_rng(child(seed, TRUE_GEOMETRY)).standard_normal(len(known.covariance))
     return known.robot.moved(factor(known.covariance) @ drawn)
 
 
 def true_deviations(robot: Robot, scenario: Scenario, seed: int) -> Array:
-    """How far the true geometric numbers (g,) of a robot that is calibrated are from its own, m and
-    rad, with the offsets of its encoders, which are the seed's."""
+    """Return the deviations (g,) of the true geometric numbers from the nominal ones, m and rad.
+
+    They include the offsets of the encoders, which are drawn from the seed.
+    """
     drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
     true = misplaced(robot, scenario.plant).geometry
     offset = of_actuators(robot, scenario.geometry, "encoder_offset")
+    # An offset of an encoder is the opposite shift of its joint.
     return true.shifted(-offset * drawn).deviations_from(robot.geometry)
 
 
 def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:
-    """The true robot, with the errors of geometry of a scenario's plant."""
+    """Return the robot with the geometric errors that a scenario's plant states."""
     rng = np.random.default_rng(plant.geometry_seed)
     geometry = nominal.geometry.with_errors(
         plant.geometry_error_m, rng, plant.length_error_m, plant.axis_error_rad
@@ -238,8 +291,10 @@ def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:
 
 @dataclass(frozen=True)
 class PlatformLoad:
-    """What a load adds to the parameters (p,): the stated values with their standard deviations,
-    and the true ones.
+    """Load on the platform, as changes of the parameters (p,).
+
+    ``stated`` are the stated values, ``std`` their standard deviations, and ``true`` the true
+    values.
     """
 
     stated: Array
@@ -250,8 +305,10 @@ class PlatformLoad:
 def drawn_load(
     layout: ParameterLayout, scenario: Scenario, rng: np.random.Generator
 ) -> PlatformLoad:
-    """The scenario's load, whose true figures miss the stated ones by the stated deviations; no
-    figure is negative.
+    """Draw the scenario's load.
+
+    The true values scatter about the stated ones with the stated standard deviations. Draws with a
+    negative value are repeated.
     """
     load = scenario.payload
     stated = payload_vector(layout, load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))

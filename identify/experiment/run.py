@@ -1,15 +1,11 @@
-"""The experiment: the true plant runs a trajectory with the images in the loop, and what is seen is
-recorded.
+"""Experiment: the true plant runs a trajectory with the sensor in the loop, and its record is kept.
 
-What is random is drawn from the streams of `identify.random_streams`.
+All random numbers come from the streams of `identify.random_streams`.
 """
 
-import warnings
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import platformdirs
 import xarray as xr
 
 import cmmsim
@@ -18,24 +14,19 @@ from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from dynamics.closed_loop.command_schedule import acting_times
 from identify.arrays import Array
-from identify.errors import WriteError
 from identify.estimation.prior import model_guess
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
-from identify.excitation.design import design_trajectories
-from identify.experiment.known_rig import known_rig
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, by_images, prepared
-from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
+from identify.experiment.plant import Plant, PlatformLoad, drawn_load
+from identify.experiment.rig_as_known import known_rig
 from identify.experiment.sensor_in_loop import (
     PoseSensor,
     SensorInLoop,
     make_sensor,
     sensor_file,
-    with_renderer,
 )
-from identify.files.atomic import write_bytes
-from identify.files.dataset import netcdf
 from identify.filtering import spline_derivatives, without_gaps
-from identify.progress import Advance, Progress, SilentProgress
+from identify.progress import Advance, Progress
 from identify.random_streams import (
     ANCHOR,
     CALIBRATION,
@@ -48,12 +39,12 @@ from identify.random_streams import (
     stream_seed,
 )
 from identify.record import recording
-from identify.record.common_errors import CommonErrors, store_common_errors
 from identify.record.drift import store_finding
 from identify.record.geometry_errors import store_geometry_covariance
-from identify.record.law import SERVO, store_law
 from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
+from identify.record.recorded_law import SERVO, store_law
+from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory, check_travel
 
@@ -63,9 +54,11 @@ PAYLOAD_RUN = 1_000_000
 
 @dataclass(frozen=True)
 class Latencies:
-    """Of the frames of a run (frames,), s: the true ones, and as they are known to a law of control
-    and to the record, which do not know how far their mean is from the scenario's. None: all are
-    the scenario's."""
+    """Latencies (frames,) [s] of the commands of a run. None stands for those of the scenario.
+
+    ``true`` are those that act. ``known`` are those that a control law and the record see, which
+    lack the unknown error of their mean.
+    """
 
     true: Array | None = None
     known: Array | None = None
@@ -73,55 +66,14 @@ class Latencies:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One run: what the experimenter sees, and the truth."""
+    """One run: the record that the experimenter sees, and the truth."""
 
     record: xr.Dataset
     truth: xr.Dataset
 
 
-def run_experiment(
-    scenario: Scenario,
-    seed: int = 0,
-    path: Path | str | None = None,
-    progress: Progress | None = None,
-    payload: bool = False,
-) -> xr.Dataset:
-    """Choose the exciting trajectory, run it with images in the loop, and return the record.
-
-    payload: with the scenario's known load on the platform; such a record beside one without it
-    shows the scale. The record holds the load as stated, the truth as drawn from its standard
-    deviations.
-
-    Record and truth are also written as netCDF: to `path`, or to the user's cache folder; attribute
-    `path` says where (`identify.experiment.truth.read_truth(path)` opens the truth). Where the
-    cache cannot be written, a warning says so, and there is no such attribute. Raises
-    ScenarioError, TrajectoryError, WriteError, cmmsim.CmmError, dynamics.DynamicsError.
-    """
-    progress = progress or SilentProgress()
-    scenario = with_renderer(scenario)
-    plant = build_plant(scenario, seed=seed)
-    trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
-    sensor = taught_sensor(scenario, plant.nominal, seed, progress)
-    with progress.stage(
-        "record", scenario.timing.frames(scenario.excitation.duration_s)
-    ) as advance:
-        experiment = excitation_run(plant, sensor, trajectories.excitation, seed, advance, payload)
-    content = netcdf(recording.record_groups(experiment.record, experiment.truth))
-    if path is not None:
-        write_bytes(path, content, parents=True)
-        return experiment.record.assign_attrs(path=str(path))
-    kept = Path(platformdirs.user_cache_dir("cmmsim")) / "records"
-    target = kept / f"{scenario.name}-{seed}{'-payload' if payload else ''}.nc"
-    try:
-        write_bytes(target, content, parents=True)
-    except WriteError as error:
-        warnings.warn(f"the record is not kept: {error}", stacklevel=2)
-        return experiment.record
-    return experiment.record.assign_attrs(path=str(target))
-
-
 def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress) -> cmmsim.Sensor:
-    """The scenario's sensor with its frames taught."""
+    """Return the scenario's sensor with its frames taught."""
     sensor = untaught_sensor(scenario, robot, seed, progress)
     teach(sensor, progress)
     return sensor
@@ -130,14 +82,17 @@ def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progres
 def untaught_sensor(
     scenario: Scenario, robot: Robot, seed: int, progress: Progress | None = None
 ) -> cmmsim.Sensor:
-    """The scenario's sensor, its teaching and what is known of its rig seeded by the run's seed."""
+    """Return the scenario's sensor before teaching.
+
+    The run's seed decides its noise in teaching, and the error of the known rig.
+    """
     rng = np.random.default_rng(stream_seed(seed, CALIBRATION))
     known = known_rig(scenario, sensor_file(scenario), rng, progress)
     return make_sensor(scenario, robot, stream_seed(seed, TEACHING), known=known)
 
 
 def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
-    """Teach the frames of a sensor, in hundredths of the work."""
+    """Teach the frames of a sensor, and report the progress in hundredths."""
     with progress.stage("teach the sensor", 100) as advance:
         shown = 0
 
@@ -157,8 +112,9 @@ def excitation_run(
     advance: Advance = lambda n=1: None,
     payload: bool = False,
 ) -> Experiment:
-    """Run the plant along the exciting trajectory, bare or under the scenario's load. Raises as
-    `run_plant` does.
+    """Run the plant along the exciting trajectory, without or with the scenario's load.
+
+    Raises the errors of `run_plant`.
     """
     duration_s = plant.scenario.excitation.duration_s
     law = plant.scenario.excitation.law
@@ -181,12 +137,37 @@ def run_plant(
     load: PlatformLoad | None = None,
     law: str = SERVO,
 ) -> Experiment:
-    """Run the plant along a trajectory; `run`: number of the run (0: excitation); `load`: what the
-    platform carries; `law`: under which it runs, with the scenario's starting model, and the load
-    as stated.
+    """Run the plant along a trajectory.
 
-    Raises TrajectoryError before the run when the trajectory leaves the travel, ScenarioError for a
-    law that cannot be, LoopFailure when the loop is unstable.
+    Parameters
+    ----------
+    plant : Plant
+        True robot in its loop.
+    sensor : PoseSensor
+        Sensor in the loop.
+    trajectory : FourierTrajectory
+        Desired motion.
+    duration_s : float
+        Length of the run.
+    seed : int
+        Seed of the experiment.
+    run : int
+        Number of the run; 0 is the excitation.
+    advance : callable
+        Receiver of the progress, once a frame.
+    load : PlatformLoad, optional
+        Load on the platform.
+    law : str
+        Name of the control law. It knows the scenario's starting model and the stated load.
+
+    Raises
+    ------
+    TrajectoryError
+        If the trajectory leaves the travel. This is checked before the run.
+    ScenarioError
+        If the law is not possible.
+    LoopFailure
+        If the loop is unstable.
     """
     scenario = plant.scenario
     times = plant.scenario.timing.frame_times(duration_s)
@@ -200,6 +181,7 @@ def run_plant(
     in_loop = None
     if law != SERVO:
         motion = NamedMotion("the trajectory", trajectory, duration_s)
+        # The law knows no more than an experimenter: starting model and stated load.
         model = model_guess(plant.nominal, scenario).values + (0.0 if load is None else load.stated)
         in_loop = prepared(plant, law, KnownModel(model), motion, by_images(eye), latencies.known)
     done = plant.run(reference, RateSensor(eye.measure), latencies.true, true_load, in_loop)
@@ -211,10 +193,10 @@ def run_plant(
     rng = np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
     if not scenario.rig.exact and isinstance(sensor, cmmsim.Sensor) and done.measured_ok.any():
+        # An exposure that is late shifts a pose by its rate, so the rates are needed, too.
         poses = without_gaps(done.measured, done.measured_ok)
-        found = sensor.common_errors(
-            poses, spline_derivatives(poses, scenario.timing.frame_rate_hz)[0]
-        )
+        rates = spline_derivatives(poses, scenario.timing.frame_rate_hz)[0]
+        found = sensor.common_errors(poses, rates)
         store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
     if watch is not None and (finding := watch.finding).judged_frames:
         store_finding(record, finding.to_dict())
@@ -229,8 +211,9 @@ def run_plant(
 
 
 def part_exposures(sensor: PoseSensor, scenario: Scenario, seed: int) -> None:
-    """Have the right camera expose later than the left by what is not known of it, one draw for all
-    runs of a seed.
+    """Delay the right camera's exposure by a random draw from its stated uncertainty.
+
+    All runs of a seed have the same delay.
     """
     rig = scenario.rig
     if isinstance(sensor, cmmsim.Sensor) and rig.right_later_s is None and rig.right_later_std_s:
@@ -239,8 +222,10 @@ def part_exposures(sensor: PoseSensor, scenario: Scenario, seed: int) -> None:
 
 
 def _watched(sensor: PoseSensor, scenario: Scenario, frames: int) -> DriftWatch | None:
-    """What watches the cameras during a run of so many frames, in which they drift as the scenario
-    says; None where nothing can: poses by planes, or a sensor that draws no images."""
+    """Let the cameras drift during a run of this many frames, and return their watch.
+
+    It is None where nothing can be watched: for poses by planes, or a sensor without images.
+    """
     if not isinstance(sensor, cmmsim.Sensor):
         return None
     sensor.drift_rig(scenario.rig.drift, frames)
@@ -250,17 +235,17 @@ def _watched(sensor: PoseSensor, scenario: Scenario, frames: int) -> DriftWatch 
 
 
 def drawn_latencies(scenario: Scenario, frames: int, seed: int, run: int) -> Latencies:
-    """Latencies of the frames of a run. What is not known of their mean is one draw for all runs of
-    a seed.
+    """Draw the latencies of the frames of a run.
+
+    The unknown error of their mean is the same for all runs of a seed.
     """
     timing = scenario.timing
     known = timing.drawn_latencies(frames, np.random.default_rng(stream_seed(seed, LATENCY, run)))
     if not timing.latency_std_s:
         return Latencies(known, known)
-    off = (
-        timing.latency_std_s
-        * np.random.default_rng(stream_seed(seed, MEAN_LATENCY)).standard_normal()
-    )
+    drawn = np.random.default_rng(stream_seed(seed, MEAN_LATENCY)).standard_normal()
+    off = timing.latency_std_s * drawn
+    # No command acts before it is issued.
     true = np.maximum((timing.latency_s if known is None else known) + np.full(frames, off), 0.0)
     return Latencies(true, known)
 
@@ -273,11 +258,9 @@ def _record(
     seed: int,
     latencies: Array | None,
 ) -> xr.Dataset:
-    """What is seen of a run; latencies (frames,) s as they are known, None: all are the
-    scenario's."""
-    latencies = (
-        np.full(len(run.time), plant.scenario.timing.latency_s) if latencies is None else latencies
-    )
+    """Record of a run with the known latencies (frames,) [s]; None stands for the scenario's."""
+    if latencies is None:
+        latencies = np.full(len(run.time), plant.scenario.timing.latency_s)
     record = recording.build_record(
         time=run.time,
         reference_pose=reference.poses,
@@ -296,4 +279,5 @@ def _record(
     store_robot(record, plant.nominal)
     if plant.geometry_covariance is not None:
         store_geometry_covariance(record, plant.nominal, plant.geometry_covariance)
+    # Twenty reasons are enough to see why frames were lost.
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))

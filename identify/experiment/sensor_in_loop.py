@@ -1,6 +1,4 @@
-"""The rendering stereo sensor as the pose sensor of the closed loop: it measures, and remembers
-what it said.
-"""
+"""Rendering stereo sensor as the pose sensor of the closed loop, with a log of its measurements."""
 
 import time
 from collections.abc import Mapping
@@ -13,8 +11,8 @@ from numpy.typing import NDArray
 
 import cmmsim
 from cmmsim.files import SensorFile, read_sensor_file
+from cmmsim.files.rig_and_bodies import marked_body
 from cmmsim.files.schema import unit
-from cmmsim.files.setup import marked_body
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.imaging.scene_bodies import PlacedBodies, rod_transforms
 from cmmsim.uncertainty.known_rig import KnownRig
@@ -27,21 +25,20 @@ from identify.progress import Advance
 from identify.scenario import Scenario
 
 OFF_PLATFORM_M = 0.05
-"""How far a leg may end from the platform that the sensor sees, and home be from its home."""
+"""Largest distance of a leg's end from the platform that the sensor sees, and of both homes, m."""
 
 
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
-    """Meshes [m] of the bodies of all legs, rods along their z axes from their first joints; they
-    hide stickers.
+    """Return the meshes [m] of the bodies of all legs, by their names. They can hide stickers.
+
+    A rod lies along its z axis and begins at its first joint.
     """
     return dict(_meshes(robot.geometry))
 
 
 @lru_cache(maxsize=4)
 def _meshes(geometry: RobotGeometry) -> dict[str, trimesh.Trimesh]:
-    """Those of a geometry, made once a process: rows of a study have a sensor each, and mostly the
-    same robot.
-    """
+    """Meshes of a geometry, cached because the rows of a study mostly have the same robot."""
     return {
         part.name: cmmsim.rod(
             float(np.linalg.norm(np.diff(part.segment.rod, axis=0))), part.segment.radius
@@ -52,9 +49,7 @@ def _meshes(geometry: RobotGeometry) -> dict[str, trimesh.Trimesh]:
 
 @lru_cache(maxsize=16)
 def _drawn(geometry: RobotGeometry) -> tuple[list[Part], tuple[str, ...], NDArray[np.int_]]:
-    """The parts of a geometry as its parameters are ordered, their names, and their places leg by
-    leg.
-    """
+    """Parts of a geometry sorted by body, their names, and their indices in the legs' order."""
     parts = parts_of(geometry).all
     places = sorted(range(len(parts)), key=lambda place: parts[place].body)
     return (
@@ -65,8 +60,9 @@ def _drawn(geometry: RobotGeometry) -> tuple[list[Part], tuple[str, ...], NDArra
 
 
 def robot_transforms(robot: Robot, pose: Array) -> PlacedBodies:
-    """base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,), in the order
-    of their meshes.
+    """Return base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,).
+
+    The order is that of their meshes.
     """
     _, names, order = _drawn(robot.geometry)
     ends = parts_of(robot.geometry).rods(robot, pose)[order]
@@ -80,11 +76,27 @@ def make_sensor(
     taught: cmmsim.Taught | None = None,
     known: KnownRig | None = None,
 ) -> cmmsim.Sensor:
-    """The scenario's sensor, with its timing and with the bodies of the robot's legs in its view,
-    and with its rig as it is known; None: exactly, or as it was when it was taught.
+    """Make the scenario's sensor, with its timing, its rig errors and the robot's legs in view.
 
-    One a process: it owns the renderer. Raises ScenarioError where the platform that it sees is not
-    the robot's.
+    A process should make only one, because the sensor owns the renderer.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Scenario with the sensor's settings.
+    robot : Robot
+        Robot whose legs are in view.
+    seed : int
+        Seed of the sensor.
+    taught : cmmsim.Taught, optional
+        Frames taught before.
+    known : KnownRig, optional
+        Rig as the estimator knows it. The default is exact knowledge, or the rig of `taught`.
+
+    Raises
+    ------
+    ScenarioError
+        If the platform that the sensor sees is not the robot's.
     """
     file = sensor_file(scenario)
     check_platform(robot, file, scenario.sensor)
@@ -98,8 +110,10 @@ def make_sensor(
 
 
 def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
-    """How far each leg of a robot ends outside of the platform of a sensor file (n,), and how far
-    that is at home from the robot's; m."""
+    """Return the distances (n,) [m] of the legs' ends outside the platform of a sensor file.
+
+    The second value is the distance [m] between the home of that platform and the robot's.
+    """
     body = marked_body("platform", file.platform)
     cuts = file.platform.cuts
     normals = np.vstack([body.normals, *[unit(cut.normal) for cut in cuts]])
@@ -109,15 +123,18 @@ def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
 
 
 def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
-    """Raise ScenarioError, with leg and distance, where legs end in mid-air beside the platform of
-    a sensor file, or where that is at home elsewhere than the robot's."""
+    """Raise ScenarioError if the platform of a sensor file is not the robot's.
+
+    It is not if a leg ends too far outside of it, or if its home is elsewhere. The message names
+    leg and distance.
+    """
     outside, away = platform_distances(robot, file)
     leg = int(np.argmax(outside))
     if outside[leg] > OFF_PLATFORM_M:
         raise ScenarioError(
             f"platform joint {leg + 1} of {robot.name} is {outside[leg]:.3g} m outside of the "
-            "platform that sensor "
-            f"{sensor} sees, limit {OFF_PLATFORM_M:g} m: its [platform] has to be that of the robot"
+            f"platform that sensor {sensor} sees, limit {OFF_PLATFORM_M:g} m: its [platform] has "
+            "to be that of the robot"
         )
     if away > OFF_PLATFORM_M:
         raise ScenarioError(
@@ -127,22 +144,23 @@ def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
 
 
 def sensor_file(scenario: Scenario) -> SensorFile:
-    """The file of the scenario's sensor with the scenario's changes and timing."""
+    """Return the file of the scenario's sensor, with the scenario's changes and timing."""
     file = read_sensor_file(scenario.sensor, scenario.sensor_changes)
     return file.model_copy(update={"timing": scenario.timing.of_sensor()})
 
 
 def with_renderer(scenario: Scenario) -> Scenario:
-    """The scenario with what draws on this machine in place of "auto"; one line of warning where
-    OpenGL is missing.
+    """Return the scenario with the renderer of this machine in place of "auto".
+
+    Where OpenGL is missing, one line of warning says so.
     """
     return scenario.with_overrides({"renderer": choose_renderer(scenario.renderer).name})
 
 
 class PoseSensor(Protocol):
-    """What measures in the loop: `cmmsim.Sensor`, or one that answers as it does.
+    """Sensor in the loop: `cmmsim.Sensor`, or an object that answers as it does.
 
-    One that says `sees_bodies = False` is not told where the robot's legs are, which takes time.
+    A sensor with `sees_bodies = False` is not told where the robot's legs are, which saves time.
     """
 
     def start_run(self, seed: int) -> None:
@@ -154,18 +172,18 @@ class PoseSensor(Protocol):
         obstacles: Mapping[str, Array] | None = None,
         pose_rate: Array | None = None,
     ) -> cmmsim.Measurement:
-        """Measure the platform at a pose (6,) [m, rad] in motion at pose_rate (6,), behind
-        obstacles (4, 4).
+        """Measure the platform at a pose (6,) [m, rad] with rate pose_rate (6,).
+
+        Obstacles are base_from_body (4, 4) by the names of the bodies.
         """
         ...
 
 
 class SensorInLoop:
-    """Sensor for `closed_loop.simulate_servo`: a measured pose (6,) a frame, or None where it lost
-    the platform.
+    """Sensor for the closed loop: a measured pose (6,) a frame, or None if the platform was lost.
 
-    Keeps the covariances (6, 6) of every frame (NaN where lost), the reasons of lost frames, and
-    the seconds spent on rendering and measuring.
+    It keeps the covariances (6, 6) of all frames (NaN where lost), the reasons of lost frames, and
+    the seconds that rendering and measuring took.
     """
 
     def __init__(
@@ -182,9 +200,7 @@ class SensorInLoop:
 
     @property
     def common(self) -> Array:
-        """Covariance (6, 6) of what all its poses near home have in common, as far as teaching
-        says.
-        """
+        """Covariance (6, 6), from teaching, of the error that all poses near home share."""
         taught = getattr(self._sensor, "taught", None)
         return (
             np.zeros((6, 6))
@@ -193,8 +209,7 @@ class SensorInLoop:
         )
 
     def measure(self, frame: int, t: float, pose: Array, rate: Array) -> Array | None:
-        """Measure the platform at its true pose in motion at its true rate; only the renderer sees
-        these.
+        """Measure the platform at its true pose and rate. Only the renderer sees these.
 
         The rate blurs the picture of an exposure that is not instantaneous.
         """

@@ -1,4 +1,4 @@
-"""The truth of a simulated run, in its own netCDF group; only validation and reports open it."""
+"""Truth of a simulated run, in its own netCDF group. Only validation and reports open it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +19,8 @@ from identify.files.dataset import (
     read_group,
     with_joint_units,
 )
-from identify.record.recording import TRUTH_GROUP, run_names
+from identify.record.provenance import digest
+from identify.record.recording import TRUTH_GROUP, read, run_names
 
 VARIABLES: Variables = {
     "position": (("time", "axis"), "m", "true position of the platform"),
@@ -51,7 +52,7 @@ MISMATCH: Variables = {
         "place of the motor of an elastic joint, which its encoder reads",
     ),
 }
-"""What is recorded of a plant only where it is not the nominal robot with rigid joints."""
+"""Variables of a plant that is not the nominal robot with rigid joints."""
 
 
 def build_truth(
@@ -66,11 +67,29 @@ def build_truth(
     mismatch: Mapping[str, ArrayLike] | None = None,
     prismatic: bool = False,
 ) -> xr.Dataset:
-    """Truth of one run at the frames: ``time`` (N,) [s], pose (N, 6), joint arrays (N, n),
-    parameters (p,) with names; ``mismatch``: values of some of `MISMATCH`; ``prismatic``: whether
-    the joints slide.
+    """Build the truth of one run.
 
-    Raises RecordError: wrong shapes, or numbers that are not finite.
+    Parameters
+    ----------
+    time : array_like, shape (N,)
+        Times of the frames, s.
+    pose : array_like, shape (N, 6)
+        True poses, m and rad.
+    joint_angle, joint_velocity, joint_torque : array_like, shape (N, n)
+        True joint coordinates, velocities, and torques or forces.
+    parameter_names : list of str
+        Names of the parameters.
+    parameters : array_like, shape (p,)
+        True parameters, SI.
+    mismatch : mapping, optional
+        Values of some of the variables of `MISMATCH`.
+    prismatic : bool
+        True if the joints slide.
+
+    Raises
+    ------
+    RecordError
+        If a shape is wrong or a number is not finite.
     """
     truth = described_dataset(
         {
@@ -91,28 +110,30 @@ def build_truth(
 
 
 def read_truth(path: Path | str, run: str = "") -> xr.Dataset:
-    """Read the truth of a file, or of one of its runs (``"run01"``), checked.
+    """Read and check the truth of a file, or of one of its runs (``"run01"``).
 
-    Raises RecordError: truncated file, no truth in it, missing variables or wrong shapes.
+    Raises RecordError if the file is truncated or holds no truth, or if a variable is missing or
+    has a wrong shape.
     """
     group = f"{run}/{TRUTH_GROUP}" if run else TRUTH_GROUP
     return check_truth(read_group(path, group), f"{path}:{group}")
 
 
 def read_truth_runs(path: Path | str) -> list[xr.Dataset]:
-    """Read the truth of all runs of a file in their order. Raises RecordError: as `read_truth`, or
-    no runs in it.
+    """Read the truth of all runs of a file, in their order.
+
+    Raises RecordError as `read_truth`, or if there are no runs.
     """
     return [read_truth(path, name) for name in run_names(path)]
 
 
 def true_poses(truth: xr.Dataset) -> Array:
-    """True poses (N, 6) [m, rad] at the frames."""
+    """Return the true poses (N, 6) [m, rad] at the frames."""
     return np.hstack([truth["position"].values, truth["orientation"].values])
 
 
 def true_parameters(truth: xr.Dataset) -> dict[str, float]:
-    """True parameters by name."""
+    """Return the true parameters by name."""
     return dict(
         zip(
             map(str, truth["parameter"].values),
@@ -123,8 +144,9 @@ def true_parameters(truth: xr.Dataset) -> dict[str, float]:
 
 
 def check_truth(truth: xr.Dataset, source: str) -> xr.Dataset:
-    """Return the truth when it is complete and finite. Raises RecordError: the first thing that is
-    not so.
+    """Return the truth if it is complete and finite.
+
+    Raises RecordError that names the first fault.
     """
     expected = VARIABLES | {name: entry for name, entry in MISMATCH.items() if name in truth}
     check_variables(truth, expected, source)
@@ -133,3 +155,23 @@ def check_truth(truth: xr.Dataset, source: str) -> xr.Dataset:
     if truth.sizes["parameter"] == 0:
         raise RecordError(f"{source} has no parameters")
     return truth
+
+
+@xr.register_dataset_accessor("truth")
+def truth_of(record: xr.Dataset) -> xr.Dataset:
+    """Truth of a record, from the file that its attribute ``path`` names: ``record.truth``.
+
+    Raises RecordError where there is no such file, or where it holds the truth of another record.
+    """
+    path = record.attrs.get("path")
+    if path is None:
+        raise RecordError(
+            "the record has no attribute path, which names the file with its truth; "
+            "setup.run(path=...) writes one, and a record of a real robot has none"
+        )
+    if digest(read(path)) != digest(record):
+        raise RecordError(
+            f"{path} holds another record by now, and the truth of that; "
+            "setup.run(path=...) keeps each record in a file of its own"
+        )
+    return read_truth(path)

@@ -1,6 +1,4 @@
-"""What runs need in machine code, compiled beforehand: robots, the loop around them, and the
-sensor, side by side.
-"""
+"""Compilation of robots, closed loop and sensor before a run, in parallel."""
 
 from collections.abc import Callable
 from functools import partial
@@ -21,6 +19,7 @@ from identify.runtime import cores, deaf_offspring
 from identify.scenario import Scenario
 
 WARM_UP_FRAMES = 12
+"""Number of frames of the motion on which everything is compiled."""
 
 Task = Callable[[], None]
 
@@ -36,17 +35,19 @@ def compile_robots(robots: tuple[Robot, ...], progress: Progress) -> None:
 
 
 def warm_up(scenario: Scenario, progress: Progress, robots: tuple[str, ...] = ()) -> None:
-    """Compile into the caches on disk what runs of a scenario need, and what built-in robots do, on
-    all cores.
+    """Compile the code of a scenario's runs, and of further robots, into the caches on disk.
 
-    Each task is a process of its own: LLVM compiles on one core. Raises what a run raises before
-    its first frame, and IdentifyError where a process dies.
+    Each task has a process of its own, because LLVM compiles on one core. All cores are used.
+
+    Raises the errors of a run before its first frame, and IdentifyError if a process dies.
     """
     scenario = with_renderer(scenario)
     build_plant(scenario)
     renderers = dict.fromkeys((scenario.renderer, "analytic"))
-    tasks: dict[str, Task] = {"the robot": partial(_compile_plant, scenario)}
-    tasks["the sensor"] = partial(_compile_sensor, scenario, tuple(renderers))
+    tasks: dict[str, Task] = {
+        "the robot": partial(_compile_plant, scenario),
+        "the sensor": partial(_compile_sensor, scenario, tuple(renderers)),
+    }
     tasks |= {name: partial(_compile_named, name) for name in robots if name != scenario.robot}
     with progress.stage("compile", len(tasks)) as advance:
         _side_by_side(tasks, advance)
@@ -76,7 +77,7 @@ def _compile_named(name: str) -> None:
 
 
 def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
-    """Do tasks by their names, each in a new process, as many at a time as there are cores."""
+    """Do named tasks, each in a new process, as many at a time as there are cores."""
     spawn = get_context("spawn")
     waiting = [spawn.Process(target=task, name=name, daemon=True) for name, task in tasks.items()]
     running: list[SpawnProcess] = []
@@ -84,6 +85,7 @@ def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
         while waiting or running:
             while waiting and len(running) < cores():
                 running.append(waiting.pop(0))
+                # Ctrl-C then reaches this process alone, which kills the others.
                 with deaf_offspring():
                     running[-1].start()
             wait([process.sentinel for process in running])
@@ -101,7 +103,7 @@ def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
 
 
 def _nearby(plant: Plant) -> Reference:
-    """A motion of some millimetres from home."""
+    """Return a motion of some millimetres from home."""
     chart = plant.nominal.geometry.chart
     rate = chart.basis @ chart.coordinates(np.array([0.02, 0.0, 0.0, 0.0, 0.05, 0.0]))
     times = np.arange(WARM_UP_FRAMES)[:, None] / plant.scenario.timing.frame_rate_hz

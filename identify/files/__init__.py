@@ -1,3 +1,1 @@
-"""Files: those of a run, written whole or not at all and read with clear errors, and those of the
-package.
-"""
+"""Files of a run and of the package, written whole or not at all and read with clear errors."""

@@ -1,7 +1,7 @@
-"""Files appear whole or not at all, and what keeps one from being written is one line.
+"""Atomic writing: files appear whole or not at all, and a failure is one line.
 
-A file's content is made in memory: libraries such as netCDF's crash when the disk that they write
-to is full. It is then written beside its place, brought to the disk, and renamed.
+A file's content is made in memory, because libraries such as netCDF's crash when their disk is
+full. The content is then written beside its place, flushed to the disk, and renamed.
 """
 
 import errno
@@ -22,15 +22,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TEMPORARY = ".cmmsim-"
-"""First characters of the names of files and folders that are being written."""
+"""Prefix of the names of files and folders that are being written."""
 
 
 @contextmanager
 def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
-    """Turn what keeps the block from writing a file into one line.
+    """Turn an error that keeps the block from writing a file into a WriteError of one line.
 
-    size: bytes of the file, where they are known.
-    Raises WriteError.
+    ``size`` is the number of bytes of the file, if known.
     """
     try:
         yield
@@ -47,8 +46,9 @@ def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
 def write_bytes(path: Path | str, content: bytes, *, parents: bool = False) -> None:
     """Write a file, whole or not at all.
 
-    parents: whether missing folders are made; if it fails, they are taken back.
-    Raises WriteError: no room, no permission, or no such folder.
+    With ``parents``, missing folders are made, and removed again on failure.
+
+    Raises WriteError if there is no room, no permission, or no such folder.
     """
     write_files({Path(path): content}, parents=parents)
 
@@ -79,11 +79,12 @@ def write_files(
 ) -> None:
     """Write several files: all of them, or none.
 
-    parents: as in `write_bytes`. check: reads the first file before any is in place, and refuses
-    it by an exception.
+    ``parents`` is as in `write_bytes`. ``check`` reads the first file before any is in place, and
+    refuses it by an exception.
+
     Raises WriteError.
     """
-    mark = token_hex(4)  # one for all, so that a reader finds what belongs to the first file
+    mark = token_hex(4)  # one for all files, so that a reader of the first finds the others
     folders: list[Path] = []
     beside: dict[Path, Path] = {}
     placed: list[Path] = []
@@ -110,9 +111,9 @@ def write_files(
 
 
 def check_writable(path: Path | str) -> None:
-    """Try whether a file could be written, before its content is made.
+    """Raise WriteError if a file could not be written, before its content is made.
 
-    Raises WriteError: not into its folder, or that above it that is there; or it is a folder.
+    This is so if it is a folder, or if its nearest existing folder cannot be written to.
     """
     path = Path(path)
     with writing(path):
@@ -124,7 +125,7 @@ def check_writable(path: Path | str) -> None:
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """Make a folder and those above it; return those that were missing, the outmost first."""
+    """Make a folder and those above it; return those that were missing, the outermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -135,14 +136,14 @@ def make_folder(folder: Path) -> list[Path]:
 
 
 def take_back(folders: list[Path]) -> None:
-    """Remove folders that `make_folder` has made, as far as they are empty."""
+    """Remove folders that `make_folder` has made, if they are empty."""
     for folder in reversed(folders):
         with suppress(OSError):
             folder.rmdir()
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what a killed process was writing into a folder, and into the folders within it."""
+    """Remove unfinished files of a killed process from a folder and the folders in it."""
     for path in (*folder.glob(f"{TEMPORARY}*"), *folder.glob(f"*/{TEMPORARY}*")):
         with suppress(OSError):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -152,8 +153,9 @@ def remove_leftovers(folder: Path) -> None:
 def atomic_contents(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder whose contents stand in ``folder`` when the block has ended.
 
-    It lies within the folder, which so may be one that cannot be replaced, such as the one that
-    the command is called from. An exception leaves the folder as it was.
+    It lies within the folder, so the folder itself is never replaced. It may therefore be the
+    current directory. An exception leaves the folder as it was.
+
     Raises WriteError.
     """
     folders: list[Path] = []
@@ -182,7 +184,7 @@ def _write_beside(path: Path, content: bytes) -> None:
 
 
 def _needed(path: Path, size: int) -> str:
-    """Say how many bytes a file takes and how many are free, in words for a message."""
+    """Words for a message: how many bytes a file takes, and how many are free."""
     needed = f"; it takes {_shown(size)}"
     with suppress(OSError, ValueError):
         return f"{needed}, {_shown(shutil.disk_usage(path.parent).free)} are free"

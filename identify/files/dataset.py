@@ -1,5 +1,4 @@
-"""Described xarray datasets over time, checked for dimensions, units and names, and their groups in
-netCDF files.
+"""Described xarray datasets over time, checked for dimensions, units and names, in netCDF groups.
 
 Files are written whole or not at all, and read with clear errors. `covariance.nc` holds the
 covariance of the estimated parameters, in their SI units.
@@ -23,7 +22,7 @@ from identify.files.stranger import ENGINE, Content, StrangerError, load, load_e
 
 
 def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
-    """Write datasets as groups of one file, whole or not at all, as `netcdf` makes it.
+    """Write datasets as groups of one file (see `netcdf`), whole or not at all.
 
     Raises WriteError.
     """
@@ -33,7 +32,8 @@ def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
 def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
     """Return the file of datasets by the names of their groups; the name ``""`` is the main group.
 
-    Group by group: an `xarray.DataTree` would give each truth the coordinates of its record.
+    Groups are written one by one: an `xarray.DataTree` would give each truth the coordinates of its
+    record.
     """
     stream = io.BytesIO()
     mode: Literal["w", "a"] = "w"
@@ -48,8 +48,8 @@ def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
 def read_group(path: Path | str, group: str = "") -> xr.Dataset:
     """Read one group into memory.
 
-    Raises RecordError: no such file, no such group, a damaged file, or one that carries no digest
-    and cannot be read within the limits of `identify.files.stranger`.
+    Raises RecordError if there is no such file or group, or if the file is damaged. A file without
+    a digest must also be readable within the limits of `identify.files.stranger`.
     """
     names, dataset = _read(path, group)
     if dataset is None:
@@ -58,9 +58,9 @@ def read_group(path: Path | str, group: str = "") -> xr.Dataset:
 
 
 def group_names(path: Path | str) -> list[str]:
-    """Return the names of all groups, nested ones as ``run01/truth``, sorted.
+    """Return the sorted names of all groups, nested ones as ``run01/truth``.
 
-    Raises RecordError: as `read_group`.
+    Raises the errors of `read_group`.
     """
     return _read(path, None)[0]
 
@@ -72,6 +72,7 @@ def _read(path: Path | str, group: str | None) -> Content:
         content = Path(path).read_bytes()
     except OSError as error:
         raise RecordError(f"cannot read {path}: {error.strerror or error}") from None
+    # The right digest shows a file of our own, which the library reads safely.
     if is_sealed(path, content):
         return load(content, group)
     try:
@@ -85,6 +86,7 @@ def _encoding(dataset: xr.Dataset) -> dict[str, dict[str, object]]:
     compressed = {
         str(name): {"zlib": True, "complevel": 4} for name in numbers if dataset[name].ndim > 1
     }
+    # xarray would add a fill value of its own.
     plain = {str(name): {"_FillValue": None} for name in numbers}
     return {name: {**plain[name], **compressed.get(name, {})} for name in plain}
 
@@ -113,11 +115,11 @@ LABELS: dict[str, list[str]] = {
 
 
 SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
-"""Units of what is said of joints where actuators slide, by those where they turn."""
+"""Units of joint variables where actuators slide, by those where they turn."""
 
 
 def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
-    """The variables with the units of joints that slide, where a robot's do."""
+    """Return the variables with the joints' units: those of actuators that slide, or that turn."""
     if not prismatic:
         return variables
     return {
@@ -127,14 +129,15 @@ def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
 
 
 def joint_numbers(values: ArrayLike) -> list[int]:
-    """Labels of the joints, from 1 on, of values whose last axis they are."""
+    """Return the labels of the joints, from 1 on, of values whose last axis they are."""
     shape = np.shape(values)
     return list(range(1, (shape[-1] if len(shape) > 1 else 0) + 1))
 
 
 def pose_parts(values: ArrayLike, name: str, position: str, orientation: str) -> dict[str, Array]:
-    """Position and orientation (N, 3) of poses (N, 6), by the names of both. Raises RecordError:
-    another shape.
+    """Return position and orientation (N, 3) of poses (N, 6), by the names of both.
+
+    Raises RecordError for another shape.
     """
     array = np.asarray(values, dtype=float)
     if array.ndim != 2 or array.shape[1] != 6:
@@ -145,10 +148,11 @@ def pose_parts(values: ArrayLike, name: str, position: str, orientation: str) ->
 def described_dataset(
     values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: Any
 ) -> xr.Dataset:
-    """Dataset of described variables on a time axis; ``labels`` are the coordinates of further
-    dimensions.
+    """Build a dataset of described variables on a time axis.
 
-    Raises RecordError: an array whose shape does not fit its dimensions.
+    ``labels`` are the coordinates of further dimensions.
+
+    Raises RecordError for an array whose shape does not fit its dimensions.
     """
     coordinates: dict[str, Any] = {"time": np.asarray(time, dtype=float), **LABELS, **labels}
     used = {dim for dims, _, _ in variables.values() for dim in dims}
@@ -170,9 +174,9 @@ def described_dataset(
 
 
 def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None:
-    """Refuse a dataset that lacks one of the variables, or has it on other dimensions.
+    """Raise RecordError if a dataset lacks one of the variables, or has it on other dimensions.
 
-    Raises RecordError: naming what is missing or wrong.
+    The message names it.
     """
     missing = [name for name in variables if name not in data]
     if missing:
@@ -190,8 +194,9 @@ def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None
 
 
 def check_finite(values: Array, name: str, source: str) -> None:
-    """Refuse values that are not finite. Raises RecordError, naming the variable and how many are
-    wrong.
+    """Raise RecordError if values are not finite.
+
+    The message names the variable and the number of wrong values.
     """
     bad = int(np.count_nonzero(~np.isfinite(values)))
     if bad:
@@ -206,17 +211,17 @@ def _description(dim: str) -> dict[str, str]:
 
 
 def shown(value: object) -> str:
-    """An attribute's value in at most 60 characters of one line, as messages show it."""
+    """Return an attribute's value on one line of at most 60 characters, as messages show it."""
     return " ".join(repr(plain(value)).split())[:60]
 
 
 def plain(value: object) -> object:
-    """The value; a number of numpy, as netCDF gives it, as a plain one."""
+    """Return the value, with a NumPy number from netCDF turned into a plain one."""
     return value.item() if isinstance(value, np.generic) else value
 
 
 def as_number(value: object) -> float:
-    """An attribute's value that is a number and no truth value; NaN for anything else."""
+    """Return an attribute's value as a number; NaN for a truth value or anything else."""
     return (
         float(value)
         if isinstance(value, int | float | np.number) and not isinstance(value, bool)
@@ -239,7 +244,7 @@ def write_covariance(
 
 
 def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict[str, str]:
-    """Return the units of a robot's parameters and of others, whose names end with theirs."""
+    """Return the units of a robot's parameters and of others, whose names end with their units."""
     units = {name: layout.unit(name) for name in layout.names}
     return units | {name: name.rpartition("_")[2] for name in others}
 
@@ -256,9 +261,9 @@ def covariance_netcdf(units: Mapping[str, str], covariance: Array) -> bytes:
 
 
 def read_covariance(path: Path | str) -> tuple[tuple[str, ...], Array]:
-    """Read names (p,) of parameters and their covariance (p, p).
+    """Read the names (p,) of parameters and their covariance (p, p).
 
-    Raises RecordError: a file that is damaged, or with variances that are none.
+    Raises RecordError if the file is damaged, or if a variance is not positive.
     """
     data = read_group(path)
     if VARIABLE not in data or data[VARIABLE].dims != DIMENSIONS:

@@ -10,20 +10,20 @@ from identify.errors import IdentifyError, OutputFolderError
 from identify.files.atomic import make_folder, remove_leftovers, take_back, writing
 
 LOCK = ".lock"
-"""File in the folder that the process holds; one that a killed process left holds nobody up."""
+"""Name of the locked file. One that a killed process left behind does not block."""
 
 PRIVATE = 0o600
-"""Mode of the file: whoever can open it can hold it, so nobody but its owner may."""
+"""Mode of the file. Only its owner can open it, because whoever opens it can hold it."""
 
 
 @contextmanager
 def working_in(folder: Path) -> Iterator[None]:
-    """Keep a folder for this process, as `locked` does; it is made where it is missing.
+    """Keep a folder for this process, as `locked` does, and make it if it is missing.
 
-    A folder that was made and stays empty is removed.
+    A new folder that stays empty is removed.
 
-    Raises OutputFolderError: another process has the folder. Raises WriteError: it cannot be made,
-    or nothing can be written into it.
+    Raises OutputFolderError if another process has the folder. Raises WriteError if it cannot be
+    made, or if nothing can be written into it.
     """
     with writing(folder):
         made = make_folder(folder)
@@ -36,13 +36,13 @@ def working_in(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(folder: Path, error: type[IdentifyError]) -> Iterator[None]:
-    """Keep a folder for this process in the block; when the process ends, its hold does too.
+    """Keep a folder for this process in the block; the hold ends with the process.
 
-    What a killed process was writing into the folder is removed first. A lock of another user,
-    which cannot be opened, is passed over.
+    Leftovers of a killed process in the folder are removed first. A lock of another user, which
+    cannot be opened, is ignored.
 
-    Raises the error that is given: another process has the folder. Raises WriteError: nothing can
-    be written into it.
+    Raises the given error if another process has the folder. Raises WriteError if nothing can be
+    written into it.
     """
     lock = FileLock(folder / LOCK, mode=PRIVATE, blocking=False)
     with writing(folder):
@@ -52,7 +52,8 @@ def locked(folder: Path, error: type[IdentifyError]) -> Iterator[None]:
         yield
     finally:
         if lock.is_locked:
-            with suppress(OSError):  # while it is held: nobody can have taken it meanwhile
+            # Removed while it is held, when nobody else can have taken it.
+            with suppress(OSError):
                 (folder / LOCK).unlink()
             lock.release()
 

@@ -1,6 +1,6 @@
-"""The folder of a run: which stage writes what, what is refused, and its figures, result.json.
+"""Folder of a run: its files, the stages that write them, and its figures in result.json.
 
-That is standard JSON: a figure that does not exist is null.
+The figures are standard JSON: one that does not exist is null.
 """
 
 import json
@@ -31,10 +31,10 @@ WRITTEN_BY = {
 """The stage of ``cmmsim`` that writes each file."""
 
 UNFINISHED = ("geometry", "trajectories.json")
-"""What `excite` writes before the scenario: without that a plan is not finished."""
+"""Files that `excite` writes before the scenario. Without the scenario a plan is not finished."""
 
 BEGUN = ("geometry", "figures", *WRITTEN_BY)
-"""What the folder of a run may hold that goes on."""
+"""Files and folders that the folder of an unfinished run may hold."""
 
 
 class RunFolder:
@@ -45,31 +45,31 @@ class RunFolder:
         self.scenario = path / "scenario.toml"  # resolved
         self.trajectories = path / "trajectories.json"  # exciting and unseen ones, with the seed
         self.experiment = path / "experiment.nc"  # record and truth of the excitation run
-        # of the same run under a known load, where that is the scale anchor
-        self.payload = path / "payload.nc"
+        self.payload = path / "payload.nc"  # the same under a load, if that is the scale anchor
         self.covariance = path / "covariance.nc"  # of the estimated parameters
         self.validation = path / "validation.nc"  # records and truth of the unseen runs
-        self.model = path / "model.nc"  # what the models do on the same trajectories
+        self.model = path / "model.nc"  # poses of the models on the same trajectories
         self.result = path / "result.json"  # figures of the run
         self.report = path / "report.html"
         self.figures = path / "figures"
 
     @property
     def whole_scenario(self) -> Path:
-        """Path of the scenario. Raises RecordError: the file is damaged, or changed by hand."""
+        """Path of the scenario.
+
+        Raises RecordError if the file is damaged or was changed by hand.
+        """
         return check_toml(self.scenario)
 
     @property
     def holds_own_record(self) -> bool:
-        """Whether the record is one of the user's own: it follows no trajectories that were
-        designed here.
-        """
+        """True if the record is the user's own, which follows no trajectory designed here."""
         return self.experiment.is_file() and not self.trajectories.exists()
 
     def require(self, *names: str) -> None:
-        """Refuse to go on without files of earlier stages, such as ``require("experiment.nc")``.
+        """Raise OutputFolderError if a file of an earlier stage is missing.
 
-        Raises OutputFolderError: naming the first missing file and the stage that writes it.
+        The message names the first missing file and the stage that writes it.
         """
         if not self.path.is_dir():
             raise OutputFolderError(
@@ -85,12 +85,12 @@ class RunFolder:
 
 @contextmanager
 def new_run_folder(path: Path | str, also: Collection[str] = ()) -> Iterator[RunFolder]:
-    """A folder that nobody else works in, see `working_in`; it must be new or empty.
+    """Keep a new or empty folder for this process, see `working_in`.
 
-    also: names of files and folders that it may hold. What a killed process left does not count.
+    The folder may hold the names in ``also``. Leftovers of a killed process do not count.
 
-    Raises OutputFolderError: something is there already, or another process works in it. Raises
-    WriteError: it cannot be made.
+    Raises OutputFolderError if the folder holds anything else, or if another process works in it.
+    Raises WriteError if it cannot be made.
     """
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
@@ -114,7 +114,10 @@ ENTRIES = {
 
 
 def save_result(path: Path | str, result: dict[str, Any]) -> None:
-    """Write a result, whole or not at all. Raises WriteError."""
+    """Write a result, whole or not at all.
+
+    Raises WriteError.
+    """
     write_bytes(path, result_json(result))
 
 
@@ -133,15 +136,19 @@ def save_files(
 ) -> None:
     """Write files by their names, all of them or none, into a folder, which is made if missing.
 
-    A file is bytes or a text as they are, figures of a run (dict) as JSON, or a drawn figure in the
-    format of its suffix. check: as in `write_files`. Raises WriteError.
+    The content of a file is bytes, text, figures of a run (dict, written as JSON), or a drawn
+    figure, written in the format of its suffix. ``check`` is as in `write_files`. Raises
+    WriteError.
     """
     contents = {folder / name: _content(name, content) for name, content in files.items()}
     write_files(contents, parents=True, check=check)
 
 
 def load_result(path: Path | str) -> dict[str, Any]:
-    """Read a result. Raises RecordError: no such file, no JSON object in it, or a damaged one."""
+    """Read a result.
+
+    Raises RecordError if there is no such file, or if it is damaged or holds no JSON object.
+    """
     try:
         result = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -154,9 +161,9 @@ def load_result(path: Path | str) -> dict[str, Any]:
 
 
 def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> None:
-    """Refuse a result without the entries of these stages, ``identify`` and ``validate``.
+    """Raise RecordError if a result lacks the entries of the stages, ``identify`` or ``validate``.
 
-    Raises RecordError: naming what is missing and the stage that writes it.
+    The message names the missing entries and the stage that writes them.
     """
     missing = {stage: [name for name in ENTRIES[stage] if name not in result] for stage in stages}
     first = next((stage for stage in stages if missing[stage]), None)
@@ -168,11 +175,11 @@ def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> Non
 
 
 def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
-    """Root mean square of pose errors (N, 6) [m, rad] as a result holds it, in um and urad.
+    """Return the root mean square of pose errors (N, 6) [m, rad], in um and urad.
 
-    ``counted`` (N,) bool names the rows that count, such as the frames that were not lost (default
-    all). All figures are NaN when none does, or when one of those that count is not finite: a model
-    that diverged has no error.
+    ``counted`` (N,) bool selects the rows that count, such as the frames that were not lost. The
+    default is all. All figures are NaN if no row counts, or if one that counts is not finite: a
+    model that diverged has no error.
     """
     rows = np.asarray(errors, dtype=float)
     rows = rows if counted is None else rows[np.asarray(counted, dtype=bool)]
@@ -182,7 +189,7 @@ def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
 
 
 def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
-    """The six figures [um, urad] of one entry; NaN where they are null or the entry is absent."""
+    """Return the six figures [um, urad] of one entry; NaN where they are null or absent."""
     if not figures:
         return [math.nan] * 6
     values = [*figures[f"position_{of}_um"], *figures[f"orientation_{of}_urad"]]
@@ -190,8 +197,9 @@ def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
 
 
 def predicted_row(run: dict[str, Any]) -> list[float]:
-    """The six predicted standard deviations [um, urad] of a validation entry; NaN where nothing was
-    predicted.
+    """Return the six predicted standard deviations [um, urad] of a validation entry.
+
+    They are NaN if nothing was predicted.
     """
     return rms_row(run.get("predicted"), "std")
 

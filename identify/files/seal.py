@@ -1,8 +1,9 @@
-"""Files that carry a digest of their own content: a damaged one is refused before it is opened.
+"""Files that carry a digest of their own content, so that a damaged one is refused.
 
-A netCDF file has it behind its end, JSON as its first entry, TOML in its first line. It comes and
-goes with the file, so that a file that is whole is never taken for a damaged one, whatever ends the
-program that writes it. A file without a digest is of somebody else's making.
+The digest is behind the end of a netCDF file, in the first entry of a JSON file, and in the first
+line of a TOML file. It is written and removed with the file: a file that is whole is never taken
+for a damaged one, however the program that writes it ends. A file without a digest was made by
+somebody else.
 """
 
 import json
@@ -14,7 +15,7 @@ from typing import Any
 from identify.errors import RecordError
 
 KEY = "sha256"
-"""First entry of a JSON file."""
+"""Name of the first entry of a JSON file, which holds its digest."""
 
 _TRAILER = b"\ncmmsim sha256 "
 _HEX = 2 * sha256().digest_size
@@ -30,7 +31,7 @@ def sealed(content: bytes) -> bytes:
 def is_sealed(path: Path | str, content: bytes) -> bool:
     """Tell whether a netCDF file carries a digest.
 
-    Raises RecordError: it has another one.
+    Raises RecordError if the digest is wrong.
     """
     start = len(content) - len(_TRAILER) - _HEX - 1
     if start < 0 or content[start : start + len(_TRAILER)] != _TRAILER:
@@ -41,14 +42,14 @@ def is_sealed(path: Path | str, content: bytes) -> bool:
 
 
 def sealed_json(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a JSON file holds, with its digest as the first entry."""
+    """Return the content of a JSON file with its digest as the first entry."""
     return {KEY: _of_json(entry), **entry}
 
 
 def opened_json(path: Path | str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a JSON file holds, without its digest.
+    """Return the content of a JSON file without its digest.
 
-    Raises RecordError: it has another digest than it carries.
+    Raises RecordError if the digest is wrong.
     """
     held = {name: value for name, value in entry.items() if name != KEY}
     if KEY in entry and entry[KEY] != _of_json(held):
@@ -62,9 +63,9 @@ def sealed_toml(text: str) -> str:
 
 
 def check_toml(path: Path) -> Path:
-    """Return the path of a TOML file that carries no digest or has the one that it carries.
+    """Return the path of a TOML file that carries the right digest or none.
 
-    Raises RecordError: another one, or no such file.
+    Raises RecordError if the digest is wrong or there is no such file.
     """
     try:
         first, _, text = path.read_bytes().partition(b"\n")
@@ -87,4 +88,5 @@ def _hex(content: bytes) -> bytes:
 
 
 def _of_json(entry: Mapping[str, Any]) -> str:
+    # The order of the entries does not count.
     return _hex(json.dumps(entry, sort_keys=True).encode()).decode()

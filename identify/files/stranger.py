@@ -1,7 +1,7 @@
-"""netCDF content, and the reading of a file that somebody else has made or that may be damaged.
+"""Reading of netCDF content, also from files that somebody else made or that may be damaged.
 
-The library can hang, crash, or ask for all memory on such a file. So another process reads it,
-within limits, and is ended where it exceeds them.
+The library can hang, crash, or ask for all memory on such a file. Another process therefore reads
+it within limits, and is ended if it exceeds them.
 """
 
 import io
@@ -22,27 +22,27 @@ ENGINE: Literal["h5netcdf"] = "h5netcdf"
 LIMIT_S = 8
 """Seconds that the reading may take."""
 START_S = 60
-"""Seconds that the process may take beside it, to begin on a machine that is busy."""
+"""Additional seconds for the process to start on a busy machine."""
 LIMIT_BYTES = 256_000_000
-"""Size of the numbers that a file may hold; a record of a million frames has so many."""
+"""Largest size of the numbers in a file: that of a record of a million frames."""
 LIMIT_MEMORY = 1_000_000_000
-"""Bytes that the reading may allocate, where the system can limit them."""
+"""Largest number of bytes that the reading may allocate, if the system can limit them."""
 
 CODE = "from identify.files.stranger import serve; serve()"
 TOO_LONG = f"it cannot be read within {LIMIT_S} s"
 
 Content = tuple[list[str], xr.Dataset | None]
-"""Names of the groups, and a group; None: not asked for, or not there."""
+"""Names of the groups, and a group; None if it was not asked for or does not exist."""
 
 
 class StrangerError(Exception):
-    """A file that cannot be read, with the reason in one line."""
+    """Reason, in one line, why a file cannot be read."""
 
 
 def load(content: bytes, group: str | None, most: float = math.inf) -> Content:
-    """Load a group of at most so many bytes of numbers, and the names of all groups.
+    """Load a group of at most this many bytes of numbers, and the names of all groups.
 
-    Raises what the library does, and ValueError: more numbers.
+    Raises the library's errors, and ValueError if the group is larger.
     """
     names: list[str] = []
     with h5py.File(io.BytesIO(content), "r") as file:
@@ -98,12 +98,14 @@ def _ended_by_alarm(status: int) -> bool:
 
 
 def serve() -> None:
-    """Load what stands on standard input, and hand out a pickle of it, or of why it cannot be."""
+    """Load the content on standard input, and write a pickle of it or of the reason for failure."""
     with suppress(ImportError, ValueError, OSError):
         import resource
 
         resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_MEMORY, LIMIT_MEMORY))
-    out, sys.stdout = sys.stdout, sys.stderr
+    # Whatever the library prints must not get among the bytes of the pickle.
+    out = sys.stdout
+    sys.stdout = sys.stderr
     found: Content | str
     content = sys.stdin.buffer.read()
     group = sys.argv[1] if len(sys.argv) > 1 else None

@@ -1,6 +1,4 @@
-"""Versions of the software that made a result, and whether all rows of a study are computed by the
-same.
-"""
+"""Versions of the software that made a result, and their comparison over the rows of a study."""
 
 import platform
 import warnings
@@ -24,17 +22,16 @@ PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Version of Python and of each package that takes part in a result (``"not installed"`` where
-    absent).
+    """Return the versions of Python and of each package that takes part in a result.
+
+    An absent package has ``"not installed"``.
     """
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
 @cache
 def _version(name: str) -> str:
-    """Kept: a study's rows have records whose versions are those of this process, and finding them
-    takes 4 ms.
-    """
+    """Version of a package, cached: each row of a study asks for it, and a search takes 4 ms."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -42,23 +39,23 @@ def _version(name: str) -> str:
 
 
 class OtherVersionsWarning(UserWarning):
-    """Some rows are computed with other versions of packages than are installed here."""
+    """Warning that some rows were computed with other versions of packages than those here."""
 
 
 @cache
 def product_version() -> str:
-    """Version of cmmsim in this process."""
+    """Return the version of cmmsim in this process."""
     return versions()["cmmsim"]
 
 
 def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
-    """Compare with the versions here those of other places, by what they are called; ``remedy``:
-    what to do then.
+    """Compare the versions of other places, by their names, with those here.
 
-    Rows of another cmmsim are those of another simulation. Other versions of what it computes with
-    change figures by little, or not at all: they are one warning that names each version once.
+    Rows of another cmmsim are those of another simulation, which is an error. Other versions of
+    numerical packages change figures by little or nothing. One warning names each such version
+    once. ``remedy`` is the advice at the end of the error.
 
-    Raises StudyError: a place has another cmmsim, or none.
+    Raises StudyError if a place has another cmmsim, or none.
     """
     here = versions()
     places = dict[tuple[str, str], list[str]]()
@@ -81,6 +78,6 @@ def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
 
 
 def require_product(place: str, there: str, here: str, remedy: str) -> None:
-    """Refuse another version of cmmsim. Raises StudyError with both."""
+    """Raise StudyError, with both versions, if a place has another version of cmmsim."""
     if there != here:
         raise StudyError(f"{place} has cmmsim {there}, here is {here}; {remedy}")

@@ -1,3 +1,1 @@
-"""Kinematic calibration: where joints, axes and zero angles of a robot are, and how long its legs,
-by static poses.
-"""
+"""Kinematic calibration by static poses: joints, axes, zero angles and lengths of legs."""

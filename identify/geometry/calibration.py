@@ -1,16 +1,17 @@
-"""The geometry of a robot from static poses: least squares on the pose at which its loops close.
+"""Geometry of a robot from static poses, by least squares on the pose at which its loops close.
 
-A measured pose is the pose at which the loops close with the joint coordinates that the encoders
-read, seen between two frames that teaching put a little off: z = base o f(joints, geometry) o
-platform + noise. Unknown are the geometric numbers (`dynamics.legs.geometric_numbers`) and the
-twelve of the frames, each with its prior: the stated tolerance of a machine part about its nominal
-value, and what teaching says; other errors that all poses have in common, such as those of the
-cameras, join them as columns. Errors of the encoders come through the loops into the pose's
-covariance. So what poses cannot tell stays where the drawing has it, with the tolerance for a
-standard deviation.
+The model of a measured pose is z = base o f(joints, geometry) o platform + noise. Here f is the
+pose at which the loops close with the joint coordinates that the encoders read. Base and platform
+are the small errors of the two frames from teaching. The unknowns are the geometric numbers
+(`dynamics.legs.geometric_numbers`) and the twelve numbers of the frames. Other errors that all
+poses have in common, such as those of the cameras, join them as columns.
 
-A joint's offset is the twin of its zero angle, or of its base joint along its slide: the numbers of
-a calibrated robot are those with which its encoders are right.
+Each unknown has a prior: the stated tolerance of a machine part about its nominal value, or the
+covariance of teaching. Errors of the encoders enter the covariance of the pose through the loops. A
+number that poses cannot show keeps its nominal value, with the tolerance for a standard deviation.
+
+A joint's offset acts like its zero angle, or like its base joint along the slide. The numbers of a
+calibrated robot are those with which its encoders are right.
 """
 
 from dataclasses import dataclass
@@ -29,21 +30,21 @@ from identify.errors import EstimationError
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 
 OBSERVABLE = 1 / 3
-"""A number is told when the poses leave at most this share of its tolerance as standard deviation:
-the prior is then a ninth of the information, and hardly moves an interval."""
+"""Largest standard deviation, as a share of the tolerance, of a number that the poses determine.
+
+The prior then is a ninth of the information, and hardly moves an interval.
+"""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Standard deviations of geometric numbers about the nominal ones: m of places and lengths, rad
-    of turns.
-    """
+    """Standard deviations of geometric numbers: places and lengths [m], turns [rad]."""
 
     m: float
     rad: float
 
     def of(self, robot: Robot) -> Array:
-        """One a number of the robot (g,)."""
+        """Return the standard deviation of each geometric number (g,) of a robot."""
         return np.array(
             [self.m if unit == "m" else self.rad for unit in robot.geometry.number_units]
         )
@@ -51,8 +52,10 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class PoseModel:
-    """What poses say of the unknowns u (g + 12,): geometric numbers and errors of the frames, in
-    units of their prior, so that each has mean zero and variance one before the poses."""
+    """Model of poses by unknowns u (g + 12,), the geometric numbers and the errors of the frames.
+
+    The unknowns are in units of their prior: each has mean zero and variance one before the poses.
+    """
 
     robot: Robot
     tolerance: Array
@@ -60,12 +63,12 @@ class PoseModel:
 
     @cached_property
     def closure(self) -> Closure:
-        """Loops of the robot's geometries."""
+        """Loop closure of the robot's geometries."""
         return Closure(self.robot.geometry)
 
     @cached_property
     def scale(self) -> Array:
-        """(g + 12, g + 12): unknowns in m and rad of those in units of their prior."""
+        """Matrix (g + 12, g + 12) from unknowns in units of their prior to m and rad."""
         count = len(self.tolerance)
         scale = np.zeros((count + 12, count + 12))
         scale[:count, :count] = np.diag(self.tolerance)
@@ -73,20 +76,21 @@ class PoseModel:
         return scale
 
     def split(self, unknowns: Array) -> tuple[Array, Array]:
-        """Deviations (g,) and errors of the frames (12,), m and rad."""
+        """Return deviations (g,) and errors of the frames (12,), m and rad."""
         values = self.scale @ unknowns
         return values[: len(self.tolerance)], values[len(self.tolerance) :]
 
     def closed(self, joints: Array, unknowns: Array, start: Array) -> Array:
-        """Poses (N, 6) at which the loops close, without the errors of the frames."""
+        """Return the poses (N, 6) at which the loops close, without the errors of the frames."""
         chart = self.robot.geometry.chart
         return self.closure.poses(
             joints, self.split(unknowns)[0], chart.pose(chart.coordinates(start))
         )
 
     def columns(self, joints: Array, closed: Array, unknowns: Array) -> tuple[Array, Array]:
-        """How the coordinates (m) of measured poses change with unknowns (N, m, g + 12) and with
-        joints (N, m, n).
+        """Return the derivatives of the coordinates (m) of measured poses.
+
+        They are with respect to the unknowns (N, m, g + 12) and to the joints (N, m, n).
         """
         free = list(self.robot.geometry.chart.freedoms)
         by_numbers, by_joints = self.closure.derivatives(closed, joints, self.split(unknowns)[0])
@@ -95,8 +99,9 @@ class PoseModel:
 
 
 def seen_between(poses: Array, frames: Array) -> Array:
-    """Poses (N, 6) between frames with errors (12,): [dt, dphi] of the base, then of the platform,
-    m and rad.
+    """Return poses (N, 6) as measured between frames with errors (12,), m and rad.
+
+    The errors are [dt, dphi] of the base, then of the platform.
     """
     base = Rotation.from_rotvec(frames[3:6])
     platform = Rotation.from_rotvec(frames[9:12])
@@ -106,7 +111,7 @@ def seen_between(poses: Array, frames: Array) -> Array:
 
 
 def frame_columns(robot: Robot, poses: Array) -> Array:
-    """d(pose)/d(errors of the frames) (N, 6, 12) at errors of zero."""
+    """Return d(pose)/d(errors of the frames) (N, 6, 12) at zero errors."""
     turned = Rotation.from_euler("XYZ", poses[:, 3:]).as_matrix()
     twists = np.zeros((len(poses), 6, 12))
     twists[:, :3, :3] = twists[:, 3:, 3:6] = np.eye(3)
@@ -119,12 +124,27 @@ def frame_columns(robot: Robot, poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What static poses say of a robot's geometry.
+    """Estimated geometry of a robot.
 
-    deviations (g,) from the nominal geometry, errors of the two frames (12,), and joint_covariance
-    (g + 12, g + 12) of both, m and rad; prior_std (g,): the tolerance; noise_ratio: mean square of
-    the residuals in units of the stated noise, near one where that and the model are right, with
-    its standard deviation; frames_known: whether anything was known of the frames.
+    Attributes
+    ----------
+    nominal : Robot
+        Robot before the calibration.
+    deviations : ndarray, shape (g,)
+        Deviations from its geometric numbers, m and rad.
+    frames : ndarray, shape (12,)
+        Errors of the two frames, m and rad.
+    joint_covariance : ndarray, shape (g + 12, g + 12)
+        Covariance of both.
+    prior_std : ndarray, shape (g,)
+        Tolerances.
+    noise_ratio : float
+        Mean square of the residuals in units of the stated noise. It is near one if model and noise
+        are right.
+    noise_ratio_std : float
+        Standard deviation of this ratio.
+    frames_known : bool
+        False if the places of the frames were unknown.
     """
 
     nominal: Robot
@@ -138,7 +158,7 @@ class Calibration:
 
     @property
     def covariance(self) -> Array:
-        """Of the deviations (g, g)."""
+        """Covariance (g, g) of the deviations."""
         count = len(self.deviations)
         return self.joint_covariance[:count, :count]
 
@@ -149,22 +169,21 @@ class Calibration:
 
     @property
     def observable(self) -> NDArray[np.bool_]:
-        """Whether the poses tell each number (g,)."""
+        """Numbers (g,) that the poses determine."""
         return np.asarray(self.std <= OBSERVABLE * self.prior_std)
 
     @property
     def robot(self) -> Robot:
-        """The nominal robot with the estimated geometry."""
+        """Nominal robot with the estimated geometry."""
         return self.nominal.with_geometry(self.nominal.geometry.moved(self.deviations))
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Residuals of poses in units of their noise, below them the unknowns as residuals of their
-    prior.
+    """Whitened residuals of the poses, with the unknowns below them as residuals of their prior.
 
-    Unknowns are those of the model, then the errors that all poses have in common. What an
-    encoder's error makes of a pose is taken at the nominal geometry.
+    The unknowns are those of the model, then the errors that all poses have in common. The effect
+    of an encoder's error on a pose is taken at the nominal geometry.
     """
 
     model: PoseModel
@@ -172,11 +191,11 @@ class _Fit:
 
     @property
     def nothing(self) -> Array:
-        """The unknowns before the poses: zero."""
+        """Unknowns before the poses: zero."""
         return np.zeros(len(self.model.scale) + self.data.common_errors.shape[2])
 
     def residuals(self, unknowns: Array) -> Array:
-        """(N m + u,)"""
+        """Return the residuals (N m + u,)."""
         of_model, common = np.split(unknowns, [len(self.model.scale)])
         closed = self.model.closed(self.data.joints, of_model, self.data.poses)
         seen = (
@@ -187,7 +206,7 @@ class _Fit:
         )
 
     def jacobian(self, unknowns: Array) -> Array:
-        """(N m + u, u)"""
+        """Return the Jacobian (N m + u, u) of the residuals."""
         of_model = unknowns[: len(self.model.scale)]
         closed = self.model.closed(self.data.joints, of_model, self.data.poses)
         columns = self.model.columns(self.data.joints, closed, of_model)[0]
@@ -202,7 +221,7 @@ class _Fit:
 
     @cached_property
     def _whiteners(self) -> Array:
-        """(N, m, m)"""
+        """Whitening matrices (N, m, m) of the poses."""
         none = np.zeros(len(self.model.scale))
         closed = self.model.closed(self.data.joints, none, self.data.poses)
         by_joints = self.model.columns(self.data.joints, closed, none)[1]
@@ -214,11 +233,12 @@ class _Fit:
 def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibration:
     """Estimate the geometry of a robot, about its nominal one, from static poses.
 
-    Raises EstimationError where the loops do not close with what the encoders read, or the search
-    does not end.
+    Raises EstimationError if the loops do not close with the encoders' readings, or if the search
+    does not converge.
     """
     model = PoseModel(robot, tolerance.of(robot), data.frames)
     fit = _Fit(model, data)
+    # Unknowns are in units of their prior, so one tolerance serves all.
     limit = 1e-10
     none = fit.nothing
     try:
@@ -233,12 +253,14 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
     own = len(model.scale)
     spread = np.linalg.inv(found.jac.T @ found.jac)
     covariance = model.scale @ spread[:own, :own] @ model.scale.T
+    # The trace counts the unknowns that the poses rather than the prior determine.
     spare = max(len(rows) - float(np.sum(spread * (rows.T @ rows))), 1.0)
     deviations, frames = model.split(found.x[:own])
     return Calibration(
         nominal=robot,
         deviations=deviations,
         frames=frames,
+        # Rounding must not make it asymmetric.
         joint_covariance=(covariance + covariance.T) / 2,
         prior_std=model.tolerance,
         noise_ratio=float(np.sum(found.fun[: len(rows)] ** 2) / spare),
@@ -248,9 +270,11 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
 
 
 def whiteners(covariances: Array, by_joints: Array, joint_std: Array) -> Array:
-    """Matrices (N, m, m) that make residuals of the coordinates of variance one: noise (N, m, m) of
-    the pose, and errors of the encoders through the loops, where coordinates change with joints by
-    (N, m, n)."""
+    """Return the matrices (N, m, m) that whiten the residuals of the coordinates.
+
+    The covariance is that of the measured pose (N, m, m) plus that of the encoders' errors, which
+    act through d(coordinates)/d(joints) (N, m, n).
+    """
     encoders = by_joints * joint_std
     return np.asarray(
         np.linalg.inv(np.linalg.cholesky(covariances + encoders @ encoders.swapaxes(1, 2)))

@@ -1,6 +1,4 @@
-"""Do encoders read what the robot does? Signs, units and cables that are swapped, named by what
-fits.
-"""
+"""Check of the encoders against measured poses: wrong signs, wrong units and swapped cables."""
 
 from math import pi
 
@@ -12,10 +10,10 @@ from identify.errors import RecordError
 from identify.geometry.static_poses import StaticPoses
 
 WRONG = 0.2
-"""Share of a joint's motion that a geometry within any tolerance leaves unexplained at most."""
+"""Largest share of a joint's motion that a geometry within its tolerances leaves unexplained."""
 
 STILL = 0.1
-"""Share of the travel: a joint that moves less is judged as if it moved so far."""
+"""Share of the travel. A joint that moves less is judged as if it moved this far."""
 
 UNITS = {
     False: {
@@ -26,13 +24,14 @@ UNITS = {
     },
     True: {"in mm": 1e3, "in um": 1e6, "in inches": 1 / 0.0254, "taken for mm": 1e-3},
 }
-"""What a reading is multiplied by where actuators turn, and where they slide."""
+"""Factors of readings in a wrong unit: False where actuators turn, True where they slide."""
 
 
 def check_encoders(robot: Robot, data: StaticPoses) -> None:
-    """Raise RecordError for joints that do not move as the nominal robot's do at the measured
-    poses, with what fits: the opposite sign, another unit, another joint's readings. Offsets are no
-    fault.
+    """Raise RecordError if joints do not move as the nominal robot's do at the measured poses.
+
+    The message says what fits: the opposite sign, another unit, or another joint's readings. An
+    offset is no fault.
 
     Raises UnreachablePoseError, naming leg and pose, for a pose that the nominal robot cannot
     reach.
@@ -70,6 +69,7 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
         for sign in (1, -1)
         for other in range(readings.shape[1])
     ]
+    # Of equal fits the simplest wins, as False sorts before True.
     left, swapped, opposite, unit, other = min(found)
     if left > WRONG:
         off = _left(moves[:, joint], readings[:, joint], still)
@@ -81,8 +81,9 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
 
 
 def _left(expected: Array, read: Array, still: float) -> float:
-    """What is left of readings, as a share of what is expected of them, or of a joint that hardly
-    moves.
+    """Norm of the unexplained motion over that of the expected one.
+
+    The latter counts as at least that of a joint with an RMS motion of `still`.
     """
     least = still * len(expected) ** 0.5
     return float(np.linalg.norm(read - expected) / max(float(np.linalg.norm(expected)), least))

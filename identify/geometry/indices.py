@@ -1,12 +1,12 @@
-"""Observability indices: what makes some static poses better than others. Each is better where it
-is smaller.
+"""Observability indices of sets of static poses. A smaller index is better.
 
-`determinant`: minus the logarithm of the determinant of the information, Borm and Menq's O1, the
-D-optimal one (Int. J. Robot. Res. 10(1), 1991). `prediction`: what the calibrated robot misses
-poses by, on average over candidates, the I-optimal one. `noise_amplification`: s_1 / s_r^2 of the
-extreme singular values of the whitened columns, the inverse of Nahvi and Hollerbach's index (ICRA
-1996), over the combinations that all candidates together can tell: of the others no choice changes
-anything.
+- `determinant`: minus the logarithm of the determinant of the information, Borm and Menq's O1,
+  which is D-optimality (Int. J. Robot. Res. 10(1), 1991).
+- `prediction`: mean error with which the calibrated robot misses the candidates' poses, which is
+  I-optimality.
+- `noise_amplification`: s_1 / s_r^2 of the extreme singular values of the whitened columns, the
+  inverse of Nahvi and Hollerbach's index (ICRA 1996). It covers the combinations that all
+  candidates together determine, because no choice changes anything about the others.
 """
 
 from abc import ABC, abstractmethod
@@ -17,31 +17,31 @@ import numpy as np
 from identify.arrays import Array
 from identify.geometry.calibration import OBSERVABLE
 
-EXTREMES, PROMISING = 24, 16
-"""Directions that are told least, and as many that are told most, among which candidates are judged
-first; and how many of these are judged exactly."""
+EXTREMES = 24
+"""Number of the best and of the worst determined directions of the first judgement."""
+PROMISING = 16
+"""Number of candidates that are then judged exactly."""
 HARDLY = 10.0
-"""Information about a direction of which its prior, one, is much."""
+"""Information about a direction below which its prior, with information one, still counts."""
 
 
 class ObservabilityIndex(ABC):
-    """Of the information (u, u) of poses and of what is known before them, about unknowns in units
-    of their prior.
-    """
+    """Index of the information (u, u) of poses and prior, for unknowns in units of their prior."""
 
     @abstractmethod
     def value(self, information: Array) -> tuple[float, Array]:
-        """The index, and minus its derivative by the information (u, u)."""
+        """Return the index, and minus its derivative with respect to the information (u, u)."""
 
     @abstractmethod
     def best(self, columns: Array, information: Array) -> int:
-        """Which of some poses, with whitened columns (N, m, u), improves the index of this
-        information most.
+        """Return the pose that improves the index of this information most.
+
+        ``columns`` (N, m, u) are the whitened columns of the poses to choose from.
         """
 
 
 class Determinant(ObservabilityIndex):
-    """O1."""
+    """Index O1 of Borm and Menq."""
 
     def value(self, information: Array) -> tuple[float, Array]:
         covariance = np.asarray(np.linalg.inv(information))
@@ -54,8 +54,9 @@ class Determinant(ObservabilityIndex):
 
 @dataclass(frozen=True)
 class Prediction(ObservabilityIndex):
-    """weight (u, u): mean square error of the candidates' coordinates, each in units of its noise,
-    by the unknowns.
+    """Mean squared error of the candidates' coordinates, each in units of its noise.
+
+    ``weight`` (u, u) is its quadratic form in the unknowns.
     """
 
     weight: Array
@@ -74,28 +75,35 @@ class Prediction(ObservabilityIndex):
 
 @dataclass(frozen=True)
 class NoiseAmplification(ObservabilityIndex):
-    """told (u, r): orthonormal directions of the unknowns that the candidates can tell."""
+    """Inverse of Nahvi and Hollerbach's index.
+
+    ``told`` (u, r) are orthonormal directions of the unknowns that the candidates can determine.
+    """
 
     told: Array
 
     @classmethod
     def among(cls, information: Array) -> "NoiseAmplification":
-        """From the information (u, u) of all candidates."""
+        """Return the index for candidates with this information (u, u) together."""
         values, vectors = np.linalg.eigh(information)
         return cls(vectors[:, values > OBSERVABLE**-2])
 
     def value(self, information: Array) -> tuple[float, Array]:
         values, vectors = np.linalg.eigh(self.told.T @ information @ self.told)
-        first, last = ((self.told @ vectors[:, place])[:, None] for place in (-1, 0))
+        first = (self.told @ vectors[:, -1])[:, None]
+        last = (self.told @ vectors[:, 0])[:, None]
         index = 0.5 * np.log(values[-1]) - np.log(values[0])
         return float(index), np.asarray(
             last @ last.T / values[0] - 0.5 * first @ first.T / values[-1]
         )
 
     def best(self, columns: Array, information: Array) -> int:
-        """By the determinant as long as some direction is hardly told, then by the index: in the
-        space of the extreme directions of what is there, which bounds it, and among the best there,
-        exactly."""
+        """Return the pose that improves the index most.
+
+        While some direction is hardly determined, the determinant decides instead. The index is
+        first bounded in the space of the extreme directions. The most promising candidates are
+        then judged exactly.
+        """
         within = self.told.T @ information @ self.told
         values, vectors = np.linalg.eigh(within)
         if values[0] < HARDLY:
@@ -109,19 +117,18 @@ class NoiseAmplification(ObservabilityIndex):
 
 
 def _eigenvalues(information: Array, columns: Array) -> Array:
-    """Of an information (k, k) with each pose of columns (N, m, k) (N, k), ascending."""
+    """Eigenvalues (N, k), ascending, of an information (k, k) plus that of each of N poses."""
     return np.asarray(np.linalg.eigvalsh(information + columns.swapaxes(1, 2) @ columns))
 
 
 def _spread(columns: Array, information: Array) -> tuple[Array, Array]:
-    """Of each pose: columns times the covariance (N, m, u), and the covariance of its coordinates
-    with noise (N, m, m)."""
+    """Columns of each pose times the covariance, and the covariance of its noisy coordinates."""
     spread = columns @ np.linalg.inv(information)
     return spread, np.eye(columns.shape[1]) + spread @ columns.swapaxes(1, 2)
 
 
 def chosen_index(criterion: str, information: Array, candidates: int) -> ObservabilityIndex:
-    """The index of a criterion's name, for so many candidates with this information (u, u)."""
+    """Return the index of a criterion for candidates with information (u, u) together."""
     if criterion == "determinant":
         return Determinant()
     if criterion == "noise_amplification":

@@ -1,4 +1,4 @@
-"""What poses can tell of a geometry: combinations that they cannot, and how many poses it takes."""
+"""Observability of a geometry: combinations that poses cannot show, and number of poses needed."""
 
 import numpy as np
 
@@ -11,27 +11,30 @@ SMALL = 0.05
 """Share of the largest coefficient below which a combination leaves a number out."""
 
 LONG_ENOUGH = 0.5
-"""A number names a combination if what is left of its share is at least this fraction of the
-largest one.
-"""
+"""Share of the largest remaining length at which a number can name a combination."""
 
 
 def untold(covariance: Array, prior_std: Array) -> Array:
-    """Directions (k, g) of geometric numbers in units of their tolerance that poses do not tell,
-    orthonormal: along them the standard deviation stays above OBSERVABLE of the tolerance."""
+    """Return orthonormal directions (k, g) of geometric numbers that the poses do not determine.
+
+    The numbers are in units of their tolerance. Along these directions the standard deviation stays
+    above OBSERVABLE of the tolerance.
+    """
     values, vectors = np.linalg.eigh(covariance / np.outer(prior_std, prior_std))
     return np.asarray(vectors[:, values > OBSERVABLE**2].T)
 
 
 def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) -> tuple[str, ...]:
-    """The combinations that poses do not tell, each named after its first number, as `a + 0.5 b`:
-    when these numbers move together by such amounts (m and rad), no pose changes enough to show it.
-    Empty where all are told."""
+    """Return the combinations that poses do not determine, such as `a + 0.5 b`.
+
+    If these numbers move together by such amounts (m and rad), no pose changes enough to show it.
+    Each combination begins with a number of its own.
+    """
     directions = untold(covariance, prior_std)
     if not len(directions):
         return ()
     pivots = _pivots(directions)
-    # each combination then has a number of its own
+    # In this basis each combination has one pivot, with coefficient one, that no other has.
     rows = np.linalg.solve(directions[:, pivots], directions)
     return tuple(
         _expression(names, row * prior_std / prior_std[pivot], np.abs(row), pivot)
@@ -40,8 +43,9 @@ def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) ->
 
 
 def _pivots(directions: Array) -> list[int]:
-    """As many columns as there are rows, which stand well apart: in their order, the first that is
-    long enough.
+    """Well-separated pivot columns, as many as there are rows.
+
+    In order, the first column that is long enough is taken.
     """
     left = directions.copy()
     pivots = list[int]()
@@ -65,8 +69,10 @@ def _expression(names: tuple[str, ...], coefficients: Array, sizes: Array, pivot
 
 
 def posterior(information: Array, scale: Array, count: int) -> Array:
-    """Covariance (g, g), m and rad, of the first `count` = g unknowns, the geometric numbers, from
-    that prior and the information (u, u) of poses about unknowns in units of their prior."""
+    """Return the covariance (g, g) [m and rad] of the first `count` = g unknowns, the geometry.
+
+    The information (u, u) of the poses is about unknowns in units of their prior, which is added.
+    """
     covariance = scale @ np.linalg.inv(information + np.eye(len(scale))) @ scale.T
     return np.asarray(covariance[:count, :count])
 
@@ -74,11 +80,10 @@ def posterior(information: Array, scale: Array, count: int) -> Array:
 def check_enough(
     robot: Robot, poses: int, information: Array, scale: Array, prior_std: Array
 ) -> None:
-    """Raise EstimationError where so many poses have fewer equations than the numbers that poses
-    can tell.
+    """Raise EstimationError if the poses have fewer equations than numbers to determine.
 
-    information (u, u): of many poses, about all unknowns in units of their prior. The message says
-    how many poses are needed, and which numbers the others would be for: those that are told least.
+    ``information`` (u, u) is that of many poses, about all unknowns in units of their prior. The
+    message says how many poses are needed and which numbers are the hardest to determine.
     """
     names = robot.geometry.number_names
     rows = len(robot.coordinate_names)
@@ -95,8 +100,6 @@ def check_enough(
     missing = told - poses * rows
     raise EstimationError(
         f"{poses} poses that differ give {poses * rows} equations for {told} combinations of the "
-        f"{len(names)} "
-        f"geometric numbers of {robot.name} that poses can tell: at least {needed} are needed; "
-        f"missing: {missing}, "
-        f"hardest to tell: {shown}"
+        f"{len(names)} geometric numbers of {robot.name} that poses can tell: at least {needed} "
+        f"are needed; missing: {missing}, hardest to tell: {shown}"
     )

@@ -1,6 +1,4 @@
-"""What a calibration of geometry leaves: its figures, the calibrated robot, the poses, and a page
-in words.
-"""
+"""Outcome of a geometry calibration: figures, calibrated robot, poses, and a page of text."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,25 +16,45 @@ from identify.files.run_folder import rms_figures, save_files
 from identify.files.seal import sealed_toml
 from identify.files.versions import versions
 from identify.geometry.calibration import Calibration, PoseModel, frame_columns, seen_between
-from identify.geometry.experiment import true_poses
 from identify.geometry.observability import combinations
 from identify.geometry.selection import Candidates
+from identify.geometry.static_experiment import true_poses
 from identify.geometry.static_poses import StaticPoses
 from identify.scenario import Scenario
 
 CURVE = 12
-"""Numbers of random poses whose worth is told."""
+"""Number of sizes of random pose sets whose expected errors are listed."""
 NOISY = 4.0
-"""Standard deviations of the noise ratio above one at which the model or the stated noise is said
-to be wrong.
-"""
+"""Excess of the noise ratio, in standard deviations, at which a warning is given."""
 
 
 @dataclass(frozen=True)
 class GeometryOutcome:
-    """A calibration by poses; true deviations (g,) and the chosen poses where they are simulated,
-    None otherwise; unseen poses to judge it by, and the candidates among which the poses were
-    chosen."""
+    """Calibration with its poses.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        Scenario of the calibration.
+    seed : int
+        Seed of the experiment.
+    model : PoseModel
+        Model of the poses.
+    calibration : Calibration
+        Estimated geometry.
+    data : StaticPoses
+        Measured poses.
+    lost_frames : int
+        Number of lost frames.
+    true : ndarray, shape (g,), or None
+        True deviations, if they are simulated.
+    unseen : Candidates
+        Poses that were not measured, by which the result is judged.
+    chosen : Candidates or None
+        Poses that were chosen, if they are simulated.
+    among : Candidates
+        Candidates from which they were chosen.
+    """
 
     scenario: Scenario
     seed: int
@@ -50,10 +68,13 @@ class GeometryOutcome:
     among: Candidates
 
     def write(self, folder: Path, pictures: Mapping[str, Any] | None = None) -> None:
-        """Write geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and
-        scenario.toml, all or none.
+        """Write the files of the outcome into a folder, all or none.
 
-        pictures: figures and texts that are written with them, by the names of their files.
+        They are geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and
+        scenario.toml.
+
+        All or none are written. ``pictures`` are further figures and texts by the names of their
+        files.
         """
         robot = self.calibration.robot
         description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
@@ -75,7 +96,7 @@ class GeometryOutcome:
 
     @cached_property
     def entry(self) -> dict[str, Any]:
-        """The content of geometry.json."""
+        """Content of geometry.json."""
         found = self.calibration
         names = self.calibration.nominal.geometry.number_names
         entry: dict[str, Any] = {
@@ -130,11 +151,9 @@ class GeometryOutcome:
         if off > NOISY:
             said.append(
                 f"the poses miss the calibrated robot by {np.sqrt(found.noise_ratio):.2f} times "
-                "what is stated of "
-                f"sensor and encoders ({off:.0f} standard deviations more than chance): intervals "
-                "are too short, or "
-                f"the robot is not what {found.nominal.name} says, as where legs bend or joints "
-                "have play"
+                f"what is stated of sensor and encoders ({off:.0f} standard deviations more than "
+                "chance): intervals are too short, or the robot is not what "
+                f"{found.nominal.name} says, as where legs bend or joints have play"
             )
         missing = 0 if self.chosen is None else len(self.chosen) - len(self.data)
         if missing:
@@ -145,9 +164,7 @@ class GeometryOutcome:
         return said
 
     def _judged(self) -> dict[str, Any]:
-        """By how much poses that were not measured are missed, as expected, and in truth where that
-        is known.
-        """
+        """Expected errors of poses that were not measured, and true errors if they are known."""
         found = self.calibration
         robot = self.calibration.nominal
         closure = self.model.closure
@@ -155,14 +172,14 @@ class GeometryOutcome:
         poses = self.unseen.poses
         columns = closure.derivatives(poses, joints, found.deviations)[0]
         covariance = found.covariance
-        if (
-            not found.frames_known
-        ):  # what the geometry lacks is then in the frames, and both together are known
+        if not found.frames_known:
+            # An error of the geometry is then in the frames, too: only their sum is known.
             of_frames = frame_columns(robot, poses)[:, list(robot.geometry.chart.freedoms)]
             columns = np.concatenate([columns, of_frames], axis=2)
             covariance = found.joint_covariance
         judged = {"expected": self._spread(columns, covariance)}
         if self.true is None:
+            # NaN becomes null in the file: without the truth there is no such figure.
             return judged | {"unseen": rms_figures(np.full((1, 6), np.nan))}
         stands = true_poses(robot, self.true, joints, poses)
         predicted = seen_between(closure.poses(joints, found.deviations, poses), found.frames)
@@ -172,8 +189,7 @@ class GeometryOutcome:
         }
 
     def _compared(self, chosen: Candidates) -> dict[str, Any]:
-        """What unseen poses are expected to be missed by after the chosen poses, after as many
-        random ones, and after twice as many."""
+        """Expected errors of unseen poses after the chosen poses, and after random ones."""
         count = len(chosen)
         sets = {"chosen": chosen, "random": self.among.of(list(range(count)))}
         if len(self.among) >= 2 * count:
@@ -181,15 +197,11 @@ class GeometryOutcome:
         return {name: self._left_by(one) for name, one in sets.items()}
 
     def _by_count(self, most: int) -> list[dict[str, Any]]:
-        """What unseen poses are expected to be missed by after so many random poses, up to a number
-        of these.
-        """
-        fewest = -(
-            -len(self.calibration.deviations) // len(self.calibration.nominal.coordinate_names)
-        )
-        counts = np.unique(
-            np.geomspace(fewest, max(fewest, min(most, len(self.among))), CURVE).astype(int)
-        )
+        """Expected errors of unseen poses after growing numbers of random poses, up to `most`."""
+        rows = len(self.calibration.nominal.coordinate_names)
+        fewest = -(-len(self.calibration.deviations) // rows)
+        largest = max(fewest, min(most, len(self.among)))
+        counts = np.unique(np.geomspace(fewest, largest, CURVE).astype(int))
         return [self._left_by(self.among.of(list(range(count)))) for count in counts.tolist()]
 
     def _left_by(self, poses: Candidates) -> dict[str, Any]:
@@ -201,24 +213,21 @@ class GeometryOutcome:
         )
 
     def _spread(self, columns: Array, covariance: Array) -> dict[str, list[float]]:
-        """Expected errors of the unseen poses, for columns (N, m, u) and a covariance (u, u) of the
-        unknowns.
-        """
+        """Expected RMS errors for columns (N, m, u) and a covariance (u, u) of the unknowns."""
         spread = np.sqrt(np.einsum("nmu,uv,nmv->nm", columns, covariance, columns))
         return rms_figures(self.calibration.nominal.geometry.chart.lifted(spread))
 
 
 def geometry_markdown(entry: dict[str, Any]) -> str:
-    """The result in words and a table."""
+    """Return the result in words and a table."""
     told = [name for name, one in entry["parameters"].items() if one["observable"]]
     lines = [
         f"# Geometry of {entry['robot']}",
         "",
         f"From {entry['poses']} static poses of {entry['frames_per_pose']} frames each; "
-        f"{entry['lost_frames']} frames "
-        f"were lost. The poses tell {len(told)} of {len(entry['parameters'])} geometric numbers; "
-        "the others stay where "
-        "the robot file has them, give or take the stated tolerance.",
+        f"{entry['lost_frames']} frames were lost. The poses tell {len(told)} of "
+        f"{len(entry['parameters'])} geometric numbers; the others stay where the robot file has "
+        "them, give or take the stated tolerance.",
         "",
         f"Residuals are {np.sqrt(entry['noise_ratio']):.3f} times what is stated of sensor and "
         "encoders.",

@@ -1,8 +1,8 @@
-"""Which poses to measure: chosen by an observability index over candidates within the travel.
+"""Selection of static poses by an observability index over candidates within the travel.
 
-The index (`indices`) is of the information about geometry and frames together. Poses are taken one
-by one from the candidates (greedy), exchanged until none is better, and then moved in joint space
-along the index's gradient, all at once, within the travel.
+The index (see `indices`) is that of the information about geometry and frames together. Poses are
+taken one by one from the candidates (greedy) and exchanged until none is better. Then all move
+together in joint space along the gradient of the index, within the travel.
 """
 
 from dataclasses import dataclass
@@ -23,20 +23,23 @@ from identify.geometry.indices import ObservabilityIndex, chosen_index
 from identify.progress import Advance
 
 STEP = 1e-5
-"""Of joint coordinates, as a share of the travel: the differences behind the gradient."""
+"""Step of the difference quotients behind the gradient, as a share of the travel."""
 GRADIENT_STEPS = 40
+"""Largest number of steps of one search along the gradient."""
 ROUNDS = 4
-"""Of such searches, each without the poses that the one before would have led astray."""
+"""Largest number of such searches. Each holds the poses that the one before led beyond a limit."""
 EXCHANGES = 3
-"""Passes over all poses at most."""
+"""Largest number of exchange passes over all poses."""
 TRIALS = 40
-"""Random joint coordinates drawn a candidate that is wanted, at most."""
+"""Largest number of random joint coordinates that are drawn for each wanted candidate."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Where a robot may stand to be measured: within its travel (rad or m), far from singularities,
-    and in sight, where that is asked for."""
+    """Limits on where a robot may stand: travel (rad or m), singularities and visibility.
+
+    Visibility counts only if ``sight`` is given.
+    """
 
     robot: Robot
     travel: float
@@ -45,7 +48,7 @@ class Limits:
     sight: SightLines | None
 
     def allowed(self, poses: Array) -> NDArray[np.bool_]:
-        """Whether the robot may stand at each pose (N, 6)."""
+        """Tell for each pose (N, 6) whether the robot may stand there."""
         measures = measure(self.robot, poses)
         good = measures.reachable & (np.abs(measures.theta) <= self.travel * (1 + 1e-9)).all(axis=1)
         good &= measures.leverage.min(axis=1) >= self.least_leverage
@@ -64,8 +67,11 @@ class Limits:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Joint coordinates (N, n), rad or m, the nominal robot's poses (N, 6) there, and what each
-    pose would tell: whitened columns (N, m, u) of the unknowns in units of their prior."""
+    """Joint coordinates (N, n) [rad or m], the nominal robot's poses (N, 6), and their information.
+
+    ``columns`` (N, m, u) are the whitened derivatives with respect to the unknowns in units of
+    their prior.
+    """
 
     joints: Array
     poses: Array
@@ -75,24 +81,27 @@ class Candidates:
         return len(self.joints)
 
     def of(self, rows: Array | list[int]) -> "Candidates":
-        """Some of them."""
+        """Return some of the candidates."""
         return Candidates(self.joints[rows], self.poses[rows], self.columns[rows])
 
     @property
     def information(self) -> Array:
-        """Of all together (u, u)."""
+        """Information (u, u) of all poses together."""
         return np.asarray(np.einsum("nmu,nmv->uv", self.columns, self.columns))
 
     @property
     def with_prior(self) -> Array:
-        """The same with what is known before the poses."""
+        """Information (u, u) of all poses together with the prior."""
         return self.information + np.eye(self.columns.shape[2])
 
 
 @dataclass(frozen=True)
 class Designer:
-    """Chooses poses for a model; covariance (6, 6): of a pose's mean, joint_std (n,): of its
-    encoders' readings; criterion: the name of the index."""
+    """Designer of pose sets for a model.
+
+    ``covariance`` (6, 6) is that of a pose's mean and ``joint_std`` (n,) that of the encoders'
+    readings. ``criterion`` names the index.
+    """
 
     model: PoseModel
     limits: Limits
@@ -101,9 +110,9 @@ class Designer:
     criterion: str = "determinant"
 
     def candidates(self, count: int, rng: np.random.Generator) -> Candidates:
-        """Random joint coordinates within the travel, of which the poses are allowed.
+        """Draw random joint coordinates within the travel whose poses are allowed.
 
-        Raises EstimationError where hardly any are.
+        Raises EstimationError if too few are.
         """
         kept_joints: list[Array] = []
         kept_poses: list[Array] = []
@@ -118,18 +127,18 @@ class Designer:
             kept_poses.append(poses[known])
             if sum(map(len, kept_joints)) >= count:
                 break
-        joints, poses = (np.concatenate(parts)[:count] for parts in (kept_joints, kept_poses))
+        joints = np.concatenate(kept_joints)[:count]
+        poses = np.concatenate(kept_poses)[:count]
         if len(joints) < count:
             raise EstimationError(
                 f"only {len(joints)} of {count * TRIALS} random joint coordinates of {robot.name} "
-                "within its travel "
-                f"({travel:.3g} {robot.layout.joint_unit}) are poses where it may stand and be "
-                f"seen; {count} are wanted"
+                f"within its travel ({travel:.3g} {robot.layout.joint_unit}) are poses where it "
+                f"may stand and be seen; {count} are wanted"
             )
         return self.seen(joints, poses)
 
     def seen(self, joints: Array, poses: Array) -> Candidates:
-        """What poses (N, 6) of joint coordinates (N, n) would tell."""
+        """Return poses (N, 6) of joint coordinates (N, n) with their information."""
         none = np.zeros(len(self.model.scale))
         free = list(self.limits.robot.geometry.chart.freedoms)
         columns, by_joints = self.model.columns(joints, poses, none)
@@ -142,8 +151,9 @@ class Designer:
     def greedy(
         self, among: Candidates, count: int, advance: Advance = lambda n=1: None
     ) -> Candidates:
-        """The best candidates one by one, then exchanged until no other is better; the same one may
-        stand twice.
+        """Choose the best candidates one by one, then exchange them until no other is better.
+
+        The same candidate may be chosen twice.
         """
         index = self.index(among)
         chosen = list[int]()
@@ -157,8 +167,8 @@ class Designer:
         for _ in range(EXCHANGES):
             before = list(chosen)
             for place in range(count):
-                # Summed anew: the difference of two sums would hide what the other poses tell
-                # least.
+                # Sum anew: a difference of two sums would lose the directions with little
+                # information.
                 information = prior + own[chosen[:place] + chosen[place + 1 :]].sum(axis=0)
                 chosen[place] = index.best(among.columns, information)
             if chosen == before:
@@ -166,9 +176,11 @@ class Designer:
         return among.of(chosen)
 
     def moved(self, chosen: Candidates, among: Candidates) -> Candidates:
-        """The poses after a search along the gradient of the index in joint space, at which it is
-        no worse; those that it would lead to where the robot may not stand are held where they
-        were."""
+        """Return the poses after a search along the gradient of the index in joint space.
+
+        Their index is no worse than before. A pose that would move to a place that is not allowed
+        keeps its old place.
+        """
         index = self.index(among)
         held = np.zeros(len(chosen), dtype=bool)
         best = chosen
@@ -191,8 +203,7 @@ class Designer:
     def _along_gradient(
         self, chosen: Candidates, held: NDArray[np.bool_], index: ObservabilityIndex
     ) -> Array:
-        """Joint coordinates (N, n) within the travel with the best index nearby, some poses
-        held."""
+        """Joint coordinates (N, n) within the travel with the best index nearby, some held."""
         shape = chosen.joints.shape
         travel = self.limits.travel
         near = chosen.poses
@@ -203,6 +214,7 @@ class Designer:
             poses = self._poses(joints, near)
             if not np.isfinite(poses).all():
                 return np.inf, np.zeros(values.size)
+            # The next closure starts here, so that it stays on the same assembly mode.
             near = poses
             at = self.seen(joints, poses)
             found, spread = index.value(at.with_prior)
@@ -228,9 +240,9 @@ class Designer:
         return np.asarray(found.x.reshape(shape) * travel)
 
     def index(self, among: Candidates) -> ObservabilityIndex:
-        """The criterion's, with what these candidates can tell."""
+        """Return the index of the criterion, relative to the information of these candidates."""
         return chosen_index(self.criterion, among.information, len(among))
 
     def _poses(self, joints: Array, start: Array) -> Array:
-        """The nominal robot's poses (N, 6); NaN where the loops do not close."""
+        """Poses (N, 6) of the nominal robot; NaN where the loops do not close."""
         return self.model.closure.nearest(joints, np.zeros(len(self.model.tolerance)), start)

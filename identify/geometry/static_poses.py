@@ -1,6 +1,4 @@
-"""Static poses: what encoders read and what the optical CMM measured while a robot stood still; and
-their file.
-"""
+"""Static poses: readings of encoders and sensor of a robot that stands still, and their file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,34 +12,34 @@ from identify.errors import RecordError
 from identify.files.run_folder import load_result
 
 UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
-"""Standard deviation (6,) of a frame of which nothing is known, m and rad: more than where any
-robot is put.
-"""
+"""Standard deviation (6,) of an unknown frame, m and rad, beyond any placement of a robot."""
 
-APART, ROUNDING = 10.0, 1e-9
-"""Standard deviations of the encoders, and rad or m, by which different poses differ in some joint.
-"""
+APART = 10.0
+"""Standard deviations of the encoders by which different poses differ in some joint."""
+
+ROUNDING = 1e-9
+"""Least difference of joint coordinates of different poses, rad or m."""
 
 
 @dataclass(frozen=True)
 class FrameKnowledge:
-    """How well the two frames that a pose is between are known: covariances (6, 6) of the small
-    errors [dt, dphi] of the base, in base axes, and of the platform, in platform axes, m and rad.
-    They are one draw for all poses."""
+    """Covariances (6, 6) [m, rad] of the small errors [dt, dphi] of a measured pose's two frames.
+
+    Those of the base are in base axes, those of the platform in platform axes. They are one draw
+    for all poses.
+    """
 
     base: Array
     platform: Array
 
     @classmethod
     def none(cls) -> "FrameKnowledge":
-        """Nothing is known of them."""
+        """Return the knowledge of frames of which nothing is known."""
         return cls(np.diag(UNKNOWN_FRAME**2), np.diag(UNKNOWN_FRAME**2))
 
     @property
     def root(self) -> Array:
-        """A matrix (12, 12) that makes errors of both, base first, of independent numbers of
-        variance one.
-        """
+        """Matrix (12, 12) from independent numbers of variance one to frame errors, base first."""
         root = np.zeros((12, 12))
         for place, covariance in ((slice(0, 6), self.base), (slice(6, 12), self.platform)):
             values, vectors = np.linalg.eigh(covariance)
@@ -51,11 +49,24 @@ class FrameKnowledge:
 
 @dataclass(frozen=True)
 class StaticPoses:
-    """Poses at which a robot stood: joint coordinates that its encoders read (N, n) with their
-    standard deviation (n,), rad or m; measured poses (N, 6), each the mean of some frames, with
-    covariances (N, 6, 6), m and rad; how well the frames of the measurement are known; and common
-    (N, 6, k): what errors of variance one that all poses have in common, beside those of the
-    frames, add to each, as those of cameras that are known only so well; None: nothing."""
+    """Readings at poses where a robot stood.
+
+    Attributes
+    ----------
+    joints : ndarray, shape (N, n)
+        Joint coordinates that its encoders read, rad or m.
+    joint_std : ndarray, shape (n,)
+        Their standard deviations.
+    poses : ndarray, shape (N, 6)
+        Measured poses, each the mean of some frames, m and rad.
+    covariances : ndarray, shape (N, 6, 6)
+        Covariances of the poses.
+    frames : FrameKnowledge
+        Knowledge of the frames of the measurement.
+    common : ndarray, shape (N, 6, k), optional
+        Shift of each pose by further independent errors of variance one that all poses share,
+        such as those of inexact cameras.
+    """
 
     joints: Array
     joint_std: Array
@@ -69,13 +80,12 @@ class StaticPoses:
 
     @property
     def common_errors(self) -> Array:
-        """As `common`, with k = 0 where there is nothing."""
+        """Array `common`, with k = 0 if there is none."""
         return np.zeros((len(self), 6, 0)) if self.common is None else self.common
 
     @property
     def different(self) -> int:
-        """How many of the poses differ in what the encoders read, by more than their noise
-        makes."""
+        """Number of poses that differ in the encoders' readings by more than their noise."""
         apart = np.maximum(APART * self.joint_std, ROUNDING)
         kept = self.joints[:0]
         for joints in self.joints:
@@ -84,7 +94,7 @@ class StaticPoses:
         return len(kept)
 
     def entry(self, robot: Robot) -> dict[str, Any]:
-        """What `read_static_poses` reads, as JSON holds it."""
+        """Return the content of the JSON file that `read_static_poses` reads."""
         return {
             "joint_names": list(robot.joint_names),
             "joint_unit": robot.layout.joint_unit,
@@ -99,11 +109,12 @@ class StaticPoses:
 
 
 def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
-    """Read the poses of a JSON file; without `base_covariance` and `platform_covariance` the frames
-    are unknown.
+    """Read the poses of a JSON file.
 
-    Raises RecordError: unreadable, an entry that is missing or of another shape, numbers that are
-    not finite, joints of another unit, or a covariance that is none.
+    Without `base_covariance` and `platform_covariance` the frames are unknown.
+
+    Raises RecordError if the file is unreadable, an entry is missing or has a wrong shape, a number
+    is not finite, the joints have another unit, or a matrix is not a covariance.
     """
     content = load_result(path)
     if not isinstance(content.get("joints"), list):
@@ -158,7 +169,7 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
 
 
 def _columns(rows: Any) -> int:
-    """Length of the first of the innermost of nested lists; one where there is none."""
+    """Length of the first of the innermost of nested lists; one if there is none."""
     try:
         return len(rows[0][0])
     except (TypeError, LookupError):
@@ -166,9 +177,9 @@ def _columns(rows: Any) -> int:
 
 
 def _check_covariances(name: str, matrices: Array, strictly: bool) -> None:
-    skewed = np.abs(matrices - matrices.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(
-        matrices
-    ).max(axis=(1, 2))
+    largest = np.abs(matrices).max(axis=(1, 2))
+    skewed = np.abs(matrices - matrices.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * largest
+    # Correlations have no unit, so one limit holds for the eigenvalues of all matrices.
     scale = np.sqrt(np.maximum(np.diagonal(matrices, axis1=1, axis2=2), 1e-300))
     least = np.linalg.eigvalsh(matrices / scale[:, :, None] / scale[:, None, :]).min(axis=1)
     wrong = skewed | (least < (1e-12 if strictly else -1e-9))

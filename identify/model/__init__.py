@@ -1,1 +1,1 @@
-"""Model of a recorded run: what drives it, what it misses, and what whitens that."""
+"""Model of a recorded run: what drives it, its residuals, and their whitening."""

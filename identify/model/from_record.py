@@ -1,4 +1,4 @@
-"""From a record and the model's side of a scenario to the model of the recorded run.
+"""Model of a recorded run, from the record and the model's side of a scenario.
 
 A record that cannot carry an identification is refused, see `identify.record.checks`.
 """
@@ -21,13 +21,13 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.command_times import logged_latencies
-from identify.record.common_errors import CommonErrors, read_common_errors
 from identify.record.drift import drift_warnings
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
-from identify.record.law import takes_torques
 from identify.record.payload import recorded_payload
 from identify.record.plausibility import check_plausible
+from identify.record.recorded_law import takes_torques
 from identify.record.recording import poses, recorded_reference
+from identify.record.stored_common_errors import CommonErrors, read_common_errors
 from identify.scenario import Scenario
 
 
@@ -46,6 +46,7 @@ def identified_model(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Lo
     run = _model(record, robot, scenario)
     check_reference(run.reference, scenario)
     check_channels(robot.geometry.chart, run.measured, run.logged, run.ok)
+    # torques cannot be compared with joint coordinates
     joint_commands = None if run.settings.drives.torques else run.logged
     check_plausible(robot, run.reference, run.measured, run.ok, joint_commands)
     return run
@@ -95,10 +96,8 @@ def _common_errors(record: xr.Dataset, scenario: Scenario, run: LoopModel) -> Co
     """Common errors of the poses that a scenario has estimated beside the parameters."""
     kinds = tuple(scenario.identification.nuisances)
     geometry = None
-    if (
-        "geometry" in kinds
-        and (covariance := read_geometry_covariance(record, run.robot)) is not None
-    ):
+    covariance = read_geometry_covariance(record, run.robot) if "geometry" in kinds else None
+    if covariance is not None:
         geometry = GeometryErrors(run.robot, covariance, run.reference.poses, run.whitener)
     latency_std = scenario.timing.latency_std_s if "latency" in kinds else 0.0
     of_poses = read_common_errors(record, kinds)

@@ -1,7 +1,7 @@
-"""Model of one recorded run, and what its poses miss of the measured ones.
+"""Model of one recorded run, and its residuals against the measured poses.
 
-The model is driven by its own servo or by the logged commands. Its residuals are in standard
-deviations of the sensor's noise, and of what all measured poses have in common.
+The model is driven by its own servo or by the logged commands. Its residuals are whitened by the
+covariance of the sensor's noise and of the errors that all measured poses have in common.
 """
 
 from collections.abc import Callable
@@ -26,32 +26,47 @@ from dynamics.closed_loop import (
     simulate_commands,
     simulate_servo,
 )
-from dynamics.closed_loop.loop_settings import (
-    MAX_DELAY_FRAMES,
-)
+from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
-from identify.record.common_errors import NONE, CommonErrors, Marginal
+from identify.record.stored_common_errors import NONE, CommonErrors, Marginal
 from identify.runtime import cores
 
 LONG_GAP_S = 0.5
-"""Lost frames in a row beyond this time are flagged: the model runs through them unobserved."""
+"""Longest time, s, of lost frames in a row without a warning.
+
+The model runs through these frames unobserved.
+"""
 
 
 @dataclass(frozen=True)
 class LoopModel:
-    """One run of the robot, for the output error of a model with parameters (p,).
+    """Model of one run of a robot, for the output error of its parameters (p,).
 
-    measured: poses (N, 6), NaN where lost; ok (N,) bool; covariance (6, 6) of one measured pose;
-    logged: the joint commands (N, n) as they were given; driven: whether the model's joints get
-    these, or its own servo acts; payload (p,): what a known load on the platform adds to the
-    parameters, with standard deviations payload_std (p,); common: errors that all measured poses
-    have in common; acted (N,): latencies after which the commands acted, s, where they were logged,
-    None: all after that of the timing; drawn: those that a model's loop can have (k,), as it has
-    them, in their standard deviations, None: none; marginal: what whitens residuals by them
-    (`with_common_errors`); groups: through which alone the inertial parameters act; where that is
-    known, sensitivities are by those that stand for all.
+    Attributes
+    ----------
+    measured, ok : ndarray, shapes (N, 6) and (N,)
+        Measured poses, NaN where lost, and which frames were measured.
+    covariance : ndarray, shape (6, 6)
+        Covariance of one measured pose.
+    logged : ndarray, shape (N, n)
+        Commands of the joints as they were given.
+    payload, payload_std : ndarray, shape (p,)
+        What a known load on the platform adds to the parameters, and its standard deviations.
+    common : CommonErrors
+        Errors that all measured poses have in common.
+    driven : bool
+        True if the model's joints get the logged commands, False if its own servo acts.
+    acted : ndarray, shape (N,), optional
+        Latencies of the commands, s, where they were logged. None: all have that of the timing.
+    drawn : ndarray, shape (k,), optional
+        Common errors that the model contains, in their standard deviations. None: it contains none.
+    marginal : Marginal, optional
+        Whitener of the residuals for common errors, see `with_common_errors`.
+    groups : RigidGroups, optional
+        Combinations of the inertial parameters on which the motion depends. Where they are given,
+        sensitivities are those with respect to their pivots and to all other parameters.
     """
 
     robot: Robot
@@ -71,41 +86,42 @@ class LoopModel:
     groups: RigidGroups | None = None
 
     def driven_by_commands(self) -> "LoopModel":
-        """The same run with the model's joints driven by the logged commands."""
+        """Return the same run with the model's joints driven by the logged commands."""
         return replace(self, driven=True, marginal=None)
 
     def having(self, drawn: Array) -> "LoopModel":
-        """The same run, whose model has these common errors (k,), in standard deviations, as far as
-        it can.
+        """Return the same run with a model that contains these common errors (k,).
+
+        They are in standard deviations. An error that no model can contain is reduced.
         """
-        return replace(
-            self, drawn=np.maximum(drawn, self._lowest) if len(drawn) else None, marginal=None
-        )
+        contained = np.maximum(drawn, self._lowest) if len(drawn) else None
+        return replace(self, drawn=contained, marginal=None)
 
     def with_common_errors(self, parameters: Array) -> "LoopModel":
-        """The same run, whose residuals are whitened by what its poses have in common, too, as a
-        model with these parameters (p,) shows it near what it has of that. Raises LoopFailure where
-        that is unstable."""
+        """Return the same run with residuals that are whitened for its common errors, too.
+
+        Their modes are those of a model with these parameters (p,), about the errors that it
+        contains. Raises LoopFailure if that model is unstable.
+        """
         if not self.common.all_names:
             return self
         seen = self.modes(parameters)[self.ok]
         modes = np.asarray(self.whitener @ seen).reshape(-1, seen.shape[2])
+        # errors of measured poses do not reach a model without a servo
         inside = slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
-        return replace(
-            self, marginal=Marginal.of(modes, modes[:, inside] @ self.errors_had[inside])
-        )
+        had = modes[:, inside] @ self.errors_had[inside]
+        return replace(self, marginal=Marginal.of(modes, had))
 
     def without_common_errors(self) -> "LoopModel":
-        """The same run, whose residuals are whitened by the sensor's noise alone."""
+        """Return the same run with residuals whitened by the sensor's noise alone."""
         return replace(self, marginal=None)
 
     def modes(self, parameters: Array) -> Array:
-        """How far (N, 6, k) the common errors, each of one standard deviation, take what is
-        measured from the model.
+        """Return the shift (N, 6, k) of the measured poses against the model by the common errors.
 
-        A model driven by the logged commands moves as the plant did, and what is measured beside
-        that is the error. A closed loop sees the error as well, and its servo takes the platform
-        where the error does not show.
+        It is the shift for one standard deviation of each error. A model driven by the logged
+        commands moves as the plant did, and what is measured beside that is the error. A closed
+        loop sees the error as well, and its servo takes the platform where the error does not show.
         """
         if not self.driven:
             return self._apart(parameters, lambda run: run.measured)
@@ -114,9 +130,7 @@ class LoopModel:
         )
 
     def pose_modes(self, parameters: Array) -> Array:
-        """How far (N, 6, k) the common errors, each of one standard deviation, take the platform
-        from the model.
-        """
+        """Return the shift (N, 6, k) of the platform by one standard deviation of each error."""
         return self._apart(parameters, lambda run: run.pose, 0.0 if self.driven else None)
 
     def _apart(
@@ -125,9 +139,11 @@ class LoopModel:
         shown: Callable[[ClosedLoopRun], Array],
         beside: Array | float | None = None,
     ) -> Array:
-        """What a run shows (N, 6) with a standard deviation more of each common error, less that
-        without; beside (N, 6, k): of those that are in the measured poses, where the loop does not
-        see them."""
+        """Return central differences (N, 6, k) of what a run shows, per unit of each common error.
+
+        shown: picks the poses (N, 6) of a run. beside (N, 6, k): columns of the errors of measured
+        poses that the loop does not see, for which nothing is simulated.
+        """
         drawn = self.errors_had
         modes = np.zeros((*self.measured.shape, len(drawn)))
         count = len(self.common.names)
@@ -140,11 +156,14 @@ class LoopModel:
             for k in moving
             for sign in (1.0, -1.0)
         ]
-        with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
+        # threads are enough: the compiled loop runs without Python's lock
+        with ThreadPoolExecutor(cores()) as pool:
             found = list(pool.map(lambda end: shown(self.having(end).simulate(parameters)), ends))
         for place, k in enumerate(moving):
-            (more, less), (high, low) = (each[2 * place : 2 * place + 2] for each in (found, ends))
-            modes[:, :, k] = (more - less) / (high - low)[k]
+            more, less = found[2 * place : 2 * place + 2]
+            high, low = ends[2 * place : 2 * place + 2]
+            # less than two units where the lower end would be a negative latency
+            modes[:, :, k] = (more - less) / (high[k] - low[k])
         if (geometry := self.common.geometry) is None:
             return modes
         by_geometry = geometry.modes(lambda robot: self.simulate(parameters, robot=robot).pose)
@@ -152,22 +171,20 @@ class LoopModel:
 
     @property
     def latencies(self) -> Array | None:
-        """Latencies of the model's commands (N,), s, with the common error that it has of them;
-        None: that of its timing."""
+        """Latencies (N,) of the model's commands, s, or None if all have that of its timing.
+
+        They include the common error of the latency that the model contains.
+        """
         if self.drawn is None or not self.common.latency_std:
             return self.acted
-        stated = (
-            np.full(len(self.ok), self.settings.timing.latency_s)
-            if self.acted is None
-            else self.acted
-        )
+        stated = self.acted
+        if stated is None:
+            stated = np.full(len(self.ok), self.settings.timing.latency_s)
         return np.maximum(stated + self.common.latency_std * float(self.drawn[-1]), 0.0)
 
     @property
     def _lowest(self) -> Array:
-        """The least that a model can have (k,) of each common error that its loop can have: no
-        latency is negative.
-        """
+        """Least values (k,) of the errors that a model can contain. No latency is negative."""
         lowest = np.full(len(self.common.names) + bool(self.common.latency_std), -np.inf)
         if self.common.latency_std:
             mean = self.settings.timing.latency_s if self.acted is None else self.acted.mean()
@@ -176,9 +193,7 @@ class LoopModel:
 
     @property
     def errors_had(self) -> Array:
-        """Common errors (k,) that the model has, of those that its loop can have: of the poses, and
-        the latency's.
-        """
+        """Common errors (k,) that the model contains: of the poses, and of the latency."""
         count = len(self.common.names) + bool(self.common.latency_std)
         return np.zeros(count) if self.drawn is None else self.drawn
 
@@ -189,9 +204,24 @@ class LoopModel:
         robot: Robot | None = None,
         noise: Array | None = None,
     ) -> ClosedLoopRun:
-        """The model's run with the common errors that it has; of another robot than the servo
-        knows, or with noise (N, 6) in what that measures, where they are given. Raises LoopFailure
-        where it is unstable."""
+        """Simulate the model with the common errors that it contains.
+
+        Parameters
+        ----------
+        parameters : ndarray, shape (p,)
+            Parameters without a known load, which is added.
+        sensitivities : bool
+            True returns derivatives with respect to the parameters, too.
+        robot : Robot, optional
+            Robot that moves, if it is another one than the servo knows.
+        noise : ndarray, shape (N, 6), optional
+            Noise of the poses that the servo measures.
+
+        Raises
+        ------
+        LoopFailure
+            The run is unstable.
+        """
         given = robot or self.robot, parameters + self.payload, self.reference, self.settings
         sensor = IdealSensor(self._lost, self._sensed(noise))
         late = self.latencies
@@ -208,8 +238,10 @@ class LoopModel:
     def simulate_repeats(
         self, parameters: Array, noises: Array
     ) -> list[ClosedLoopRun | LoopFailure]:
-        """The model's run with each noise of noises (runs, N, 6) in what that measures, or why it
-        is unstable.
+        """Simulate the model once for each noise (N, 6) of noises (runs, N, 6).
+
+        The servo measures its poses with that noise. A run that is unstable is returned as its
+        LoopFailure.
         """
         sensed = np.asarray(self._sensed(noises))
         given = self.robot, parameters + self.payload, self.reference, self.settings
@@ -219,19 +251,23 @@ class LoopModel:
 
     @property
     def _lost(self) -> NDArray[np.bool_] | None:
-        """Frames (N,) at which the servo of the model measures nothing; None under commands."""
+        """Frames (N,) at which the model's servo measures nothing, or None under commands."""
         return None if self.driven else ~self.ok
 
     def commands_before(self, frame: int) -> tuple[Array, Array | None]:
-        """Commands (k, n) that may still be on their way at a frame, or act there, the first where
-        there is none before it; and their latencies (k,), s, None: that of the timing."""
+        """Return the commands (k, n) that may act at a frame or later, and their latencies.
+
+        They were issued before the frame. At the first frame it is the first command of the run.
+        The latencies (k,) are in s, or None if all have that of the timing.
+        """
         rows = slice(max(0, frame - MAX_DELAY_FRAMES - 2), max(frame, 1))
         latencies = self.latencies
         return self.logged[rows], None if latencies is None else latencies[rows]
 
     def _sensed(self, noise: Array | None) -> Array | None:
-        """What is added to the poses (N, 6) that a model's servo measures: its common errors, and
-        noise (..., N, 6).
+        """Return what is added to the poses (N, 6) that the model's servo measures.
+
+        It is the common errors that the model contains, and noise (..., N, 6).
         """
         if self.drawn is None or not self.common.names or self.driven:
             return noise
@@ -239,18 +275,20 @@ class LoopModel:
         return error if noise is None else error + noise
 
     def model_poses(self, parameters: Array) -> Array:
-        """Poses (N, 6) of the model. Raises LoopFailure where it is unstable."""
+        """Return the poses (N, 6) of the model. Raises LoopFailure if it is unstable."""
         return self.simulate(parameters).pose
 
     def misses(self, parameters: Array, ahead: bool = False) -> Array:
-        """Whitened pose residuals model - measurement (n, 6) of the good frames; ahead: from a run
-        with the sensitivities that `residuals` will need. Raises LoopFailure."""
+        """Return the whitened residuals model - measurement (n, 6) of the good frames.
+
+        With `ahead` they come from a run with the sensitivities that `residuals` will need. Raises
+        LoopFailure if the model is unstable.
+        """
         return self.without_common(self._missed(self._latest_run(parameters, sensitivities=ahead)))
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
-        """The model's run, the one that is there if it was the latest of its kind. Raises
-        LoopFailure.
-        """
+        """Return the model's run, which is kept until the next of its kind. Raises LoopFailure."""
+        # a copy, as the caller may change the array
         given = parameters.tobytes()
         known, run = self._runs.get(sensitivities, (b"", None))
         if run is None or known != given:
@@ -260,88 +298,85 @@ class LoopModel:
 
     @cached_property
     def _runs(self) -> dict[bool, tuple[bytes, ClosedLoopRun]]:
-        """The latest runs without and with sensitivities, and the parameters that they were made
-        with.
-        """
+        """Latest runs without and with sensitivities, and the parameters of each."""
         return {}
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
-        """`misses` (n, 6) of a model driven by the logged commands, which are white if it is right;
-        rng: for what a fit to the poses themselves has taken out of them. Raises LoopFailure."""
+        """Return `misses` (n, 6) of a model driven by the logged commands.
+
+        They are white if the model is right. rng: draws what a fit to the poses themselves has
+        taken out of the residuals. Raises LoopFailure if the model is unstable.
+        """
         return self.misses(parameters)
 
     def residuals(self, parameters: Array) -> tuple[Array, Array]:
-        """`misses` (n, 6), and their Jacobian (n, 6, p)."""
+        """Return `misses` (n, 6), and their Jacobian (n, 6, p)."""
         missed, shown = self.shown_residuals(parameters)
         return missed, self.of_all(shown)
 
     def shown_residuals(self, parameters: Array) -> tuple[Array, Array]:
-        """`misses` (n, 6), and their derivatives (n, 6, k) by the parameters that stand for all,
-        see `of_all`.
-        """
+        """Return `misses` (n, 6), and their derivatives (n, 6, k) before `of_all`."""
         missed, shown = self._shown_in_noise(parameters)
         return self.without_common(missed), self.without_common(shown)
 
     def of_all(self, shown: Array) -> Array:
-        """Derivatives (..., p) by all parameters, from those (..., k) by the ones that stand for
-        all.
+        """Return derivatives (..., p) with respect to all parameters.
+
+        shown (..., k): derivatives with respect to the pivots of `groups` and to all other
+        parameters.
         """
         if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
             return shown
         return self.groups.of_all(shown)
 
     def residuals_in_noise(self, parameters: Array) -> tuple[Array, Array]:
-        """The same in standard deviations of the noise alone."""
+        """Return what `residuals` returns, but whitened by the noise alone."""
         missed, shown = self._shown_in_noise(parameters)
         return missed, self.of_all(shown)
 
     def _shown_in_noise(self, parameters: Array) -> tuple[Array, Array]:
         run = self._latest_run(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
-        return self._missed(run), np.asarray(
-            self.whitener @ run.pose_sensitivity[self.ok], dtype=float
-        )
+        shown = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
+        return self._missed(run), shown
 
     def _missed(self, run: ClosedLoopRun) -> Array:
-        """What a run of the model misses of the measurements (n, 6), in standard deviations of the
-        noise alone; its common errors count as none."""
+        """Return the residuals (n, 6) of a run of the model, whitened by the noise alone.
+
+        The part that is due to the common errors that the model contains is taken out.
+        """
         seen = run.pose if self.driven or self.drawn is None else run.measured
         missed = self.whiten(seen - self.measured)
         return missed if self.marginal is None else missed - self.marginal.had.reshape(missed.shape)
 
     def whiten(self, differences: Array) -> Array:
-        """Pose differences (N, 6) at the good frames in standard deviations of the noise,
-        (n, 6)."""
+        """Return pose differences (N, 6) at the good frames whitened by the noise, (n, 6)."""
         return np.asarray(differences[self.ok] @ self.whitener.T, dtype=float)
 
     @property
     def whitened_modes(self) -> Array:
-        """Those (n, 6, k) of a run `with_common_errors`, at the good frames in standard deviations
-        of the noise.
-        """
+        """Modes (n, 6, k) of a run `with_common_errors`, at the good frames and whitened."""
         count = np.count_nonzero(self.ok)
-        return (
-            np.zeros((count, 6, 0))
-            if self.marginal is None
-            else self.marginal.modes.reshape(count, 6, -1)
-        )
+        if self.marginal is None:
+            return np.zeros((count, 6, 0))
+        return self.marginal.modes.reshape(count, 6, -1)
 
     def without_common(self, rows: Array) -> Array:
-        """Rows (n, 6, ...) in standard deviations of the noise, in those of noise and common
-        errors.
+        """Return rows (n, 6, ...) whitened for the common errors, too.
+
+        The rows are whitened by the noise already.
         """
         if self.marginal is None:
             return rows
-        return self.marginal.whiten(rows.reshape(self.marginal.directions.shape[0], -1)).reshape(
-            rows.shape
-        )
+        stacked = rows.reshape(self.marginal.directions.shape[0], -1)
+        return self.marginal.whiten(stacked).reshape(rows.shape)
 
     def without_gaps(self) -> Array:
-        """Measured poses (N, 6) with lost frames interpolated in time; for linear fits only."""
+        """Return measured poses (N, 6) with lost frames interpolated, for linear fits only."""
         return without_gaps(self.measured, self.ok)
 
     def warnings(self) -> tuple[str, ...]:
-        """What in this record weakens the estimate."""
+        """Return a warning if many frames in a row were lost, which weakens the estimate."""
         edges = np.flatnonzero(np.diff(np.concatenate([[0], ~self.ok, [0]])))
         if not len(edges):
             return ()
@@ -352,8 +387,8 @@ class LoopModel:
             return ()
         return (
             f"{gaps[longest]} frames in a row were lost from t = "
-            f"{edges[2 * longest] / rate_hz:.2f} s on: the model "
-            f"runs through {gaps[longest] / rate_hz:.2f} s unobserved",
+            f"{edges[2 * longest] / rate_hz:.2f} s on: the model runs through "
+            f"{gaps[longest] / rate_hz:.2f} s unobserved",
         )
 
     @cached_property

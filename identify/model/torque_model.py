@@ -1,11 +1,12 @@
-"""A record whose drives took torques: in short spans, as no robot stands on torques alone.
+"""Model of a record whose drives took torques, in short spans.
 
-Under logged torques nothing holds the model where the robot was: a deviation grows by some e^7 in a
-second. Over a span of half a second it stays small. Coordinates and rates at the start of each span
-are fitted to its measured poses, by Gauss-Newton, for every set of parameters; the poses of a run
-are then those of the fitted spans, and their derivatives by the parameters those at fitted starts
-(variable projection in Kaufman's form; BIT 15, 1975). What is known of the starts beside the span's
-own poses is next to nothing, and 2 m of the residuals of a span go into them.
+No robot stands on torques alone. Under logged torques nothing holds the model where the robot was,
+and a deviation grows by some e^7 in a second. Over a span of half a second it stays small.
+Coordinates and rates at the start of each span are fitted to its measured poses by Gauss-Newton,
+for every set of parameters. The poses of a run are then those of the fitted spans. Their
+derivatives with respect to the parameters are those at fitted starts (variable projection in
+Kaufman's form; BIT 15, 1975). Beside the span's own poses next to nothing is known of its start, so
+that 2 m of its residuals go into the start.
 """
 
 from dataclasses import dataclass, field, replace
@@ -28,25 +29,43 @@ from identify.model.loop_model import LoopModel
 from identify.scenario import Scenario
 
 SPAN_S = 0.5
-"""Length of a span: twice as long a one is e^3.5 times as sensitive to its start."""
+"""Length of a span, s. One twice as long is e^3.5 times as sensitive to its start."""
 
-STEPS, HALVINGS, SETTLED = 8, 8, 1e-3
-"""Gauss-Newton steps of a start at most, halvings of one, and the largest change of a pose, in
-standard deviations, that ends them."""
+STEPS = 8
+"""Largest number of Gauss-Newton steps of a start."""
+
+HALVINGS = 8
+"""Largest number of halvings of a step."""
+
+SETTLED = 1e-3
+"""Largest change of a pose, in standard deviations, at which the steps end."""
 
 SHORTEST = 4
-"""Frames of a span, or of a part of it, that is fitted without its first half before."""
+"""Largest number of frames of a span that is not halved when no start is known."""
 
-NEAR, RATE = 10.0, 20.0
-"""Deviations of the noise by which a start may be off the filtered poses, which is next to nothing
-known of it; and what the filter makes of the noise of a pose in its rate, 1/s."""
+NEAR = 10.0
+"""Standard deviation of a start about the filtered poses, in those of the noise.
+
+It is so large that next to nothing is known of the start.
+"""
+
+RATE = 20.0
+"""Noise of a filtered rate per noise of a pose, 1/s."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A span run from a start (2 m,): the run, the derivative of its whitened poses by the start (6
-    n, 2 m), and what it misses, (6 n + 2 m,): of the measured poses, and of the filtered start in
-    its widths."""
+    """Span that was run from a start (2 m,).
+
+    Attributes
+    ----------
+    start, run
+        Coordinates and rates of the start, and the run from there.
+    seen : ndarray, shape (6 n, 2 m)
+        Derivatives of the whitened poses with respect to the start.
+    missed : ndarray, shape (6 n + 2 m,)
+        Residuals of the measured poses, and of the filtered start in its standard deviations.
+    """
 
     start: Array
     run: ClosedLoopRun
@@ -56,8 +75,9 @@ class Fit:
 
 @dataclass(frozen=True)
 class TorqueModel(LoopModel):
-    """`LoopModel` of torques; starts (k, 2 m): coordinates and rates of the filtered poses where
-    spans begin.
+    """Model of a run under torques.
+
+    starts (k, 2 m): coordinates and rates of the filtered poses where the k spans begin.
     """
 
     starts: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -70,10 +90,10 @@ class TorqueModel(LoopModel):
         robot: Robot | None = None,
         noise: Array | None = None,
     ) -> ClosedLoopRun:
-        """The model's poses and their derivatives in fitted spans; the rest of the run is that of
-        the first span.
+        """Simulate the model in fitted spans, with derivatives of its poses.
 
-        Raises LoopFailure where a span leaves the reach.
+        What the run holds beside poses is that of the first span. Raises LoopFailure where a span
+        leaves the reach.
         """
         fits = self._fits(parameters, robot)
         pose = np.concatenate([fit.run.pose for fit in fits])
@@ -89,20 +109,23 @@ class TorqueModel(LoopModel):
     def simulate_repeats(
         self, parameters: Array, noises: Array
     ) -> list[ClosedLoopRun | LoopFailure]:
-        """The model's poses, which no noise moves, with each noise (runs, N, 6) in what is
-        measured.
+        """Return the model's run once for each noise (N, 6) of noises (runs, N, 6).
+
+        The noise is added to the measured poses. It does not move the model.
         """
         return [self.simulate(parameters, noise=noise) for noise in noises]
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
-        """The model's run; what is kept of the latest one are its fits, from which the next ones
-        start.
+        """Return the model's run.
+
+        Only the fits of the latest one are kept, from which the next fits start.
         """
         return self.simulate(parameters, sensitivities)
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
-        """`misses`, with drawn noise where the fit of the starts has taken it out: white, if the
-        model is right.
+        """Return `misses`, with drawn noise where the fit of the starts has taken it out.
+
+        They are white if the model is right.
         """
         drawn = []
         for fit in self._fits(parameters, None):
@@ -116,14 +139,16 @@ class TorqueModel(LoopModel):
 
     @property
     def _width(self) -> Array:
-        """How far a start (2 m,) may be from the filtered poses."""
+        """Standard deviations (2 m,) of a start about the filtered poses."""
         free = self.robot.geometry.chart.basis
         noise = np.sqrt(np.diag(free.T @ self.covariance @ free))
         return np.concatenate([NEAR * noise, NEAR * RATE * noise])
 
     def _fits(self, parameters: Array, robot: Robot | None) -> list[Fit]:
-        """All spans; those of the evaluation before are kept, as what follows asks for them again
-        or begins there.
+        """Return the fits of all spans.
+
+        Those of the latest evaluation are kept, since later calls ask for them again, or begin
+        there.
         """
         key = parameters.tobytes() + self.errors_had.tobytes()
         if robot is None and key in self._latest:
@@ -146,12 +171,17 @@ class TorqueModel(LoopModel):
         filtered: Array,
         before: Fit | None,
     ) -> Fit:
-        """The span from the start that fits it best, from one before on, if there is one; else from
-        that which fits half of it. Raises LoopFailure."""
-        near, (first, last) = np.diag(1 / self._width), span
-        fit = (
-            None if before is None else self._tried(parameters, robot, span, before.start, filtered)
-        )
+        """Return the fit of a span with the start that fits it best.
+
+        The search begins at the start of the fit before, if there is one and the span runs from
+        there. Else it begins at the start that fits half of the span, or at the filtered one.
+        Raises LoopFailure.
+        """
+        near = np.diag(1 / self._width)
+        first, last = span
+        fit = None
+        if before is not None:
+            fit = self._tried(parameters, robot, span, before.start, filtered)
         if fit is None and last - first > SHORTEST:
             half = self._fitted(parameters, robot, (first, (first + last) // 2), filtered, None)
             fit = self._tried(parameters, robot, span, half.start, filtered)
@@ -160,10 +190,10 @@ class TorqueModel(LoopModel):
             step = np.linalg.lstsq(np.vstack([fit.seen, near]), fit.missed, rcond=None)[0]
             if np.abs(fit.seen @ step).max(initial=0.0) < SETTLED:
                 break
+            # a whole step may go too far, even out of the reach
             for halving in range(HALVINGS):
-                lower = self._tried(
-                    parameters, robot, span, fit.start - 0.5**halving * step, filtered
-                )
+                start = fit.start - 0.5**halving * step
+                lower = self._tried(parameters, robot, span, start, filtered)
                 if lower is not None and lower.missed @ lower.missed < fit.missed @ fit.missed:
                     break
             else:
@@ -183,38 +213,45 @@ class TorqueModel(LoopModel):
     def _from(
         self, parameters: Array, robot: Robot, span: tuple[int, int], start: Array, filtered: Array
     ) -> Fit:
-        chart, reference, (first, last) = robot.geometry.chart, self.reference, span
+        chart = robot.geometry.chart
+        first, last = span
         coordinates, rates = np.split(start, 2)
         pose = chart.pose(coordinates)
-        none = np.zeros(robot.layout.joints)
+        # drives that take torques have no integrals, nor does a run without its servo
+        no_joint_integral = np.zeros(robot.layout.joints)
+        no_pose_integral = np.zeros(len(coordinates))
         before, earlier = self.commands_before(first)
         begin = StartState(
             pose,
             chart.lifted(rates),
-            none,
-            np.zeros(len(coordinates)),
+            no_joint_integral,
+            no_pose_integral,
             before,
             pose,
             latencies=earlier,
         )
+        frames = slice(first, last)
         run = differentiate_commands(
             robot,
             parameters,
-            Reference(reference.poses[first:last], reference.rates[first:last]),
+            Reference(self.reference.poses[frames], self.reference.rates[frames]),
             self.settings,
-            self.logged[first:last],
+            self.logged[frames],
             start=begin,
             by_start=True,
-            latencies=None if self.latencies is None else self.latencies[first:last],
+            latencies=None if self.latencies is None else self.latencies[frames],
         )
-        ok = self.ok[first:last]
+        ok = self.ok[frames]
         by_start = np.asarray(run.start_sensitivity)[:, :, : len(start)]
-        missed = ((run.pose - self.measured[first:last])[ok] @ self.whitener.T).ravel()
+        missed = ((run.pose - self.measured[frames])[ok] @ self.whitener.T).ravel()
         seen = (self.whitener @ by_start[ok]).reshape(-1, len(start))
         return Fit(start, run, seen, np.concatenate([missed, (start - filtered) / self._width]))
 
     def _slopes(self, fit: Fit, ok: np.ndarray) -> Array:
-        """Derivatives (n, 6, p) of a span's poses by the parameters, which the start follows."""
+        """Return derivatives (n, 6, p) of a span's poses with respect to the parameters.
+
+        The start follows the parameters.
+        """
         states = fit.seen.shape[1]
         near = np.diag(1 / self._width)
         by_parameters = np.asarray(fit.run.pose_sensitivity)
@@ -227,14 +264,14 @@ class TorqueModel(LoopModel):
 
 
 def torque_model(run: LoopModel, scenario: Scenario) -> TorqueModel:
-    """A recorded run whose commands are torques, and which begins at rest."""
+    """Return the model of a recorded run whose commands are torques, and which begins at rest."""
     drives = Drives(torques=True, torque_limit=run.settings.drives.torque_limit)
     chart = run.robot.geometry.chart
     rate_hz = scenario.timing.frame_rate_hz
     filtering = scenario.filter
     measured = chart.coordinates(run.without_gaps())
     place, rate, _ = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
-    rate[0] = 0.0
+    rate[0] = 0.0  # the run begins at rest, whatever the filter says at its end
     starts = np.hstack([place, rate])[span_edges(len(run.ok), rate_hz)[:-1]]
     parts = {name: getattr(run, name) for name in LoopModel.__dataclass_fields__}
     return TorqueModel(
@@ -243,7 +280,9 @@ def torque_model(run: LoopModel, scenario: Scenario) -> TorqueModel:
 
 
 def span_edges(frames: int, rate_hz: float) -> list[int]:
-    """Where the spans of a run begin, and its number of frames; all are of about the same
-    length."""
+    """Return where the spans of a run begin, and its number of frames.
+
+    All spans are of about the same length.
+    """
     count = max(1, round(frames / (SPAN_S * rate_hz)))
     return [int(edge) for edge in np.linspace(0, frames, count + 1).round()]

@@ -1,1 +1,1 @@
-"""What the experimenter has: the record of a run, and the motion and loop it was asked for."""
+"""The record of a run, with the motion that was asked for and the loop that made it."""

@@ -1,7 +1,7 @@
-"""What a whole record must be to carry an identification: of this robot and loop, long enough, and
-moving.
+"""Checks that a record can carry an identification.
 
-Each check raises EstimationError with what it found, in frames counted from 0.
+A record must be of this robot and loop, long enough, and moving. Each check raises EstimationError
+with what it found. Frames are counted from 0.
 """
 
 from collections.abc import Sequence
@@ -30,24 +30,28 @@ REFERENCE_GAP = 0.05
 """Share of its travel by which a reference may differ from the integral of its rate."""
 
 ROUNDING = 1e-9
-"""m or rad: difference that means nothing, of a reference from its trajectory or from one that
-stands still; and relative, of a frame rate."""
+"""Difference, m or rad, that counts as rounding. It is relative where frame rates are compared."""
 
 ASYMMETRY = 1e-6
-"""Difference of two mirrored entries of a covariance that rounding may make, in units of the
-standard deviations.
+"""Largest difference of two mirrored entries of a covariance that counts as rounding.
+
+Its unit is the product of the two standard deviations.
 """
 
 
 class TooFewFramesError(EstimationError):
-    """A record most of whose frames were lost."""
+    """Error for a record most of whose frames were lost."""
 
 
 def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
-    """The record must be whole, of this robot, and made with the timing and the servo that the
-    model is to have.
+    """Check that a record is whole, of this robot, and made with the model's timing and servo.
 
-    Raises RecordError too, for a record that is not whole or does not say so.
+    Raises
+    ------
+    RecordError
+        The record is not whole, or does not state its scenario.
+    EstimationError
+        Robot, joints, timing or servo differ, or frames are missing.
     """
     check_record(record, "the record")
     check_robot(record, robot)
@@ -68,30 +72,28 @@ def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
                 )
     _check_stated_rate(record, scenario.timing.frame_rate_hz)
     steps = np.diff(np.asarray(record["time"].values, dtype=float)) * scenario.timing.frame_rate_hz
+    # a time of NaN must not pass, which `>` would let
     if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
         worst = int(np.abs(steps - 1).argmax())
         raise EstimationError(
             f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of "
-            f"{scenario.timing.frame_rate_hz:g} Hz "
-            "apart: frames are missing in the record; keep lost ones with measured_ok = 0"
+            f"{scenario.timing.frame_rate_hz:g} Hz apart: frames are missing in the record; keep "
+            "lost ones with measured_ok = 0"
         )
 
 
 def _check_stated_rate(record: xr.Dataset, rate_hz: float) -> None:
-    """A frame rate that the record states beside its scenario must be that of the scenario [Hz]."""
+    """Check that a frame rate stated beside the scenario is the scenario's, Hz."""
     stated = record.attrs.get("frame_rate_hz", rate_hz)
     if not abs(as_number(stated) - rate_hz) <= ROUNDING * rate_hz:
         raise EstimationError(
             f"the record contradicts itself: its attribute frame_rate_hz is {shown(stated)}, and "
-            "timing.frame_rate_hz "
-            f"of its attribute scenario is {rate_hz:g}"
+            f"timing.frame_rate_hz of its attribute scenario is {rate_hz:g}"
         )
 
 
 def check_trajectory(record: xr.Dataset, trajectory: FourierTrajectory, scenario: Scenario) -> None:
-    """The record's reference must be the exciting trajectory (eq. 37) at the frames that the
-    scenario asks for.
-    """
+    """Check that the reference is the exciting trajectory (eq. 37) at the scenario's frames."""
     asked = scenario.timing.frame_times(scenario.excitation.duration_s)
     if record.sizes["time"] != len(asked):
         raise EstimationError(
@@ -105,14 +107,16 @@ def check_trajectory(record: xr.Dataset, trajectory: FourierTrajectory, scenario
         raise EstimationError(
             f"the record's reference is not the exciting trajectory: its {POSE[worst]} differs by "
             f"{gap[frame, worst]:.3g} {'m' if worst < 3 else 'rad'} at t = {asked[frame]:.2f} s: "
-            "it is of another "
-            "experiment"
+            "it is of another experiment"
         )
 
 
 def check_reference(reference: Reference, scenario: Scenario) -> None:
-    """The reference must move, and its poses must be what its rates make of the first: a motion
-    faster than half the frame rate looks like a slow one in the poses."""
+    """Check that the reference moves, and that its poses are the integral of its rates.
+
+    A motion faster than half the frame rate looks like a slow one in the poses. Its rates reveal
+    it.
+    """
     poses = reference.poses
     rates = reference.rates
     travel = np.ptp(poses, axis=0)
@@ -120,25 +124,27 @@ def check_reference(reference: Reference, scenario: Scenario) -> None:
         raise EstimationError(
             "the reference is the same pose in every frame: nothing was asked to move"
         )
-    if len(poses) <= SPLINE_DEGREE:
+    if len(poses) <= SPLINE_DEGREE:  # no spline goes through so few
         return
     times = np.arange(len(poses)) * scenario.timing.frame_period_s
-    gap = np.ptp(
-        make_interp_spline(times, rates, k=SPLINE_DEGREE).antiderivative()(times) - poses, axis=0
-    )
+    integral = make_interp_spline(times, rates, k=SPLINE_DEGREE).antiderivative()
+    # the range of the difference does not depend on the constant of integration
+    gap = np.ptp(integral(times) - poses, axis=0)
     worst = int(np.argmax(gap - REFERENCE_GAP * travel))
     if gap[worst] > REFERENCE_GAP * travel[worst] + ROUNDING:
         raise EstimationError(
             f"the reference's {POSE[worst]} travels {travel[worst]:.3g}, and its rate makes it "
-            "another motion, up to "
-            f"{gap[worst]:.3g} away: it has harmonics above half of "
-            f"{scenario.timing.frame_rate_hz:g} Hz, or the rate "
-            "is not its derivative"
+            f"another motion, up to {gap[worst]:.3g} away: it has harmonics above half of "
+            f"{scenario.timing.frame_rate_hz:g} Hz, or the rate is not its derivative"
         )
 
 
 def check_length(frames: int, scenario: Scenario, what: str = "the record has") -> None:
-    """One period of the highest harmonic, and what the filter takes at its ends."""
+    """Check that a record has enough frames.
+
+    It needs one period of the highest harmonic, and what the filter takes at its ends. The message
+    begins with `what`.
+    """
     timing = scenario.timing
     filtering = scenario.filter
     needed = max(
@@ -148,26 +154,29 @@ def check_length(frames: int, scenario: Scenario, what: str = "the record has") 
     if frames < needed:
         raise EstimationError(
             f"{what} {frames} frames ({frames / timing.frame_rate_hz:.3g} s), at least {needed} "
-            "are needed: "
-            "one period of the highest harmonic, and what the filter takes at its ends"
+            "are needed: one period of the highest harmonic, and what the filter takes at its ends"
         )
 
 
 def check_good_share(ok: NDArray[np.bool_], seen: Sequence[str] = ()) -> None:
-    """Enough frames (N,) that were measured; else TooFewFramesError, with what a watch saw of the
-    cameras.
+    """Check that enough of the frames were measured, as `ok` (N,) states.
+
+    The message of the TooFewFramesError ends with `seen`, what a watch saw of the cameras.
     """
     if ok.mean() < MINIMUM_GOOD_SHARE:
         why = "".join(f": {warning}" for warning in seen)
         raise TooFewFramesError(
-            f"only {ok.sum()} of {len(ok)} frames were measured; at least "
-            f"{MINIMUM_GOOD_SHARE:.0%} are needed{why}"
+            f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} "
+            f"are needed{why}"
         )
 
 
 def check_channels(chart: Chart, measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
-    """No coordinate of the poses (N, 6) in the good frames, `ok` (N,), and no command (N, n), that
-    is dead. What the chart does not let move may stand still."""
+    """Check that every coordinate and every command changes.
+
+    Coordinates are those of the measured poses (N, 6) in the good frames, `ok` (N,). Commands (N,
+    n) are taken in all frames. Components that the chart holds fixed may stand still.
+    """
     channels = list(zip(chart.coordinate_names, chart.coordinates(measured[ok]).T, strict=True))
     channels += [
         (f"command of joint {joint}", column) for joint, column in enumerate(logged.T, start=1)
@@ -180,7 +189,10 @@ def check_channels(chart: Chart, measured: Array, logged: Array, ok: NDArray[np.
 
 
 def checked_covariance(covariances: Array, ok: NDArray[np.bool_]) -> Array:
-    """Mean (6, 6) of the covariances (N, 6, 6) of the good frames, `ok` (N,)."""
+    """Return the mean (6, 6) of the covariances (N, 6, 6) of the good frames, `ok` (N,).
+
+    Raises EstimationError unless they are symmetric and the mean is positive definite.
+    """
     _check_symmetry(covariances[ok], np.flatnonzero(ok))
     mean = covariances[ok].mean(axis=0)
     if np.linalg.eigvalsh(mean)[0] <= 0:
@@ -189,8 +201,9 @@ def checked_covariance(covariances: Array, ok: NDArray[np.bool_]) -> Array:
 
 
 def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
-    """Covariances (n, 6, 6) of these frames (n,) must be symmetric: what follows reads one triangle
-    only.
+    """Check that the covariances (n, 6, 6) of these frames (n,) are symmetric.
+
+    Later computations read one triangle only.
     """
     gap = np.abs(covariances - covariances.transpose(0, 2, 1))
     std = np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
@@ -200,8 +213,7 @@ def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
     worst, row, column = np.unravel_index(int(np.argmax(excess > 0)), excess.shape)
     raise EstimationError(
         f"measured_covariance is not symmetric in {np.sum((excess > 0).any(axis=(1, 2)))} frames: "
-        "in frame "
-        f"{frames[worst]} its entry ({POSE[row]}, {POSE[column]}) is "
-        f"{covariances[worst, row, column]:.6g} and "
-        f"({POSE[column]}, {POSE[row]}) is {covariances[worst, column, row]:.6g}"
+        f"in frame {frames[worst]} its entry ({POSE[row]}, {POSE[column]}) is "
+        f"{covariances[worst, row, column]:.6g} and ({POSE[column]}, {POSE[row]}) is "
+        f"{covariances[worst, column, row]:.6g}"
     )

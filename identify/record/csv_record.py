@@ -1,8 +1,7 @@
-"""A record as a CSV table: which columns it has, how one is read, and the rules that hold for any
-record.
+"""Records as CSV tables: their columns, their rules, and reading them.
 
-One row a frame, one column a number, its unit at the end of the name; lines that begin with # are
-comments. Messages name the line of the file, counted from 1.
+A row is a frame, and a column is a number whose unit is at the end of the column's name. Lines that
+begin with # are comments. Messages name the line of the file, counted from 1.
 """
 
 import csv
@@ -21,31 +20,31 @@ from identify.files.dataset import POSE
 RULES = """\
 A record begins at rest: before its first row the robot has stood still at the first reference pose,
 and the reference starts from there without a jump of its rate. It has one row a frame, at the frame
-rate of [timing],
-without gaps: a frame whose pose the sensor lost stays, with empty measured columns. Units are m,
-rad and s. Poses are those of the platform frame in the base frame of the robot file, R = Rx(alpha)
-Ry(beta) Rz(gamma); time is the instant at which the sensor saw the pose. A command is the joint
-coordinate that the servo asked for from its row on, with the zero and the direction of the robot
-file; it acts at its command_time_s, which may be empty only in a row whose pose was lost, and
-without that column after the latency of [timing]. Rates are time derivatives of the reference
-pose's six numbers, not the angular velocity; without these columns they are taken from a spline
-through the reference.
+rate of [timing], without gaps: a frame whose pose the sensor lost stays, with empty measured
+columns. Units are m, rad and s. Poses are those of the platform frame in the base frame of the
+robot file, R = Rx(alpha) Ry(beta) Rz(gamma); time is the instant at which the sensor saw the pose.
+A command is the joint coordinate that the servo asked for from its row on, with the zero and the
+direction of the robot file; it acts at its command_time_s, which may be empty only in a row whose
+pose was lost, and without that column after the latency of [timing]. Rates are time derivatives of
+the reference pose's six numbers, not the angular velocity; without these columns they are taken
+from a spline through the reference.
 """
-"""What must hold of a record of one's own."""
+"""Rules that a record of one's own must keep."""
 
 LARGEST = 200_000_000
-"""Bytes of a table, of which an hour at 60 Hz takes a hundred million."""
+"""Largest size of a table, bytes. An hour at 60 Hz takes a hundred million."""
 
 TIME_ROUNDING = 1e-3
-"""Share of a frame by which a stated time may miss its own."""
+"""Share of a frame period by which a stated time may be off."""
 
 UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
 
 
 @dataclass(frozen=True)
 class Group:
-    """Columns that belong together: their names, what they hold, and whether all of them may be
-    left out.
+    """Columns that belong together: their names, and what they mean.
+
+    Columns of an optional group may be left out, but only all of them.
     """
 
     names: tuple[str, ...]
@@ -54,7 +53,7 @@ class Group:
 
 
 def columns_of(robot: Robot) -> dict[str, Group]:
-    """The columns of a robot's record, by what they make up."""
+    """Return the groups of columns of a robot's record, by name."""
     joints = range(1, robot.layout.joints + 1)
     unit = "m" if robot.layout.prismatic else "rad"
     pairs = [(a, b) for k, a in enumerate(POSE) for b in POSE[k:]]
@@ -89,8 +88,9 @@ def columns_of(robot: Robot) -> dict[str, Group]:
 
 @dataclass(frozen=True)
 class Table:
-    """The groups of columns that a file has, each (N, k), NaN where a cell is empty; and the line
-    (N,) of each row.
+    """Groups of columns of a file, each (N, k), and the line of each row.
+
+    Cells that are empty are NaN.
     """
 
     path: Path
@@ -98,8 +98,9 @@ class Table:
     lines: tuple[int, ...]
 
     def check_times(self, rate_hz: float) -> None:
-        """Refuse rows that are not one frame of this rate apart. Raises RecordError, with line and
-        times.
+        """Check that the rows are one frame of this rate apart.
+
+        Raises RecordError with the line and the times.
         """
         times = self.groups["time"][:, 0]
         frames = np.diff(times) * rate_hz
@@ -108,18 +109,17 @@ class Table:
             row = int(wrong[0])
             raise RecordError(
                 f"{self.path} line {self.lines[row + 1]}: time_s is {times[row + 1]:g} after "
-                f"{times[row]:g} in the row "
-                f"before, which is {frames[row]:.4g} frames of {rate_hz:g} Hz "
-                "(timing.frame_rate_hz) and not one; a "
-                "frame that was lost keeps its row, with empty measured columns"
+                f"{times[row]:g} in the row before, which is {frames[row]:.4g} frames of "
+                f"{rate_hz:g} Hz (timing.frame_rate_hz) and not one; a frame that was lost keeps "
+                "its row, with empty measured columns"
             )
 
 
 def read_table(path: Path, robot: Robot) -> Table:
-    """The table of a robot's record.
+    """Read the table of a robot's record.
 
-    Raises RecordError: no such file; a column that is missing or unknown; a cell that is no number;
-    no rows.
+    Raises RecordError if the file does not exist, a column is missing or unknown, a cell is no
+    number, or there are no rows.
     """
     groups = columns_of(robot)
     lines = _lines(path)
@@ -136,7 +136,7 @@ def read_table(path: Path, robot: Robot) -> Table:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number and cells of each line that is neither empty nor a comment."""
+    """Yield number and cells of each line that is neither empty nor a comment."""
     content = read_bytes(path, f"record {path}", RecordError, LARGEST)
     try:
         text = content.decode("utf-8-sig")
@@ -154,7 +154,7 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 def _checked_header(
     path: Path, number: int, header: list[str], groups: Mapping[str, Group]
 ) -> list[str]:
-    """The groups that the header has, each whole."""
+    """Return the names of the groups that the header has, each of which must be whole."""
     if len(header) == 1 and ";" in header[0]:
         raise RecordError(
             f"{path} line {number}: cells are separated by commas, and these by semicolons"
@@ -175,13 +175,11 @@ def _checked_header(
 
 
 def _meant(name: str, known: list[str]) -> str:
-    """Which column a name may stand for, and its unit; else all of them."""
+    """Return a hint at the column that a name may stand for, or else at all columns."""
     stem = name.rpartition("_")[0]
-    meant = [
-        one
-        for one in known
-        if stem and one.startswith(f"{stem}_") and "_s" not in one[len(stem) + 1 :]
-    ]
+    alike = [one for one in known if stem and one.startswith(f"{stem}_")]
+    # reference_x_mm means reference_x_m, but rate_x_mm does not mean rate_x_m_s
+    meant = [one for one in alike if "_s" not in one[len(stem) + 1 :]]
     if len(meant) == 1:
         return f": {meant[0]} is meant, in {meant[0].rpartition('_')[2]}"
     return f"; the columns are {', '.join(known)}"
@@ -195,16 +193,15 @@ def _numbers(path: Path, number: int, header: list[str], cells: list[str]) -> li
     values = []
     for name, cell in zip(header, cells, strict=True):
         try:
-            if "_" in cell:  # which float() overlooks
+            if "_" in cell:  # float() would take 1_0 for 10
                 raise ValueError
             values.append(float(cell) if cell else np.nan)
         except ValueError:
             raise RecordError(
                 f"{path} line {number}: {name} is {cell[:40]!r}, which is no number"
             ) from None
-        if not (
-            np.isfinite(values[-1]) or name.startswith(("measured_", "covariance_", "command_time"))
-        ):
+        may_be_empty = name.startswith(("measured_", "covariance_", "command_time"))
+        if not (np.isfinite(values[-1]) or may_be_empty):
             raise RecordError(
                 f"{path} line {number}: {name} is {cell or 'empty'}, must be a finite number"
             )

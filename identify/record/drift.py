@@ -1,4 +1,4 @@
-"""What a watch over the cameras' drift found during a run, beside its record."""
+"""Finding of a watch over the cameras' drift during a run, kept with its record."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -9,17 +9,18 @@ import xarray as xr
 from identify.errors import RecordError
 
 DRIFT = "drift_watch"
-"""Attribute of a record, and entry of `result.json`."""
+"""Name of the attribute of a record, and of the entry of `result.json`."""
 
 
 def store_finding(record: xr.Dataset, finding: Mapping[str, Any]) -> None:
-    """Keep a finding, as the sensor's drift watch gives it, with a record."""
+    """Store a finding of the sensor's drift watch with a record."""
     record.attrs[DRIFT] = json.dumps(dict(finding))
 
 
 def read_finding(record: xr.Dataset) -> dict[str, Any] | None:
-    """The finding that a record holds; None where nobody watched. Raises RecordError for what is
-    none.
+    """Return the finding that a record holds, or None if nobody watched.
+
+    Raises RecordError if the attribute is no finding.
     """
     if DRIFT not in record.attrs:
         return None
@@ -34,7 +35,7 @@ def read_finding(record: xr.Dataset) -> dict[str, Any] | None:
 
 
 def drift_warnings(records: Sequence[xr.Dataset]) -> tuple[str, ...]:
-    """What the findings of records warn of. Raises RecordError."""
+    """Return the warnings in the findings of records. Raises RecordError as `read_finding`."""
     findings = [read_finding(record) for record in records]
     return tuple(
         found["warning"] for found in findings if found is not None and found["warning"] is not None

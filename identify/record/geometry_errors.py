@@ -1,12 +1,12 @@
-"""What a geometry that is known only so well does to all poses of a record: how the model's poses
-change with it.
+"""Effect of an inexactly known geometry on all poses of a record.
 
-The true robot is off the known one by dg, one draw with the covariance of its calibration. To first
-order the measured poses are those of the model plus J dg, with J the derivative of the model's
-poses by the geometric numbers; the servo knows the known geometry all along. J is taken by central
-differences of whole runs, one standard deviation of dg to either side, along independent
-directions. Those that move no pose of the run by what its noise would show are left out, as the
-loops' closure says.
+The true robot differs from the known one by dg, one draw with the covariance of its calibration. To
+first order the measured poses are those of the model plus J dg, with J the derivative of the
+model's poses with respect to the geometric numbers. The servo uses the known geometry throughout.
+
+J is taken by central differences of whole runs, one standard deviation of dg to either side, along
+independent directions. A direction is left out if it moves no pose of the run by what the noise
+would show. The derivatives of the loop closure tell which these are.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from dynamics import Robot
 from dynamics.closure import Closure
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.record.covariance import covariance_fault, factor, noticed_directions
+from identify.record.pose_covariance import covariance_fault, factor, noticed_directions
 from identify.runtime import cores
 
 COVARIANCE = "geometry_covariance"
@@ -30,11 +30,10 @@ PREFIX = "geometry."
 
 @dataclass(frozen=True)
 class GeometryErrors:
-    """Errors of the geometry of a known robot: covariance (g, g) of the true numbers about its own,
-    m and rad.
+    """Errors of the geometry of a known robot.
 
-    poses (N, 6) are those of the run, and whitener (6, 6) that of its noise: they say which
-    directions are noticed.
+    covariance (g, g): that of the true geometric numbers about the robot's, m and rad. poses (N, 6)
+    of the run and whitener (6, 6) of its noise tell which directions are noticed.
     """
 
     robot: Robot
@@ -44,20 +43,24 @@ class GeometryErrors:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers (g)."""
+        """Names of the g geometric numbers."""
         return tuple(PREFIX + name for name in self.robot.geometry.number_names)
 
     @property
     def factor(self) -> Array:
-        """F (g, g) with F F^T the covariance: its columns are independent directions, the most
-        noticed ones first.
+        """Factor F (g, g) with F F^T the covariance.
+
+        Its columns are independent directions, the most noticed ones first.
         """
         return self._noticed[0]
 
     def modes(self, poses_of: Callable[[Robot], Array]) -> Array:
-        """Changes (N, 6, g) of a run's poses by each direction, zero where it is not noticed;
-        poses_of: the poses (N, 6) of a run of a robot near the known one."""
-        with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
+        """Return the changes (N, 6, g) of a run's poses along each direction, zero where unnoticed.
+
+        poses_of: function that returns the poses (N, 6) of a run of a robot near the known one.
+        """
+        # threads are enough: the compiled loop runs without Python's lock
+        with ThreadPoolExecutor(cores()) as pool:
             found = list(pool.map(poses_of, [robot for pair in self._moved for robot in pair]))
         modes = np.zeros((*self.poses.shape, len(self.covariance)))
         for place, (more, less) in enumerate(zip(found[::2], found[1::2], strict=True)):
@@ -65,8 +68,9 @@ class GeometryErrors:
         return modes
 
     def joints(self, poses: Array) -> Array:
-        """Changes (N, n, k) of the joint coordinates at poses (N, 6) by each direction that is
-        noticed.
+        """Return the changes (N, n, k) of the joint coordinates along each noticed direction.
+
+        poses: (N, 6).
         """
         chart = self.robot.geometry.chart
         held = chart.pose(chart.coordinates(poses))
@@ -74,35 +78,33 @@ class GeometryErrors:
             more.inverse_kinematics(held) - less.inverse_kinematics(held)
             for more, less in self._moved
         ]
-        return (
-            np.stack(apart, axis=2) / 2.0
-            if apart
-            else np.zeros((len(poses), self.robot.layout.joints, 0))
-        )
+        if not apart:
+            return np.zeros((len(poses), self.robot.layout.joints, 0))
+        return np.stack(apart, axis=2) / 2.0
 
     @cached_property
     def _noticed(self) -> tuple[Array, int]:
-        """The factor, and how many of its directions are noticed."""
+        """Factor, and the number of its directions that are noticed."""
         geometry = self.robot.geometry
         root = factor(self.covariance)
         chart = geometry.chart
         nominal = self.robot.functions_of
         poses = chart.pose(chart.coordinates(self.poses))
         off = geometry.deviations_from(nominal)
-        by_numbers = Closure(nominal).derivatives(poses, self.robot.inverse_kinematics(poses), off)[
-            0
-        ]
-        return noticed_directions(root, self.whitener[:, list(chart.freedoms)] @ by_numbers @ root)
+        joints = self.robot.inverse_kinematics(poses)
+        by_numbers = Closure(nominal).derivatives(poses, joints, off)[0]
+        seen = self.whitener[:, list(chart.freedoms)] @ by_numbers @ root
+        return noticed_directions(root, seen)
 
     @cached_property
     def _moved(self) -> list[tuple[Robot, Robot]]:
-        """The robot with its geometry off by plus and by minus each direction that is noticed."""
+        """Robot with its geometry off by plus and by minus each noticed direction."""
         directions, count = self._noticed
         return [(self.robot.moved(one), self.robot.moved(-one)) for one in directions.T[:count]]
 
 
 def store_geometry_covariance(record: xr.Dataset, robot: Robot, covariance: Array) -> None:
-    """Keep with a record how well the geometry of its robot is known."""
+    """Store with a record how well the geometry of its robot is known."""
     names = list(robot.geometry.number_names)
     record[COVARIANCE] = xr.DataArray(
         covariance,
@@ -116,23 +118,19 @@ def store_geometry_covariance(record: xr.Dataset, robot: Robot, covariance: Arra
 
 
 def read_geometry_covariance(record: xr.Dataset, robot: Robot) -> Array | None:
-    """Covariance (g, g) of the geometric numbers of a record's robot; None where it states none.
+    """Return the covariance (g, g) of the geometric numbers of a record's robot, or None.
 
-    Raises RecordError: of other numbers, not finite, or no covariance.
+    Raises RecordError if it is of other numbers, not finite, or no covariance.
     """
     if COVARIANCE not in record:
         return None
     covariance = np.asarray(record[COVARIANCE].values, dtype=float)
-    names = (
-        tuple(map(str, record["geometric_number"].values))
-        if "geometric_number" in record.coords
-        else ()
-    )
+    stated = record["geometric_number"].values if "geometric_number" in record.coords else ()
+    names = tuple(map(str, stated))
     if names != robot.geometry.number_names or covariance.shape != (len(names),) * 2:
         raise RecordError(
             f"{COVARIANCE} has shape {covariance.shape} and is not of the "
-            f"{len(robot.geometry.number_names)} geometric "
-            f"numbers of {robot.name}, in their order"
+            f"{len(robot.geometry.number_names)} geometric numbers of {robot.name}, in their order"
         )
     if fault := covariance_fault(covariance):
         raise RecordError(f"{COVARIANCE} {fault}")

@@ -1,6 +1,4 @@
-"""The geometry as servo and estimator know it: that of the robot file, or as static poses have
-calibrated it.
-"""
+"""Geometry as servo and estimator know it: of the robot file, or calibrated from static poses."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,21 +10,25 @@ from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.dataset import read_covariance
 from identify.files.seal import check_toml
-from identify.record.covariance import covariance_fault
+from identify.record.pose_covariance import covariance_fault
 from identify.scenario import Scenario
 
 FOLDER = "geometry"
-"""Of a run: what its own calibration wrote."""
+"""Folder within a run that holds the run's own calibration."""
+
 COVARIANCE = "covariance.nc"
-"""Beside the file of a calibrated robot."""
+"""Name of the file that stands beside the file of a calibrated robot."""
+
 SAME_ROBOT = 20.0
 """Tolerances by which a number of a calibrated robot may be off the robot file's."""
 
 
 @dataclass(frozen=True)
 class KnownGeometry:
-    """The robot as it is known, and the covariance (g, g) of its true geometric numbers about it, m
-    and rad; None where they are taken for exact."""
+    """Robot as it is known, and the covariance (g, g) of its true geometric numbers, m and rad.
+
+    The covariance is None if the numbers are taken as exact.
+    """
 
     robot: Robot
     covariance: Array | None = None
@@ -35,12 +37,12 @@ class KnownGeometry:
 def known_geometry(
     scenario: Scenario, folder: Path | None = None, nominal: Robot | None = None
 ) -> KnownGeometry:
-    """What a scenario's estimator knows: the robot file's geometry, one calibrated before, or that
-    of a run's folder.
+    """Return the geometry that a scenario's estimator knows.
 
-    nominal: the scenario's robot, where it is at hand; calibrated ones share its functions. Raises
-    ScenarioError: no such file, no covariance beside it or one that is none, a calibration of
-    another robot.
+    It is that of the robot file, of an earlier calibration, or of the calibration in a run's
+    folder. nominal: the scenario's robot, if it is loaded already. Calibrated robots share its
+    functions. Raises ScenarioError if the file does not exist, the covariance beside it is missing
+    or not valid, or the calibration is of another robot.
     """
     nominal = nominal or load_robot(scenario.robot)
     settings = scenario.geometry
@@ -51,8 +53,7 @@ def known_geometry(
         if folder is None:
             raise ScenarioError(
                 "geometry.known = 'calibrated' is for a run with a folder, as of cmmsim run; "
-                "elsewhere name the "
-                "robot.toml of a calibration, which cmmsim geometry writes"
+                "elsewhere name the robot.toml of a calibration, which cmmsim geometry writes"
             )
         path = check_toml(folder / FOLDER / "robot.toml")
     said = f"geometry.known = {str(path)!r}"
@@ -71,15 +72,14 @@ def known_geometry(
         )
     if fault := covariance_fault(covariance):
         raise ScenarioError(f"{said}: {COVARIANCE} {fault}")
+    # the nominal robot with the calibrated numbers has functions that are compiled already
     return KnownGeometry(
         nominal.moved(found.geometry.deviations_from(nominal.geometry)), covariance
     )
 
 
 def _check_same(said: str, found: Robot, nominal: Robot, scenario: Scenario) -> None:
-    """Raise ScenarioError for a calibration of another robot than the scenario's, with the number
-    that differs.
-    """
+    """Raise ScenarioError, with the number that differs, for a calibration of another robot."""
     there = found.geometry
     here = nominal.geometry
     if [type(leg) for leg in there.legs] != [type(leg) for leg in here.legs]:
@@ -97,6 +97,5 @@ def _check_same(said: str, found: Robot, nominal: Robot, scenario: Scenario) -> 
     if off[worst] > limits[worst]:
         raise ScenarioError(
             f"{said} is of another robot: {here.number_names[worst]} is {off[worst]:.3g} "
-            f"{here.number_units[worst]} "
-            f"off that of {nominal.name}, limit {limits[worst]:.3g}"
+            f"{here.number_units[worst]} off that of {nominal.name}, limit {limits[worst]:.3g}"
         )

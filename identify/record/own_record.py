@@ -1,8 +1,8 @@
-"""Records of one's own, from netCDF or CSV, with all that an identification must know of them.
+"""Records of one's own, from netCDF or CSV, with all that an identification needs to know of them.
 
 A netCDF record states its scenario and its scale anchor itself. A CSV table has a TOML file of the
-same name beside it: a scenario, of which robot, timing, servo, model, filter, identification and
-payload count, with a table `[record]` for what was measured beside the poses.
+same name beside it. That file is a scenario, of which robot, timing, servo, model, filter,
+identification and payload count. Its table `[record]` holds what was measured beside the poses.
 """
 
 from collections.abc import Mapping
@@ -35,8 +35,7 @@ DESCRIPTION = "record"
 
 
 class Measured(Section):
-    """What was measured beside the poses: what fixes the scale, and how exact a measured
-    pose is."""
+    """Measurements beside the poses: what fixes the scale, and how exact a measured pose is."""
 
     anchor_value: float | None = quantity(
         None,
@@ -62,19 +61,26 @@ class Measured(Section):
 
 
 def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
-    """Records by file, and the scenario of the first; further ones are of the same robot under a
-    known load.
+    """Read records from files, and return them with the scenario of the first.
 
-    Raises RecordError: a file that cannot be read, or breaks a rule of records
-    (`csv_record.RULES`), with its line. Raises ScenarioError: no robot, timing or servo that can
-    be. Raises dynamics.RobotFileError: no such robot.
+    Further records are of the same robot under a known load.
+
+    Raises
+    ------
+    RecordError
+        A file cannot be read, or breaks a rule of records (`csv_record.RULES`). The message names
+        the line.
+    ScenarioError
+        Robot, timing or servo are not valid.
+    dynamics.RobotFileError
+        There is no such robot.
     """
     pairs = [_of_csv(path) if path.suffix.lower() == ".csv" else _of_netcdf(path) for path in paths]
     return [record for record, _ in pairs], pairs[0][1]
 
 
 def description_file(path: Path) -> Path:
-    """The file beside a CSV record that says what it is a record of."""
+    """Return the path of the file that says what a CSV table is a record of."""
     return path.with_suffix(".toml")
 
 
@@ -91,17 +97,17 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
     poses = table.groups["measured"]
     ok = _measured_ok(table)
     start = table.groups["time"][0, 0]
+    acted = table.groups.get("command_time")
     record = build_record(
         time=table.groups["time"][:, 0] - start,
         reference_pose=table.groups["reference"],
         reference_rate=_rates(table, scenario),
+        # a pose in a row that says it was lost is not taken
         measured_pose=np.where(ok[:, None], poses, np.nan),
         measured_covariance=_covariances(table, measured, ok),
         measured_ok=ok,
         command=table.groups["command"],
-        command_time=table.groups["command_time"][:, 0] - start
-        if "command_time" in table.groups
-        else None,
+        command_time=None if acted is None else acted[:, 0] - start,
         robot=robot.name,
         scenario_toml=scenario.to_toml(),
         frame_rate_hz=scenario.timing.frame_rate_hz,
@@ -115,8 +121,10 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
 
 
 def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
-    """What a CSV table is a record of. Raises RecordError, ScenarioError: no such file, no TOML,
-    wrong content.
+    """Read what a CSV table is a record of: the scenario, and what was measured beside the poses.
+
+    Raises RecordError or ScenarioError if there is no such file, it is no TOML, or its content is
+    not valid.
     """
     if not is_file(path):
         raise RecordError(
@@ -134,7 +142,10 @@ def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
 
 
 def record_schema() -> dict[str, Any]:
-    """JSON schema of the files beside CSV records, for editors; `record.schema.json` holds it."""
+    """Return the JSON schema, for editors, of the files beside CSV records.
+
+    The file `record.schema.json` holds it.
+    """
     schema = scenario_schema()
     own = Measured.model_json_schema()
     schema["required"].remove("name")
@@ -144,7 +155,10 @@ def record_schema() -> dict[str, Any]:
 
 
 def _measured_ok(table: Table) -> NDArray[np.bool_]:
-    """Which rows (N,) hold a measured pose: as the table says, or those with no empty cell."""
+    """Return which rows (N,) hold a measured pose.
+
+    They have no empty cell and, if the table has a column measured_ok, a 1 there.
+    """
     whole = np.asarray(np.isfinite(table.groups["measured"]).all(axis=1))
     if "ok" not in table.groups:
         return whole
@@ -159,9 +173,9 @@ def _measured_ok(table: Table) -> NDArray[np.bool_]:
 
 
 def _rates(table: Table, scenario: Scenario) -> Array:
-    """Rates (N, 6) of the reference: stated, or of a spline through its poses that begins at
-    rest."""
+    """Return the rates (N, 6) of the reference: stated, or of a spline through its poses."""
     poses = table.groups["reference"]
+    # too few rows for a spline are refused later, with the length of the record
     if "rate" in table.groups or len(poses) < 6:
         return table.groups.get("rate", np.zeros_like(poses))
     times = np.arange(len(poses)) * scenario.timing.frame_period_s
@@ -169,8 +183,9 @@ def _rates(table: Table, scenario: Scenario) -> Array:
 
 
 def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Array:
-    """Covariances (N, 6, 6) of the measured poses: the table's, or those of the stated standard
-    deviations.
+    """Return the covariances (N, 6, 6) of the measured poses.
+
+    They are those of the table, or follow from the stated standard deviations.
     """
     if "covariance" in table.groups:
         rows, columns = np.triu_indices(len(POSE))
@@ -179,16 +194,16 @@ def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Arr
         return values
     if measured.position_std_m is None or measured.orientation_std_rad is None:
         raise RecordError(
-            f"{table.path} has no covariance columns, so {description_file(table.path)} must "
-            "state position_std_m and "
-            f"orientation_std_rad in [{DESCRIPTION}]: how exact a measured pose is"
+            f"{table.path} has no covariance columns, so {description_file(table.path)} must state "
+            f"position_std_m and orientation_std_rad in [{DESCRIPTION}]: how exact a measured pose "
+            "is"
         )
     std = np.repeat([measured.position_std_m, measured.orientation_std_rad], 3)
     return np.tile(np.diag(std**2), (len(ok), 1, 1))
 
 
 def _state_anchor(record: xr.Dataset, scenario: Scenario, measured: Measured, source: Path) -> None:
-    """Keep with a record what fixes the scale of its parameters."""
+    """Store with a record what fixes the scale of its parameters."""
     settings = scenario.identification
     record.attrs["scale_anchor"] = settings.scale_anchor
     if settings.scale_anchor in ("payload", "prior"):
@@ -196,8 +211,7 @@ def _state_anchor(record: xr.Dataset, scenario: Scenario, measured: Measured, so
     if measured.anchor_value is None or settings.anchor_std is None:
         raise RecordError(
             f"{source}: the scale anchor {settings.scale_anchor} needs what was measured, "
-            "anchor_value in "
-            f"[{DESCRIPTION}], and how exactly, anchor_std in [identification]"
+            f"anchor_value in [{DESCRIPTION}], and how exactly, anchor_std in [identification]"
         )
     record.attrs |= {
         "scale_anchor_value": measured.anchor_value,
@@ -206,14 +220,10 @@ def _state_anchor(record: xr.Dataset, scenario: Scenario, measured: Measured, so
 
 
 def _state_payload(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
-    """Keep with a record the load that the platform carried, and how well it is known."""
+    """Store with a record the load that the platform carried, and how well it is known."""
     load: Mapping[str, Any] = scenario.payload.model_dump()
-    values, deviations = (
-        [load[f"{figure}{std}_{unit}"] for figure, unit in LOAD_UNITS.items()]
-        for std in ("", "_std")
-    )
-    vectors = [
-        payload_vector(robot.layout, one[0], (one[1], one[2], one[3]))
-        for one in (values, deviations)
-    ]
+    vectors = []
+    for std in ("", "_std"):
+        mass, *moments = (load[f"{figure}{std}_{unit}"] for figure, unit in LOAD_UNITS.items())
+        vectors.append(payload_vector(robot.layout, mass, (moments[0], moments[1], moments[2])))
     store_payload(record, robot.layout, *vectors)

@@ -1,10 +1,10 @@
-"""A known load on the platform: the same motion with and without it shows the scale of all
-parameters.
+"""Known load on the platform, which shows the scale of all parameters.
 
-The load is a rigid body whose centre lies in the origin of the platform frame; it adds its mass and
-its principal inertias to the platform's. Its figures stand with the record, as the experimenter's
-knowledge, and beside each its standard deviation: how well it was weighed or computed. Records that
-state the same figures carry the same load.
+The same motion is made with and without the load. The load is a rigid body whose centre lies in the
+origin of the platform frame. It adds its mass and its principal moments of inertia to those of the
+platform. A record holds these figures as the experimenter knows them, each with its standard
+deviation, which says how well it was weighed or computed. Records that state the same figures carry
+the same load.
 """
 
 import numpy as np
@@ -22,16 +22,18 @@ ADDED = {
     "payload_Iyy": ("platform.Iyy", "kg m2"),
     "payload_Izz": ("platform.Izz", "kg m2"),
 }
-"""Attributes of a record, and the parameter and unit to which each adds; `payload_mass_std` is the
-deviation of one.
+"""Attributes of a record, with the parameter to which each adds, and its unit.
+
+The standard deviation of `payload_mass` is `payload_mass_std`, and so for the others.
 """
 
 
 def payload_vector(
     layout: ParameterLayout, mass_kg: float, inertia_kg_m2: tuple[float, float, float]
 ) -> Array:
-    """What a load adds to a robot's parameters (p,); or, of standard deviations, the deviations of
-    that.
+    """Return what a load adds to a robot's parameters (p,).
+
+    Given the standard deviations of its figures, it is the standard deviations of that.
     """
     added = np.zeros(len(layout.names))
     for (parameter, _), value in zip(ADDED.values(), (mass_kg, *inertia_kg_m2), strict=True):
@@ -42,8 +44,9 @@ def payload_vector(
 def store_payload(
     record: xr.Dataset, layout: ParameterLayout, payload: Array, std: Array | None = None
 ) -> None:
-    """Keep a load (p,) with the record made under it, and its standard deviations (p,); None: known
-    exactly.
+    """Store a load (p,) with the record made under it.
+
+    std (p,): standard deviations of the load. None: it is known exactly.
     """
     deviations = np.zeros(len(layout.names)) if std is None else std
     for name, (parameter, _) in ADDED.items():
@@ -52,10 +55,10 @@ def store_payload(
 
 
 def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array, Array]:
-    """The load (p,) of a record and its standard deviations (p,); zero where it states none.
+    """Return the load (p,) of a record and its standard deviations (p,), zero if it states none.
 
-    Raises RecordError: some but not all of its figures, one or its deviation that is no finite
-    number >= 0, moments of no body, or a deviation that exceeds its figure.
+    Raises RecordError if a figure is missing, a figure or its standard deviation is no finite
+    number >= 0, the moments are of no body, or a standard deviation exceeds its figure.
     """
     load = np.zeros(len(layout.names))
     std = np.zeros(len(layout.names))
@@ -75,7 +78,7 @@ def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array
 
 
 def _not_negative(name: str, value: object, unit: str) -> float:
-    """An attribute's value, a finite number >= 0."""
+    """Return an attribute's value, which must be a finite number >= 0."""
     number = as_number(value)
     if not 0 <= number < 1e6:
         raise RecordError(

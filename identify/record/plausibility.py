@@ -1,5 +1,6 @@
-"""Whether a record is one of this robot, from rest, in m and rad: rules that no shape and no type
-can show.
+"""Checks that a record is of this robot, begins at rest, and is in m and rad.
+
+No shape and no type can show that.
 """
 
 from collections.abc import Callable
@@ -18,18 +19,21 @@ REST_RATE = 0.05
 """Share of its largest rate with which a reference may begin."""
 
 REST_POSE = 0.1
-"""Share of the largest travel of the positions, or of the angles, by which the first measured pose
-may be away.
+"""Distance from the reference at which the first measured pose may be.
+
+It is a share of the largest travel of the positions, or of the angles.
 """
 
 TRAVELS = 2.0
-"""Travels by which a measured pose may be away from the reference, and a command from where that
-puts the joints.
+"""Distance, in travels, at which a measured pose may be from the reference.
+
+A command may be as far from the joint coordinates of the reference.
 """
 
 BUILT = 0.05
-"""Share of the joints' travel limit by which a robot that is built otherwise than its file may need
-other commands.
+"""Share of the joints' travel limit by which commands may differ from those of the robot file.
+
+A robot that is built otherwise than its file needs other commands.
 """
 
 OTHER_UNITS = {
@@ -45,8 +49,9 @@ def check_plausible(
 ) -> None:
     """Refuse a record that does not begin at rest, or is in other units or frames than the robot.
 
-    measured: poses (N, 6), NaN where lost; ok (N,); logged: joint commands (N, n), if any.
-    Raises EstimationError, with the frame, what was found, and units in which it would fit.
+    measured (N, 6): poses, NaN where lost. ok (N,): frames that were measured. logged (N, n): joint
+    commands, if any. Raises EstimationError with the frame, what was found, and units in which it
+    would fit.
     """
     _check_reach(robot, reference.poses)
     _check_rest(reference)
@@ -71,20 +76,20 @@ def _check_rest(reference: Reference) -> None:
     largest = np.abs(reference.rates).max(axis=0)
     worst = int(np.argmax(first - REST_RATE * largest))
     if first[worst] > REST_RATE * largest[worst]:
+        unit = "m/s" if worst < 3 else "rad/s"
         raise EstimationError(
             f"the record does not begin at rest: the rate of {POSE[worst]} in its first frame is "
-            f"{first[worst]:.3g} "
-            f"{'m/s' if worst < 3 else 'rad/s'}, {100 * first[worst] / largest[worst]:.0f} % of "
-            "its largest; begin the "
-            "record where the robot stood still"
+            f"{first[worst]:.3g} {unit}, {100 * first[worst] / largest[worst]:.0f} % of its "
+            "largest; begin the record where the robot stood still"
         )
 
 
 def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]) -> None:
-    """The measured poses stay within some travels of the reference, and begin where it does."""
+    """Check that the measured poses stay near the reference, and begin where it does."""
     travel = np.repeat(np.ptp(reference.poses, axis=0).reshape(2, 3).max(axis=1), 3)
-    # of angles that nobody asked to move nothing is known
+    # angles that nobody asked to move have no travel to compare with
     usual = np.where(travel > 0, travel, np.inf)
+    # only at rest, in the first frame, must the robot be where the reference is
     limits = np.full(len(ok), TRAVELS)
     limits[0] = REST_POSE
 
@@ -101,10 +106,9 @@ def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]
         rest = "the record does not begin at rest, or " if frame == 0 else ""
         raise EstimationError(
             f"in frame {frame} the measured {POSE[worst]} is {measured[frame, worst]:.6g} and the "
-            "reference "
-            f"{reference.poses[frame, worst]:.6g}, {100 * found[frame, worst]:.0f} % of its "
-            f"travel apart: {rest}both "
-            f"are in different frames or units{_unit_hint(measured, near)}"
+            f"reference {reference.poses[frame, worst]:.6g}, {100 * found[frame, worst]:.0f} % of "
+            f"its travel apart: {rest}both are in different frames or "
+            f"units{_unit_hint(measured, near)}"
         )
 
 
@@ -118,24 +122,22 @@ def _check_commands(robot: Robot, reference: Reference, logged: Array) -> None:
 
     if not follows(logged):
         frame, joint = np.unravel_index(int(np.argmax(np.abs(logged - wanted))), logged.shape)
-        other, factor = ("mm", 1e-3) if robot.layout.prismatic else ("degrees", np.pi / 180)
-        unit = "m" if robot.layout.prismatic else "rad"
-        hint = (
-            f"; in {other} it would fit, and records are in {unit}"
-            if follows(factor * logged)
-            else ""
-        )
+        prismatic = robot.layout.prismatic
+        unit = "m" if prismatic else "rad"
+        other = "mm" if prismatic else "degrees"
+        factor = 1e-3 if prismatic else np.pi / 180
+        hint = ""
+        if follows(factor * logged):
+            hint = f"; in {other} it would fit, and records are in {unit}"
         raise EstimationError(
-            f"the command of joint {joint + 1} in frame {frame} is {logged[frame, joint]:.6g}, "
-            "and the reference needs "
-            f"{wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} {unit} away: zero, "
-            "direction or unit of the "
-            f"joints differ from the robot file's{hint}"
+            f"the command of joint {joint + 1} in frame {frame} is {logged[frame, joint]:.6g}, and "
+            f"the reference needs {wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} "
+            f"{unit} away: zero, direction or unit of the joints differ from the robot file's{hint}"
         )
 
 
 def _unit_hint(poses: Array, fits: Callable[[Array], bool]) -> str:
-    """In which units poses (N, 6) would fit; empty where in none."""
+    """Return a hint at units in which poses (N, 6) would fit, or an empty string."""
     for units, (position, angle) in OTHER_UNITS.items():
         if fits(poses * np.repeat([position, angle], 3)):
             return f"; in {units} it would fit, and records are in m and rad"

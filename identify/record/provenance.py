@@ -1,8 +1,7 @@
-"""Where a record comes from, and what a result was made of: scenario, seed, robot, and digests of
-what was read.
+"""Provenance of records and results: scenario, seed, robot, and digests of what was read.
 
-A stage that is repeated leaves the files of later ones where they are; by the digests these stages
-tell what is no longer theirs.
+A stage that is repeated leaves the files of later stages where they are. By the digests these
+stages find files that no longer belong together.
 """
 
 import json
@@ -26,19 +25,21 @@ from identify.record.recording import VARIABLES, read, read_model_runs, read_run
 from identify.scenario import Scenario, scenario_from_toml
 
 ROBOT = "robot_geometry"
-"""Attribute with the geometry of the robot file: a name alone does not say which robot file was
-meant.
+"""Attribute with the geometry of the robot file.
+
+A name alone does not say which robot file was meant.
 """
 
 ROUNDING = 1e-9
-"""Largest difference of any number [SI] of a geometry that another computer's arithmetic may make.
-"""
+"""Largest difference of a number of a geometry, SI, by another computer's arithmetic."""
 
 SHARED = ("base_joints", "platform_joints", "home_pose", "travel_limit", "gravity")
 """Numbers of a geometry that do not depend on the kind of its legs."""
 
 OLDER = "crank_length"
-"""Stands in the geometry of records of older versions, which name the rest of the legs otherwise.
+"""Number that the geometry in records of older versions has.
+
+These versions give the other numbers of the legs other names.
 """
 
 STATED = (
@@ -52,31 +53,31 @@ STATED = (
     *ADDED,
     *(f"{name}_std" for name in ADDED),
 )
-"""Attributes that an identification reads; beside them timing and servo of the scenario."""
+"""Attributes that an identification reads, beside timing and servo of the scenario."""
 
 ENTRY = "made_of"
-"""Of a result: digests by the file's name. Results of older versions have none, and nothing is
-asked of them.
+"""Entry of a result with digests by the file's name.
+
+Results of older versions have none, and are not checked.
 """
 
 RECORDS = ("experiment.nc", "payload.nc")
-"""What an identification may have read."""
+"""Files that an identification may have read."""
 
 _AGAIN = {"validation.nc": "validate", "model.nc": "validate"}
-"""The stage that makes a result of the file as it now is, where it is not `identify`."""
+"""Stage that renews a result after a change of a file, where it is not `identify`."""
 
 
 def recorded_scenario(record: xr.Dataset) -> Scenario:
-    """The scenario that a record was made with.
+    """Return the scenario that a record was made with.
 
-    Raises RecordError: the record states none, with what to set; or one that is no scenario.
+    Raises RecordError if the record states none, with what to set, or one that is not valid.
     """
     text = record.attrs.get("scenario")
     if text is None:
         raise RecordError(
             "the record has no attribute scenario, which says with what timing and servo it was "
-            "made: set "
-            "record.attrs['scenario'] = scenario.to_toml(), or make the record by "
+            "made: set record.attrs['scenario'] = scenario.to_toml(), or make the record by "
             "identify.build_record"
         )
     if not isinstance(text, str):
@@ -91,9 +92,9 @@ def recorded_scenario(record: xr.Dataset) -> Scenario:
 
 
 def recorded_seed(record: xr.Dataset) -> int:
-    """The seed of a record; zero where it states none, as the record of a real robot.
+    """Return the seed of a record, or zero if it states none, as the record of a real robot.
 
-    Raises RecordError: one that is no whole number >= 0.
+    Raises RecordError unless the seed is a whole number >= 0.
     """
     seed = record.attrs.get("seed", 0)
     if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer) or seed < 0:
@@ -104,15 +105,19 @@ def recorded_seed(record: xr.Dataset) -> int:
 
 
 def store_robot(record: xr.Dataset, robot: Robot) -> None:
-    """Keep the geometry of the robot file with the record, as JSON."""
+    """Store the geometry of the robot file with the record, as JSON."""
     record.attrs[ROBOT] = json.dumps(_numbers(robot))
 
 
 def check_robot(record: xr.Dataset, robot: Robot) -> None:
-    """The record must be of a robot of this name and, where it states one, of this geometry.
+    """Check that a record is of a robot of this name and, if it states one, of this geometry.
 
-    Raises EstimationError: another name, or the first number of the geometry that differs. Raises
-    RecordError: a geometry that cannot be read.
+    Raises
+    ------
+    EstimationError
+        The name differs, or a number of the geometry, of which the message names the first.
+    RecordError
+        The geometry cannot be read.
     """
     if record.attrs.get("robot") != robot.name:
         raise EstimationError(
@@ -137,13 +142,12 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
             place = "".join(f"[{k + 1}]" for k in worst)
             raise EstimationError(
                 f"the record is of another robot {robot.name!r}: {name}{place} was "
-                f"{theirs[worst]:.9g} when it was "
-                f"made, the robot file says {known[worst]:.9g}"
+                f"{theirs[worst]:.9g} when it was made, the robot file says {known[worst]:.9g}"
             )
 
 
 def _numbers(robot: Robot) -> dict[str, Any]:
-    """All numbers of a geometry by name, those of a leg by its own: as `leg2.crank_length`."""
+    """Return all numbers of a geometry by name, those of a leg as `leg2.crank_length`."""
     geometry = robot.geometry
     numbers: dict[str, Any] = {
         **{name: np.asarray(getattr(geometry, name)).tolist() for name in SHARED},
@@ -169,7 +173,7 @@ def _read(text: object) -> dict[str, Array]:
 
 
 class RunFiles:
-    """What the files of a run hold, each read once, when it is first asked for.
+    """Contents of the files of a run, each read once, when it is first asked for.
 
     Raises RecordError for a file that is damaged.
     """
@@ -178,23 +182,27 @@ class RunFiles:
         self.folder = folder
 
     experiment = cached_property(lambda self: read(self.folder.experiment))
-    # of the same run under a known load
+    # the same run under a known load
     payload = cached_property(lambda self: read(self.folder.payload))
     validation = cached_property(lambda self: read_runs(self.folder.validation))
-    model = cached_property(lambda self: read_model_runs(self.folder.model))  # by the run's name
+    model = cached_property(lambda self: read_model_runs(self.folder.model))
 
-    # of the estimates
+    # names of the estimates, and their covariance
     named_covariance = cached_property(lambda self: read_covariance(self.folder.covariance))
 
     @property
     def covariance(self) -> Array:
-        """Of the estimates (p, p), and behind them of what all poses have in common, where a result
-        has that.
+        """Covariance (p + k, p + k) of the p estimates and of k common errors of the poses.
+
+        A result without common errors has k = 0.
         """
         return self.named_covariance[1]
 
     def covariance_of(self, robot: Robot) -> Array:
-        """`covariance` of a robot's parameters. Raises RecordError where the file is of others."""
+        """Return `covariance`, which must be that of a robot's parameters.
+
+        Raises RecordError if the file is of others.
+        """
         names = robot.layout.names
         found = self.named_covariance[0][: len(names)]
         if found != names:
@@ -205,21 +213,25 @@ class RunFiles:
         return self.covariance
 
     def content(self, name: str) -> Any:
-        """What a file holds, by its name, as ``experiment.nc``."""
+        """Return the content of a file by its name, such as ``experiment.nc``."""
         return getattr(self, name.removesuffix(".nc"))
 
     def digests(self, *names: str) -> dict[str, str]:
-        """Digests of files by their names."""
+        """Return digests of files by their names."""
         return {name: digest(self.content(name)) for name in names}
 
     def check_made_of(self, *names: str, result: Mapping[str, Any] | None = None) -> None:
-        """Refuse files of these names that are not those that the result was made of, as far as it
-        states them.
+        """Check that a result was made of the files of these names, as far as it states them.
 
-        result: None: that of the folder, where it has one.
+        The default result is that of the folder, if it has one.
 
-        Raises OutputFolderError: one of them is gone. Raises RecordError: one of them is another,
-        with the stage to repeat; or damaged; or digests that are none.
+        Raises
+        ------
+        OutputFolderError
+            A file is gone.
+        RecordError
+            A file is another one, with the stage to repeat, or is damaged, or the result's digests
+            are not valid.
         """
         run = self.folder
         if result is None:
@@ -238,37 +250,36 @@ class RunFiles:
 
 
 def digest(content: xr.Dataset | Sequence[xr.Dataset] | Mapping[str, xr.Dataset] | Array) -> str:
-    """Digest, hexadecimal, of a record or of records in their order, of model runs by name, or of a
-    covariance.
+    """Return the digest, hexadecimal, of one or several records, of model runs, or of a covariance.
 
-    Equal where what follows reads the same, in whatever file and whenever it was written.
-    Raises RecordError for a record that does not state its scenario.
+    Records count in their order, and model runs by their names. Digests are equal where later
+    stages read the same, in whatever file and whenever it was written. Raises RecordError for a
+    record that does not state its scenario.
     """
     if isinstance(content, np.ndarray):
         return array_digest({"covariance": content})
     if isinstance(content, xr.Dataset):
         return _record_digest([content])
     if isinstance(content, Mapping):
-        return array_digest(
-            {
-                f"{run}/{name}": one[name].values
-                for run, one in content.items()
-                for name in one.data_vars
-            }
-        )
+        variables = {
+            f"{run}/{name}": one[name].values
+            for run, one in content.items()
+            for name in one.data_vars
+        }
+        return array_digest(variables)
     return _record_digest(content)
 
 
 def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
-    """Digest of named arrays of numbers, hexadecimal; their order and their type do not matter.
+    """Return the digest, hexadecimal, of named arrays of numbers, whatever their order and type.
 
-    Of the numbers, not of a file's bytes, which differ from one writing to the next.
+    It is of the numbers and not of a file's bytes, which differ from one writing to the next.
     """
     whole = sha256()
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name], dtype="<f8")
         whole.update(f"{name} {values.shape}\n".encode())
-        # one of the many bit patterns of NaN
+        # NaN has many bit patterns: this makes them one
         whole.update(np.where(np.isnan(values), np.nan, values).tobytes())
     return whole.hexdigest()
 
@@ -276,6 +287,7 @@ def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
 def _record_digest(records: Sequence[xr.Dataset]) -> str:
     whole = sha256()
     for record in records:
+        # only what an identification reads: a new title or date is no other record
         held = ("time", *VARIABLES, *(name for name in OPTIONAL if name in record))
         arrays = {name: record[name].values for name in held}
         stated = {name: plain(record.attrs[name]) for name in STATED if name in record.attrs}

@@ -1,10 +1,9 @@
-"""What the experimenter sees of a run, as an xarray dataset in netCDF, and what models do on the
-same motion.
+"""Records of runs as xarray datasets in netCDF, and runs of models on the same motion.
 
-A record is the main group of its file. The truth stands in a group of its own
-(`identify.experiment.truth`), so that an estimator that reads a record cannot see it. Several runs
-share a file as the groups ``run01``, ``run01/truth``, ``run02``, ...; model runs (``model.nc``) are
-the groups ``excitation``, ``run01``, ``run02``, ...
+A record is what the experimenter sees of a run. It is the main group of its file. The truth stands
+in a group of its own (`identify.experiment.truth`), so that an estimator that reads a record cannot
+see it. Several runs share a file as the groups ``run01``, ``run01/truth``, ``run02``, ... Model
+runs (``model.nc``) are the groups ``excitation``, ``run01``, ``run02``, ...
 """
 
 from __future__ import annotations
@@ -38,10 +37,8 @@ TRUTH_GROUP = "truth"
 
 CONVENTIONS = (
     "SI units. Pose [x y z alpha beta gamma] of the platform frame in the base frame, R = "
-    "Rx(alpha) Ry(beta) "
-    "Rz(gamma). Rates are time derivatives of the pose components, not the angular velocity. time "
-    "is the instant of "
-    "exposure."
+    "Rx(alpha) Ry(beta) Rz(gamma). Rates are time derivatives of the pose components, not the "
+    "angular velocity. time is the instant of exposure."
 )
 
 VARIABLES: Variables = {
@@ -71,7 +68,9 @@ VARIABLES: Variables = {
     "measured_ok": (("time",), "1", "1 where the sensor measured the pose, 0 where it was lost"),
     "command": (("time", "joint"), "rad", "joint command of the visual servo from this frame on"),
 }
+
 MAY_BE_LOST = ("measured_position", "measured_orientation", "measured_covariance")
+"""Variables that are NaN where the pose was lost."""
 
 
 def build_record(
@@ -90,18 +89,46 @@ def build_record(
     seed: int | None = None,
     prismatic: bool = False,
 ) -> xr.Dataset:
-    """Record of one run: ``time`` (N,) [s], poses and rates (N, 6), ``command`` (N, n), covariance
-    (N, 6, 6), ok (N,).
+    """Build the record of one run, in SI units and the conventions of CONVENTIONS.
 
-    SI units; the poses, and what is a rate, as CONVENTIONS says. ``command``: of the n joints [rad,
-    or m where they are ``prismatic``], each from its frame on, or from ``command_time`` (N,) [s]
-    on, when it was written to the drives, see `identify.record.command_times`. Where
-    ``measured_ok`` is 0 the pose was lost, and may be NaN. ``scenario_toml``: timing and servo of
-    the run, as `Scenario.to_toml` gives them. ``seed``: of a simulated run; that of a real robot
-    has none.
+    Parameters
+    ----------
+    time : array_like, shape (N,)
+        Times of the frames, s.
+    reference_pose, reference_rate : array_like, shape (N, 6)
+        Desired poses and their rates.
+    measured_pose : array_like, shape (N, 6)
+        Measured poses. They may be NaN where lost.
+    measured_covariance : array_like, shape (N, 6, 6)
+        Covariances of the measured poses.
+    measured_ok : array_like, shape (N,)
+        1 where the pose was measured, 0 where it was lost.
+    command : array_like, shape (N, n)
+        Commands of the n joints, each from its frame on: rad, or m where they are prismatic.
+    command_time : array_like, shape (N,), optional
+        Times at which the commands were written to the drives, s, from which on they act. See
+        `identify.record.command_times`.
+    scenario_toml : str
+        Timing and servo of the run, as `Scenario.to_toml` gives them.
+    robot : str
+        Name of the robot.
+    frame_rate_hz : float
+        Frame rate.
+    seed : int, optional
+        Seed of a simulated run. The record of a real robot has none.
+    prismatic : bool
+        True where the joints are prismatic.
 
-    Raises RecordError: wrong shapes, numbers that are not finite where a measurement was not lost,
-    or a `measured_ok` that is neither 1 nor 0.
+    Returns
+    -------
+    xarray.Dataset
+        The record.
+
+    Raises
+    ------
+    RecordError
+        A shape is wrong, a number is not finite where nothing was lost, or an entry of
+        `measured_ok` is neither 1 nor 0.
     """
     logged = {} if command_time is None else {COMMAND_TIME: np.asarray(command_time, dtype=float)}
     record = described_dataset(
@@ -148,10 +175,10 @@ def record_groups(record: xr.Dataset, truth: xr.Dataset | None = None) -> dict[s
 
 
 def read(path: Path | str, run: str = "") -> xr.Dataset:
-    """Read the record of a file, or of one of its runs (``"run01"``), checked; never the truth.
+    """Read and check the record of a file, or of one of its runs (``"run01"``); never the truth.
 
-    Raises RecordError: truncated file, missing variables, wrong shapes, or numbers that are not
-    finite.
+    Raises RecordError if the file is truncated, a variable is missing, a shape is wrong, or a
+    number is not finite.
     """
     return check_record(read_group(path, run), f"{path}{':' + run if run else ''}")
 
@@ -174,35 +201,35 @@ def run_groups(
 
 
 def read_runs(path: Path | str) -> list[xr.Dataset]:
-    """Read the records of all runs of a file in their order, checked.
+    """Read and check the records of all runs of a file, in their order.
 
-    Raises RecordError: as `read`, or no runs in it.
+    Raises RecordError as `read` does, or if there are no runs in the file.
     """
     return [read(path, name) for name in run_names(path)]
 
 
 def run_names(path: Path | str) -> list[str]:
-    """Names of the runs in a file, ``["run01", "run02", ...]``.
+    """Return the names of the runs in a file, ``["run01", "run02", ...]``.
 
-    Raises RecordError: truncated file, or no runs in it.
+    Raises RecordError if the file is truncated, or there are no runs in it.
     """
     names = [name for name in group_names(path) if name.startswith("run") and "/" not in name]
     if not names:
         raise RecordError(f"{path} holds no runs (groups run01, run02, ...)")
+    # by number: as text, run100 stands before run11
     return sorted(names, key=lambda name: int(name.removeprefix("run")))
 
 
 def run_name(number: int) -> str:
-    """Group of the run with this number, counted from 1."""
+    """Return the group of the run with this number, counted from 1."""
     return f"run{number:02d}"
 
 
 def poses(record: xr.Dataset, kind: str) -> Array:
-    """Poses (N, 6) [m, rad] of one kind: ``measured`` (NaN where lost) or ``reference``.
+    """Return the poses (N, 6), m and rad, of one kind.
 
-    The same for the kinds ``initial`` and ``identified`` of a model run.
-
-    Raises RecordError: the dataset has no such poses.
+    Kinds of a record are ``measured``, NaN where lost, and ``reference``. Those of a model run are
+    ``initial`` and ``identified``. Raises RecordError if the dataset has no such poses.
     """
     missing = [name for name in (f"{kind}_position", f"{kind}_orientation") if name not in record]
     if missing:
@@ -214,9 +241,9 @@ def poses(record: xr.Dataset, kind: str) -> Array:
 
 
 def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
-    """Return the record when it is complete, of the right shapes and finite where nothing was lost.
+    """Return a record that is complete, of the right shapes, and finite where nothing was lost.
 
-    Raises RecordError: the first thing that is not so.
+    Raises RecordError with the first thing that is not so.
     """
     check_variables(record, VARIABLES, source)
     stated = record["measured_ok"].values
@@ -279,7 +306,7 @@ PREDICTED: Variables = {
         "predicted deviation of the plant from the identified model",
     ),
 }
-"""Of unseen trajectories only: elsewhere nothing is predicted."""
+"""Variables of unseen trajectories, since elsewhere nothing is predicted."""
 
 
 def build_model_run(
@@ -288,11 +315,21 @@ def build_model_run(
     identified_pose: ArrayLike,
     std: ArrayLike | None = None,
 ) -> xr.Dataset:
-    """Poses (N, 6) [m, rad] of both models at the frames ``time`` (N,) [s] of a run; NaN after a
-    model has diverged.
+    """Build the dataset of both models' poses in a run.
 
-    std (N, 6): predicted deviations of the plant from the identified model, where they were
-    predicted. Raises RecordError: wrong shapes.
+    Parameters
+    ----------
+    time : array_like, shape (N,)
+        Times of the frames, s.
+    initial_pose, identified_pose : array_like, shape (N, 6)
+        Poses of the models, m and rad. After a model has diverged they become NaN.
+    std : array_like, shape (N, 6), optional
+        Predicted deviations of the plant from the identified model.
+
+    Raises
+    ------
+    RecordError
+        A shape is wrong.
     """
     values = pose_parts(initial_pose, "initial_pose", "initial_position", "initial_orientation")
     values |= pose_parts(
@@ -302,6 +339,7 @@ def build_model_run(
     if std is not None:
         values |= pose_parts(std, "std", "std_position", "std_orientation")
         variables = MODEL_VARIABLES | PREDICTED
+    # a model that has diverged may be infinite
     finite = {name: np.where(np.isfinite(v), v, np.nan) for name, v in values.items()}
     return described_dataset(finite, time, variables)
 
@@ -324,7 +362,7 @@ def model_groups(
 def read_model_runs(path: Path | str) -> Mapping[str, xr.Dataset]:
     """Read all model runs by group name, ``excitation`` among them.
 
-    Raises RecordError: truncated file, missing variables or wrong shapes.
+    Raises RecordError if the file is truncated, a variable is missing, or a shape is wrong.
     """
     runs = {}
     for name in group_names(path):
@@ -335,7 +373,7 @@ def read_model_runs(path: Path | str) -> Mapping[str, xr.Dataset]:
 
 
 def recorded_reference(record: xr.Dataset) -> Reference:
-    """Reference motion of a record."""
+    """Return the reference motion of a record."""
     rates = np.hstack(
         [record["reference_velocity"].values, record["reference_orientation_rate"].values]
     )

@@ -1,6 +1,4 @@
-"""What a user fills in for a record of one's own: an empty table of a robot, and the file that goes
-with it.
-"""
+"""Files to fill in for a record of one's own: an empty table, and what goes with it."""
 
 from pathlib import Path
 from textwrap import wrap
@@ -16,14 +14,16 @@ SCHEMA = Path(__file__).parent / "record.schema.json"
 SHOWN_ROWS = 2
 WIDTH = 96
 SECTIONS = ("robot", "timing", "servo", "model", "filter", "identification", "payload")
-"""What of a scenario a record is made with, or an identification reads."""
+"""Parts of a scenario that a record is made with, or that an identification reads."""
 
-FRAME_RATE_HZ, POSITION_STD_M, ORIENTATION_STD_RAD = 60.0, 5e-6, 2e-5
-"""What stands in a starting file, for the user to replace."""
+# values of a starting file, for the user to replace
+FRAME_RATE_HZ = 60.0
+POSITION_STD_M = 5e-6
+ORIENTATION_STD_RAD = 2e-5
 
 
 def table_text(robot: Robot) -> str:
-    """A table with comments, the columns of a robot, and rows at rest at its home pose."""
+    """Return a table with comments, the columns of a robot, and rows at rest at its home pose."""
     groups = columns_of(robot)
     comments = [*wrap(RULES, WIDTH), ""]
     for group in groups.values():
@@ -47,8 +47,9 @@ def table_text(robot: Robot) -> str:
 
 
 def description_text(robot: Robot, name_or_path: str, table: str) -> str:
-    """What goes with a table: robot, timing, servo and scale, to be replaced by those of the
-    record.
+    """Return what goes with a table: robot, timing, servo and scale.
+
+    The user replaces them by those of the record.
     """
     mass = float(robot.parameter_sets["initial"].vector[robot.layout.names.index("platform.mass")])
     made_with = Scenario.model_validate(

@@ -1,5 +1,6 @@
-"""The goals of a run and whether its result meets them: accuracy and honesty, the same on every
-machine.
+"""Goals of a run, and the judgement whether its result meets them.
+
+The limits on accuracy and on the honesty of stated uncertainties are the same on every machine.
 """
 
 import math
@@ -11,6 +12,7 @@ import numpy as np
 from identify.estimation.explanation import MISFIT, SIGNIFICANT, SUSPICIOUS
 from identify.files.run_folder import rms_row
 
+# Limits of the goals: RMS in µm and µrad, a share of the truth, and standard deviations.
 VALIDATION_UM = 2.0
 VALIDATION_URAD = 10.0
 SENSOR_UM = 20.0
@@ -30,8 +32,10 @@ FAR_OFF = "friction and gains far off"
 
 @dataclass(frozen=True)
 class Goal:
-    """One goal: ``value`` against ``limit`` in ``unit``; ``relation`` is ``<=`` or ``>=``;
-    ``detail``: what the value is, in words that continue its name."""
+    """Goal of a run: a value that is to keep to a limit, both in ``unit``.
+
+    ``relation`` is ``<=`` or ``>=``. ``detail`` explains the value in words that continue its name.
+    """
 
     name: str
     value: float
@@ -42,52 +46,46 @@ class Goal:
 
     @property
     def passed(self) -> bool:
-        """Whether the value meets the limit; a value that is NaN does not."""
+        """True if the value meets the limit. A value that is NaN does not."""
         return self.value <= self.limit if self.relation == "<=" else self.value >= self.limit
 
 
 def check_goals(result: dict[str, Any]) -> list[Goal]:
-    """The goals that the parts of a result allow to judge; accuracy is that of the worst axis of
-    the worst run.
+    """Judge every goal for which the result holds the needed entries.
+
+    Accuracy is that of the worst axis in the worst run.
     """
     parts = (_validation, _sensor, explanation_goals, _parameters)
     return [goal for part in parts for goal in part(result)]
 
 
 def explanation_goals(result: dict[str, Any]) -> list[Goal]:
-    """Whether the model explains the record: what it leaves is no larger than noise alone makes it,
-    and is white.
+    """Judge whether the model explains the record.
+
+    It does if the residuals are no larger than noise alone makes them, and are white.
     """
     found = result.get("identification", {})
     goals = []
     if "noise_ratio_std" in found:
         ratio, expected, std = (math.nan if found[key] is None else found[key] for key in MISFIT)
         text = (
-            "mean square of measured minus identified pose, in units of the noise that the "
-            "cameras state; noise alone "
-            f"leaves {expected:.3f} ± {std:.3f}"
+            "mean square of measured minus identified pose, in units of the noise that the cameras "
+            f"state; noise alone leaves {expected:.3f} ± {std:.3f}"
         )
         goals.append(Goal(RESIDUALS, ratio, "<=", expected + SIGNIFICANT * std, "× noise", text))
     if "whiteness" in found:
         chance = found["whiteness"]["p_value"]
+        percent = math.nan if chance is None else 100 * chance
         text = (
             "probability that noise alone leaves residuals that depend as much on those of the "
             "frames before"
         )
-        goals.append(
-            Goal(
-                CHANCE,
-                math.nan if chance is None else 100 * chance,
-                ">=",
-                100 * SUSPICIOUS,
-                "%",
-                text,
-            )
-        )
+        goals.append(Goal(CHANCE, percent, ">=", 100 * SUSPICIOUS, "%", text))
     return goals
 
 
 def _validation(result: dict[str, Any]) -> list[Goal]:
+    # One row (6,) a run, in µm and µrad, so that the maximum is that of the worst axis and run.
     rows = np.array([rms_row(run["true"]) for run in result.get("validation", [])])
     if not len(rows):
         return []
@@ -124,6 +122,7 @@ def _parameters(result: dict[str, Any]) -> list[Goal]:
     }
     if not judged:
         return []
+    # A small friction may be off by more than 5 %, if its standard deviation says so.
     outside = [name for name, p in judged.items() if not within_tolerance(p)]
     text = (
         f"of {len(judged)}: estimates off the truth by more than 5 % and more than 3 standard "
@@ -134,16 +133,12 @@ def _parameters(result: dict[str, Any]) -> list[Goal]:
 
 
 def is_friction_or_pid(name: str) -> bool:
-    """Whether the goals judge the parameter: friction of the joints and gains of the joint
-    controller.
-    """
+    """Tell whether a parameter is a joint friction or a gain of the joint controller."""
     return name.startswith("joint_pid.") or name.endswith((".coulomb", ".viscous"))
 
 
 def within_tolerance(parameter: dict[str, Any]) -> bool:
-    """Whether an estimate lies within 5 % of the truth or within 3 of its reported standard
-    deviations.
-    """
+    """Tell whether an estimate is within 5 % of the truth or within 3 standard deviations of it."""
     if parameter["estimate"] is None or parameter["true"] is None:
         return False
     error = abs(parameter["estimate"] - parameter["true"])

@@ -1,25 +1,24 @@
-"""The paper whose experiment this is: its figures stand beside those of a run only where the run
-repeats its settings.
+"""Figures of the paper whose experiment this project repeats.
 
-RMS of x, y, z [µm], alpha, beta, gamma [µrad] compare the paper's identified model with what was
-measured of a real robot; no truth was known there.
+They stand beside those of a run only where the run repeats the paper's settings. The rows give the
+RMS of x, y, z [µm] and alpha, beta, gamma [µrad]. They compare the paper's identified model with
+measurements of a real robot, whose truth was not known.
 """
 
 from identify.reporting.settings import BUILT_IN_PAPER, changed_settings
 
 CITATION = (
     "P. Li, A. Ghasemi, W. Xie, W. Tian: Visual Closed-Loop Dynamic Model Identification of "
-    "Parallel Robots Based on "
-    "Optical CMM Sensor. Electronics 8(8), 836 (2019)"
+    "Parallel Robots Based on Optical CMM Sensor. Electronics 8(8), 836 (2019)"
 )
 
 DOI = "https://doi.org/10.3390/electronics8080836"
 
 BEFORE = (1260.0, 1160.0, 1550.0, 2520.0, 3580.0, 2800.0)
-"""Table 3, starting model on the exciting trajectory."""
+"""RMS of the starting model on the exciting trajectory (table 3)."""
 
 AFTER = (408.0, 235.0, 494.0, 956.0, 797.0, 725.0)
-"""Table 3, identified model on the exciting trajectory."""
+"""RMS of the identified model on the exciting trajectory (table 3)."""
 
 VALIDATION = (
     (517.0, 384.0, 709.0, 1091.0, 963.0, 966.0),
@@ -33,21 +32,25 @@ VALIDATION = (
     (342.0, 510.0, 557.0, 1411.0, 1156.0, 711.0),
     (318.0, 379.0, 473.0, 1219.0, 1023.0, 905.0),
 )
-"""Table 4, identified model on ten unseen trajectories. The 1411 is over the 1.4e-3 rad that the
-text states.
+"""RMS of the identified model on ten unseen trajectories (table 4).
+
+The 1411 exceeds the 1.4e-3 rad that the text states.
 """
 
-INDEX_FIRST, INDEX_BEST = 0.38, 1.345
-"""Observability index at the start and after 324 iterations of a genetic algorithm (section 4.2).
-"""
+INDEX_FIRST = 0.38
+"""Observability index at the start of the paper's search (section 4.2)."""
+
+INDEX_BEST = 1.345
+"""Observability index after 324 iterations of a genetic algorithm (section 4.2)."""
 
 FREE = ("renderer", "description", "sensor_note")
-"""Settings that are no part of its experiment."""
+"""Settings that may differ in a run that repeats the experiment."""
 
 
 def repeats_the_paper(recorded: str) -> bool:
-    """Whether a record, whose scenario this is (TOML), was made with the robot and the settings of
-    the paper's.
+    """Tell whether a record was made with the paper's robot and settings.
+
+    ``recorded`` is the scenario of the record (TOML).
     """
     base, changed = changed_settings(recorded)
     return base == BUILT_IN_PAPER and not any(setting.key not in FREE for setting in changed)

@@ -1,5 +1,7 @@
-"""Tables of the parameters: what is identified, what is not and why, and the sums that motion
-shows.
+"""Tables of the identified parameters and of the base parameters.
+
+Sentences say what fixes the scale, which law the drives have, and why a parameter is not
+identified.
 """
 
 from collections.abc import Mapping
@@ -10,13 +12,16 @@ from identify.reporting.number_format import interval, number, rounded, with_dev
 from identify.reporting.tables import Table
 
 ON_GUESS = "rests on starting values"
+"""Remark on an estimate that depends on the starting values of other parameters."""
 
 Entry = dict[str, Any]
 
 
 def parameter_table(result: dict[str, Any]) -> Table:
-    """The identified parameters: starting value, truth where it is known, estimate with deviation
-    and interval.
+    """Return the table of the identified parameters.
+
+    It holds the starting value, the truth where it is known, and the estimate with its standard
+    deviation and interval.
     """
     identification = result["identification"]
     rows = [
@@ -36,8 +41,7 @@ def parameter_table(result: dict[str, Any]) -> Table:
     if any(row[-1] for row in rows):
         note += (
             f"One that {ON_GUESS} is shown only in sums with other parameters: it is right where "
-            "their starting "
-            "values are, within the standard deviations that were stated for them."
+            "their starting values are, within the standard deviations that were stated for them."
         )
     header = (
         "parameter",
@@ -55,7 +59,10 @@ def parameter_table(result: dict[str, Any]) -> Table:
 
 
 def scale_sentence(identification: Mapping[str, Any]) -> str:
-    """What fixes the common factor of all parameters, or that what was to fix it does not."""
+    """Return the sentence that says what fixes the common factor of all parameters.
+
+    It warns where the intended anchor does not fix it.
+    """
     anchor = identification["scale_anchor"]
     said = ANCHORS.get(anchor, anchor)
     gain = identification["parameters"].get("joint_pid.lp", {})
@@ -66,8 +73,8 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
         return f"The overall scale is fixed by {said}."
     return (
         f"The overall scale should be fixed by {said}, but is not: {100 * share:.0f} % of the "
-        "variance of joint_pid.lp "
-        "comes from the starting values, and all that is given in kg, N m or N is as good as those."
+        "variance of joint_pid.lp comes from the starting values, and all that is given in kg, N m "
+        "or N is as good as those."
     )
 
 
@@ -77,15 +84,18 @@ ANCHORS = {
     "payload": "a second run under a known load",
     "prior": "the starting values alone: all of them may be off by one common factor",
 }
+"""Descriptions of the scale anchors."""
 
 
 def group_table(result: dict[str, Any]) -> Table:
-    """Base parameters: the combinations of parameters that motion can show, with truth, estimate
-    and deviation.
+    """Return the table of the base parameters that combine several parameters.
+
+    It holds the truth, the estimate and its standard deviation.
     """
     identification = result["identification"]
     rows = []
     for group in identification.get("groups", {}).values():
+        # A sum of one member is a parameter by itself, and stands in the table of parameters.
         if len(group["coefficients"]) > 1:
             known = _remark(group) if group["identifiable"] else "not identified"
             shown = _shown(group, _size(group, identification["parameters"]))
@@ -94,9 +104,8 @@ def group_table(result: dict[str, Any]) -> Table:
             )
     note = (
         "In the SI unit of the first parameter of each sum. A sum may be known where none of its "
-        "members is: it "
-        "counts as identified when little of the size of its members is in doubt, though it may "
-        "almost vanish itself."
+        "members is: it counts as identified when little of the size of its members is in doubt, "
+        "though it may almost vanish itself."
     )
     header = (
         "sum",
@@ -113,7 +122,7 @@ def group_table(result: dict[str, Any]) -> Table:
 
 
 def correlation_table(result: dict[str, Any]) -> Table:
-    """The pairs of identified parameters that the record ties together most."""
+    """Return the table of the pairs of identified parameters with the strongest correlations."""
     pairs = result["identification"].get("strongest_correlations", [])
     rows = tuple(
         (f"{p['first']}, {p['second']}", f"{p['correlation']:+.4f}".replace("-", "−"))
@@ -124,8 +133,7 @@ def correlation_table(result: dict[str, Any]) -> Table:
         ("parameters", "correlation"),
         rows,
         "Poses show friction and gains relative to each other better than their common factor, "
-        "which moves all of them "
-        "together: their ratios are known better than each of them.",
+        "which moves all of them together: their ratios are known better than each of them.",
         folded=True,
     )
 
@@ -137,12 +145,13 @@ DRIVES = {
     "cascade": "a P-PI cascade, position around velocity",
     "pid_filtered": "a PID whose rate is filtered",
 }
-"""Laws of the drives in words."""
+"""Descriptions of the control laws of the drives."""
 
 
 def drive_sentence(identification: Mapping[str, Any]) -> str:
-    """What law the drives have, and how that is known; nothing of the usual one that nobody asked
-    about.
+    """Return the sentence that says which law the drives have, and how that is known.
+
+    It is empty where the scenario states the usual law, a PID.
     """
     drive = identification.get("drive")
     if drive is not None and not drive.get("in_loop", True):
@@ -181,21 +190,14 @@ def drive_sentence(identification: Mapping[str, Any]) -> str:
 
 
 def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
-    """Why parameters are not identified, in a sentence each, with the names of those that it is
-    true of.
-    """
+    """Return the reasons why parameters are not identified, each with their names."""
     parameters = identification["parameters"]
     groups = identification.get("groups", {}).values()
-    alone = {
-        name
-        for group in groups
-        for name in group["coefficients"]
-        if len(group["coefficients"]) == 1
-    }
-    summed = {
-        name for group in groups for name in group["coefficients"] if len(group["coefficients"]) > 1
-    }
+    coefficients = [group["coefficients"] for group in groups]
+    alone = {name for weights in coefficients for name in weights if len(weights) == 1}
+    summed = {name for weights in coefficients for name in weights if len(weights) > 1}
     left = [name for name, p in parameters.items() if not p["identifiable"]]
+    # A record that the model does not explain leaves every parameter unidentified.
     if left and len(left) == len(parameters):
         return [("the model does not explain the record, so that no estimate can be trusted", left)]
     fixed = set(identification.get("drive", {}).get("fixed_at_zero", ()))
@@ -226,27 +228,23 @@ def _remark(entry: Entry) -> str:
 
 
 def _shown(entry: Entry, size: float) -> tuple[str, ...]:
-    """Start, truth, estimate, interval and error; dashes for what is not identified, so that nobody
-    quotes it.
+    """Format start, truth, estimate, interval and error of an entry.
 
-    size: of what the entry is made of; what is nothing but rounding beside it is zero.
+    What is not identified gets dashes, so that nobody quotes it. ``size`` is the size of the parts
+    of the entry; values that are only rounding beside it are shown as zero.
     """
-    start, true = (number(rounded(entry[key], size)) for key in ("initial", "true"))
+    start = number(rounded(entry["initial"], size))
+    true = number(rounded(entry["true"], size))
     if not entry["identifiable"] or entry["estimate"] is None:
         return start, true, "-", "-", "-"
     ends = entry.get("interval") or [None, None]
     reach = "-" if None in ends else interval(*ends)
-    return (
-        start,
-        true,
-        with_deviation(entry["estimate"], entry["std"]),
-        reach,
-        _percent(entry, size),
-    )
+    estimate = with_deviation(entry["estimate"], entry["std"])
+    return start, true, estimate, reach, _percent(entry, size)
 
 
 def _deviations(group: Entry) -> str:
-    """The error in standard deviations."""
+    """Format the error in standard deviations."""
     true = group["true"]
     estimate = group["estimate"]
     std = group["std"]
@@ -256,7 +254,7 @@ def _deviations(group: Entry) -> str:
 
 
 def _size(group: Entry, parameters: Mapping[str, Entry]) -> float:
-    """Of the parts of a sum, by their starting values."""
+    """Return the sum of the absolute values of the parts of a sum at their starting values."""
     return sum(
         abs(weight * (parameters[name]["initial"] or 0.0))
         for name, weight in group["coefficients"].items()

@@ -1,5 +1,4 @@
-"""The pictures of a run by the names of their files, each with a caption that says how to
-read it."""
+"""Pictures of a run by the names of their files, each with a caption that says how to read it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +18,11 @@ from identify.reporting.run_data import RunData, read_run
 
 @dataclass(frozen=True)
 class Picture:
-    """What draws a figure, and what it shows in words; painted: whether a page takes it as an
-    image, for it is of too many strokes, or of grey values."""
+    """Function that draws a figure, and its caption.
+
+    ``painted`` is true if a page takes the figure as an image, because it has too many strokes or
+    grey values.
+    """
 
     draw: Callable[[], Figure]
     caption: str
@@ -28,11 +30,16 @@ class Picture:
 
 
 def run_figures(folder: Path | str) -> dict[str, Callable[[], Figure]]:
-    """The figures of a finished run by the names of their files: each is a function that draws it
-    for print.
+    """Return the figures of a finished run by the names of their files.
 
-    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file of the
-    run is damaged.
+    Each is a function that draws the figure for print.
+
+    Raises
+    ------
+    OutputFolderError
+        An earlier stage has not been run.
+    RecordError
+        A file of the run is damaged.
     """
     return {
         name: partial(drawn, picture.draw)
@@ -41,11 +48,13 @@ def run_figures(folder: Path | str) -> dict[str, Callable[[], Figure]]:
 
 
 def pictures(data: RunData) -> dict[str, Picture]:
-    """The pictures that the files of a run allow, in the order of the report."""
+    """Return the pictures that the files of a run allow, in the order of the report."""
     found = data.result["identification"]
     names = found["parameters"]
     groups = found.get("groups", {})
     several = any(len(group["coefficients"]) > 1 for group in groups.values())
+    sums = {"groups": Picture(lambda: estimates.group_figure(groups, names), GROUPS)}
+    # The order of the keys is that of the report.
     return {
         **_of_the_scene(data),
         "errors": _errors(data),
@@ -57,11 +66,7 @@ def pictures(data: RunData) -> dict[str, Picture]:
         "parameters": Picture(
             lambda: estimates.parameter_figure(names), _parameters_caption(names)
         ),
-        **(
-            {"groups": Picture(lambda: estimates.group_figure(groups, names), GROUPS)}
-            if several
-            else {}
-        ),
+        **(sums if several else {}),
         "correlation": Picture(
             lambda: estimates.correlation_figure(*data.correlations), CORRELATION
         ),
@@ -71,29 +76,24 @@ def pictures(data: RunData) -> dict[str, Picture]:
 
 FIT = (
     "The {}: measured poses (circles), starting model (dashed) and identified model (line); "
-    "beneath each component "
-    "what the identified model leaves of every measured pose, with its RMS for the starting and "
-    "for the identified "
-    "model."
+    "beneath each component what the identified model leaves of every measured pose, with its RMS "
+    "for the starting and for the identified model."
 )
 
 GROUPS = (
     "Which parameters enter which sum that motion shows: one row a sum, one column a parameter. "
-    "The area of a dot is "
-    "the share of coefficient times starting value; an open one is subtracted. A star marks a sum "
-    "that is identified."
+    "The area of a dot is the share of coefficient times starting value; an open one is "
+    "subtracted. A star marks a sum that is identified."
 )
 
 CORRELATION = (
     "How the errors of identified parameters go together: the area of a dot is the size of their "
-    "correlation, an open "
-    "one is negative."
+    "correlation, an open one is negative."
 )
 
 
 def _errors(data: RunData) -> Picture:
-    """Both models against the truth in one look; against the measurement where no truth is
-    known."""
+    """Show the errors of both models against the truth or, without one, the measurement."""
     shown = data.validation_fit
     if shown is None:
         text = (
@@ -103,14 +103,13 @@ def _errors(data: RunData) -> Picture:
         return Picture(lambda: fit.error_figure(data.excitation_fit), text)
     text = (
         "How far both models, and the single poses that the cameras measure, are from the true "
-        "robot, on the first "
-        "trajectory that no model was fitted to."
+        "robot, on the first trajectory that no model was fitted to."
     )
     return Picture(lambda: fit.error_figure(shown), text)
 
 
 def _of_the_scene(data: RunData) -> dict[str, Picture]:
-    """Robot and cameras, and what these see; nothing where the robot's file is gone."""
+    """Show robot, cameras and camera images; nothing where the robot's file is gone."""
     cell = data.scene
     view = data.stereo_view
     if isinstance(cell, str):
@@ -124,14 +123,13 @@ def _of_the_scene(data: RunData) -> dict[str, Picture]:
         }
     text = (
         f"The robot {data.robot} and both cameras, with their rays to the stickers of the "
-        "platform, half way along the "
-        "exciting trajectory; beneath it what both cameras see at that time, with the stickers "
-        "that were found."
+        "platform, half way along the exciting trajectory; beneath it what both cameras see at "
+        "that time, with the stickers that were found."
     )
     residuals = (
         "The same images, drawn anew from scenario, seed and true pose: detected ellipses, and "
-        "arrows from each "
-        "detected centre that show by how much it misses the true one, enlarged as written."
+        "arrows from each detected centre that show by how much it misses the true one, enlarged "
+        "as written."
     )
     return {
         "scene": Picture(
@@ -145,11 +143,11 @@ def _of_the_sensor(data: RunData) -> dict[str, Picture]:
     measured = poses(data.experiment, "measured")
     covariances = data.experiment["measured_covariance"].values
     errors = None if data.truth is None else true_poses(data.truth) - measured
+    # The reference has no noise, so that it tells which components move.
     shown = moving(poses(data.experiment, "reference"))
     text = (
         "How well single poses are measured: ellipses that hold 95 % of true poses by what the "
-        "cameras state, enlarged "
-        "along the path as written above each row."
+        "cameras state, enlarged along the path as written above each row."
     )
     if errors is not None:
         text += " Dots: the true poses, their distance from the measured ones enlarged alike."
@@ -180,8 +178,7 @@ def _parameters_caption(entries: dict[str, Any]) -> str:
     if any(entry["true"] is not None for entry in entries.values()):
         return (
             "Error of each identified parameter with its 95 % interval, in per cent of the truth. "
-            "Grey: 5 %. "
-            "Nineteen of twenty intervals should reach zero."
+            "Grey: 5 %. Nineteen of twenty intervals should reach zero."
         )
     return "95 % interval of each identified parameter, in per cent of the estimate. Grey: 5 %."
 
@@ -191,9 +188,9 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
     if shown is None:
         return {}
     bars = (
-        "The identified model on each unseen trajectory: bars against the truth, diamonds what "
-        "the uncertainty of the "
-        "parameters lets expect, dashes against the measurement, whose noise they hold."
+        "The identified model on each unseen trajectory: bars against the truth, diamonds what the "
+        "uncertainty of the parameters lets expect, dashes against the measurement, whose noise "
+        "they hold."
     )
     text = (
         FIT.format("first unseen trajectory")

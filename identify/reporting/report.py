@@ -1,11 +1,12 @@
-"""The page of a report: one HTML text without a script, whose figures take on the colours of its
-reader's screen.
+"""HTML page of a report.
+
+The page is one text without a script. Its figures take on the colours of the reader's screen.
 """
 
 import base64
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,43 +29,65 @@ from identify.reporting.verdict import key_numbers, verdict
 TEMPLATES = Path(__file__).parent / "templates"
 
 FIRST_LOOK = ("scene", "errors")
-"""Pictures beside the verdict."""
+"""Names of the pictures beside the verdict."""
 
-WIDEST_PX, QUALITY = 1500, 85
-"""Of an image on the page; the PNG file beside it has every pixel."""
+WIDEST_PX = 1500
+"""Largest width and height of an image on the page. The PNG file beside it has every pixel."""
 
+QUALITY = 85
+"""Quality of an image on the page, as WebP counts it."""
+
+# Figures are drawn in the colours of the palette, which the page then replaces by names.
 _NAMES = {code: name for name, code in PALETTE.items()}
 _CODES = re.compile("|".join(_NAMES))
 
 
-def write_report(folder: Path | str, progress: Progress | None = None) -> Path:
-    """Write ``figures/*.png``, ``figures/*.pdf`` and ``report.html`` of a run folder, all or none;
-    return the path of the report.
+def write_report(
+    folder: Path | str,
+    progress: Progress | None = None,
+    further: Callable[[], dict[Path, bytes]] = dict,
+) -> Path:
+    """Write the report and the figures of a run folder, and return the path of the report.
 
-    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file of the
-    run is damaged. Raises WriteError.
+    The files are ``report.html``, ``figures/*.png`` and ``figures/*.pdf``. All or none are written.
+    ``further`` returns files that are written with them.
+
+    Raises
+    ------
+    OutputFolderError
+        An earlier stage has not been run.
+    RecordError
+        A file of the run is damaged.
+    WriteError
+        A file cannot be written.
     """
     run = RunFolder(Path(folder))
     data = read_run(run)
     shown = pictures(data)
     drawings = {}
     files: dict[Path, bytes] = {}
+    # Everything is drawn before anything is written, so that a failure leaves the old report.
     with (progress or SilentProgress()).stage("report", len(shown) + 1) as advance:
         for name, picture in shown.items():
             figure = drawn(picture.draw)
             png = figure_bytes(figure, ".png")
             files[run.figures / f"{name}.png"] = png
             files[run.figures / f"{name}.pdf"] = figure_bytes(figure, ".pdf")
+            # An SVG of many strokes would be larger than the image, and slow to show.
             drawings[name] = painting(png) if picture.painted else svg_text(figure, name)
             advance()
         files[run.report] = render(data, shown, drawings).encode()
-        write_files(files, parents=True)
+        write_files(files | further(), parents=True)
         advance()
     return run.report
 
 
 def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, str]) -> str:
-    """The report as one HTML text; drawings: the pictures as elements, by their names."""
+    """Return the report as one HTML text.
+
+    ``drawings`` holds the pictures as HTML elements, by their names.
+    """
+    # The texts come from files, and may hold characters that mean something in HTML.
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -92,7 +115,7 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
 
 
 def painting(png: bytes) -> str:
-    """A PNG file as an <img> element that holds it, small enough for a page."""
+    """Return an <img> element that holds a PNG file, made small enough for a page."""
     stream = io.BytesIO()
     with Image.open(io.BytesIO(png)) as image:
         whole = image.convert("RGB")
@@ -104,20 +127,23 @@ def painting(png: bytes) -> str:
 
 
 def _subtitle(result: Mapping[str, Any]) -> str:
-    """Scenario and, of a simulated run, seed."""
+    """Return the name of the scenario and, for a simulated run, the seed."""
     seed = result.get("seed")
     return f"scenario {result.get('scenario')}" + ("" if seed is None else f", seed {seed}")
 
 
 def _sentence(text: str) -> str:
-    """A warning as a sentence."""
     return f"{text[:1].upper()}{spelled(text[1:])}."
 
 
 def _coloured(element: str) -> str:
-    """A figure whose colours are variables of the page; what it shows is told by its caption."""
-    # an attribute takes no variables
+    """Return a figure whose colours are variables of the page.
+
+    Screen readers skip it, because its caption tells what it shows.
+    """
+    # CSS variables work in a style, but not in an attribute of SVG.
     text = re.sub(r'\sfill="(#[0-9a-f]{6})"', r' style="fill: \g<1>"', element)
     text = _CODES.sub(lambda code: f"var(--{_NAMES[code[0]]})", text)
     head, _, rest = text.partition(">")
+    # Without a fixed size, the drawing scales to the width of the page.
     return re.sub(r'\s(width|height)="[^"]*"', "", head) + f' aria-hidden="true">{rest}'

@@ -1,4 +1,4 @@
-"""The sections of the report after its first look: words, pictures, tables, and what is folded."""
+"""Sections of the report after its first look: text, pictures, tables and folded parts."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,7 +13,10 @@ from identify.reporting.tables import Table
 
 @dataclass(frozen=True)
 class Fold:
-    """Text under a title that opens it; printed: whether paper shows it."""
+    """Text that is folded under a title.
+
+    ``printed`` is true if it is shown on paper, ``verbatim`` if its lines are kept as they are.
+    """
 
     title: str
     text: str
@@ -23,8 +26,11 @@ class Fold:
 
 @dataclass(frozen=True)
 class Section:
-    """One section of the report: its text in paragraphs, the names of its pictures, those that
-    stand folded under a title, its tables, and what else is folded."""
+    """Section of the report.
+
+    It has a text in paragraphs, names of pictures, names of folded pictures by their titles,
+    tables, and folded texts.
+    """
 
     title: str
     text: tuple[str, ...] = ()
@@ -35,31 +41,28 @@ class Section:
 
 
 def sensor_section(data: RunData) -> Section:
-    """What the sensor measured against the truth, or what it says of itself."""
+    """Describe the sensor's errors where the truth is known, else what it states of itself."""
     ok = data.experiment["measured_ok"].values.astype(bool)
     note = data.scenario.sensor_note
     name = Path(data.scenario.sensor).stem
     said = [] if data.truth is None else [f"The sensor is {name}{f': {note}' if note else '.'}"]
     if isinstance(data.scene, str):
         said.append(f"Robot and cameras are not drawn: {data.scene}.")
+    # A record of a real robot has no entry of the sensor, because no truth is known.
     if "sensor" not in data.result:
         said.append(
             f"{len(ok)} frames were recorded at {data.scenario.timing.frame_rate_hz:g} Hz; in "
-            f"{int((~ok).sum())} of "
-            "them the platform was lost. No truth is known here: what follows is what the sensor "
-            "states of itself."
+            f"{int((~ok).sum())} of them the platform was lost. No truth is known here: what "
+            "follows is what the sensor states of itself."
         )
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
-    if data.cameras_acquitted is not None:
+    if data.cameras_acquitted:
+        common_errors = data.result["identification"].get("nuisances")
+        beside = ", beside what is wrong in all frames alike" if common_errors else ""
+        said.append(f"Its errors are the noise that it states, new in every frame{beside}.")
+    elif data.cameras_acquitted is not None:
         said.append(
-            "Its errors are the noise that it states, new in every frame"
-            + (
-                ", beside what is wrong in all frames alike."
-                if data.result["identification"].get("nuisances")
-                else "."
-            )
-            if data.cameras_acquitted
-            else "Its errors are larger than the noise that it states, or depend on those of the "
+            "Its errors are larger than the noise that it states, or depend on those of the "
             "frames before."
         )
     watch = data.result.get("drift_watch")
@@ -68,18 +71,19 @@ def sensor_section(data: RunData) -> Section:
             "By the stickers' pattern and the gaps of the rays, the cameras stayed as they were "
             "calibrated."
         )
+    # An empty table is left out.
     common = [table for table in (tables.common_error_table(data.result),) if table.rows]
     shown = (tables.sensor_table(data.result), *common)
     return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)
 
 
 def excitation_section(data: RunData) -> Section:
-    """The motion that the record is of."""
+    """Describe the exciting motion."""
     return Section("Excitation", _index_text(data), ("path", "excitation"))
 
 
 def fit_section(data: RunData) -> Section:
-    """How the models follow the exciting trajectory, and how the search ended."""
+    """Describe how the models follow the exciting trajectory, and how the search ended."""
     found = data.result["identification"]
     text = (
         f"The search took {found['iterations']} steps; it ended because "
@@ -90,22 +94,18 @@ def fit_section(data: RunData) -> Section:
 
 
 def parameter_section(data: RunData) -> Section:
-    """What is identified first; what is not, folded, with the reason."""
+    """Describe the identified parameters and, folded, the others with the reasons."""
     found = data.result["identification"]
     parameters = found["parameters"]
     groups = found.get("groups", {})
     known = [p for p in parameters.values() if p["identifiable"]]
     sums = [group for group in groups.values() if len(group["coefficients"]) > 1]
+    known_sums = sum(bool(group["identifiable"]) for group in sums)
+    counted = f", and {known_sums} of {len(sums)} sums of several" if sums else ""
     text = [
-        f"The record identifies {len(known)} of {len(parameters)} parameters"
-        + (
-            f", and {sum(bool(g['identifiable']) for g in sums)} of {len(sums)} sums of several."
-            if sums
-            else "."
-        )
-        + " Identified means that it at least halves what the starting value left open, and "
-        "leaves less than half of "
-        "the quantity in doubt.",
+        f"The record identifies {len(known)} of {len(parameters)} parameters{counted}. Identified "
+        "means that it at least halves what the starting value left open, and leaves less than "
+        "half of the quantity in doubt.",
         parameter_tables.scale_sentence(found),
         *filter(None, [parameter_tables.drive_sentence(found)]),
         *_prior_text(found),
@@ -125,13 +125,12 @@ def parameter_section(data: RunData) -> Section:
 
 
 def validation_section(data: RunData) -> Section:
-    """Unseen trajectories."""
+    """Describe the errors on unseen trajectories."""
     if not data.validation:
         text = (
             "There are no unseen trajectories of this record. Record another motion of the robot, "
-            "and compare what the "
-            "model predicts of it: a model that only follows the motion that it was fitted to is "
-            "of no use."
+            "and compare what the model predicts of it: a model that only follows the motion that "
+            "it was fitted to is of no use."
         )
         return Section("Validation", (text,))
     both = (
@@ -143,7 +142,7 @@ def validation_section(data: RunData) -> Section:
 
 
 def provenance_section(data: RunData) -> Section:
-    """Scenario, versions and times, so that the run can be repeated."""
+    """List scenario, versions and times, so that the run can be repeated."""
     changed = tables.settings_table(data.result, data.scenario_toml)
     made = f"Record made {data.experiment.attrs.get('created', 'at an unknown time')}."
     text = [made, "Every picture is also in the folder figures, as PDF for print and as PNG."]
@@ -171,10 +170,11 @@ SECTIONS: tuple[Callable[[RunData], Section], ...] = (
     validation_section,
     provenance_section,
 )
+"""Functions that build the sections, in the order of the report."""
 
 
 def _prior_text(found: dict[str, Any]) -> list[str]:
-    """How many estimates rest on the starting values of others."""
+    """Tell how many estimates depend on the starting values of other parameters."""
     counts = {
         "parameters": sum(bool(p.get("rests_on_prior")) for p in found["parameters"].values()),
         "sums": sum(bool(g.get("rests_on_prior")) for g in found.get("groups", {}).values()),
@@ -194,29 +194,27 @@ def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
     directions = conditioning["directions"]
     unshown = conditioning["unshown"]
     return [
-        f"Poses can show {directions} independent quantities of this robot and its controller, "
-        "but for one common "
-        f"factor of all of them. This record shows {directions - unshown} of them better than the "
-        "starting values do."
+        f"Poses can show {directions} independent quantities of this robot and its controller, but "
+        f"for one common factor of all of them. This record shows {directions - unshown} of them "
+        "better than the starting values do."
     ]
 
 
 def _index_text(data: RunData) -> tuple[str, ...]:
-    """What the search for an exciting trajectory gained."""
+    """Tell what the search for an exciting trajectory gained."""
     chosen = data.trajectories
     if chosen is None:
         return ()
     text = (
         "The observability index (eq. 39 of the paper; larger is better) is "
-        f"{number(chosen.first_index, 3)} for the "
-        f"first random candidate, {number(chosen.median_index, 3)} for the middle one, and "
+        f"{number(chosen.first_index, 3)} for the first random candidate, "
+        f"{number(chosen.median_index, 3)} for the middle one, and "
         f"{number(chosen.observability_index, 3)} for the trajectory that was used."
     )
     if data.beside_paper:
         text += (
             f" The paper, on its own geometry, went from {paper.INDEX_FIRST:g} to "
-            f"{paper.INDEX_BEST:g} by a genetic "
-            "algorithm."
+            f"{paper.INDEX_BEST:g} by a genetic algorithm."
         )
     return (text,)
 
@@ -226,8 +224,7 @@ def _paper_text(data: RunData) -> tuple[str, ...]:
         return ()
     return (
         "This run repeats the paper's experiment on a simulated robot of the same kind, with its "
-        "masses, gains and "
-        "motion frequencies; where it filters and how it searches for its trajectory are its own "
-        "(scenario.toml). The "
-        "paper's own figures stand beside. They are of a real robot whose truth nobody knows.",
+        "masses, gains and motion frequencies; where it filters and how it searches for its "
+        "trajectory are its own (scenario.toml). The paper's own figures stand beside. They are of "
+        "a real robot whose truth nobody knows.",
     )

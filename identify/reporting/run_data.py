@@ -1,5 +1,7 @@
-"""All that a report shows of a run, read from its files; of a record of a real robot there is
-less."""
+"""Data of a run that its report shows, read from the files of the run.
+
+A record of a real robot has less of them than a simulated run.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -30,10 +32,13 @@ from identify.trajectory import TrajectorySet, load_trajectories
 
 @dataclass(frozen=True)
 class RunData:
-    """The result, the record with its truth, the unseen runs with the truth of the first one, what
-    the models do on both, the covariance (p, p) of the parameters with their names (p,), and the
-    trajectories. What is not known of a record of a real robot is None or empty: truth, unseen
-    runs, trajectories."""
+    """Data of a run.
+
+    The covariance (p, p) is that of the parameters with the given names (p,). ``validation`` holds
+    the unseen runs, ``validation_truth`` the truth of the first one, and ``models`` what the models
+    do on the record and on the unseen runs. For a record of a real robot, truth and trajectories
+    are None, and there are no unseen runs.
+    """
 
     result: dict[str, Any]
     experiment: xr.Dataset
@@ -52,33 +57,36 @@ class RunData:
 
     @property
     def scenario_toml(self) -> str:
-        """The scenario that the record was made with."""
+        """Scenario that the record was made with, as TOML."""
         return str(self.experiment.attrs.get("scenario", ""))
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The same, read. Raises RecordError: the record states none, or one that cannot be
-        read."""
+        """Scenario that the record was made with.
+
+        Raises RecordError if the record states none, or one that cannot be read.
+        """
         return recorded_scenario(self.experiment)
 
     @cached_property
     def beside_paper(self) -> bool:
-        """Whether this run repeats the paper's experiment, so that its figures may stand beside the
-        paper's.
-        """
+        """True if the run repeats the paper's experiment, so that the two can be compared."""
         return repeats_the_paper(self.scenario_toml)
 
     @cached_property
     def cameras_acquitted(self) -> bool | None:
-        """Whether the cameras cannot be the cause of what a model leaves; None where no truth is
-        known.
+        """True if the cameras cannot be the cause of the model's residuals.
+
+        None where no truth is known.
         """
         return cameras_acquitted(self.experiment, self.truth)
 
     @cached_property
     def scene(self) -> Workcell | str:
-        """Robot and cameras as the scenario places them, the robot alone where the record is of a
-        real one; why there is nothing to draw where a file is gone."""
+        """Robot and cameras as the scenario places them, or the reason why they cannot be drawn.
+
+        A record of a real robot shows the robot alone. A file that is gone is such a reason.
+        """
         try:
             robot = load_robot(self.scenario.robot)
             return (
@@ -91,8 +99,10 @@ class RunData:
 
     @cached_property
     def stereo_view(self) -> StereoView | None:
-        """What both cameras of a simulated run see at its middle, drawn anew from scenario, seed
-        and true pose.
+        """View of both cameras of a simulated run at the middle of the record.
+
+        The images are drawn anew from scenario, seed and true pose. None where they cannot be
+        drawn.
         """
         if self.truth is None or isinstance(self.scene, str):
             return None
@@ -105,8 +115,9 @@ class RunData:
 
     @property
     def middle(self) -> Array:
-        """Pose (6,) of the platform half way through the record, m and rad: the true one where it
-        is known.
+        """Pose (6,) of the platform half way through the record, in m and rad.
+
+        It is the true pose where that is known, and the reference otherwise.
         """
         measured = (
             poses(self.experiment, "reference") if self.truth is None else true_poses(self.truth)
@@ -117,14 +128,17 @@ class RunData:
     def excitation_fit(self) -> Fit:
         """Measurement and models on the exciting trajectory."""
         covariances = self.experiment["measured_covariance"].values
+        # One number a component: the root of the mean variance over the frames that were measured.
         noise = np.sqrt(np.nanmean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
         fit = replace(_fit(self.experiment, self.models[EXCITATION]), noise=noise)
         return fit if self.truth is None else replace(fit, truth=true_poses(self.truth))
 
     @cached_property
     def validation_fit(self) -> Fit | None:
-        """Measurement, models and truth on the first unseen trajectory; None where there is
-        none."""
+        """Measurement, models and truth on the first unseen trajectory.
+
+        None where there is none.
+        """
         if not self.validation or self.validation_truth is None:
             return None
         fit = _fit(self.validation[0], self.models[run_name(1)])
@@ -139,9 +153,8 @@ class RunData:
         chosen = [
             k for k, name in enumerate(self.names) if parameters.get(name, {}).get("identifiable")
         ]
-        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [
-            self.names[k] for k in chosen
-        ]
+        names = [self.names[k] for k in chosen]
+        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), names
 
 
 def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
@@ -155,11 +168,16 @@ def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
 
 
 def read_run(run: RunFolder) -> RunData:
-    """Read what the stages of a run wrote. A record without truth needs no validation.
+    """Read the files that the stages of a run wrote. A record without truth needs no validation.
 
-    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file is
-    damaged, or the files are not of one run.
+    Raises
+    ------
+    OutputFolderError
+        An earlier stage has not been run.
+    RecordError
+        A file is damaged, or the files are not of one run.
     """
+    # What is missing is reported before anything is read, with the stage that writes it.
     run.require("result.json", "covariance.nc", "experiment.nc")
     files = RunFiles(run)
     simulated = TRUTH_GROUP in group_names(run.experiment)
@@ -176,6 +194,7 @@ def read_run(run: RunFolder) -> RunData:
         names=files.named_covariance[0],
         trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
     )
+    # A model of another record would be drawn beside the wrong measurement.
     records = {EXCITATION: data.experiment}
     records |= {run_name(number): record for number, record in enumerate(data.validation, start=1)}
     for name, record in records.items():
@@ -187,7 +206,7 @@ def read_run(run: RunFolder) -> RunData:
 
 
 def _checked_result(run: RunFolder, files: RunFiles, simulated: bool) -> dict[str, Any]:
-    """The whole result of a run, made of the files that are there."""
+    """Read the result of a run, and check that it was made of the files that are there."""
     result = load_result(run.result)
     check_entries(run.result, result, "identify", *(["validate"] if simulated else []))
     later = ["validation.nc"] if simulated else []

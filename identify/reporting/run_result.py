@@ -1,4 +1,4 @@
-"""Entries of `result.json` from what the stages computed and recorded."""
+"""Entries of `result.json`, from what the stages computed and recorded."""
 
 from typing import Any
 
@@ -6,9 +6,7 @@ import numpy as np
 import xarray as xr
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop.start_state import (
-    checked_loop_parameters,
-)
+from dynamics.closed_loop.start_state import checked_loop_parameters
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.experiment.truth import true_poses
@@ -19,19 +17,19 @@ from identify.validation.unseen import PosePrediction
 
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
-    """Enter the true parameters, and the true values of their groups, into an identification
-    entry."""
+    """Add the true values of parameters and of their groups to an identification entry."""
     for name, value in truth.items():
         identification["parameters"][name]["true"] = value
+    # The true value of a group follows from those of its members.
     for group in identification.get("groups", {}).values():
         group["true"] = sum(weight * truth[name] for name, weight in group["coefficients"].items())
 
 
 def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) -> Array:
-    """A robot's parameters (p,) of one column ("initial", "estimate", ...) of an identification
-    entry.
+    """Return one column of an identification entry as a robot's parameters (p,).
 
-    Raises RecordError: one that is missing or no number, or that no model can have.
+    ``column`` is "initial", "estimate" or another of the entry. Raises RecordError if a parameter
+    is missing, is no number, or has a value that no model can have.
     """
     values = parameter_column(identification, column, robot.layout.names)
     try:
@@ -43,10 +41,11 @@ def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) 
 def check_intervals(identification: dict[str, Any]) -> None:
     """Refuse an estimate outside its own interval, which no identification gives.
 
-    Raises RecordError: naming the parameter with both.
+    Raises RecordError, which names the parameter, its estimate and its interval.
     """
     for name, entry in parameter_entries(identification).items():
-        estimate, (low, high) = entry["estimate"], entry.get("interval") or (-np.inf, np.inf)
+        estimate = entry["estimate"]
+        low, high = entry.get("interval") or (-np.inf, np.inf)
         if estimate is not None and not low <= estimate <= high:
             raise RecordError(
                 f"the estimate {estimate:g} of {name} is outside its interval {low:g} to {high:g}"
@@ -54,12 +53,14 @@ def check_intervals(identification: dict[str, Any]) -> None:
 
 
 def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
-    """The sensor against the truth over all (record, truth) pairs; speed of rendering and measuring
-    in one process.
+    """Compare the sensor with the truth over all pairs of record and truth.
+
+    The entry also holds the speed of rendering and measuring in one process.
     """
     errors = np.vstack(
         [recording.poses(record, "measured") - true_poses(truth) for record, truth in runs]
     )
+    # A lost frame has no pose, and only counts as lost.
     ok = np.concatenate([record["measured_ok"].values.astype(bool) for record, _ in runs])
     seconds = sum(float(record.attrs["sensor_seconds"]) for record, _ in runs)
     return {
@@ -73,7 +74,10 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
 def validation_entry(
     record: xr.Dataset, truth: xr.Dataset, initial: Array, identified: Array
 ) -> dict[str, Any]:
-    """One unseen run: both models (N, 6) against the measured and against the true plant pose."""
+    """Return the entry of one unseen run.
+
+    Both models (N, 6) are compared with the measured and with the true poses of the plant.
+    """
     ok = record["measured_ok"].values.astype(bool)
     measured = recording.poses(record, "measured")
     true = true_poses(truth)
@@ -86,8 +90,11 @@ def validation_entry(
 
 
 def prediction_entry(prediction: PosePrediction, truth: xr.Dataset) -> dict[str, Any]:
-    """How far the plant was expected from the predicted poses, RMS over the run, how far it was,
-    and that squared in units of what was expected."""
+    """Compare the plant's deviation from the predicted poses with the expected one.
+
+    The entry holds both as RMS over the run, and the squared deviation in units of the expected
+    one.
+    """
     std = 1e6 * np.sqrt(np.mean(prediction.std**2, axis=0))
     true = true_poses(truth)
     return {

@@ -1,6 +1,4 @@
-"""The settings of a run as its report tells them: what differs from the built-in scenario that it
-began with.
-"""
+"""Settings of a run, compared with those of the built-in scenario that it began with."""
 
 import tomllib
 from collections.abc import Mapping
@@ -9,14 +7,16 @@ from typing import Any, NamedTuple
 from identify.scenario import load_scenario, scenario_names
 
 BUILT_IN_PAPER = "paper"
-"""The scenario whose settings are the paper's, and with which those without a built-in name are
-compared.
+"""Name of the built-in scenario that has the paper's settings.
+
+Scenarios without a built-in name are compared with it.
 """
 
 
 class Setting(NamedTuple):
-    """A setting of a run by its dotted key, of the scenario and of the built-in one; a dash where
-    one has none.
+    """Setting of a run by its dotted key, with its value and that of the built-in scenario.
+
+    A value is a dash where the scenario does not have the setting.
     """
 
     key: str
@@ -28,14 +28,19 @@ class Setting(NamedTuple):
 def changed_settings(
     recorded: str, estimator: Mapping[str, Any] | None = None
 ) -> tuple[str, list[Setting]]:
-    """The built-in scenario that a recorded one (TOML) is to be compared with, by name, and the
-    settings that differ.
+    """Return the name of the built-in scenario that fits a recorded one, and what differs.
 
-    estimator: settings of the identification by dotted key, where they may have been changed after
-    the record was made.
+    Parameters
+    ----------
+    recorded
+        The scenario of the record, as TOML.
+    estimator
+        Settings of the identification by dotted key. They may have been changed after the record
+        was made.
     """
     ours = _settings(recorded)
     name = ours["name"].value if "name" in ours else ""
+    # A user's own scenario may have any name.
     base = name if name in scenario_names() else BUILT_IN_PAPER
     theirs = _settings(load_scenario(base).to_toml())
     for key, value in (estimator or {}).items():
@@ -45,6 +50,7 @@ def changed_settings(
             ours[key] = _Stated(value, f"{before.meaning}; {when}" if before.meaning else when)
     absent = _Stated(None, "")
     changed = []
+    # A set would lose the order of the file.
     for key in dict.fromkeys((*ours, *theirs)):
         one = ours.get(key, absent)
         other = theirs.get(key, absent)
@@ -56,14 +62,14 @@ def changed_settings(
 
 
 class _Stated(NamedTuple):
-    """A value of a scenario, None where it states none, and what it means."""
+    """Value of a scenario, None where it states none, and what the value means."""
 
     value: Any
     meaning: str
 
 
 def _settings(text: str) -> dict[str, _Stated]:
-    """The settings of a scenario as `to_toml` writes it, by dotted key."""
+    """Return the settings of a scenario by dotted key, from the text that `to_toml` writes."""
     found = {}
     section = ""
     for line in text.splitlines():
@@ -71,6 +77,7 @@ def _settings(text: str) -> dict[str, _Stated]:
             section = line.partition("]")[0].strip("[ ") + "."
         elif " = " in line:
             key, _, rest = line.partition(" = ")
+            # The comment after a value is the description of its setting.
             meaning = rest.rpartition(" # ")[2] if " # " in rest else ""
             found[section + key.strip()] = _Stated(
                 tomllib.loads(f"value = {rest}")["value"], meaning.strip()
@@ -79,7 +86,7 @@ def _settings(text: str) -> dict[str, _Stated]:
 
 
 def _shown(value: Any) -> str:
-    """A value as a table shows it; a dash where there is none."""
+    """Format a value for a table, with a dash where there is none."""
     if value is None:
         return "-"
     return str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,5 +1,6 @@
-"""The tables of a run, and what it says of itself at the terminal; the paper's figures where it
-repeats the paper.
+"""Tables of a run, and the summaries at the terminal.
+
+The paper's figures stand beside those of a run that repeats the paper's experiment.
 """
 
 import math
@@ -24,8 +25,11 @@ AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, s
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table of text; ``note`` says what the reader must know to read it; ``folded``:
-    whether only its title is seen at first."""
+    """Table of text with a title.
+
+    ``note`` says what the reader must know to read it. ``folded`` is true if only the title is seen
+    at first.
+    """
 
     title: str
     header: tuple[str, ...]
@@ -35,7 +39,8 @@ class Table:
 
     @property
     def words(self) -> tuple[bool, ...]:
-        """Whether each column holds words and not numbers."""
+        """Flags of the columns that hold words, and not numbers."""
+        # Signs and dashes are the typographic ones that `number` writes.
         numeric = re.compile(r"([-+−≤≥(]? ?[\d.]+.*|[-–]?|diverged)$")
         columns = zip(*self.rows, strict=True)
         return tuple(
@@ -44,7 +49,7 @@ class Table:
         )
 
     def without(self, hidden: Collection[int]) -> "Table":
-        """The table without some of its columns."""
+        """Return the table without the columns of the given indices."""
 
         def kept(cells: tuple[str, ...]) -> tuple[str, ...]:
             return tuple(cell for k, cell in enumerate(cells) if k not in hidden)
@@ -52,21 +57,22 @@ class Table:
         return replace(self, header=kept(self.header), rows=tuple(map(kept, self.rows)))
 
     def without_empty(self) -> "Table":
-        """The table without columns in which nothing stands."""
+        """Return the table without columns that hold only empty cells and dashes."""
         columns = enumerate(zip(*self.rows, strict=True)) if self.rows else ()
         return self.without(
             [k for k, column in columns if all(cell in ("", "-") for cell in column)]
         )
 
     def markdown(self) -> str:
-        """The table as Markdown, numbers aligned to the right."""
+        """Return the table as Markdown, with numbers aligned to the right."""
         lines = [self.header, ("---",) + ("--:",) * (len(self.header) - 1), *self.rows]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def goals_table(result: dict[str, Any]) -> Table:
-    """Every goal with its value, its limit and whether it is met; below them the speed, which no
-    goal judges.
+    """Return every goal with its value, its limit and whether it is met.
+
+    The speed stands below, which no goal judges.
     """
     rows = tuple(
         (
@@ -85,9 +91,10 @@ def goals_table(result: dict[str, Any]) -> Table:
 
 
 def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Speed of what has been done so far."""
+    """Return the rows on the speed of the stages that have been run."""
     rate = result.get("sensor", {}).get("stereo_frames_per_second")
     seconds = result.get("seconds", {})
+    # Names with a dot are parts of a stage, and would be counted twice.
     stages = [
         value
         for name, value in seconds.items()
@@ -95,26 +102,20 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
     ]
     rows: list[tuple[str, ...]] = []
     if rate:
-        rows.append(
-            (
-                "stereo frames",
-                f"{number(rate)} 1/s",
-                "",
-                "",
-                "rendered and measured, in one process",
-            )
-        )
+        what = "rendered and measured, in one process"
+        rows.append(("stereo frames", f"{number(rate)} 1/s", "", "", what))
     if stages:
         total = seconds.get("total") or sum(stages)
-        rows.append(
-            ("whole run", f"{number(total)} s", "", "", "all stages so far, compiling included")
-        )
+        what = "all stages so far, compiling included"
+        rows.append(("whole run", f"{number(total)} s", "", "", what))
     return rows
 
 
 def common_error_table(result: dict[str, Any]) -> Table:
-    """What all poses of the record have in common: how well it was known, what the record says of
-    it, and how well.
+    """Return the errors that all poses of the record have in common.
+
+    Each has the standard deviation that was known beforehand, the estimate from the record and its
+    standard deviation.
     """
     found = result["identification"]
     rows = tuple(
@@ -127,28 +128,24 @@ def common_error_table(result: dict[str, Any]) -> Table:
     )
     note = (
         "True minus known, in the unit that ends the name; of the geometry in m and rad. Where a "
-        "servo acts, it takes "
-        "the platform to where such an error does not show; then little is learnt of "
-        f"it.{_shares(found)}"
+        "servo acts, it takes the platform to where such an error does not show; then little is "
+        f"learnt of it.{_shares(found)}"
     )
     header = ("error", "standard deviation beforehand", "found ± standard deviation")
     return Table("What is wrong in all frames alike", header, rows, note, folded=True)
 
 
 KINDS = {"rig": "cameras", "teaching": "taught frames", "exposure": "exposures apart"}
-"""Words for kinds of errors that all frames have in common; the others are words."""
+"""Words for the kinds of common errors whose names need some."""
 
 
 def _shares(found: dict[str, Any]) -> str:
-    """What each kind of common error makes of the variance of what is identified, at most, in a
-    sentence.
-    """
+    """Return a sentence with the largest share of each kind of common error in a variance."""
     identified = [
         one.get("common_share") for one in found["parameters"].values() if one["identifiable"]
     ]
-    shares = [
-        one for one in identified if isinstance(one, dict)
-    ]  # older results have none, or one for all kinds
+    # Older results have no share, or one number for all kinds together.
+    shares = [one for one in identified if isinstance(one, dict)]
     largest = {kind: max(one[kind] for one in shares) for kind in (shares[0] if shares else ())}
     said = ", ".join(
         f"{KINDS.get(kind, kind)} {number(100.0 * share, 2)} %" for kind, share in largest.items()
@@ -157,8 +154,11 @@ def _shares(found: dict[str, Any]) -> str:
 
 
 def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -> Table:
-    """Model against measurement on the exciting trajectory before and after identification; beside
-    the paper's table 3 for a run that repeats its experiment."""
+    """Compare the model with the measurement on the exciting trajectory.
+
+    The rows are before and after identification. For a run that repeats the paper's experiment, the
+    paper's table 3 stands beside them.
+    """
     before = _rms(rms_row(result.get("before")))
     after = _rms(rms_row(result.get("after")))
     header: tuple[str, ...] = ("component", "before", "after")
@@ -175,8 +175,10 @@ def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -
 
 
 def validation_table(result: dict[str, Any], beside_paper: bool = False) -> Table:
-    """Models against measurement and truth on the unseen trajectories; with the paper's table 4 for
-    a run that repeats its experiment."""
+    """Compare the models with measurement and truth on the unseen trajectories.
+
+    For a run that repeats the paper's experiment, the paper's table 4 follows.
+    """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
         rows.append((f"{n}: identified, true", *_rms(rms_row(run["true"]))))
@@ -198,13 +200,15 @@ def validation_table(result: dict[str, Any], beside_paper: bool = False) -> Tabl
 
 
 def prediction_table(result: dict[str, Any]) -> Table:
-    """Predicted deviation of the plant from the identified model beside the deviation found, on
-    unseen trajectories.
+    """Compare the predicted deviation of the plant from the identified model with the found one.
+
+    The rows are the unseen trajectories.
     """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
         predicted = run.get("predicted", {})
         rows.append((f"{n}: predicted", *map(number, predicted_row(run)), ""))
+        # Without a prediction, the deviation is that from the identified model.
         found = rms_row(predicted if "position_rms_um" in predicted else run["true"])
         rows.append(
             (f"{n}: found", *_rms(found), number(predicted.get("normalised_squared_error")))
@@ -214,20 +218,17 @@ def prediction_table(result: dict[str, Any]) -> Table:
         ("run", *AXIS_HEADER, "found²/predicted²"),
         tuple(rows),
         "Predicted by the identified model and what its record taught of errors in common to all "
-        "frames; how far, from "
-        "the uncertainty of both, and from what the cameras' noise does to the robot through the "
-        "servo. The last "
-        "column is the squared error in units of what was predicted: one on average where the "
-        "prediction is right. "
-        "The runs share one set of parameters, so they stray together. Where cameras and taught "
-        "frames count as exact, "
-        "their error, which moves the robot as a whole, is not predicted.",
+        "frames; how far, from the uncertainty of both, and from what the cameras' noise does to "
+        "the robot through the servo. The last column is the squared error in units of what was "
+        "predicted: one on average where the prediction is right. The runs share one set of "
+        "parameters, so they stray together. Where cameras and taught frames count as exact, their "
+        "error, which moves the robot as a whole, is not predicted.",
         folded=True,
     )
 
 
 def sensor_table(result: dict[str, Any]) -> Table:
-    """Measured pose against truth."""
+    """Compare the measured poses with the truth."""
     sensor = result["sensor"]
     header = ("frames", "lost", "frames a second", *AXIS_HEADER)
     frames = sensor["frames"]
@@ -238,14 +239,17 @@ def sensor_table(result: dict[str, Any]) -> Table:
 
 
 def seconds_table(result: dict[str, Any]) -> Table:
-    """Time of each stage."""
+    """Return the time of each stage."""
     rows = tuple((name, number(value)) for name, value in result.get("seconds", {}).items())
     return Table("Time of the stages", ("stage", "seconds"), rows, folded=True)
 
 
 def settings_table(result: dict[str, Any], recorded: str) -> Table:
-    """What differs from the built-in scenario with which the recorded one (TOML) is to be compared,
-    the settings that were changed for the identification among it."""
+    """Return the differences from the built-in scenario that the recorded one is compared with.
+
+    ``recorded`` is the scenario of the record (TOML). Settings that were changed for the
+    identification are among the differences.
+    """
     base, changed = changed_settings(recorded, result.get("settings"))
     rows = tuple((one.key, one.value, one.built_in, one.meaning) for one in changed)
     return Table(
@@ -254,7 +258,7 @@ def settings_table(result: dict[str, Any], recorded: str) -> Table:
 
 
 def versions_table(result: dict[str, Any]) -> Table:
-    """Versions of the software that identified."""
+    """Return the versions of the software that identified."""
     rows = tuple((name, str(value)) for name, value in result.get("versions", {}).items())
     return Table("Software", ("package", "version"), rows, folded=True)
 
@@ -264,8 +268,10 @@ def _rms(values: list[float]) -> list[str]:
 
 
 def print_identification(result: dict[str, Any], path: Path) -> None:
-    """What is identified, how well the model explains the record, the time it took, and where all
-    of it is.
+    """Print a summary of the identification.
+
+    It says what is identified, how well the model explains the record, the time it took, and where
+    the result is.
     """
     identification = result["identification"]
     kinds = {"parameters": "parameters", "groups": "sums of them that motion shows"}
@@ -291,7 +297,7 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
 
 
 def print_goals(result: dict[str, Any], report: Path) -> None:
-    """The goals of a run with their values, what was missed, and where its report is."""
+    """Print the goals of a run with their values, which were missed, and where the report is."""
     table = goals_table(result)
     print_table(
         table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note

@@ -1,5 +1,6 @@
-"""Variation of the estimates beside the paper's table 5: a table, a figure, and the entry of
-`variation.json`.
+"""Variation of the estimates over several runs, beside the paper's table 5.
+
+It is given as a table, a figure and the entry of `variation.json`.
 """
 
 from typing import Any
@@ -11,12 +12,16 @@ from identify.reporting.tables import Table, number
 from identify.validation.variation import Variation
 
 GOAL_PERCENT = 5.0
-"""What every identified parameter should keep to."""
+"""Largest variation that every identified parameter should have."""
 
 PAPER_WORST_PERCENT = 24.9
+"""Largest variation in the paper's table 5."""
 
 SMALLEST_PERCENT = 0.1
-"""Where the figure begins: what is weighed once for all runs hardly varies."""
+"""Left end of the figure's axis.
+
+The platform is weighed once for all runs, so that its mass hardly varies.
+"""
 
 PAPER_PERCENT = {
     "platform.mass": 0.48,
@@ -36,12 +41,15 @@ PAPER_PERCENT = {
     },
     **dict(zip(("joint_pid.lp", "joint_pid.li", "joint_pid.ld"), (2.82, 0.44, 3.7), strict=True)),
 }
-"""Table 5 of the paper's robot, as far as its rows can be told apart (in our copy a cell is missing
-in its left column) and as far as these parameters can be identified at all."""
+"""Variation of the parameters of the paper's robot (table 5).
+
+It holds the rows that can be told apart, as our copy lacks a cell in the left column, of parameters
+that can be identified at all.
+"""
 
 
 def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
-    """Entry of `variation.json`: `trajectories` says which runs it is of."""
+    """Return the entry of `variation.json`. ``trajectories`` says which runs it is of."""
     name, worst = found.worst
     return {
         "trajectories": trajectories,
@@ -50,6 +58,7 @@ def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
         "goal_percent": GOAL_PERCENT,
         "paper_worst_percent": PAPER_WORST_PERCENT,
         "parameters": {
+            # Also of parameters that are not identified in every run, which the table leaves out.
             parameter: {
                 "unit": found.layout.unit(parameter),
                 "mean": found.mean[k],
@@ -64,8 +73,10 @@ def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
 
 
 def variation_table(found: Variation) -> Table:
-    """The parameters that every run identifies: mean, variation, what the intervals let expect, and
-    the paper's.
+    """Return the table of the parameters that every run identifies.
+
+    It holds mean, variation, the variation that the intervals let expect, and the paper's
+    variation.
     """
     rows = tuple(
         (
@@ -83,14 +94,16 @@ def variation_table(found: Variation) -> Table:
         ("parameter", "unit", "mean", "variation [%]", "expected [%]", "paper [%]"),
         rows,
         "Variation: standard deviation over mean. Expected: from the standard deviations that the "
-        "runs state. "
-        "Parameters that are identified in every run; the platform is weighed once for all.",
+        "runs state. Parameters that are identified in every run; the platform is weighed once for "
+        "all.",
     )
 
 
 def variation_figure(found: Variation) -> Figure:
-    """Variation of each identified parameter, with what was expected, the paper's, and both
-    limits."""
+    """Draw the variation of each identified parameter.
+
+    Markers show the expected variation and the paper's. A line shows the goal.
+    """
     shown = np.flatnonzero(found.identified)
     figure = Figure(figsize=(9, 2.0 + 0.28 * len(shown)), layout="constrained")
     axes = figure.subplots()
@@ -111,6 +124,7 @@ def variation_figure(found: Variation) -> Figure:
     )
     axes.set_yticks(places, [found.names[k] for k in shown], fontsize="small")
     axes.invert_yaxis()
+    # Variations range from less than a tenth of a per cent to some ten per cent.
     axes.set_xscale("log")
     axes.set_xlim(left=SMALLEST_PERCENT)
     axes.set_xlabel(f"variation of {found.runs} identifications [%]")

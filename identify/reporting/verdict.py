@@ -1,9 +1,9 @@
-"""The verdict of a run in whole sentences: what is right, what is not, who may be the cause, and
-what nobody can tell.
+"""Verdict on a run in whole sentences.
 
-A model is called wrong only where the cameras cannot be the cause: where the truth is known, and
-what they measured misses it by no more than the noise that they state, without dependence from
-frame to frame.
+It says what is right, what is not, what may be the cause, and what cannot be known. The model is
+called wrong only where the cameras cannot be the cause. For that the truth must be known, and the
+cameras' errors must be no larger than the noise that they state, without dependence from frame to
+frame.
 """
 
 from dataclasses import dataclass
@@ -23,14 +23,15 @@ from identify.reporting.goals import check_goals, explanation_goals
 from identify.reporting.number_format import number, share
 
 CAMERAS_MISS = 1.5
-"""Mean squared error of measured poses, in units of what the cameras state, beyond which they may
-be the cause.
+"""Limit of the mean squared error of the measured poses, in units of the stated covariance.
+
+Beyond it, the cameras may be the cause.
 """
 
 
 @dataclass(frozen=True)
 class KeyNumber:
-    """A number of the first look: with its unit, and what it means."""
+    """Number of the first look, with its unit and its meaning."""
 
     value: str
     unit: str
@@ -39,8 +40,10 @@ class KeyNumber:
 
 @dataclass(frozen=True)
 class Verdict:
-    """good: whether nothing speaks against the result; headline: in one sentence; sentences: the
-    reasons.
+    """Verdict on a run.
+
+    ``good`` is true if nothing speaks against the result. The sentences are the reasons for the
+    headline.
     """
 
     good: bool
@@ -49,13 +52,16 @@ class Verdict:
 
 
 def cameras_acquitted(record: xr.Dataset, truth: xr.Dataset | None) -> bool | None:
-    """Whether what the cameras measured misses the truth only by the noise that they state; None:
-    no truth is known, or the record is too short to judge."""
+    """Tell whether the cameras' errors are only the noise that they state.
+
+    None if no truth is known, or if the record is too short to judge.
+    """
     if truth is None:
         return None
     ok = record["measured_ok"].values.astype(bool)
     errors = true_poses(truth) - poses(record, "measured")
     roots = np.linalg.cholesky(record["measured_covariance"].values[ok])
+    # Whitened errors have unit covariance where the cameras state their noise correctly.
     white = np.full_like(errors, np.nan)
     white[ok] = np.linalg.solve(roots, errors[ok][..., None])[..., 0]
     try:
@@ -66,8 +72,10 @@ def cameras_acquitted(record: xr.Dataset, truth: xr.Dataset | None) -> bool | No
 
 
 def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
-    """What a result says; acquitted: whether the cameras cannot be the cause of what the model
-    leaves (see above).
+    """Return the verdict on a result.
+
+    ``acquitted`` is true if the cameras cannot be the cause of the residuals, as
+    `cameras_acquitted` returns it.
     """
     every = check_goals(result)
     unseen = bool(result.get("validation"))
@@ -75,12 +83,14 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
     explained = all(goal.passed for goal in explanation_goals(result))
     sentences = [_residual_sentence(result, explained, acquitted)]
     if unseen:
+        # What weighs most stands first: a model that does not explain its record is no model.
         sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
     sentences += [
         f"Not met: {sentence(goal)}"
         for goal in missed
         if goal.name not in (goals.RESIDUALS, goals.CHANCE)
     ]
+    # Without unseen runs no truth is known, and only the residuals can be judged.
     if not unseen:
         headline = EXPLAINED if explained else _blame(None, result)
         return Verdict(explained, headline, (*sentences, NO_TRUTH))
@@ -94,15 +104,14 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
 
 NO_TRUTH = (
     "No truth is known of this record. So nobody can tell here how far the measured poses, the "
-    "estimates and the "
-    "model's predictions are from the real robot: an error that the cameras repeat in every "
-    "frame, and an error of "
-    "the model that the parameters take up, leave no trace in the residuals."
+    "estimates and the model's predictions are from the real robot: an error that the cameras "
+    "repeat in every frame, and an error of the model that the parameters take up, leave no trace "
+    "in the residuals."
 )
 
 
 def sentence(goal: goals.Goal) -> str:
-    """A goal with its value and limit."""
+    """Return a sentence with the value and the limit of a goal."""
     relation = "at most" if goal.relation == "<=" else "at least"
     limit = f"{relation} {number(goal.limit)} {goal.unit}".strip()
     value = f"{number(goal.value)} {goal.unit}".strip()
@@ -110,7 +119,7 @@ def sentence(goal: goals.Goal) -> str:
 
 
 def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
-    """Three numbers of the first look."""
+    """Return three numbers for the first look."""
     identification = result["identification"]
     parameters = identification["parameters"]
     validation = result.get("validation")
@@ -133,25 +142,24 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
             number(measured, 2), "µm", "from the true pose: one pose as the cameras measure it."
         )
         return [worst, seen, shown]
-    before, after = (max(rms_row(result.get(key))[:3]) for key in ("before", "after"))
+    before = max(rms_row(result.get("before"))[:3])
+    after = max(rms_row(result.get("after"))[:3])
     left = KeyNumber(
         number(after, 2), "µm", "between the identified model and the measured poses of the record."
     )
-    began = KeyNumber(
-        *((number(before, 2), "µm") if np.isfinite(before) else ("–", "")),
-        "between the starting model and the same poses."
-        if np.isfinite(before)
-        else "The starting model is unstable.",
-    )
+    if np.isfinite(before):
+        meaning = "between the starting model and the same poses."
+        began = KeyNumber(number(before, 2), "µm", meaning)
+    else:
+        began = KeyNumber("–", "", "The starting model is unstable.")
     return [left, began, shown]
 
 
 def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
-    """How far both models are from the true robot on unseen trajectories."""
+    """Tell how far both models are from the true robot on unseen trajectories."""
     runs = result["validation"]
-    identified, started = (
-        np.array([rms_row(run.get(key)) for run in runs]) for key in ("true", "initial_true")
-    )
+    identified = np.array([rms_row(run.get("true")) for run in runs])
+    started = np.array([rms_row(run.get("initial_true")) for run in runs])
     turns = bool((identified[:, 3:] != 0).any())
     text = f"On {len(runs)} trajectories that it never saw, the identified model "
     if np.isfinite(identified).all():
@@ -168,16 +176,14 @@ def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
 
 
 def _distance(rows: Array, turns: bool) -> str:
-    """The worst of errors (n, 6) [µm, µrad], of the orientation where the robot turns."""
+    """Format the largest of errors (n, 6) [µm, µrad], without the angles if none turns."""
     position = float(rows[:, :3].max())
     orientation = float(rows[:, 3:].max())
     return f"{number(position, 2)} µm" + (f" and {number(orientation, 2)} µrad" if turns else "")
 
 
 def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool | None) -> str:
-    """Whether noise is all that the model leaves of the record, and who may be the cause where it
-    is not.
-    """
+    """Tell whether the residuals are only noise and, where they are not, what may be the cause."""
     found = {goal.name: goal for goal in explanation_goals(result)}
     if not found:
         return "How well the model explains the record was not tested."
@@ -202,11 +208,15 @@ def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool 
 
 
 def _drift_warning(result: dict[str, Any]) -> str | None:
-    """What the run's watch of the cameras says; None where they still fitted, or nobody watched."""
+    """Return the warning of the run's drift watch.
+
+    None where the cameras still fitted their calibration, or nobody watched.
+    """
     return (result.get("drift_watch") or {}).get("warning")
 
 
 def _cause(acquitted: bool | None, result: dict[str, Any]) -> str:
+    # Cameras that have moved spoil the measurement, whatever the model is.
     if warning := _drift_warning(result):
         return (
             f"{warning[0].upper()}{warning[1:]}. Calibrate them again; whether the model is "
@@ -215,8 +225,7 @@ def _cause(acquitted: bool | None, result: dict[str, Any]) -> str:
     if acquitted:
         return (
             "The cameras are not the cause, for they miss the truth only by the noise that they "
-            "state: the model's "
-            "geometry, joints or friction are not those of the robot."
+            "state: the model's geometry, joints or friction are not those of the robot."
         )
     if acquitted is None:
         return (

@@ -1,4 +1,4 @@
-"""The names of a robot's parameters, as a scenario may state them."""
+"""Names of a robot's parameters, as a scenario may state them."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -8,13 +8,14 @@ if TYPE_CHECKING:
 
 
 def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
-    """Raise ValueError for a name that is no parameter's of a robot, given by name or path, with
-    the valid ones; also where there is no such robot."""
+    """Check that names are those of parameters of a robot, given by name or path.
+
+    Raises ValueError with the valid names for one that is not, and if there is no such robot.
+    """
     if not known:
         return
-    from dynamics.errors import (
-        RobotFileError,
-    )  # dynamics loads CasADi, for which the command line must not wait
+    # Late imports: dynamics loads CasADi, for which the command line's help must not wait.
+    from dynamics.errors import RobotFileError
     from dynamics.parameters import parameter_layout
     from dynamics.robot_file import read_robot_file
 
@@ -24,19 +25,17 @@ def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
         raise ValueError(f"robot: {error}") from None
     for name in known:
         if name not in layout.names:
+            # TOML reads a dotted key without quotes as a table within a table.
             unquoted = any(full.startswith(f"{name}.") for full in layout.names)
-            hint = (
-                f'; its dot needs quotes: {{"{name}.…" = {{value = …, std = …}}}}'
-                if unquoted
-                else ""
-            )
+            quoted = f'; its dot needs quotes: {{"{name}.…" = {{value = …, std = …}}}}'
+            hint = quoted if unquoted else ""
             raise ValueError(
                 f"identification.prior: no parameter {name!r}; valid: {in_words(layout)}{hint}"
             )
 
 
 def in_words(layout: "ParameterLayout") -> str:
-    """The names of all parameters in one line."""
+    """Return the names of all parameters in one line."""
     kinds: dict[str, list[str]] = {}
     for body, kind in zip(layout.bodies, layout.kinds, strict=True):
         kinds.setdefault(kind.name, []).append(body)
@@ -44,8 +43,7 @@ def in_words(layout: "ParameterLayout") -> str:
     gains = ", ".join(f".{name.split('.')[1]}" for name in layout.joint_pid_names[1:])
     return (
         f"mass, Ixx, Iyy or Izz of {bodies} (platform.mass), coulomb or viscous of "
-        f"{_range(layout.joint_names)}, and "
-        f"{layout.joint_pid_names[0]}, {gains}"
+        f"{_range(layout.joint_names)}, and {layout.joint_pid_names[0]}, {gains}"
     )
 
 

@@ -1,5 +1,6 @@
-"""The sections of a scenario about the robot in its loop: servo, law of control, true plant and
-model of it.
+"""Sections of a scenario about the robot in its loop.
+
+They are the servo, the control law, the true plant and the model of it.
 """
 
 from typing import Literal, get_args
@@ -7,31 +8,41 @@ from typing import Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from dynamics.quantities import Gain, within
-from identify.plugins import LAWS, check_choice
+from identify.own_parts import LAWS, check_choice
 from identify.scenario.section import Section, quantity
 
 FrictionName = Literal["coulomb_viscous", "smoothed", "stribeck"]
-"""``coulomb_viscous``: the exact law with stick and slip (eq. 24); ``smoothed``: tanh(theta_dot /
-v_s); ``stribeck``: exact, with a breakaway torque above the Coulomb torque."""
+"""Friction laws of the joints.
+
+``coulomb_viscous`` is the exact law with stick and slip (eq. 24), ``smoothed`` has tanh(theta_dot /
+v_s) instead of the sign, and ``stribeck`` is exact with a breakaway torque above the Coulomb
+torque.
+"""
 
 FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
     "coulomb_viscous": (),
     "smoothed": (("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),),
     "stribeck": (("static_ratio",), ("stribeck_velocity_rad_s", "stribeck_velocity_m_s")),
 }
-"""The constants each law needs, one key of each; it takes no others."""
+"""Constants that each friction law needs, each with its possible keys. A law takes no others."""
 
 DriveName = Literal["pid", "pd", "pi", "cascade", "pid_filtered"]
-"""Laws by which drives make torques of joint commands: the paper's PID, parts of it, P-PI, or with
-a filtered rate; see `closed_loop.drives`."""
+"""Laws by which drives turn joint commands into torques, see `closed_loop.drives`.
+
+They are the paper's PID, parts of it, a P-PI cascade, and a PID with a filtered rate.
+"""
 
 FILTERED: DriveName = "pid_filtered"
 
 AUTO = "auto"
+"""Drive of a model whose law the record is to decide."""
 
 
 def check_filter(drive: str, seconds: float | None) -> None:
-    """Raise ValueError for a drive without its filter, or a filter that belongs to another."""
+    """Check that the filtered drive has the time constant of its filter, and no other has.
+
+    Raises ValueError otherwise.
+    """
     if (drive == FILTERED) != (seconds is not None):
         raise ValueError(
             f"drive = {drive!r} with derivative_filter_s = {seconds}: the law {FILTERED} needs "
@@ -46,7 +57,7 @@ DRIVE_GAINS: dict[str, tuple[str, ...]] = {
     "cascade": ("lp", "li", "ld"),
     "pid_filtered": ("lp", "li", "ld"),
 }
-"""Gains that each of them reads."""
+"""Gains that each law of the drives reads."""
 
 
 class Servo(Section):
@@ -58,9 +69,11 @@ class Servo(Section):
 
 
 class Control(Section):
-    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the
-    law pid, but for the excitation, which has a key of its own. The torque limit is that of all
-    runs, and the model knows it."""
+    """Law by which `cmmsim track` makes the robot follow a motion.
+
+    All other runs have the law pid, except the excitation, which has a key of its own. The torque
+    limit holds in all runs, and the model knows it.
+    """
 
     law: str = Field("pid", description=f"{', '.join(LAWS)}, or module:function")
     observer: bool = Field(
@@ -114,6 +127,7 @@ class _Friction(Section):
     def _constants_fit_the_law(self) -> "_Friction":
         for law, constants in FRICTION_CONSTANTS.items():
             for keys in constants:
+                # Keys of turning and of sliding actuators exclude each other.
                 given = {name: value for name in keys if (value := getattr(self, name)) is not None}
                 if (law == self.friction) != (len(given) == 1):
                     said = " and ".join(
@@ -122,19 +136,17 @@ class _Friction(Section):
                     needed = " and ".join(" or ".join(names) for names in constants)
                     raise ValueError(
                         f"friction = {self.friction!r} with {said}: the law {law} needs {needed}, "
-                        "and no other law "
-                        "has them"
+                        "and no other law has them"
                     )
         return self
 
 
 class Plant(_Friction):
-    """The simulated real robot. Each way in which it may differ from any model of the estimator is
-    a switch.
+    """Simulated real robot. Each way in which it may differ from the estimator's model is a switch.
 
-    At the largest geometry error all of 100 robots reach the whole box of +-10 mm and +-0.04 rad,
-    at twice that one does not. At the largest stiffness a run differs from that of rigid joints by
-    0.03 um, and takes 1000 steps a frame.
+    With the largest geometry error, all of 100 robots reach the whole box of +-10 mm and +-0.04
+    rad. With twice that error, one does not. With the largest stiffness, a run differs from that of
+    rigid joints by 0.03 um, and takes 1000 steps a frame.
     """
 
     parameters: str = Field(
@@ -216,7 +228,7 @@ class Plant(_Friction):
 
 
 class Model(_Friction):
-    """The estimator's model of the robot."""
+    """Estimator's model of the robot."""
 
     start_parameters: str = Field(
         "initial", description="named parameter set of the robot file, the starting guess"
@@ -235,12 +247,12 @@ class Model(_Friction):
 
     @property
     def drive_law(self) -> DriveName:
-        """Law of the drives; where the record is to tell, that of the paper until it has."""
+        """Law of the drives. Where the record is to decide, it is the paper's until then."""
         return "pid" if self.drive == "auto" else self.drive
 
     @property
     def drives_considered(self) -> tuple[DriveName, ...]:
-        """Laws of the drives that `auto` chooses between."""
+        """Laws of the drives that `auto` chooses from."""
         return tuple(
             law for law in get_args(DriveName) if law != FILTERED or self.derivative_filter_s
         )

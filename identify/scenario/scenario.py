@@ -1,8 +1,7 @@
-"""A scenario: everything that decides a synthetic experiment, read from TOML and checked as a
-whole.
+"""Scenario: settings of a synthetic experiment, read from TOML and checked as a whole.
 
-Each field states its unit; an error names the key, the value, the unit and, for a wrong name, the
-valid names.
+Each field states its unit. An error names the key, the value and the unit and, for a wrong name,
+the valid names.
 """
 
 from collections.abc import Iterator, Mapping
@@ -33,7 +32,7 @@ from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, 
 
 
 class Scenario(Section):
-    """A whole synthetic experiment; load one with `load_scenario`."""
+    """Whole synthetic experiment. `load_scenario` loads one."""
 
     name: Name = Field(description="short name, used for folders")
     description: str = ""
@@ -50,8 +49,7 @@ class Scenario(Section):
     renderer: str = Field(
         "auto",
         description="what draws the images: pyrender, analytic, auto: pyrender where OpenGL "
-        "works, or module:name; "
-        "statistical: nothing, it says what would be found in them",
+        "works, or module:name; statistical: nothing, it says what would be found in them",
     )
     pose_method: Literal["registration", "planes"] = "registration"
     rig: Rig = Rig()
@@ -63,7 +61,7 @@ class Scenario(Section):
     excitation: Excitation = Excitation()
     filter: Filter = Filter()
     identification: Identification = Identification()
-    # made late: its check is one of dynamics, which loads CasADi
+    # Made late, because its check is one of dynamics, which loads CasADi.
     payload: Payload = Field(default_factory=Payload)
     validation: Validation = Validation()
     geometry: Geometry = Geometry()
@@ -71,9 +69,8 @@ class Scenario(Section):
     @field_validator("renderer")
     @classmethod
     def _known_renderer(cls, name: str) -> str:
-        from cmmsim.plugins import (
-            require_renderer,
-        )  # the command line's help must not wait for the sensor
+        # A late import: the command line's help must not wait for the sensor.
+        from cmmsim.allowed_plugins import require_renderer
 
         return require_renderer(name)
 
@@ -86,13 +83,13 @@ class Scenario(Section):
     @classmethod
     def _names_parameters_of_its_robot(cls, values: Any) -> Any:
         if isinstance(values, Mapping):
+            # These are raw values: a section may be a dictionary or already a model.
             section = values.get("identification")
             robot = values.get("robot", cls.model_fields["robot"].default)
-            known = (
-                section.get("prior")
-                if isinstance(section, Mapping)
-                else getattr(section, "prior", None)
-            )
+            if isinstance(section, Mapping):
+                known = section.get("prior")
+            else:
+                known = getattr(section, "prior", None)
             if isinstance(known, Mapping) and isinstance(robot, str):
                 check_parameter_names(known, robot)
         return values
@@ -116,6 +113,8 @@ class Scenario(Section):
         if whole and not self.sensor_changes:
             return
         timing, note = completed(self.timing, self.sensor, self.sensor_changes)
+        # Past the frozen model, so that these values do not count as set: with another sensor they
+        # are taken from that one.
         self.__dict__["timing"] = timing
         if "sensor_note" not in self.model_fields_set:
             self.__dict__["sensor_note"] = note
@@ -127,14 +126,12 @@ class Scenario(Section):
         if nyquist <= highest:
             raise ValueError(
                 f"timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz is not above twice the "
-                "highest harmonic of "
-                f"the excitation, {highest:g} Hz"
+                f"highest harmonic of the excitation, {highest:g} Hz"
             )
         if cutoff >= nyquist:
             raise ValueError(
                 f"filter.cutoff_hz = {cutoff:g} Hz is not below the Nyquist frequency {nyquist:g} "
-                "Hz "
-                f"of timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz"
+                f"Hz of timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz"
             )
         if cutoff <= highest:
             raise ValueError(
@@ -149,42 +146,45 @@ class Scenario(Section):
         if self.timing.frames(self.excitation.duration_s) <= padding:
             raise ValueError(
                 f"excitation.duration_s = {self.excitation.duration_s:g} s is too short for the "
-                "filter, which needs "
-                f"more than {padding} frames ({padding / self.timing.frame_rate_hz:.3g} s)"
+                f"filter, which needs more than {padding} frames "
+                f"({padding / self.timing.frame_rate_hz:.3g} s)"
             )
 
     def _check_whole_frames(self, key: str, duration_s: float) -> None:
         frames = duration_s * self.timing.frame_rate_hz
+        # A product of decimal numbers may miss a whole number by rounding.
         if abs(frames - round(frames)) > 1e-6 or round(frames) < 1:
             raise ValueError(
                 f"{key} = {duration_s:g} s is {frames:g} frames at {self.timing.frame_rate_hz:g} "
-                "Hz, "
-                "not a whole number of frames"
+                "Hz, not a whole number of frames"
             )
 
     def with_overrides(self, overrides: Mapping[str, Any]) -> "Scenario":
-        """Copy with values replaced by dotted path, such as ``{"timing.frame_rate_hz": 30.0}``;
-        None takes one back.
+        """Return a copy with values replaced by dotted path.
 
-        A path among them starts from the current folder, and the copy holds it absolute, as files
-        leave it. What this scenario took from its sensor is taken again, from the copy's.
+        An example is ``{"timing.frame_rate_hz": 30.0}``. None restores the default. A value that is
+        a path starts from the current folder, and the copy holds it absolute, as files do. What
+        this scenario took from its sensor is taken again from the sensor of the copy.
 
-        Raises ScenarioError: a path that does not exist (with the valid names) or a value that does
+        Raises ScenarioError if a dotted path does not exist (with the valid names) or a value does
         not fit.
         """
+        # Values that are not set are left out, so that another sensor can provide them.
         data = self.model_dump(exclude_none=True, exclude_unset=True)
         for path, value in overrides.items():
             _replace(data, path, value)
         return SCENARIOS.from_dict(data, f"scenario {self.name!r}")
 
     def to_toml(self) -> str:
-        """Fully resolved TOML text, every default written out with its unit; reading it gives an
-        equal scenario.
+        """Return TOML text with every default written out with its unit.
+
+        Reading it gives an equal scenario.
         """
         return to_toml(self)
 
 
 def _robot_names() -> list[str]:
+    # A late import, as dynamics loads CasADi.
     from dynamics.robot_file import built_in_robots
 
     return built_in_robots()
@@ -205,35 +205,68 @@ SCENARIOS = SettingsFiles(
 
 
 def scenario_names() -> list[str]:
-    """Names of the built-in scenarios."""
+    """Return the names of the built-in scenarios."""
     return SCENARIOS.names()
 
 
-def load_scenario(name_or_path: str | Path) -> Scenario:
-    """Load a built-in scenario by name, or one from a TOML file, from whose folder its paths start.
+def load_scenario(name_or_path: str | Path, **entries: Any) -> Scenario:
+    """Load a built-in scenario by name, or one from a TOML file.
 
-    Raises ScenarioError: no such scenario (with the built-in names), no TOML, or wrong content.
+    Paths in a file start from the file's folder.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        Name of a built-in scenario, see `scenario_names`, or path of a file.
+    **entries
+        Values that replace those of the file: entries by name, sections as dictionaries.
+
+    Returns
+    -------
+    Scenario
+        Scenario, checked as a whole.
+
+    Raises
+    ------
+    ScenarioError
+        There is no such scenario or entry (with the valid names), or a value does not fit.
+
+    Examples
+    --------
+    >>> load_scenario("quick", renderer="analytic", timing={"latency_s": 0.01}).timing.latency_s
+    0.01
     """
-    return SCENARIOS.load(name_or_path)
+    found = SCENARIOS.load(name_or_path)
+    return found.with_overrides(dict(_dotted(entries))) if entries else found
+
+
+def _dotted(entries: Mapping[str, Any], section: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield entries of nested dictionaries by dotted path."""
+    for key, value in entries.items():
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{section}{key}.")
+        else:
+            yield f"{section}{key}", value
 
 
 def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
-    """Scenario from TOML text; ``source`` names it in error messages, and its paths start from the
-    current folder.
+    """Read a scenario from TOML text, whose paths start from the current folder.
 
-    Raises ScenarioError: no TOML, or wrong content.
+    ``source`` names it in error messages. Raises ScenarioError if the text is no TOML or does not
+    fit.
     """
     return SCENARIOS.from_toml(text, source)
 
 
 def scenario_schema() -> dict[str, Any]:
-    """JSON schema of scenario files, for editors; `built_in/scenario.schema.json` holds it."""
+    """Return the JSON schema of scenario files, which `built_in/scenario.schema.json` holds."""
     return Scenario.model_json_schema()
 
 
 def numbers_by_name() -> Iterator[str]:
-    """The keys of a scenario, dotted, whose values are tables of numbers by names, which may have
-    dots themselves.
+    """Yield the dotted keys whose values are tables of numbers by name.
+
+    Such names may have dots themselves.
     """
     for section, field in Scenario.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
@@ -246,9 +279,9 @@ def numbers_by_name() -> Iterator[str]:
 
 
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:
-    table = next(
-        (one for one in ("sensor_changes", *numbers_by_name()) if path.startswith(f"{one}.")), ""
-    )
+    # The keys of such a table may have dots, so that the path is split only up to the table.
+    tables = ("sensor_changes", *numbers_by_name())
+    table = next((one for one in tables if path.startswith(f"{one}.")), "")
     *sections, key = path.split(".", table.count(".") + 1 if table else -1)
     for section in sections:
         data = data.setdefault(section, {})
@@ -261,19 +294,22 @@ def _replace(data: dict[str, Any], path: str, value: Any) -> None:
 
 
 SECTIONS = ("identification", "model", "filter")
-"""What of a scenario is the estimator's alone: it may change after the record was made, all else
-may not.
+"""Sections of a scenario that only the estimator reads.
+
+They may change after the record was made. All others may not.
 """
 
 RECORDED = ("identification.scale_anchor", "identification.anchor_std")
-"""Settings of these sections that a record follows all the same: it holds what its anchor measured.
+"""Settings of these sections that the record depends on.
+
+The record holds what its scale anchor measured.
 """
 
 
 def with_estimator_settings(scenario: Scenario, overrides: Mapping[str, Any]) -> Scenario:
-    """Copy of the scenario of a record with other settings of the estimator, by dotted path.
+    """Return a record's scenario with other settings of the estimator, by dotted path.
 
-    Raises ScenarioError: a setting that the record was made with (with the sections allowed), or as
+    Raises ScenarioError if the record was made with a setting (with the sections allowed), or as
     `with_overrides` does.
     """
     for path in overrides:
@@ -282,14 +318,13 @@ def with_estimator_settings(scenario: Scenario, overrides: Mapping[str, Any]) ->
             allowed = ", ".join(f"{allowed}.*" for allowed in SECTIONS)
             raise ScenarioError(
                 f"{path!r} cannot be set for an identification: the record was made with the rest "
-                "of the scenario; "
-                f"allowed: {allowed}, except {' and '.join(RECORDED)}"
+                f"of the scenario; allowed: {allowed}, except {' and '.join(RECORDED)}"
             )
     return scenario.with_overrides(overrides) if overrides else scenario
 
 
 def estimator_settings(scenario: Scenario) -> dict[str, Any]:
-    """All settings of the estimator by dotted path; those that are not set are left out."""
+    """Return all settings of the estimator by dotted path, without those that are not set."""
     return {
         f"{section}.{name}": value
         for section in SECTIONS

@@ -1,6 +1,4 @@
-"""What every section of a scenario is: fields with units and limits, and the keys of a robot's
-actuators.
-"""
+"""Base of all sections of a scenario: fields with units and limits, and keys of the actuators."""
 
 from typing import Any
 
@@ -32,7 +30,7 @@ ACTUATOR_KEYS = {
     "torque_limit": ("torque_limit_N_m", "torque_limit_N"),
     "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
 }
-"""Settings of the joints: their key where a robot's actuators turn, and where they slide."""
+"""Keys of the settings of the joints, for actuators that turn and for those that slide."""
 
 
 RANGES = {
@@ -56,18 +54,22 @@ RANGES = {
 
 
 def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
-    """A field with a unit, in whose range its values must be.
+    """Return a field with a unit, whose values must be in the range of the unit.
 
-    limits: further ones, as pydantic names them, such as ge and lt. A field that may be negative
-    has the range that these say.
+    ``limits`` are further ones, as pydantic names them, such as ge and lt. For a field that may be
+    negative, only these hold.
     """
     field = Field(default, description=what, json_schema_extra={"unit": unit}, **limits)
     if unit in RANGES and not limits.get("ge", 0) < 0:
+        # As a validator in the field's metadata, the range adds to the limits of pydantic.
         field.metadata.append(RANGES[unit])
     return field
 
 
 class Section(BaseModel):
-    """What all sections are: frozen, of exact types, with known keys and finite numbers only."""
+    """Base of all sections.
+
+    Sections are frozen. They have exact types, known keys and finite numbers only.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)

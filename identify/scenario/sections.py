@@ -1,5 +1,6 @@
-"""The sections of a scenario. Each field states its unit and its limits; what a section checks
-concerns it alone.
+"""Sections of a scenario that do not concern the control loop.
+
+Each field states its unit and its limits. A section checks only its own values.
 """
 
 from collections.abc import Mapping
@@ -8,18 +9,19 @@ from typing import Literal
 from pydantic import Field, field_validator, model_validator
 
 from dynamics.quantities import Within
-from identify.plugins import CRITERIA, LAWS, check_choice
+from identify.own_parts import CRITERIA, LAWS, check_choice
 from identify.scenario.section import Section, quantity
 
 ROUNDING = 1e-9
-"""Share by which the moments of a flat body may miss their sum."""
+"""Relative tolerance for the moments of a flat body, of which two sum to the third."""
 
 
 def check_moments(moments: Mapping[str, float]) -> None:
     """Check the three principal moments of inertia [kg m2] of one body, by their names.
 
-    Raises ValueError where one exceeds the sum of the other two, which no distribution of mass has.
+    Raises ValueError if one exceeds the sum of the other two, which no distribution of mass has.
     """
+    # A late import: dynamics loads CasADi, for which the command line's help must not wait.
     from dynamics.inertia import moments_fault
 
     fault = moments_fault(moments, ROUNDING)
@@ -28,9 +30,9 @@ def check_moments(moments: Mapping[str, float]) -> None:
 
 
 def check_load_std(name: str, std: float, load_name: str, load: float, unit: str) -> None:
-    """Check how well a figure of a known load is known, by the names of both.
+    """Check the standard deviation of a figure of a known load.
 
-    Raises ValueError where the standard deviation exceeds the figure itself.
+    Raises ValueError if it exceeds the figure itself.
     """
     if std > load:
         raise ValueError(
@@ -40,7 +42,7 @@ def check_load_std(name: str, std: float, load_name: str, load: float, unit: str
 
 
 class Excitation(Section):
-    """The exciting trajectory (eq. 37) and its optimisation (eq. 39)."""
+    """Exciting trajectory (eq. 37) and its optimisation (eq. 39)."""
 
     fundamental_hz: float = quantity(0.1, "Hz", "fundamental frequency f0", gt=0)
     harmonics: int = quantity(5, "1", "number of harmonics n", ge=2, le=100)
@@ -81,8 +83,7 @@ class Excitation(Section):
     law: str = Field(
         "pid",
         description=f"law of the run, which knows the starting model: {', '.join(LAWS)}, or "
-        "module:function; under "
-        "another than pid the model gets the logged commands",
+        "module:function; under another than pid the model gets the logged commands",
     )
     generations: int = quantity(
         324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000
@@ -114,27 +115,30 @@ class Filter(Section):
 
 
 class PriorValue(Section):
-    """What is known of a parameter before the experiment, in its SI unit."""
+    """Prior knowledge of a parameter before the experiment, in its SI unit."""
 
     value: float = quantity(..., "SI", "expected value", ge=0, le=1e12)
     std: float = quantity(..., "SI", "its standard deviation", ge=1e-24, le=1e12)
 
 
 CAMERA_CHANGE = Within(-1e3, 1e3, "in the unit of the parameter")
+"""Range of the error or the drift of one parameter of a camera."""
 
 RIG_KNOWN = ["exact", "calibrated", "photographs"]
-"""How well a rig may be known, beside the path of a calibration's result."""
+"""Ways in which a rig may be known, besides the path of a calibration's result."""
 
 
 class Rig(Section):
-    """How well the estimator knows the cameras; those that take the pictures are the sensor
-    file's."""
+    """Estimator's knowledge of the cameras.
+
+    The cameras that take the images are those of the sensor's file.
+    """
 
     known: str = Field(
         "exact",
         description="exact; calibrated: from pictures of a board that the run takes first; "
-        "photographs: as fifteen "
-        "photographs of a board leave it; or a calibration.json, whose covariance says how well",
+        "photographs: as fifteen photographs of a board leave it; or a calibration.json, whose "
+        "covariance says how well",
     )
     pairs: int = quantity(20, "1", "pairs of pictures of the board, where calibrated", ge=3, le=500)
     errors: dict[str, float] = Field(
@@ -161,8 +165,7 @@ class Rig(Section):
     watch: Literal["platform", "both", "none"] = Field(
         "platform",
         description="whose stickers tell a run whether the cameras still are as they were; both: "
-        "the base's, too, "
-        "in twice the time",
+        "the base's, too, in twice the time",
     )
 
     @field_validator("errors", "drift")
@@ -177,12 +180,12 @@ class Rig(Section):
 
     @property
     def exact(self) -> bool:
-        """Whether the estimator takes the rig, and what was taught with it, for exact."""
+        """True if the estimator takes the rig, and what was taught with it, as exact."""
         return self.known == "exact" and self.right_later_std_s == 0.0
 
 
 GEOMETRY_KNOWN = ["exact", "calibrated"]
-"""How well a geometry may be known, beside the path of a calibrated robot."""
+"""Ways in which a geometry may be known, besides the path of a calibrated robot."""
 
 
 class Identification(Section):
@@ -233,11 +236,9 @@ class Identification(Section):
     @model_validator(mode="after")
     def _anchor_measures_what_is_stated(self) -> "Identification":
         if self.anchor_std is not None and self.scale_anchor in ("payload", "prior"):
-            hint = (
-                "; payload.mass_std_kg says how well its load is known"
-                if self.scale_anchor == "payload"
-                else ""
-            )
+            hint = ""
+            if self.scale_anchor == "payload":
+                hint = "; payload.mass_std_kg says how well its load is known"
             raise ValueError(
                 f"anchor_std = {self.anchor_std:g}: the anchor {self.scale_anchor} measures no "
                 f"parameter{hint}"
@@ -246,16 +247,15 @@ class Identification(Section):
 
 
 LOAD_UNITS = {"mass": "kg", "Ixx": "kg_m2", "Iyy": "kg_m2", "Izz": "kg_m2"}
-"""The figures of a load, with the units that end their keys."""
+"""Figures of a load, with the units that end their keys."""
 
 
 class Payload(Section):
-    """The known load that the platform carries in the second run, where the scale anchor is a
-    payload.
+    """Known load that the platform carries in the second run, if the scale anchor is a payload.
 
     A load that is a percent heavier than stated makes all parameters a percent too small, and no
-    residual tells. So state how well it is known: intervals allow for it, and a synthetic
-    experiment draws its true load accordingly.
+    residual shows it. The standard deviations say how well the load is known. Intervals allow for
+    them, and a synthetic experiment draws its true load from them.
     """
 
     mass_kg: float = quantity(
@@ -303,15 +303,15 @@ class Validation(Section):
 
 
 class Geometry(Section):
-    """Kinematic calibration by static poses, `cmmsim geometry`, and what servo and estimator of a
-    run know of it.
+    """Kinematic calibration by static poses (`cmmsim geometry`).
+
+    It also says what servo and estimator of a run know of the geometry.
     """
 
     known: str = Field(
         "exact",
         description="exact: the robot file's; calibrated: by static poses, which the run measures "
-        "first; or the "
-        "robot.toml of a calibration, with its covariance beside it",
+        "first; or the robot.toml of a calibration, with its covariance beside it",
     )
     poses: int = quantity(60, "1", "number of poses that are measured", ge=1, le=10_000)
     frames_per_pose: int = quantity(20, "1", "frames whose mean counts as a pose", ge=1, le=10_000)
@@ -360,15 +360,15 @@ class Geometry(Section):
 
     @model_validator(mode="after")
     def _stands_where_it_is_known(self) -> "Geometry":
+        # A calibration alone may leave the frames unknown; a run needs the robot's place.
         if self.known == "calibrated" and self.frames == "unknown":
             raise ValueError(
                 "known = 'calibrated' with frames = 'unknown': the geometry would be known up to "
-                "where the robot "
-                "stands, and a run needs frames = 'taught'"
+                "where the robot stands, and a run needs frames = 'taught'"
             )
         return self
 
     @property
     def exact(self) -> bool:
-        """Whether servo and estimator take the robot file's geometry for exact."""
+        """True if servo and estimator take the robot file's geometry as exact."""
         return self.known == "exact"

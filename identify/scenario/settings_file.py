@@ -1,6 +1,4 @@
-"""Files of settings (TOML), such as scenarios and studies: which there are, how one is read,
-written and refused.
-"""
+"""Files of settings (TOML), such as scenarios and studies: reading, writing and error messages."""
 
 import dataclasses
 import json
@@ -22,12 +20,21 @@ Settings = TypeVar("Settings", bound=BaseModel)
 
 @dataclass(frozen=True)
 class SettingsFiles(Generic[Settings]):
-    """The files of one kind, as ``scenario``: those of a folder of the package, by name, and a
-    user's own, by path.
+    """Files of one kind: built-in ones by name, and a user's own by path.
 
-    model: what they hold; error: what a refusal raises, with the reason in one line; files: keys,
-    dotted where they stand in tables, that name files of another kind, each with the names that are
-    built in. Such a path, also one in a list of them, starts from the file that states it.
+    Attributes
+    ----------
+    kind
+        Name of the kind, such as ``scenario``.
+    folder
+        Folder of the package with the built-in files.
+    model
+        Model of the content.
+    error
+        Exception that a refusal raises, with the reason in one line.
+    files
+        Keys, dotted for those in tables, that name files of another kind, each with the names that
+        are built in. Such a path, or a list of paths, starts from the file that states it.
     """
 
     kind: str
@@ -37,14 +44,14 @@ class SettingsFiles(Generic[Settings]):
     files: Mapping[str, Callable[[], Collection[str]]] = dataclasses.field(default_factory=dict)
 
     def names(self) -> list[str]:
-        """Names of the built-in files."""
+        """Return the names of the built-in files."""
         return sorted(path.stem for path in self.folder.glob("*.toml"))
 
     def load(self, name_or_path: str | Path) -> Settings:
         """Read a built-in file by name, or a user's own by path.
 
-        Raises IdentifyError: of this kind: neither a built-in name nor a file (with the names), no
-        TOML, wrong content.
+        Raises the error of this kind if there is neither such a name (with the names) nor such a
+        file, or if the file is no TOML or has wrong content.
         """
         text, path = self.text(name_or_path)
         built_in = path.parent == self.folder
@@ -52,13 +59,15 @@ class SettingsFiles(Generic[Settings]):
         return self.from_toml(text, source, path.parent)
 
     def text(self, name_or_path: str | Path) -> tuple[str, Path]:
-        """The text of a built-in file by name, or of a user's own by path, and where it stands.
+        """Return the text and the path of a built-in file by name, or of a user's own by path.
+
         Raises as `load`.
         """
         name = str(name_or_path)
         built_in = self.names()
         path = self.folder / f"{name}.toml" if name in built_in else Path(name)
         if not is_file(path):
+            # The system refuses to look for names with a null character or of great length.
             folder = "\0" not in name and len(name) < 200 and path.is_dir()
             reason = " nor a file" + ", but a folder" * folder
             raise self.error(
@@ -67,20 +76,24 @@ class SettingsFiles(Generic[Settings]):
         return read_text(path, f"{self.kind} file {name}", self.error), path
 
     def from_toml(self, text: str, source: str, folder: Path = Path()) -> Settings:
-        """Settings from TOML text; `source` names it in messages, its paths start from `folder`.
-        Raises as `load`.
+        """Read settings from TOML text.
+
+        ``source`` names it in messages. Its paths start from ``folder``. Raises as `load`.
         """
         return self.from_dict(parse_toml(text, source, self.error), source, folder)
 
     def from_dict(self, content: Mapping[str, Any], source: str, folder: Path = Path()) -> Settings:
-        """Settings from nested mappings, all wrong entries named in one line. Raises as `load`."""
+        """Read settings from nested mappings.
+
+        An error names all wrong entries in one line. Raises as `load`.
+        """
         try:
             return self.model.model_validate(self._placed(content, folder))
         except ValidationError as error:
             raise self.error(f"{source}: {one_line(error, self.model)}") from error
 
     def _placed(self, value: Any, folder: Path, key: str = "") -> Any:
-        """What stands at a dotted key, with its paths made absolute from a folder on."""
+        """Return the value at a dotted key, with its paths made absolute from a folder."""
         if isinstance(value, Mapping):
             return {
                 name: self._placed(one, folder, f"{key}.{name}".lstrip("."))
@@ -93,32 +106,31 @@ class SettingsFiles(Generic[Settings]):
 
 
 def file_path(name: str, folder: Path, built_in: Collection[str]) -> str:
-    """The absolute path of a file that is named relative to a folder; a built-in name stays one.
+    """Return the absolute path of a file that is named relative to a folder.
 
-    So does what is neither: it is left for whoever reads the file to refuse, with the valid names.
+    A built-in name is returned as it is. So is a name that is neither built in nor a file: the
+    reader of the file refuses it with the valid names.
     """
     path = folder / name
-    return (
-        name
-        if name in built_in or not (path.suffix == ".toml" or is_file(path))
-        else str(path.resolve())
-    )
+    if name in built_in or not (path.suffix == ".toml" or is_file(path)):
+        return name
+    return str(path.resolve())
 
 
 def to_toml(model: BaseModel) -> str:
-    """TOML text of a two-level pydantic model: plain values first, then one table a section, units
-    as comments.
+    """Return the TOML text of a two-level pydantic model, with units as comments.
 
-    Fields whose value is None have no TOML form and are left out.
+    Plain values come first, and then a table for each section. Fields whose value is None have no
+    TOML form and are left out.
     """
     return _text(model, lambda owner, name: None if getattr(owner, name) is None else "")
 
 
 def starting_toml(model: BaseModel, only: Collection[str] | None = None) -> str:
-    """The same text to start from: what is not stated is a comment, with the value that holds so,
-    or with none.
+    """Return TOML text to start a file from.
 
-    only: the fields and sections that are written, all by default.
+    It is that of `to_toml`, but a value that is not stated is a comment, which shows the default or
+    no value. Only the given fields and sections are written, by default all.
     """
     return _text(model, lambda owner, name: "" if name in owner.model_fields_set else "# ", only)
 
@@ -128,7 +140,10 @@ def _text(
     before: Callable[[BaseModel, str], str | None],
     only: Collection[str] | None = None,
 ) -> str:
-    """TOML text; before: what stands before the entry of a field, None where it has no entry."""
+    """Return TOML text.
+
+    ``before`` returns what stands before the entry of a field, or None if the field has no entry.
+    """
 
     def entries(section: BaseModel) -> list[str]:
         fields = type(section).model_fields.items()
@@ -156,7 +171,7 @@ def _text(
 
 
 MOST_COMPLAINTS = 8
-"""Complaints about one file; more are counted."""
+"""Number of errors of one file that are listed. The rest is counted."""
 
 DOTTED = (
     "; a name with a dot stands in quotes, which a shell leaves inside of others: "
@@ -165,8 +180,9 @@ DOTTED = (
 
 
 def one_line(error: ValidationError, model: type[BaseModel]) -> str:
-    """All complaints of a validation in one line, each with key, value, unit and, where wrong, the
-    valid names.
+    """Return all errors of a validation in one line.
+
+    Each has key, value and unit and, for a wrong name, the valid names.
     """
     found = error.errors()
     said = [_complaint(details, model) for details in found[:MOST_COMPLAINTS]]
@@ -175,15 +191,15 @@ def one_line(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def _entry(name: str, value: Any, field: FieldInfo) -> str:
-    comment = "".join(
-        [f" [{unit}]" if (unit := _unit(field)) else "", f" {field.description or ''}"]
-    ).strip()
+    unit = _unit(field)
+    comment = f"{f'[{unit}]' if unit else ''} {field.description or ''}".strip()
     entry = f"{name} = {_toml_value(value)}" if value is not None else f"{name} ="
     return f"{entry:<40} # {comment}" if comment else entry
 
 
 def _toml_value(value: Any) -> str:
     if isinstance(value, str):
+        # Strings of JSON are strings of TOML, but for the control character DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(_toml_value(one) for one in value)}]"
@@ -209,6 +225,7 @@ def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{key} is missing"
     unit = f" [{u}]" if path and path[-1] in fields and (u := _unit(fields[path[-1]])) else ""
     message = details["msg"]
+    # A dotted name without quotes makes a table where a number should be.
     nested = isinstance(details["input"], dict) and details["type"] == "float_type"
     return (
         f"{key} = {shown(details['input'])}{unit}: "
@@ -217,11 +234,13 @@ def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
-    """The model whose field the path's last part names; a part of the path may be the key of a
-    mapping to models.
+    """Return the model that has the field at the end of a path.
+
+    A part of the path may be the key of a mapping to models.
     """
     owner: Any = model
     for part in path[:-1]:
+        # The next part of the path is a key of the user's own, and names no field.
         if get_origin(owner) is dict:
             owner = get_args(owner)[1]
         elif (

@@ -1,8 +1,8 @@
-"""When the sensor looks and when its poses are used: the one timing of sensor, servo and model.
+"""Timing of sensor, servo and model: when the sensor looks, and when its poses are used.
 
-The sensor's file states it, in keys without units, and a scenario may state single values
-otherwise; this is the only place that knows both spellings. Imports of the sensor stand in the
-functions: the command line's help must not wait for them.
+The sensor's file states it, in keys without units, and a scenario may replace single values. Only
+this module knows both spellings. It imports the sensor within functions, because the command line's
+help must not wait for that.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cmmsim.files import Timing as SensorTiming
 
 LATENCY_STDS = 5.0
-"""Standard deviations by which the mean latency may be longer than stated."""
+"""Standard deviations by which the mean latency may exceed the stated one."""
 
 IN_FILE = {
     "frame_rate_hz": "frame_rate",
@@ -28,14 +28,14 @@ IN_FILE = {
     "latency_jitter_s": "latency_jitter",
     "dropout": "dropout",
 }
-"""The sensor file's key of each key of a scenario's ``[timing]``."""
+"""Keys of the sensor's file, by the keys of a scenario's ``[timing]``."""
 
 
 class Timing(Section):
     """Sampling of the pose sensor and of the visual servo.
 
-    All but the hold is the sensor file's where a scenario does not state it. A measured pose is
-    that in the middle of its exposure, which is the time of its frame.
+    All values except the hold are the sensor file's where a scenario does not state them. A
+    measured pose is that in the middle of its exposure, which is the time of its frame.
     """
 
     frame_rate_hz: float = quantity(
@@ -62,22 +62,24 @@ class Timing(Section):
         return 1.0 / self.frame_rate_hz
 
     def frames(self, duration_s: float) -> int:
-        """Number of frames in a duration."""
+        """Return the number of frames in a duration."""
         return round(duration_s * self.frame_rate_hz)
 
     def frame_times(self, duration_s: float) -> Array:
-        """Instants of exposure (N,) [s], each the middle of one, of a run: whole frames, its end
-        excluded.
+        """Return the times (N,) [s] of the frames of a run, each in the middle of an exposure.
+
+        The run has whole frames, and its end is excluded.
         """
         return np.arange(self.frames(duration_s), dtype=float) * self.frame_period_s
 
     def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array | None:
-        """Latency of each frame (frames,) [s] of a run; None where all have the mean."""
+        """Draw the latency of each frame (frames,) [s]; None where all have the mean."""
         return self.of_sensor().drawn_latencies(frames, rng) if self.latency_jitter_s else None
 
     def of_sensor(self) -> "SensorTiming":
-        """The same values as a sensor's file holds them. Raises ValueError: values that contradict
-        each other.
+        """Return the same values as a sensor's file holds them.
+
+        Raises ValueError if they contradict each other.
         """
         from cmmsim.files import Timing as SensorTiming
 
@@ -87,36 +89,45 @@ class Timing(Section):
             raise ValueError(f"timing: {error.errors()[0]['ctx']['error']}") from error
 
     def check(self) -> None:
-        """Refuse values that contradict each other, and a latency that the closed loop cannot hold
-        back.
+        """Check that the values agree, and that the closed loop can delay commands by the latency.
 
-        Raises ValueError: with the longest latency that is possible.
+        Raises ValueError otherwise, with the longest possible latency.
         """
-        from dynamics.closed_loop.loop_settings import (
-            MAX_DELAY_FRAMES,
-        )
+        from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 
+        # The true mean may be longer than the stated one by what is not known of it.
         longest = self.of_sensor().largest_latency + LATENCY_STDS * self.latency_std_s
         if longest * self.frame_rate_hz > MAX_DELAY_FRAMES:
             raise ValueError(
                 f"timing.latency_s = {self.latency_s:g} s with timing.latency_jitter_s = "
-                f"{self.latency_jitter_s:g} s "
-                f"and timing.latency_std_s = {self.latency_std_s:g} s reaches {longest:.4g} s, "
-                f"{longest * self.frame_rate_hz:.1f} frames of {self.frame_rate_hz:g} Hz; at most "
-                f"{MAX_DELAY_FRAMES} "
-                "frames are possible"
+                f"{self.latency_jitter_s:g} s and timing.latency_std_s = {self.latency_std_s:g} s "
+                f"reaches {longest:.4g} s, {longest * self.frame_rate_hz:.1f} frames of "
+                f"{self.frame_rate_hz:g} Hz; at most {MAX_DELAY_FRAMES} frames are possible"
             )
 
 
 def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[Timing, str]:
-    """Timing with what it does not state itself from a built-in sensor or a sensor's file, and the
-    note of that file.
+    """Return a timing completed from a sensor, and the note of the sensor's file.
 
-    What comes from the sensor does not count as set: with another sensor it is taken from that one.
-    ``changes``: a scenario's ``[sensor_changes]`` by dotted key.
+    What comes from the sensor does not count as set, so that with another sensor it is taken from
+    that one.
 
-    Raises ValueError: changes without effect, as the scenario itself states otherwise; or a timing
-    that none may have. Raises cmmsim.CmmError: no such sensor, or a bad file.
+    Parameters
+    ----------
+    stated
+        Timing that the scenario states. The rest is taken from the sensor.
+    sensor
+        Name of a built-in sensor, or path of a sensor's file.
+    changes
+        A scenario's ``[sensor_changes]`` by dotted key.
+
+    Raises
+    ------
+    ValueError
+        A change has no effect, because the scenario itself states another value, or the timing is
+        not valid.
+    cmmsim.CmmError
+        There is no such sensor, or its file is bad.
     """
     from cmmsim.files import read_sensor_file
 
@@ -127,26 +138,27 @@ def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[
         if f"timing.{IN_FILE[name]}" in changes and own[name] != of_file[name]:
             raise ValueError(
                 f"sensor_changes.timing.{IN_FILE[name]} = {of_file[name]:g} has no effect where "
-                "the scenario itself "
-                f"states timing.{name} = {own[name]:g}"
+                f"the scenario itself states timing.{name} = {own[name]:g}"
             )
     try:
         whole = Timing(**(of_file | own))
     except ValidationError as error:
         raise ValueError(f"timing of the sensor {sensor!r}: {one_line(error, Timing)}") from error
+    # The values are validated already. Only the scenario's own count as set.
     return Timing.model_construct(_fields_set=set(own), **whole.model_dump()), file.note
 
 
 def sensor_names() -> list[str]:
-    """Names of the built-in sensors."""
+    """Return the names of the built-in sensors."""
     from cmmsim.files import built_in_names
 
     return built_in_names()
 
 
 def by_dotted_key(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A scenario's ``[sensor_changes]``, also as tables in tables, by dotted key of the sensor's
-    file.
+    """Return a scenario's ``[sensor_changes]`` by dotted key of the sensor's file.
+
+    They may be tables within tables.
     """
     from cmmsim.files import dotted
 

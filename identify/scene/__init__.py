@@ -1,10 +1,9 @@
-"""What an experiment looks like: robot, stickers and cameras, their images, and the page that
-replays a run.
+"""Scene of an experiment: robot, stickers, cameras, their images, and the page that replays a run.
 
-workcell(robot, sensor), workcell_of_scenario(scenario) -> Workcell    robot and sensor as they
-stand stereo_view(cell, pose) -> StereoView          both camera images, and the stickers found in
-them scene_figure(cell, pose) -> Figure             the scene, drawn for print stereo_figure(view)
--> Figure                  both images with what was found, drawn for print
+- `workcell` and `workcell_of_scenario` place robot and sensor.
+- `stereo_view` draws both camera images and finds the stickers in them.
+- `scene_figure`, `stereo_figure` and `overview_figure` draw for print.
+- `read_motion` and `write_page` make a page that replays a run.
 """
 
 from identify.scene.camera_images import Found, StereoView, stereo_view

@@ -1,5 +1,6 @@
-"""Both camera images of a pose, cut to where the robot is, and the stickers that the project's
-detector finds there.
+"""Camera images of a pose, cut to the robot, and the stickers that are found in them.
+
+The detector is that of the project.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,17 +16,26 @@ from identify.arrays import Array
 from identify.scene.workcell import Workcell
 
 MARGIN_PX = 24.0
-"""Around stickers and bodies, in the part of the images that is shown."""
+"""Margin around stickers and bodies, in the part of the images that is shown."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """k stickers of one body that were found in both images.
+    """Stickers of one body, k of them, that were found in both images.
 
-    ids (k,); centres (2, k, 2) in the whole images, px; shapes (2, k, 2, 2) px: each carries the
-    unit disc onto the detected ellipse, None where the detector states none; expected (2, k, 2):
-    where the true places are seen, px; points (k, 3) m and covariances (k, 3, 3) m^2, triangulated,
-    base axes.
+    Attributes
+    ----------
+    ids
+        Names (k,).
+    centres
+        Centres (2, k, 2) in the whole images, in px.
+    shapes
+        Matrices (2, k, 2, 2) that map the unit disc to the detected ellipses, in px. None where the
+        detector states none.
+    expected
+        Images (2, k, 2) of the true places, in px.
+    points, covariances
+        Triangulated points (k, 3), in m, and their covariances (k, 3, 3), in m², in the base frame.
     """
 
     ids: tuple[str, ...]
@@ -38,10 +48,10 @@ class Found:
 
 @dataclass(frozen=True)
 class StereoView:
-    """Both camera images of one pose (6,) m and rad, drawn with noise.
+    """Camera images of one pose (6,) [m, rad], drawn with noise.
 
-    images (2, h, w) uint8, a part of the whole images whose first pixels (x, y) are corners (2, 2);
-    found: stickers by the body's name, "platform" and "base".
+    ``images`` (2, h, w) are parts of the whole images. ``corners`` (2, 2) are the places (x, y) of
+    their first pixels. ``found`` holds the stickers of the bodies "platform" and "base".
     """
 
     pose: Array
@@ -51,12 +61,18 @@ class StereoView:
 
 
 class StereoEye:
-    """Draws the images of a workcell's sensor at one pose after another, and finds the stickers in
-    them.
+    """Sensor of a workcell that draws images at given poses, and finds the stickers in them.
 
-    Nothing is taught: a sticker is looked for about its nominal place. seed: of the noise;
-    renderer: "analytic" needs no OpenGL; region: first pixels (2, 2) and side px of the part that
-    is shown, None: the whole images.
+    Nothing is taught: a sticker is searched near its nominal place.
+
+    Parameters
+    ----------
+    seed
+        Seed of the noise.
+    renderer
+        "analytic", which needs no OpenGL, or "pyrender".
+    region
+        First pixels (2, 2) and side, in px, of the part that is shown; None for the whole images.
     """
 
     def __init__(
@@ -73,11 +89,13 @@ class StereoEye:
         self._region = region
 
     def look(self, pose: Array) -> StereoView:
-        """Images and stickers at a pose (6,). Raises dynamics.UnreachablePoseError,
-        cmmsim.CmmError.
+        """Return images and stickers at a pose (6,).
+
+        Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
         """
         drawn = self._sensor.look(pose, self._cell.obstacles(pose))
         if self._region is not None and self._sensor.renderer == "analytic":
+            # The analytic renderer can draw a part alone, without the rest of the image.
             corners, side = self._region
             images: NDArray = drawn.windows(corners[:, None], side)[:, 0]
         else:
@@ -89,15 +107,16 @@ class StereoEye:
                 images = _Cut(images, np.zeros_like(corners)).windows(corners[:, None], side)[:, 0]
         cut = _Cut(images, corners)
         found = {body.name: self._found(cut, pose, k) for k, body in enumerate(self._cell.bodies)}
+        # The sensor may have more grey levels than the eight bits of a page's image.
         white = self._sensor.noise.white_level
         return StereoView(
             pose, np.asarray(images * (255.0 / white), dtype=np.uint8), corners, found
         )
 
     def _found(self, images: "_Cut", pose: Array, number: int) -> Found:
-        """Stickers of the platform (0) or the base (1)."""
+        """Find the stickers of the platform (0) or the base (1)."""
         body = self._cell.bodies[number]
-        nominal = self._cell.marked(self._cell.bodies[number].name)
+        nominal = self._cell.marked(body.name)
         place = self._camera_from_base @ (pose_to_transform(pose) if number == 0 else np.eye(4))
         seen = self._sensor.observer.observe(
             images, place, nominal.nominal, nominal.sticker_normals
@@ -117,49 +136,50 @@ class StereoEye:
 def stereo_view(
     cell: Workcell, pose: Array | None = None, seed: int = 0, renderer: str = "analytic"
 ) -> StereoView:
-    """Both camera images of a workcell at a pose (6,), by default home, cut to the robot, and the
-    stickers in them.
+    """Draw the camera images of a workcell, cut to the robot, and find the stickers in them.
 
-    seed: of the noise; renderer: "pyrender" needs OpenGL. Raises dynamics.UnreachablePoseError,
-    cmmsim.CmmError.
+    The pose (6,) is by default home, and ``seed`` is that of the noise. The renderer "pyrender"
+    needs OpenGL. Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
     """
     at = cell.home if pose is None else np.asarray(pose, dtype=float)
     return StereoEye(cell, seed, renderer, region_of(cell, [at])).look(at)
 
 
 def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_], int]:
-    """First pixels (2, 2) and side px of a square part of both images that shows both bodies at all
-    poses (6,).
+    """Return a square part of both images that shows both bodies at all poses (6,).
+
+    It is given by its first pixels (2, 2) and its side, in px.
     """
     assert cell.rig is not None
     rig, camera_from_base = cell.rig
     platform, base = (body.vertices for body in cell.bodies)
+    # Both bodies are convex, so that their vertices bound their images.
     points = np.vstack([base, *(apply(pose_to_transform(pose), platform) for pose in poses)])
     pixels = rig.project(apply(camera_from_base, points))[0]
     size = np.array([[camera.width, camera.height] for camera in rig.cameras])
-    low, high = (
-        np.clip(extreme, 0, size - 1)
-        for extreme in (pixels.min(axis=1) - MARGIN_PX, pixels.max(axis=1) + MARGIN_PX)
-    )
+    low = np.clip(pixels.min(axis=1) - MARGIN_PX, 0, size - 1)
+    high = np.clip(pixels.max(axis=1) + MARGIN_PX, 0, size - 1)
+    # One size for both images, so that they can be shown side by side.
     side = int(min(np.ceil((high - low).max()), size.min()))
     corners = np.clip(np.rint(0.5 * (low + high - side)), 0, size - side).astype(int)
     return corners, side
 
 
 class _Cut:
-    """Parts of two images, read as if they were whole."""
+    """Parts of two images, which are read as if they were whole."""
 
     def __init__(self, images: NDArray, corners: NDArray[np.int_]) -> None:
         self._images = images
         self._corners = corners
 
     def full(self) -> StereoFrame:
-        """Both parts."""
+        """Return both parts."""
         return StereoFrame(*self._images)
 
     def windows(self, corners: NDArray[np.int_], size: int) -> NDArray:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) in the
-        whole images.
+        """Return the grey values (2, n, size, size) of windows.
+
+        Their first pixels ``corners`` (2, n, 2) are given in the whole images.
         """
         sides = zip(self._images, corners, self._corners, strict=True)
         return np.stack([cut_windows(image, at - first, size) for image, at, first in sides])

@@ -1,7 +1,7 @@
-"""The scene and what both cameras see, drawn for print: matplotlib figures that become PDF, SVG or
-PNG.
+"""Matplotlib figures of the scene and of the camera images, for print as PDF, SVG or PNG.
 
-Every colour stands beside another brightness or a word, so that they can be read without colour.
+Things of different colour also differ in brightness or have a word, so that the figures can be read
+without colour.
 """
 
 import matplotlib.patheffects as effects
@@ -20,7 +20,7 @@ from identify.scene.workcell import Solid, ViewingCamera, Workcell
 
 SOLIDS = {"platform": "#a9bdd0", "base": "#b8b3a6"}
 LEGS = ("#c9723a", "#e6c79c", "#7d9d8f", "#8a7fa8")
-"""Of the first, second, ... body of each leg."""
+"""Colours of the first, second, ... body of each leg."""
 
 CAMERA = "#3b3f46"
 RAY = "#c8102e"
@@ -29,13 +29,15 @@ BRIGHT = "#fdfdf5"
 FOUND = {"platform": "#ff9f1c", "base": "#4cc9f0"}
 
 SIDES = ("left", "right")
+
 ARROWS = 3000.0
-"""Times by which errors of a hundredth of a pixel are enlarged, so that they can be seen."""
+"""Factor that enlarges errors of a hundredth of a pixel, so that they can be seen."""
 
 CAMERA_M = np.array([0.05, 0.04, 0.12])
-"""Half width, half height and length of the box that stands for a camera."""
+"""Half width, half height and length of the box that stands for a camera, in m."""
+
 FRUSTUM_M = 0.30
-"""How far before a camera its field of view is drawn."""
+"""Distance in front of a camera up to which its field of view is drawn, in m."""
 
 
 def scene_figure(
@@ -47,11 +49,22 @@ def scene_figure(
     rays: bool = True,
     labels: bool = True,
 ) -> Figure:
-    """Robot with legs and stickers, both cameras with their field of view and rays to the stickers
-    that both can see.
+    """Draw the robot and both cameras.
 
-    pose (6,) of the platform, m and rad, by default home; size in inches; rays, labels: whether to
-    draw them. Needs no OpenGL. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    The robot has its legs and stickers. The cameras have their field of view, and rays to the
+    stickers that both can see. No OpenGL is needed. Raises dynamics.UnreachablePoseError or
+    dynamics.ChartError.
+
+    Parameters
+    ----------
+    pose
+        Pose (6,) of the platform [m, rad], by default home.
+    view
+        Direction from which the scene is seen.
+    size
+        Width and height, in inches.
+    rays, labels
+        Flags whether to draw them.
     """
     figure = Figure(figsize=size, layout="constrained")
     draw_scene(figure.add_subplot(), cell, _at(cell, pose), view or View(), rays, labels)
@@ -61,10 +74,10 @@ def scene_figure(
 def stereo_figure(
     view: StereoView, *, size: tuple[float, float] = (7.0, 3.9), arrows: float | None = ARROWS
 ) -> Figure:
-    """Both camera images with the detected ellipses, and each centre's error as an arrow.
+    """Draw both camera images with the detected ellipses, and each centre's error as an arrow.
 
-    size in inches; arrows: how many times the errors (detected less true centre) are enlarged,
-    None: no arrows.
+    ``size`` is in inches. ``arrows`` is the factor that enlarges the errors, which are detected
+    minus true centres; None draws no arrows.
     """
     figure = Figure(figsize=size, layout="constrained")
     for side, axes in enumerate(figure.subplots(1, 2, squeeze=False)[0]):
@@ -81,11 +94,11 @@ def overview_figure(
     size: tuple[float, float] = (10.0, 5.2),
     arrows: float | None = None,
 ) -> Figure:
-    """The scene, and beside it what both cameras see of it, with the detected ellipses.
+    """Draw the scene, and beside it both camera images with the detected ellipses.
 
-    view: as `stereo_view` gives it, of the pose that the scene has too; towards: from where the
-    scene is looked at; size in inches; arrows: as of `stereo_figure`. Raises
-    dynamics.UnreachablePoseError, dynamics.ChartError.
+    The scene has the pose of ``view``, and is seen from the direction ``towards``. ``size`` and
+    ``arrows`` are as in `stereo_figure`. Raises dynamics.UnreachablePoseError or
+    dynamics.ChartError.
     """
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplot_mosaic([["scene", "left"], ["scene", "right"]], width_ratios=[2.6, 1.0])
@@ -115,6 +128,7 @@ def draw_scene(
     for camera in cell.cameras:
         _camera(painter, camera)
         for sticker in cell.seen(pose) if rays else ():
+            # A little before the platform, lest its faces cover the end of the ray.
             painter.line(np.array([camera.centre, sticker]), RAY, 0.45, alpha=0.55, towards=0.02)
     _triad(painter, axes, labels)
     painter.paint(axes)
@@ -123,8 +137,9 @@ def draw_scene(
 
 
 def draw_image(axes: Axes, view: StereoView, side: int, arrows: float | None) -> None:
-    """Draw one image, 0 left or 1 right, with the detected ellipses into axes, px of the whole
-    image.
+    """Draw one image with the detected ellipses into axes, in px of the whole image.
+
+    ``side`` is 0 for the left and 1 for the right image.
     """
     show_image(axes, view, side)
     for body in view.found:
@@ -137,24 +152,27 @@ def _at(cell: Workcell, pose: Array | None) -> Array:
 
 
 def _explain(figure: Figure, view: StereoView, arrows: float | None) -> None:
-    """The legend below images."""
+    """Draw the legend below the images."""
     handles = [
         Line2D([], [], ls="", marker="o", mfc="none", mec=FOUND[name]) for name in view.found
     ]
     words = [f"{len(found.ids)} stickers found on the {name}" for name, found in view.found.items()]
-    note = (
-        None if arrows is None else f"arrows: detected less true centre, {arrows:g} times enlarged"
-    )
+    note = None
+    if arrows is not None:
+        note = f"arrows: detected less true centre, {arrows:g} times enlarged"
     small = {"title_fontsize": 8, "fontsize": 8, "frameon": False}
     figure.legend(handles, words, title=note, loc="outside lower center", ncols=2, **small)
 
 
 def show_image(axes: Axes, view: StereoView, side: int) -> None:
-    """One image of a view in its place in the whole image, px, brightened so that dark bodies show
-    in print.
+    """Draw one image at its place in the whole image, in px.
+
+    It is brightened, so that dark bodies show in print.
     """
-    image, (x, y) = view.images[side], view.corners[side]
+    image = view.images[side]
+    x, y = view.corners[side]
     height, width = image.shape
+    # The centre of the first pixel has the coordinates (0, 0).
     edges = (x - 0.5, x + width - 0.5, y + height - 0.5, y - 0.5)
     axes.imshow(
         brightened(image), cmap="gray", vmin=0, vmax=255, extent=edges, interpolation="bilinear"
@@ -165,19 +183,24 @@ def show_image(axes: Axes, view: StereoView, side: int) -> None:
 
 
 def brightened(image: Array) -> Array:
-    """Grey values (h, w) uint8 for a screen or paper: a square root, which shows what is dark."""
+    """Return grey values (h, w) uint8 for a screen or for paper.
+
+    They are square roots, which show what is dark.
+    """
     return np.asarray(np.sqrt(image / 255.0) * 255.0, dtype=np.uint8)
 
 
 def ellipse_points(centre: Array, shape: Array, count: int = 32) -> Array:
-    """Points (count + 1, 2) px along a detected ellipse, closed; centre (2,) and shape (2,
-    2) px."""
+    """Return points (count + 1, 2) [px] along a detected ellipse, closed.
+
+    The ellipse has a centre (2,) and a shape (2, 2), in px.
+    """
     turn = np.linspace(0, 2 * np.pi, count + 1)
     return np.asarray(centre + np.column_stack([np.cos(turn), np.sin(turn)]) @ shape.T)
 
 
 def leg_colour(cell: Workcell, leg: int, body: int) -> str:
-    """Colour of a body of a leg, by its number in the robot's layout."""
+    """Return the colour of a body of a leg, by the body's number in the robot's layout."""
     assert cell.robot is not None
     return LEGS[cell.robot.layout.of_leg[leg].index(body) % len(LEGS)]
 
@@ -189,18 +212,21 @@ def _solid(painter: Painter, body: Solid, place: Array) -> None:
     turned = body.normals @ place[:3, :3].T
     for centre, normal in zip(apply(place, body.places), turned, strict=True):
         painter.disc(centre, normal, body.ring_radius, DARK, 0.03)
+        # Small stickers are drawn larger than they are, so that they show in print.
         painter.disc(centre, normal, max(body.radius, 0.45 * body.ring_radius), BRIGHT, 0.031)
 
 
 def camera_box(camera: ViewingCamera) -> tuple[Array, NDArray[np.int_]]:
-    """A box behind a camera's centre: vertices (8, 3), base axes, m, and faces (12, 3)."""
+    """Return a box behind a camera's centre.
+
+    It has vertices (8, 3) in the base frame, in m, and faces (12, 3).
+    """
     import trimesh
 
     width, height, length = CAMERA_M
     box = trimesh.creation.box((2 * width, 2 * height, length))
-    return apply(
-        camera.base_from_camera, np.asarray(box.vertices) - [0.0, 0.0, 0.5 * length]
-    ), np.asarray(box.faces)
+    behind = np.asarray(box.vertices) - [0.0, 0.0, 0.5 * length]
+    return apply(camera.base_from_camera, behind), np.asarray(box.faces)
 
 
 def _camera(painter: Painter, camera: ViewingCamera) -> None:
@@ -214,7 +240,7 @@ def _camera(painter: Painter, camera: ViewingCamera) -> None:
 
 
 def _triad(painter: Painter, axes: Axes, labels: bool) -> None:
-    """The axes of the base, 0.15 m long, before everything: they lie within the robot."""
+    """Draw the axes of the base, 0.15 m long, over everything: they lie within the robot."""
     for name, direction in zip("xyz", np.eye(3), strict=True):
         ends = np.array([np.zeros(3), 0.15 * direction])
         painter.line(ends, DARK, 1.4, towards=1.0)
@@ -239,6 +265,7 @@ def _labels(painter: Painter, axes: Axes, cell: Workcell, solids: list[Array]) -
         )
     for body, vertices, side in zip(cell.bodies, solids, (-1, 1), strict=False):
         flat = painter.pixels(vertices)
+        # The name stands at the vertex furthest to its side, where it hides least.
         end = flat[np.argmax(side * flat[:, 0])]
         align = "left" if side > 0 else "right"
         axes.annotate(
@@ -269,6 +296,7 @@ def _ellipses(axes: Axes, view: StereoView, side: int, body: str, arrows: float 
         linewidths=0.6,
     )
     if arrows is not None and len(centres):
+        # Enlarged, because errors of a hundredth of a pixel would not show.
         errors = arrows * (centres - found.expected[side])
         axes.quiver(
             *centres.T,

@@ -1,7 +1,7 @@
-"""The bodies of a workcell as one glTF file (binary), which the page's three.js, Blender and others
-open.
+"""Bodies of a workcell as one binary glTF file.
 
-Its nodes are called as bodies and legs are; lengths in m, axes of the base, z up.
+The page's three.js, Blender and other programs open it. Its nodes have the names of bodies and
+legs. Lengths are in m, in the base frame with z up.
 """
 
 import numpy as np
@@ -18,15 +18,15 @@ from identify.scene.drawings import BRIGHT, CAMERA, DARK, SOLIDS, camera_box, le
 from identify.scene.workcell import Solid, Workcell
 
 ABOVE_M = 0.0004
-"""How far a sticker is drawn above its plane, so that the plane does not show through."""
+"""Height of a drawn sticker above its plane, in m, so that the plane does not show through."""
 
 
 def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
-    """A workcell with its platform at a pose (6,), by default home.
+    """Return a workcell as glTF, with its platform at a pose (6,), by default home.
 
-    Nodes: "platform" and "base" with their stickers; one for each body of a leg, a rod along its z
-    axis from its origin; "left camera" and "right camera". Raises dynamics.UnreachablePoseError,
-    dynamics.ChartError.
+    The nodes are "platform" and "base" with their stickers, one for each body of a leg, and "left
+    camera" and "right camera". A body of a leg is a rod along its z axis from its origin. Raises
+    dynamics.UnreachablePoseError or dynamics.ChartError.
     """
     at = cell.home if pose is None else pose
     scene = trimesh.Scene()
@@ -34,15 +34,10 @@ def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
         _add(scene, body.name, body.vertices, body.faces, SOLIDS[body.name], place)
         _add_stickers(scene, body)
     for part, ends in zip(cell.parts, cell.rods(at), strict=True):
+        # Upright, so that the page can place a rod anew in each frame by one matrix.
         mesh = trimesh.creation.cylinder(part.segment.radius, segment=_upright(ends), sections=20)
-        _add(
-            scene,
-            part.name,
-            mesh.vertices,
-            mesh.faces,
-            leg_colour(cell, part.leg, part.body),
-            rod_transform(*ends),
-        )
+        colour = leg_colour(cell, part.leg, part.body)
+        _add(scene, part.name, mesh.vertices, mesh.faces, colour, rod_transform(*ends))
     for camera in cell.cameras:
         _add(scene, f"{camera.name} camera", *camera_box(camera), CAMERA, np.eye(4))
     return bytes(scene.export(file_type="glb"))
@@ -59,16 +54,10 @@ def _add_stickers(scene: trimesh.Scene, body: Solid) -> None:
     ):
         discs = [_disc(*one, radius, above) for one in zip(body.places, body.normals, strict=True)]
         if discs:
+            name = f"{body.name} {words}"
             mesh = trimesh.util.concatenate(discs)
-            _add(
-                scene,
-                f"{body.name} {words}",
-                mesh.vertices,
-                mesh.faces,
-                colour,
-                np.eye(4),
-                body.name,
-            )
+            # As a child of the body, the stickers move with it.
+            _add(scene, name, mesh.vertices, mesh.faces, colour, np.eye(4), body.name)
 
 
 def _disc(place: Array, normal: Array, radius: float, above: float) -> trimesh.Trimesh:
@@ -87,8 +76,9 @@ def _add(
     place: Array,
     parent: str | None = None,
 ) -> None:
-    """Add a body without normals: whoever shows it shades each face for itself."""
-    linear = [((share + 0.055) / 1.055) ** 2.4 for share in to_rgb(colour)]  # as glTF has it
+    """Add a body without normals, so that a viewer shades each face by itself."""
+    # The colours of glTF are linear, those of matplotlib are sRGB.
+    linear = [((share + 0.055) / 1.055) ** 2.4 for share in to_rgb(colour)]
     material = PBRMaterial(
         baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9, name=name
     )

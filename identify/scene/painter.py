@@ -1,9 +1,8 @@
-"""Bodies drawn as shaded polygons in perspective, far ones first: vector graphics for print,
-without OpenGL.
+"""Painter of bodies as shaded polygons in perspective, for vector graphics without OpenGL.
 
-Large faces and long lines are cut into pieces, so that the order of their middles is the order in
-which they hide each other. Where two bodies pierce each other, what hides what is right to a
-piece's size.
+The polygons are drawn from far to near. Large faces and long lines are cut into pieces, so that the
+order of the pieces' middles is the order in which they hide each other. Where two bodies pierce
+each other, this is right to the size of a piece.
 """
 
 from collections.abc import Sequence
@@ -20,15 +19,21 @@ from cmmsim.geometry.pose import Array
 
 PIECE = 1 / 60
 """Longest edge of a piece, in sizes of the scene."""
+
 LIGHT = np.array([0.35, -0.55, 0.76])
+"""Direction from the scene to the light, in the base frame. Its length does not matter."""
+
 SHADE = 0.62
-"""Brightness of a face that the light does not reach, of one that it reaches squarely."""
+"""Brightness of a face without light, where one that faces the light has one."""
 
 
 @dataclass(frozen=True)
 class View:
-    """From where a scene is looked at: azimuth from the x axis about z and elevation, degrees;
-    distance from the middle of the scene in sizes of it."""
+    """Direction and distance from which a scene is seen.
+
+    The azimuth is counted from the x axis about z. The distance is taken from the middle of the
+    scene, in sizes of the scene.
+    """
 
     azimuth_deg: float = -50.0
     elevation_deg: float = 23.0
@@ -36,7 +41,7 @@ class View:
 
 
 class Painter:
-    """Collects what is to be drawn and lays it into axes; centre (3,) and size of the scene, m."""
+    """Collector of shapes, which it draws into axes. Centre (3,) and size of the scene are in m."""
 
     def __init__(self, view: View, centre: Array, size: float) -> None:
         azimuth, elevation = np.deg2rad([view.azimuth_deg, view.elevation_deg])
@@ -50,41 +55,42 @@ class Painter:
         self._pieces: list[tuple[float, Array, tuple, tuple, float]] = []
 
     def pixels(self, points: Array) -> Array:
-        """Places (..., 2) on the paper of points (..., 3), in m at the middle of the scene."""
+        """Project points (..., 3) to places (..., 2) on the paper.
+
+        The places are in m at the middle of the scene.
+        """
         seen = (points - self._eye) @ self._axes
         return np.asarray(self._far * seen[..., :2] / -seen[..., 2:], dtype=float)
 
     def faces(
         self, vertices: Array, faces: NDArray[np.int_], colour: str, towards: float = 0.0
     ) -> None:
-        """Triangles (m, 3) of a closed body, counter-clockwise from outside, as its light falls on
-        them.
+        """Add the triangles (m, 3) of a closed body, shaded by the light.
 
-        towards: by how much they are drawn before what lies as far away, m.
+        Their corners run counter-clockwise, seen from outside. They are drawn as if they were
+        nearer by ``towards``, in m.
         """
+        # A large face has no single distance by which to be sorted.
         corners, pieces = trimesh.remesh.subdivide_to_size(vertices, faces, self._piece)
         triangles = np.asarray(corners)[np.asarray(pieces)]
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         middles = triangles.mean(axis=1)
         facing = np.einsum("ni,ni->n", normals, self._eye - middles) > 0
-        lit = (
-            normals[facing]
-            @ LIGHT
-            / (np.linalg.norm(normals[facing], axis=1) * np.linalg.norm(LIGHT))
-        )
+        lengths = np.linalg.norm(normals[facing], axis=1) * np.linalg.norm(LIGHT)
+        lit = normals[facing] @ LIGHT / lengths
         bright = SHADE + (1 - SHADE) * np.maximum(lit, 0.0)
         base = np.array(to_rgb(colour))
-        closed = self.pixels(triangles[facing])[
-            :, [0, 1, 2, 0]
-        ]  # its outline fills the seams between pieces
+        # Closed triangles have an outline, which fills the seams between pieces.
+        closed = self.pixels(triangles[facing])[:, [0, 1, 2, 0]]
         for flat, middle, share in zip(closed, middles[facing], bright, strict=True):
             self._add(middle, flat, (*(share * base), 1.0), None, 0.5, towards)
 
     def edges(
         self, vertices: Array, faces: NDArray[np.int_], colour: str, width: float = 0.7
     ) -> None:
-        """The edges of a convex body that its visible faces have."""
+        """Add the edges of a convex body that belong to its visible faces."""
         body = trimesh.Trimesh(vertices, faces, process=True)
+        # Edges between triangles of one plane are none of the body's.
         sharp = body.face_adjacency_angles > 1e-3
         normals = body.face_normals
         middles = body.triangles_center
@@ -96,9 +102,10 @@ class Painter:
     def disc(
         self, centre: Array, normal: Array, radius: float, colour: str, towards: float
     ) -> None:
-        """A flat disc, where its outward normal (3,) looks this way."""
+        """Add a flat disc, if its outward normal (3,) points to the viewer."""
         if normal @ (self._eye - centre) <= 0:
             return
+        # The axis most across the normal gives the best conditioned cross product.
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
         turn = np.linspace(0, 2 * np.pi, 20, endpoint=False)[:, None]
@@ -108,7 +115,7 @@ class Painter:
     def line(
         self, ends: Array, colour: str, width: float, alpha: float = 1.0, towards: float = 0.0
     ) -> None:
-        """A straight line between two points (2, 3)."""
+        """Add a straight line between two points (2, 3)."""
         count = int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / self._piece)) + 1
         places = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
         flat = self.pixels(places)
@@ -117,7 +124,8 @@ class Painter:
             self._add(middle, flat[k : k + 2], None, to_rgba(colour, alpha), width, towards)
 
     def paint(self, axes: Axes) -> None:
-        """Lay all that was collected into axes of one scale, without a frame."""
+        """Draw everything that was added into axes of equal scale, without a frame."""
+        # The painter's algorithm: near pieces are drawn over far ones.
         self._pieces.sort(key=lambda piece: -piece[0])
         polygons, filled, lines, widths = zip(*(piece[1:] for piece in self._pieces), strict=True)
         drawn = PolyCollection(
@@ -148,15 +156,19 @@ class Painter:
 
 
 def tube(ends: Array, radius: float, sides: int = 14) -> tuple[Array, NDArray[np.int_]]:
-    """A closed cylinder between two points (2, 3): vertices (n, 3) and faces (m, 3),
-    counter-clockwise from outside.
+    """Return a closed cylinder between two points (2, 3).
+
+    It has vertices (n, 3) and faces (m, 3), counter-clockwise from outside.
     """
     body = trimesh.creation.cylinder(radius=radius, segment=ends, sections=sides)
     return np.asarray(body.vertices), np.asarray(body.faces)
 
 
 def extent(points: Sequence[Array]) -> tuple[Array, float]:
-    """Middle (3,) and diagonal, m, of the box about points (n, 3) of several bodies."""
+    """Return the middle (3,) and the diagonal of the box around points (n, 3) of several bodies.
+
+    Both are in m.
+    """
     every = np.vstack(points)
     low = every.min(axis=0)
     high = every.max(axis=0)

@@ -1,8 +1,8 @@
-"""The page that replays a motion: one HTML file with scene, images and curves that opens without a
-network.
+"""Page that replays a motion: one HTML file that opens without a network.
 
-What draws the scene is three.js, as trimesh carries it; what moves it is in `replay_page/`. Numbers
-go into the page in double precision, so that it shows what the files say.
+It shows the scene, the images and the curves. The scene is drawn by three.js, as trimesh carries
+it, and moved by the scripts in `replay_page/`. Poses go into the page in double precision, so that
+it shows what the files say.
 """
 
 import base64
@@ -31,31 +31,42 @@ PARTS = Path(__file__).parent / "replay_page"
 SCRIPTS = ("scene.js", "curves.js", "images.js", "player.js")
 
 KEY_FRAMES = 24
-"""Frames of which the images are drawn: they take most of the time and half of the file."""
+"""Number of frames with images, which take most of the time and half of the file."""
 
 IMAGE_QUALITY = 45
-"""Of JPEG: some 30 kB an image. WebP would be half as large and take as long as drawing the image.
+"""Quality of the images, as JPEG counts it. An image takes some 30 kB.
+
+WebP would be half as large, but take as long to write as the image takes to draw.
 """
 
 CONFIDENCE = 2.7955
 """Standard deviations that hold 95 % of a normal distribution in space."""
 
 LIBRARY_ENDS = "THREE.GLTFLoader=GLTFLoader;})();"
-"""With this the libraries end in the page that trimesh writes; its own viewer follows."""
+"""End of the libraries in the page that trimesh writes. Its own viewer follows."""
 
 
 def write_page(path: Path | str, motion: Motion, progress: Progress | None = None) -> None:
     """Write the page of a motion, whole or not at all.
 
-    Raises WriteError: the file cannot be written, which is tried before anything is drawn. Raises
-    dynamics.UnreachablePoseError, cmmsim.CmmError.
+    Before anything is drawn, it is tried whether the file can be written.
+
+    Raises
+    ------
+    WriteError
+        The file cannot be written.
+    dynamics.UnreachablePoseError
+        The robot cannot take a pose of the motion.
+    cmmsim.CmmError
+        The sensor cannot be made or cannot draw.
     """
     check_writable(path)
     write_text(path, page(motion, progress or SilentProgress()), parents=True)
 
 
 def page(motion: Motion, progress: Progress) -> str:
-    """The page of a motion as one HTML text. Raises as `write_page`."""
+    """Return the page of a motion as one HTML text. Raises as `write_page`, but for WriteError."""
+    # A short motion has fewer frames than there may be images.
     frames = np.unique(np.linspace(0, len(motion.time) - 1, KEY_FRAMES).round().astype(int))
     with progress.stage("draw the replay", 2 + len(frames) * _has_images(motion)) as advance:
         rods = np.array([motion.cell.rods(pose) for pose in motion.drawn])
@@ -81,16 +92,18 @@ def page(motion: Motion, progress: Progress) -> str:
         style=(PARTS / "page.css").read_text(encoding="utf-8"),
         library=three_js(),
         scripts=[(PARTS / name).read_text(encoding="utf-8") for name in SCRIPTS],
+        # A name such as "</script>" would otherwise end the element that holds the data.
         data=json.dumps(data).replace("<", "\\u003c"),
     )
 
 
 def three_js() -> str:
-    """The text of three.js with its loader of glTF files and its controls by the mouse, as trimesh
-    carries them.
+    """Return the text of three.js with its loader of glTF files and its controls by the mouse.
 
-    Raises IdentifyError where the installed trimesh carries them otherwise.
+    It is taken from the page that trimesh writes. Raises IdentifyError if the installed trimesh
+    carries it otherwise.
     """
+    # Any scene will do: only the libraries of its page are kept.
     whole = scene_to_html(trimesh.Scene(trimesh.creation.box()))
     library, found, _ = whole.partition("<script>")[2].partition(LIBRARY_ENDS)
     if not found:
@@ -101,12 +114,12 @@ def three_js() -> str:
 
 
 def _has_images(motion: Motion) -> bool:
-    """Whether there are cameras, and a truth that they can see."""
+    """Tell whether there are cameras, and a truth that they can see."""
     return motion.cell.sensor is not None and TRUE in motion.poses
 
 
 def _views(motion: Motion, frames: Array) -> Any:
-    """Frames and what both cameras see in them, as far as there are images."""
+    """Yield the frames with their stereo views, as far as there are images."""
     if not _has_images(motion):
         return
     chosen = motion.poses[TRUE][frames]
@@ -116,7 +129,7 @@ def _views(motion: Motion, frames: Array) -> Any:
 
 
 def _data(motion: Motion, rods: Array) -> dict[str, Any]:
-    """All that the page's scripts read, but for the images."""
+    """Return all that the page's scripts read, except the images."""
     cell = motion.cell
     bodies = {body.name: {"ids": body.ids, "places": body.places.tolist()} for body in cell.bodies}
     cameras = [
@@ -127,6 +140,7 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
         }
         for camera in cell.cameras
     ]
+    # Single precision suffices for what is only drawn; poses are also written as numbers.
     return {
         "frames": len(motion.time),
         "time": _numbers(motion.time, "f8"),
@@ -145,7 +159,7 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
 
 
 def _look(frame: int, view: StereoView) -> dict[str, Any]:
-    """What the page shows of a stereo view."""
+    """Return what the page shows of a stereo view."""
     return {
         "frame": frame,
         "images": [_jpeg(image) for image in view.images],
@@ -167,8 +181,9 @@ def _stickers(found: Found) -> dict[str, Any]:
 
 
 def _shapes(covariances: Array) -> Array:
-    """Matrices (n, 3, 3) that carry the unit ball onto the ellipsoids that hold 95 %; NaN where a
-    covariance is.
+    """Return matrices (n, 3, 3) that map the unit ball to the ellipsoids that hold 95 %.
+
+    They are NaN where a covariance is.
     """
     known = np.isfinite(covariances).all(axis=(1, 2))
     shapes = np.full_like(covariances, np.nan)
@@ -177,20 +192,21 @@ def _shapes(covariances: Array) -> Array:
 
 
 def png(figure: Figure) -> bytes:
-    """A figure as PNG."""
+    """Return a figure as PNG."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=120)
     return drawn.getvalue()
 
 
 def _numbers(values: Array, kind: str) -> str:
-    """Numbers as the page reads them: little-endian, in base64."""
+    """Encode numbers as the page reads them: little-endian, in base64."""
     return base64.b64encode(np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()).decode()
 
 
 def _jpeg(image: Array) -> str:
-    """A grey image as the address of itself; the page brightens it, which here would spend the file
-    on noise.
+    """Return a grey image as a data URL.
+
+    The page brightens it. Doing that here would spend the file on noise.
     """
     encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, IMAGE_QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(encoded.tobytes()).decode()}"

@@ -1,6 +1,4 @@
-"""What moved in a run: poses as they were, were measured and are modelled, frame by frame, and what
-is missing.
-"""
+"""Motion of a run: true, measured and modelled poses, frame by frame."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,18 +18,34 @@ from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
 from identify.scenario import load_scenario
 from identify.scene.workcell import Workcell, workcell, workcell_of_scenario
 
-TRUE, MEASURED, IDENTIFIED, STARTING = "true", "measured", "identified", "starting"
-"""The poses of a motion, as the page calls them."""
+# Names of the poses of a motion, as the page knows them.
+TRUE = "true"
+MEASURED = "measured"
+IDENTIFIED = "identified"
+STARTING = "starting"
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """One motion of a workcell over N frames; of a scene without a run there is one frame, at home.
+    """Motion of a workcell over N frames. A scene without a run has one frame, at home.
 
-    time (N,) s; poses by their name, (N, 6) m and rad, NaN where there is none in a frame: "true",
-    "measured", "identified", "starting"; covariance (N, 6, 6) of the measured ones, NaN where lost;
-    seed: of the images' noise; renderer: what draws them; title; notes: sentences about what is
-    missing.
+    Attributes
+    ----------
+    time
+        Times (N,), in s.
+    poses
+        Poses (N, 6) [m, rad] named "true", "measured", "identified" and "starting". They are NaN in
+        frames without a pose.
+    covariance
+        Covariances (N, 6, 6) of the measured poses, NaN where a frame was lost.
+    seed
+        Seed of the images' noise.
+    renderer
+        Renderer of the images.
+    title
+        Title of the page.
+    notes
+        Sentences about what is missing.
     """
 
     cell: Workcell
@@ -45,39 +59,46 @@ class Motion:
 
     @property
     def drawn(self) -> Array:
-        """Poses (N, 6) in which the robot is drawn: the true ones, else the last measured ones in
-        its own freedoms.
+        """Poses (N, 6) in which the robot is drawn.
+
+        They are the true ones. Where these are not known, they are the last measured ones,
+        projected to the robot's degrees of freedom.
         """
         if TRUE in self.poses:
             return self.poses[TRUE]
         measured = self.poses[MEASURED]
         robot = self.cell.robot
         good = np.asarray(np.isfinite(measured).all(axis=1))
+        # Index of the last measured frame, or of the first one for the frames before it.
         last = np.maximum.accumulate(np.where(good, np.arange(len(good)), good.argmax()))
         return measured[last] if robot is None else robot.pose(robot.coordinates(measured[last]))
 
 
 def motion_at_home(cell: Workcell, renderer: str = "analytic") -> Motion:
-    """A workcell that stands still; renderer: what draws its images."""
+    """Return a workcell that stands still at home. ``renderer`` draws its images."""
     return Motion(
         cell, np.zeros(1), {TRUE: cell.home[None]}, renderer=renderer, title=cell.name.capitalize()
     )
 
 
 def motion_names(run: RunFolder) -> list[str]:
-    """Names of the motions that a run folder holds: "excitation", and the unseen "run01", ...,
-    where there are any.
-    """
+    """Return the names of a run's motions: "excitation", and "run01", ... of the unseen ones."""
     unseen = len(RunFiles(run).validation) if run.validation.is_file() else 0
     return [EXCITATION, *(run_name(number) for number in range(1, unseen + 1))]
 
 
 def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
-    """The motion of a run folder of this name, see `motion_names`.
+    """Read the motion of a run folder with one of the names of `motion_names`.
 
-    Raises OutputFolderError: no record in it. Raises RecordError: a file that is damaged or of an
-    older version, no such motion, or files that are not of one run. Raises dynamics.RobotFileError,
-    EstimationError: the robot's file is gone, or another one than that of the record.
+    Raises
+    ------
+    OutputFolderError
+        The folder holds no record.
+    RecordError
+        A file is damaged or of an older version, there is no such motion, or the files are not of
+        one run.
+    dynamics.RobotFileError, EstimationError
+        The robot's file is gone, or is another one than that of the record.
     """
     run = RunFolder(Path(folder))
     run.require("scenario.toml", "experiment.nc")
@@ -110,7 +131,7 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
 
 
 def _cell(run: RunFolder, record: xr.Dataset, notes: list[str]) -> Workcell:
-    """Robot and sensor of a run; the robot alone, with a note, where the sensor cannot be had."""
+    """Return robot and sensor of a run, or the robot alone with a note if there is no sensor."""
     scenario = load_scenario(run.whole_scenario)
     robot = known_geometry(scenario, run.path).robot
     check_robot(record, robot)
@@ -122,7 +143,8 @@ def _cell(run: RunFolder, record: xr.Dataset, notes: list[str]) -> Workcell:
 
 
 def _truth(run: RunFolder, name: str) -> Array | None:
-    """True poses (N, 6) of a motion; None where its file holds none."""
+    """Return the true poses (N, 6) of a motion, or None if its file holds none."""
+    # Unseen runs share a file, where each has a group; the excitation has a file of its own.
     path, group = (run.experiment, "") if name == EXCITATION else (run.validation, name)
     inside = f"{group}/{TRUTH_GROUP}" if group else TRUTH_GROUP
     return true_poses(read_truth(path, group)) if inside in group_names(path) else None
@@ -131,14 +153,16 @@ def _truth(run: RunFolder, name: str) -> Array | None:
 def _models(
     run: RunFolder, files: RunFiles, name: str, frames: int, notes: list[str]
 ) -> dict[str, Array]:
-    """Poses (N, 6) of the identified and the starting model, as far as they are there and belong to
-    the record.
+    """Return the poses (N, 6) of the identified and the starting model.
+
+    A note tells why there are none. Raises RecordError if they do not belong to the record.
     """
     missing = "so no model is shown; this command adds it: cmmsim validate --out"
     if not run.model.is_file() or not run.result.is_file():
         notes.append(f"The run is not validated yet, {missing} {run.path}.")
         return {}
     result = load_result(run.result)
+    # Identifying again drops the entry of the validation, whose models are then outdated.
     if "validation" not in result:
         notes.append(
             f"The run has been identified anew and not been validated since, {missing} {run.path}."
@@ -153,4 +177,5 @@ def _models(
         IDENTIFIED: poses(files.model[name], "identified"),
         STARTING: poses(files.model[name], "initial"),
     }
+    # A model that has diverged from the start has no pose to show.
     return {kind: values for kind, values in found.items() if np.isfinite(values).any()}

@@ -1,5 +1,6 @@
-"""A robot and the stereo sensor that looks at it, as they stand: bodies, stickers, legs and
-cameras, to be drawn.
+"""Workcell of a robot and the stereo sensor that looks at it, ready to be drawn.
+
+It has bodies, stickers, legs and cameras.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 import cmmsim
 from cmmsim.files import SensorFile
-from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
+from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, rig_from_file
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
 from cmmsim.geometry.stereo_rig import StereoRig
@@ -31,15 +32,25 @@ from identify.experiment.sensor_in_loop import (
 from identify.scenario import Scenario
 
 PLATE_M = 0.012
-"""Half the thickness of the plate that stands for a platform of which only the joints are known."""
+"""Half the thickness of the plate that stands for a platform with known joints only, in m."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A convex body with its stickers, in its own axes, m.
+    """Convex body with its stickers, in its own frame, in m.
 
-    vertices (n, 3) and faces (m, 3), triangles seen counter-clockwise from outside; ids (k,) of the
-    stickers, their true places (k, 3) and outward normals (k, 3); radius and ring_radius of each.
+    Attributes
+    ----------
+    vertices
+        Vertices (n, 3).
+    faces
+        Triangles (m, 3), whose corners run counter-clockwise, seen from outside.
+    ids
+        Names (k,) of the stickers.
+    places, normals
+        True places (k, 3) and outward normals (k, 3) of the stickers.
+    radius, ring_radius
+        Radii of a sticker and of its ring.
     """
 
     name: str
@@ -54,7 +65,10 @@ class Solid:
 
 @dataclass(frozen=True)
 class ViewingCamera:
-    """A camera where it stands: base_from_camera (4, 4), its axes x right, y down, z forward."""
+    """Camera at its place, given by base_from_camera (4, 4).
+
+    Its axes are x right, y down and z forward.
+    """
 
     name: str
     lens: PinholeCamera
@@ -62,38 +76,41 @@ class ViewingCamera:
 
     @property
     def centre(self) -> Array:
-        """Where it sees from (3,), base axes, m."""
+        """Centre of projection (3,) in the base frame, in m."""
         return np.asarray(self.base_from_camera[:3, 3])
 
     def frustum(self, depth: float) -> Array:
-        """Corners (4, 3) of what it sees at a depth, m, base axes, clockwise from the top left of
-        its image.
+        """Return the corners (4, 3) of the field of view at a depth, in m.
+
+        They are in the base frame, in m, clockwise from the top left corner of the image.
         """
+        # The outer edges of the image: the centre of its first pixel is (0, 0).
         right = self.lens.width - 0.5
         low = self.lens.height - 0.5
         pixels = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
         ideal = self.lens.undistort(pixels)[0]
+        # Rays through the undistorted corners, because the lens bends the field of view.
         rays = np.column_stack([ideal, np.ones(4)]) @ np.linalg.inv(self.lens.matrix).T
         return apply(self.base_from_camera, depth * rays)
 
 
 @dataclass(frozen=True, eq=False)
 class Workcell:
-    """A robot, a sensor, or both: the sensor looks at the robot's platform. Made by `workcell`."""
+    """Robot, sensor, or both, made by `workcell`. The sensor looks at the robot's platform."""
 
     robot: Robot | None
     sensor: SensorFile | None
 
     @property
     def name(self) -> str:
-        """What a title calls it."""
+        """Name in a title."""
         robot = f"robot {self.robot.name}" if self.robot else ""
         sensor = f"sensor {self.sensor.name}" if self.sensor else ""
         return " and ".join(filter(None, (robot, sensor)))
 
     @property
     def home(self) -> Array:
-        """Pose (6,) of the platform at home, m and rad."""
+        """Pose (6,) of the platform at home [m, rad]."""
         if self.robot is not None:
             return self.robot.home_pose
         assert self.sensor is not None
@@ -101,8 +118,9 @@ class Workcell:
 
     @cached_property
     def bodies(self) -> tuple[Solid, ...]:
-        """The platform in its own axes, and the sensor's body with stickers on the base, in base
-        axes.
+        """Platform in its own frame, and body with stickers on the base, in the base frame.
+
+        The latter is the sensor's; without a sensor there is only the platform.
         """
         if self.sensor is None:
             assert self.robot is not None
@@ -112,46 +130,46 @@ class Workcell:
         )
 
     def placed(self, pose: Array) -> list[tuple[Solid, Array]]:
-        """The bodies, and base_from_body (4, 4) of each with the platform at a pose (6,)."""
+        """Return the bodies, each with base_from_body (4, 4). The platform is at a pose (6,)."""
         return list(zip(self.bodies, (pose_to_transform(pose), np.eye(4)), strict=False))
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """The bodies of the robot's legs, leg by leg from the base; none without a robot."""
+        """Bodies of the robot's legs, leg by leg from the base. There are none without a robot."""
         return () if self.robot is None else tuple(parts_of(self.robot.geometry).all)
 
     def rods(self, pose: Array) -> Array:
-        """Ends (parts, 2, 3) of the bodies of the legs, m, base axes, with the platform at a pose
-        (6,).
+        """Return the ends (parts, 2, 3) of the bodies of the legs.
 
-        Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+        They are in m, in the base frame, with the platform at a pose (6,). Raises
+        dynamics.UnreachablePoseError or dynamics.ChartError.
         """
-        return (
-            np.zeros((0, 2, 3))
-            if self.robot is None
-            else parts_of(self.robot.geometry).rods(self.robot, pose)
-        )
+        if self.robot is None:
+            return np.zeros((0, 2, 3))
+        return parts_of(self.robot.geometry).rods(self.robot, pose)
 
     @cached_property
     def frame(self) -> Array:
-        """Lines (n, 2, 3), m, base axes, from one leg's joint on the base to the next one's; none
-        without a robot.
+        """Lines (n, 2, 3) from one leg's joint on the base to the next one's.
+
+        They are in m, in the base frame. There are none without a robot.
         """
         if self.robot is None:
             return np.zeros((0, 2, 3))
         joints = self.robot.geometry.base_joints
+        # Joints in the order of their angle about their middle, so that lines do not cross.
         away = joints - joints.mean(axis=0)
         around = joints[np.argsort(np.arctan2(away[:, 1], away[:, 0]))]
         return np.stack([around, np.roll(around, -1, axis=0)], axis=1)
 
     @cached_property
     def rig(self) -> tuple[StereoRig, Array] | None:
-        """The stereo rig and camera_from_base (4, 4); None without a sensor."""
+        """Stereo rig and camera_from_base (4, 4). None without a sensor."""
         return None if self.sensor is None else rig_from_file(self.sensor.rig)
 
     @cached_property
     def cameras(self) -> tuple[ViewingCamera, ...]:
-        """Left and right camera; none without a sensor."""
+        """Left and right camera. There are none without a sensor."""
         if self.rig is None:
             return ()
         rig, camera_from_base = self.rig
@@ -161,23 +179,24 @@ class Workcell:
         )
 
     def seen(self, pose: Array) -> Array:
-        """Places (k, 3), m, base axes, of the platform's stickers that both cameras can look for at
-        a pose (6,).
+        """Return the places (k, 3) of the platform's stickers that both cameras can look for.
 
-        What stands between a sticker and a camera is not asked.
+        They are in m, in the base frame, at a pose (6,). Bodies between a sticker and a camera are
+        not considered.
         """
         if self.rig is None or self.sensor is None:
             return np.zeros((0, 3))
+        # The sensor looks for stickers at their nominal places; they are drawn at the true ones.
         lines = SightLines(self.marked("platform"), *self.rig)
         return apply(pose_to_transform(pose), self.bodies[0].places[lines.visible(pose)])
 
     def marked(self, name: str) -> MarkedBody:
-        """Nominal stickers of the "platform" or the "base", as the sensor knows them."""
+        """Return the nominal stickers of the "platform" or the "base", as the sensor knows them."""
         assert self.sensor is not None
         return marked_body(name, getattr(self.sensor, name))
 
     def live_sensor(self, seed: int, renderer: str) -> cmmsim.Sensor:
-        """The sensor with the legs in its view, not taught."""
+        """Return the sensor with the legs in its view. It is not taught."""
         assert self.sensor is not None
         sensor = cmmsim.Sensor(self.sensor, seed, renderer=renderer)
         if self.robot is not None:
@@ -185,16 +204,18 @@ class Workcell:
         return sensor
 
     def obstacles(self, pose: Array) -> Mapping[str, Array]:
-        """base_from_body (4, 4) by name of the legs' bodies, which may hide stickers, at a pose
-        (6,).
+        """Return base_from_body (4, 4) of the legs' bodies by name, at a pose (6,).
+
+        These bodies may hide stickers.
         """
         return {} if self.robot is None else robot_transforms(self.robot, pose)
 
 
 def workcell(robot: Robot | None = None, sensor: SensorFile | None = None) -> Workcell:
-    """A robot, the file of a sensor (`cmmsim.files.read_sensor_file`), or both.
+    """Return the workcell of a robot, of the file of a sensor, or of both.
 
-    Raises ScenarioError: neither is given, or the platform that the sensor sees is not the robot's.
+    `cmmsim.files.read_sensor_file` reads the file of a sensor. Raises ScenarioError if neither is
+    given, or if the platform that the sensor sees is not the robot's.
     """
     if robot is None and sensor is None:
         raise ScenarioError("a scene needs a robot, a sensor, or both")
@@ -204,41 +225,43 @@ def workcell(robot: Robot | None = None, sensor: SensorFile | None = None) -> Wo
 
 
 def workcell_of_scenario(scenario: Scenario, robot: Robot | None = None) -> Workcell:
-    """Robot and sensor of a scenario, with its changes; robot: where it is loaded already.
+    """Return the workcell of a scenario, with the changes that it makes to the sensor.
 
-    Raises ScenarioError, cmmsim.CmmError, dynamics.RobotFileError.
+    A robot that is loaded already may be given. Raises ScenarioError, cmmsim.CmmError or
+    dynamics.RobotFileError.
     """
     return workcell(robot or load_robot(scenario.robot), sensor_file(scenario))
 
 
 def _marked(name: str, file: SensorFile, stream: int) -> Solid:
-    """A body of a sensor file with its stickers where they truly are."""
+    """Return a body of a sensor file with its stickers at their true places."""
     section = getattr(file, name)
     stickers = file.stickers
     marked = marked_body(name, section)
     drawn = scene_body(marked, section, stickers, stream)
     ids = tuple(map(str, marked.sticker_ids))
     normals = marked.sticker_normals
-    radii = stickers.radius, stickers.ring_radius
     return Solid(
-        name, drawn.solid.vertices, drawn.solid.faces, ids, drawn.sticker_places, normals, *radii
+        name,
+        drawn.solid.vertices,
+        drawn.solid.faces,
+        ids,
+        drawn.sticker_places,
+        normals,
+        stickers.radius,
+        stickers.ring_radius,
     )
 
 
 def _plate(name: str, joints: Array) -> Solid:
-    """A plate about joints (n, 3), where nothing else is known of a platform."""
+    """Return a plate around joints (n, 3), for a platform of which nothing else is known."""
     around = PLATE_M * np.vstack([np.eye(3), -np.eye(3)]) * np.array([1.5, 1.5, 1.0])
     points = (joints[:, None] + around).reshape(-1, 3)
     hull = ConvexHull(points)
     corners = points[hull.simplices]
     outward = hull.equations[:, :3]
-    turned = (
-        np.einsum(
-            "ni,ni->n",
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
-            outward,
-        )
-        < 0
-    )
+    # Qhull does not order the corners of its triangles.
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    turned = np.einsum("ni,ni->n", normals, outward) < 0
     faces = np.where(turned[:, None], hull.simplices[:, ::-1], hull.simplices).astype(int)
     return Solid(name, points, faces)

@@ -1,1 +1,1 @@
-"""Stages of a run that are longer than a few lines; `identify.pipeline` calls them in order."""
+"""Longer stages of a run, which `identify.pipeline` calls in order."""

@@ -1,4 +1,4 @@
-"""From the records in a run folder to the identified parameters and their covariance."""
+"""Stage from the records in a run folder to the identified parameters and their covariance."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -36,12 +36,15 @@ from identify.validation.unseen import model_on_record
 
 
 def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | None = None) -> None:
-    """Estimate the parameters from the record; writes result.json (without the truth) and
-    covariance.nc.
+    """Estimate the parameters from the record, and write result.json and covariance.nc.
 
-    settings: of the estimator, by dotted path, instead of the scenario's. Once they have given a
-    result, scenario.toml holds them for the stages that follow. Raises as `identification.identify`
-    does, and ScenarioError for a setting that the record was made with.
+    The result does not contain the truth.
+
+    ``settings`` of the estimator, by dotted path, replace those of the scenario. Once they have
+    given a result, scenario.toml holds them for the later stages.
+
+    Raises the errors of `identification.identify`, and ScenarioError for a setting that the record
+    was made with.
     """
     run_folder = RunFolder(folder)
     if run_folder.holds_own_record:
@@ -66,11 +69,11 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
 def identify_own(
     paths: Sequence[Path], folder: Path, progress: Progress, settings: Mapping[str, Any]
 ) -> None:
-    """Estimate the parameters from records of one's own, `read_own_records`; writes a run folder
-    without the truth.
+    """Estimate the parameters from a user's own records; write a run folder without the truth.
 
-    Nothing is written where they cannot carry an identification. Raises as `identify`, and as
-    `read_own_records`.
+    Nothing is written if the records cannot carry an identification.
+
+    Raises the errors of `identify` and of `read_own_records`.
     """
     run_folder = RunFolder(folder)
     contents, stated = read_own_records(list(paths))
@@ -90,8 +93,11 @@ def identify_own(
 
 @dataclass(frozen=True)
 class _Identified:
-    """Records by file, what an identification made of them, the models' poses (N, 6) on the first,
-    before and after, and the time that it took."""
+    """Records by file, with their identification.
+
+    ``models`` are the poses (N, 6) on the first record of the model before and after, and
+    ``seconds`` is the time that it took.
+    """
 
     records: Mapping[str, xr.Dataset]
     result: IdentificationResult
@@ -114,6 +120,7 @@ def _identified(
     robot = known_geometry(scenario, folder).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
     first = next(iter(records.values()))
+    # The models run with the drive law that was identified.
     scenario = with_drive(scenario, result.drive.law)
     before, after = (
         model_on_record(robot, scenario, values, first)
@@ -125,9 +132,9 @@ def _identified(
 def _identified_files(
     run_folder: RunFolder, found: _Identified, scenario: Scenario, seed: int | None
 ) -> dict[Path, bytes]:
-    """Return covariance.nc and result.json; and model.nc of a record of one's own.
+    """Return covariance.nc and result.json, and model.nc for a user's own record.
 
-    Such a record has no seed, and `validate`, which writes model.nc else, cannot judge it.
+    Such a record has no seed. `validate`, which otherwise writes model.nc, cannot judge it.
     """
     seen = found.record
     result = found.result
@@ -135,6 +142,7 @@ def _identified_files(
     ok = seen["measured_ok"].values.astype(bool)
     before, after = found.models
     covariance = result.whole_covariance
+    # By these digests later stages see whether the result belongs to its files.
     made_of = {name: digest(one) for name, one in found.records.items()} | {
         "covariance.nc": digest(covariance)
     }

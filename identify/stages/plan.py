@@ -18,8 +18,8 @@ from identify.files.run_folder import (
     RunFolder,
 )
 from identify.files.seal import sealed_toml
+from identify.geometry.before_a_run import calibrated_for_a_run
 from identify.geometry.outcome import GeometryOutcome
-from identify.geometry.run import calibrated_for_a_run
 from identify.loop_parameters import check_parameter_set
 from identify.progress import Progress
 from identify.record.checks import check_length, check_trajectory
@@ -44,12 +44,13 @@ def is_begun(scenario: Scenario, seed: int, folder: Path) -> bool:
 def begin(
     scenario: Scenario, seed: int, folder: Path, progress: Progress
 ) -> tuple[cmmsim.Sensor, Plant, dict[str, float]]:
-    """Excite and teach; return the taught sensor, the plant, and the seconds that each took."""
+    """Excite and teach; return the taught sensor, the plant, and the seconds of each stage."""
     began = time.perf_counter()
     calibration, known = _calibrated(scenario, seed, progress)
     calibrated_at = time.perf_counter()
     plant = build_plant(scenario, seed=seed, known=known)
     sensor = untaught_sensor(scenario, plant.nominal, seed)
+    # Fail before the search for a trajectory, which takes time.
     if scenario.renderer == "pyrender":
         cmmsim.require_opengl()
     trajectories = _designed(plant, seed, progress)
@@ -63,8 +64,10 @@ def begin(
 
 
 def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
-    """Choose the trajectories; writes scenario.toml and trajectories.json, and the folder geometry,
-    where that is calibrated."""
+    """Choose the trajectories; write scenario.toml and trajectories.json.
+
+    The folder geometry is also written if the run calibrates it.
+    """
     scenario = with_renderer(scenario)
     calibration, known = _calibrated(scenario, seed, progress)
     plant = build_plant(scenario, seed=seed, known=known)
@@ -73,7 +76,7 @@ def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> N
 
 
 def open_run(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, KnownGeometry]:
-    """Read the plan of a run folder, and what its estimator knows of the geometry."""
+    """Read the plan of a run folder and the geometry that its estimator knows."""
     run_folder = RunFolder(folder)
     scenario = load_scenario(run_folder.whole_scenario)
     return (
@@ -87,9 +90,7 @@ def open_run(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, KnownGeo
 def _calibrated(
     scenario: Scenario, seed: int, progress: Progress
 ) -> tuple[GeometryOutcome | None, KnownGeometry]:
-    """The calibration of the geometry that precedes a run, where there is one, and what is known of
-    the geometry.
-    """
+    """Calibration of the geometry before a run, if there is one, and the known geometry."""
     if scenario.geometry.known != "calibrated":
         return None, known_geometry(scenario)
     return calibrated_for_a_run(scenario, seed, progress)
@@ -98,7 +99,7 @@ def _calibrated(
 def check_planned(
     file: Path, record: xr.Dataset, scenario: Scenario, trajectories: TrajectorySet
 ) -> None:
-    """The record of a file must be of the folder's exciting trajectory."""
+    """Raise EstimationError if a file's record does not follow the planned trajectory."""
     try:
         check_trajectory(record, trajectories.excitation, scenario)
     except EstimationError as error:
@@ -106,12 +107,12 @@ def check_planned(
 
 
 def record_files(scenario: Scenario) -> tuple[str, ...]:
-    """The file of the record and, where the scenario asks for one, that of the run under a load."""
+    """Return the names of the record and, if the scenario asks for one, of the run under a load."""
     return RECORDS if scenario.identification.scale_anchor == "payload" else RECORDS[:1]
 
 
 def _designed(plant: Plant, seed: int, progress: Progress) -> TrajectorySet:
-    """Trajectories that stay clear of limits and singularities; compiles the robot on first use."""
+    """Trajectories that avoid limits and singularities. The robot is compiled on first use."""
     scenario = plant.scenario
     robot = plant.nominal
     check_length(
@@ -146,8 +147,9 @@ def scenario_file(run_folder: RunFolder, scenario: Scenario) -> dict[Path, bytes
 
 
 def _check_singularities(robot: Robot, scenario: Scenario, trajectories: TrajectorySet) -> None:
-    """Raise TrajectoryError, with time and leg, where a trajectory comes near a singularity
-    (section 3.3).
+    """Raise TrajectoryError if a trajectory comes near a singularity (section 3.3).
+
+    The message names time and leg.
     """
     durations = [scenario.excitation.duration_s] + [scenario.validation.duration_s] * len(
         trajectories.validation

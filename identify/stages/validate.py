@@ -1,4 +1,4 @@
-"""Identified model against the plant on unseen trajectories, and against the truth."""
+"""Stage that runs the identified model and the plant on unseen trajectories and opens the truth."""
 
 import time
 from pathlib import Path
@@ -40,17 +40,17 @@ def validate(
     workers: int | None = None,
     taught: cmmsim.Taught | None = None,
 ) -> None:
-    """Run plant and models on the unseen trajectories and open the truth: validation.nc, model.nc,
-    result.json.
+    """Run plant and models on the unseen trajectories and open the truth.
 
-    Raises RecordError for a result that is not whole, or was made of another record or covariance.
-    Raises OutputFolderError for a record of one's own, whose truth nobody knows.
+    Writes validation.nc, model.nc and result.json.
+
+    Raises RecordError if the result is incomplete, or was made of another record or covariance.
+    Raises OutputFolderError for a user's own record, whose truth nobody knows.
     """
     if RunFolder(folder).holds_own_record:
         raise OutputFolderError(
             f"{folder} holds a record of your own: no plant is there that could run unseen "
-            "trajectories; go on with: "
-            f"cmmsim report --out {folder}"
+            f"trajectories; go on with: cmmsim report --out {folder}"
         )
     run_folder, scenario, trajectories, known = open_run(folder)
     began = time.perf_counter()
@@ -78,6 +78,7 @@ def validate(
     predictions = predicted_runs(
         robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress, found
     )
+    # The exciting run was fitted, so nothing is predicted for it.
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [
         build_model_run(seen["time"].values, initial, identified, std)
@@ -107,7 +108,7 @@ def validate(
 
 
 def _identified_models(robot: Robot, run_folder: RunFolder, result: dict[str, Any]) -> list[Array]:
-    """Parameters (p,) of the starting and of the identified model."""
+    """Parameters (p,) of the starting model and of the identified one."""
     try:
         return [
             parameter_vector(robot, result["identification"], column)

@@ -1,1 +1,1 @@
-"""Noise studies: a scenario varied over factors, many rows, on one machine or many."""
+"""Noise studies: a scenario varied over factors, in many rows, on one machine or many."""

@@ -1,16 +1,16 @@
-"""The batches of a study on a Dask cluster that is running, of many machines.
+"""Batches of a study on the workers of a Dask cluster that is already running.
 
-A worker that dies loses nothing but the batches it had, which are computed elsewhere. Batches whose
-workers died are taken apart, and each of their rows is tried alone; a row that then kills its
-worker again is an error of this row.
+A worker that dies loses only the batches it had, which are computed elsewhere. A batch whose
+workers died is taken apart, and each of its rows is tried alone. A row that then kills its worker
+again becomes an error of this row.
 
-Whoever can speak to a scheduler can run code as its owner. So one beyond this machine must be
-reached by TLS with certificates, which are those of Dask's own configuration.
+Whoever can speak to a scheduler can run code as its owner. A scheduler beyond this machine must
+therefore be reached by TLS, with the certificates of Dask's own configuration.
 
-Finished batches come by a callback into a queue, which is waited for with a limit: that of
-``distributed.as_completed`` holds for all of a study, and it looks ten times a second.
+A callback puts finished batches into a queue, which is read with a time limit. The limit of
+``distributed.as_completed`` would hold for the whole study, and it polls ten times a second.
 ``Client.get_versions(check=True)`` compares Dask's own packages, also those of the scheduler, which
-computes nothing; here those count with which rows are computed.
+computes nothing. Here the packages are compared that compute the rows.
 """
 
 import asyncio
@@ -29,16 +29,14 @@ from distributed.security import Security
 
 from identify.errors import StudyError
 from identify.files.versions import product_version, require_product, same_versions, versions
-from identify.studies.design import Case, Finished, Setup
 from identify.studies.runner import Batches, Suspects, compute
+from identify.studies.study_design import Case, Finished, Setup
 
 WORKERLESS_SECONDS = 180
-"""How long a cluster may be without any worker; one that starts again needs its time on a busy
-machine.
-"""
+"""Longest time that a cluster may be without workers, s. On a busy machine they start slowly."""
 
 ANSWER_SECONDS = 30
-"""How long a scheduler may take to answer."""
+"""Longest time that a scheduler may take to answer, s."""
 
 GONE = "the Dask scheduler is gone; the same command goes on from here with another"
 
@@ -49,8 +47,9 @@ BATCHES_A_WORKER = 3
 
 
 class DaskExecutor:
-    """Computes the batches of a study on the workers of a client, only a few of them on their way
-    at a time.
+    """Executor of a study's batches on the workers of a client.
+
+    Only a few batches are on their way at a time.
     """
 
     def __init__(self, client: Client) -> None:
@@ -65,8 +64,10 @@ class DaskExecutor:
     def __call__(self, setup: Setup, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches as they are done.
 
-        Raises StudyError: the scheduler or all workers are gone, or workers cannot run this
-        program.
+        Raises
+        ------
+        StudyError
+            The scheduler or all workers are gone, or workers cannot run this program.
         """
         try:
             while self._send_more(setup, batches):
@@ -78,8 +79,9 @@ class DaskExecutor:
             raise gone(error) from error
 
     def _send_more(self, setup: Setup, batches: Batches) -> bool:
-        """Keep all workers busy; rows that may kill their workers come last, one at a time. False
-        at the end.
+        """Keep all workers busy. Return False at the end.
+
+        Rows that may kill their workers come last, one at a time.
         """
         workers = self._count_workers()
         while len(self._open) < BATCHES_A_WORKER * workers and (cases := batches.take(workers)):
@@ -89,12 +91,16 @@ class DaskExecutor:
         return bool(self._open)
 
     def _send(self, setup: Setup, cases: list[Case]) -> None:
+        # With pure=True, Dask would answer a second try with the failure of the first.
         future = self._client.submit(_compute_alike, product_version(), setup, cases, pure=False)
         self._open[future.key] = (future, cases)
         future.add_done_callback(self._done.put)
 
     def _next(self) -> list[Finished]:
-        """The next finished batch; empty when there is none yet, or when one was taken apart."""
+        """Return the next finished batch.
+
+        It is empty if none has finished yet, or if its workers died and it was taken apart.
+        """
         try:
             future = self._done.get(timeout=1.0)
         except queue.Empty:
@@ -114,8 +120,11 @@ class DaskExecutor:
             raise StudyError(f"the cluster cannot compute rows: {text}") from error
 
     def _result(self, future: Future) -> list[Finished]:
-        """What a finished batch found. Where it died with its worker it is computed again: that may
-        take a while, but not without any worker."""
+        """Return the rows of a finished batch.
+
+        If they were lost with their worker, Dask computes them again. That may take a while, but
+        not without any worker.
+        """
         while True:
             try:
                 return list(future.result(timeout=ANSWER_SECONDS))
@@ -123,8 +132,9 @@ class DaskExecutor:
                 self._check_cluster()
 
     def _count_workers(self) -> int:
-        """How many workers there are, or were a second ago; at least one, which may be about to
-        come.
+        """Return the number of workers, at most a second old.
+
+        It is at least 1, since a worker may be about to come.
         """
         if time.monotonic() > self._asked + 1.0:
             self._workers = max(1, self._ask_workers())
@@ -149,32 +159,40 @@ class DaskExecutor:
 def _compute_alike(version: str, setup: Setup, cases: list[Case]) -> list[Finished]:
     """Compute rows on a worker, which may have come after the others were checked.
 
-    Raises StudyError: it has another version of cmmsim than the study's.
+    Raises StudyError if the worker has another version of cmmsim than the study.
     """
     require_product(f"worker {get_worker().address}", product_version(), version, REMEDY)
     return compute(setup, cases)
 
 
 def gone(error: OSError) -> StudyError:
-    """A scheduler that does not answer any more, as the error of the study."""
+    """Return the error of a study whose scheduler no longer answers."""
     return StudyError(f"{GONE}: {' '.join(str(error).split())}")
 
 
 CONNECT_SECONDS = 20
-"""How long a scheduler may take to answer at first; a busy machine takes seconds for TLS."""
+"""Longest time that a scheduler may take to answer at first, s. TLS takes seconds if it is busy."""
 
 ENCRYPTED = ("tls", "wss")
-"""Kinds of address at which both sides show a certificate."""
+"""Kinds of address for which both sides show a certificate."""
 
 
 @contextmanager
 def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecutor]:
-    """Workers: those of a cluster that is running.
+    """Provide the workers of a cluster that is running.
 
-    insecure: its scheduler may be one that anybody on the network can speak to.
+    Parameters
+    ----------
+    address : str
+        Address of the scheduler.
+    insecure : bool, optional
+        Also take a scheduler that anybody on the network can speak to.
 
-    Raises StudyError: no scheduler answers there, or anybody can speak to it, or it has no workers,
-    or one with another version of cmmsim.
+    Raises
+    ------
+    StudyError
+        No scheduler answers there, anybody can speak to it, it has no workers, or one of its
+        workers has another version of cmmsim.
     """
     _silence_dask()
     try:
@@ -215,7 +233,7 @@ def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecut
 
 
 def _is_here(host: str) -> bool:
-    """Whether only this machine reaches a host."""
+    """Tell whether only this machine reaches a host."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -223,7 +241,7 @@ def _is_here(host: str) -> bool:
 
 
 def _check_certificates(address: str, security: Security) -> None:
-    """Refuse to call on a scheduler without certificates. Raises StudyError."""
+    """Refuse to call a scheduler without certificates. Raises StudyError."""
     try:
         there = security.get_connection_args("client").get("ssl_context")
         why = "none are named"
@@ -238,12 +256,15 @@ def _check_certificates(address: str, security: Security) -> None:
 
 
 def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
-    """Compare with the versions here those that workers answered, by address.
+    """Compare the versions that workers answered, by address, with those here.
 
-    A worker that answered with an error cannot run cmmsim, but one that did not answer (OSError) is
-    gone.
+    A worker that answered with an error cannot run cmmsim. One that did not answer (OSError) is
+    gone, and does not count.
 
-    Raises StudyError: a worker has another cmmsim, or none.
+    Raises
+    ------
+    StudyError
+        A worker has another cmmsim, or none.
     """
     for worker, answer in there.items():
         if isinstance(answer, Exception) and not isinstance(answer, OSError):
@@ -258,10 +279,10 @@ def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
 
 
 async def _identity(address: str, security: Security) -> object:
-    """What a scheduler says of itself. A client would wait without end where something listens and
-    never answers.
+    """Ask a scheduler for its identity.
 
-    Raises OSError where nothing answers in time, and other errors where something else does.
+    A client would wait without end for something that listens and never answers. Raises OSError if
+    nothing answers in time, and other errors if something else does.
     """
     arguments = security.get_connection_args("client")
     async with rpc(address, connection_args=arguments) as scheduler:
@@ -276,7 +297,7 @@ def _no_scheduler(address: str, why: str) -> StudyError:
 
 
 def _silence_dask() -> None:
-    """What Dask notes of workers that come and go is no news for the user of a study."""
+    """Silence Dask's log of workers that come and go, which is no news for the user of a study."""
     for name in (
         "distributed",
         "distributed.client",

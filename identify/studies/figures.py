@@ -1,5 +1,7 @@
-"""Figures of a study, PNG, PDF and SVG: its figures against each factor with bands, two factors as
-a map, the laws.
+"""Figures of a study as PNG, PDF and SVG.
+
+They show the figures of its rows against each factor with bands, or over two factors as a map, and
+its laws.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,7 +27,7 @@ from identify.studies.theory import CONFIDENCE as LAWS
 from identify.studies.theory import Verdict, law_data, point_statistics, with_data
 
 PANEL = (3.4, 2.8)
-"""Size of a panel, inches: a column of a journal."""
+"""Width and height of a panel, inches. The width is that of a journal's column."""
 STYLE: Any = {
     "font.size": 8,
     "axes.spines.top": False,
@@ -44,24 +46,23 @@ CURVES: list[dict[str, Any]] = [
         strict=True,
     )
 ]
-"""Markers, lines and colours, so that curves differ without colour."""
+"""Markers, lines and colours, so that curves differ even without colour."""
 FORMATS = ("png", "pdf", "svg")
 LEAST_SPAN = 2.0
-"""Smallest ratio of the ends of a logarithmic axis: small differences shall look small."""
+"""Smallest ratio of the ends of a logarithmic axis. It makes small differences look small."""
 WIDEST_BAND = 3.0
-"""Factor by which a logarithmic axis goes beyond what is drawn for the sake of bands; wider ones
-run out of it.
+"""Factor by which bands may extend a logarithmic axis beyond the curves. Wider ones run out of it.
 """
 LETTERS_PER_INCH = 14.0
-"""Letters of a title, a little fewer than there is room for."""
+"""Letters of a title per inch, a little fewer than there is room for."""
 BESIDE = 1.02
-"""Ratio of the places of two curves that have the same levels."""
+"""Ratio between the places of two curves that have the same levels."""
 MOST_CURVES = 6
-"""Settings of the other factors that are drawn as curves of their own; more are drawn as one."""
-NEAREST_TICKS, LETTER = 0.09, 0.034
-"""Shares of an axis: that two numbers above each other are apart, at least; of a letter of a
-number.
-"""
+"""Largest number of settings of the other factors drawn as separate curves, else all as one."""
+NEAREST_TICKS = 0.09
+"""Smallest distance of two ticks above each other, as a share of the axis."""
+LETTER = 0.034
+"""Width of a letter of a tick's number, as a share of the axis."""
 TICKS: list[list[float]] = [
     [1 + k / 10 for k in range(90)],
     [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8],
@@ -70,7 +71,7 @@ TICKS: list[list[float]] = [
     [1, 3],
     [1],
 ]
-"""Numbers within each decade that may stand on a logarithmic axis, as many as find room."""
+"""Choices of ticks within a decade of a logarithmic axis. The first one that has room is taken."""
 MOST_TICKS = 7
 
 Others = Sequence[tuple[str, pd.DataFrame]]
@@ -80,9 +81,7 @@ Others = Sequence[tuple[str, pd.DataFrame]]
 def draw(
     folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]
 ) -> None:
-    """Write the figures of a study's finished rows; `shown`: the figures of the rows that are
-    drawn.
-    """
+    """Write the figures of a study's finished rows. `shown` names the rows' figures to draw."""
     if not len(done) or not shown:
         return
     _write(folder, _figures(study, done, shown, verdicts))
@@ -91,8 +90,10 @@ def draw(
 def draw_side_by_side(
     folder: Path, study: Study, done: pd.DataFrame, shown: list[str], others: Others
 ) -> None:
-    """Write the figures against each factor, or against the studies where they vary nothing, with
-    the finished rows of other studies, by their names, beside them."""
+    """Write figures that show the finished rows of other studies beside a study's own.
+
+    They are drawn against each factor, or against the studies if these vary nothing.
+    """
     names, tables = zip((study.name, done), *others, strict=True)
     together = pd.concat(
         [table.assign(study=name) for name, table in zip(names, tables, strict=True)]
@@ -118,7 +119,7 @@ def _write(folder: Path, figures: Iterable[tuple[str, Figure]]) -> None:
 def _figures(
     study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]
 ) -> Iterator[tuple[str, Figure]]:
-    """All figures of a study, by the names of their files."""
+    """Yield all figures of a study with the names of their files."""
     for path in study.factors:
         yield f"by_{path}", factor_figure(study, done, path, shown)
     grid = [path for path, values in study.factors.items() if isinstance(values, list)]
@@ -134,8 +135,9 @@ def _figures(
 
 
 def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str]) -> Figure:
-    """Rms of each figure against one factor with its band, a curve for each setting of the other
-    factors.
+    """Draw the rms of each figure against one factor with its band.
+
+    There is a curve for each setting of the other factors.
     """
     figure, panels = panel_grid(len(shown), *PANEL)
     others = [other for other in study.factors if other != path]
@@ -146,23 +148,12 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
         else:
             curves = _curves(have, others)
             for place, (label, rows) in enumerate(curves):
-                _curve(
-                    axes,
-                    _beside(rows[path], place, len(curves)),
-                    rows[name].to_numpy(dtype=float),
-                    label,
-                    place,
-                )
-        law = next(
-            (
-                one
-                for one in study.theory
-                if (one.figure, one.per, one.factor) == (name, None, path)
-            ),
-            None,
-        )
-        if law is not None and law.exponent is not None:
-            _theory_line(axes, have[path], have[name].to_numpy(dtype=float), law.exponent)
+                levels = _beside(rows[path], place, len(curves))
+                _curve(axes, levels, rows[name].to_numpy(dtype=float), label, place)
+        drawn = (name, None, path)
+        laws = [one for one in study.theory if (one.figure, one.per, one.factor) == drawn]
+        if laws and laws[0].exponent is not None:
+            _theory_line(axes, have[path], have[name].to_numpy(dtype=float), laws[0].exponent)
         scale(axes, have[path])
         axes.set_xlabel(axis_label(path, study))
         axes.set_ylabel(axis_label(name, study))
@@ -176,13 +167,14 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
 def map_figure(
     study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: list[str]
 ) -> Figure:
-    """Rms of each figure over two factors, over all settings of the others."""
+    """Draw the rms of each figure over two factors, over all settings of the others."""
     figure, panels = panel_grid(len(shown), *PANEL)
     for axes, name in zip(panels, shown, strict=True):
         squares = done.assign(square=done[name] ** 2)
         table = np.sqrt(squares.pivot_table("square", paths[0], paths[1], "mean", sort=False))
         rms: Array = table.to_numpy(dtype=float)
         picture = axes.imshow(rms, aspect="auto", origin="lower")
+        # The default colour map is bright in its upper part, where white letters are hard to read.
         bright = 0.4 * np.nanmin(rms) + 0.6 * np.nanmax(rms)
         for (row, column), value in np.ndenumerate(rms):
             ink = "black" if value > bright else "white"
@@ -200,8 +192,9 @@ def map_figure(
 
 
 def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]]) -> Figure:
-    """What each law speaks of against its factor, on logarithmic axes, with the power that it
-    states.
+    """Draw the quantity of each law against its factor, with the power that the law states.
+
+    The axes are logarithmic.
     """
     figure, panels = panel_grid(len(laws), *PANEL)
     for axes, (law, verdict) in zip(panels, laws, strict=True):
@@ -229,8 +222,9 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
 
 
 def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
-    """The factor's value in each row; where it is a figure, its mean over the rows of a point, if
-    there are several.
+    """Return the factor's value in each row.
+
+    If the factor is a figure, it is its mean over the rows of the same point.
     """
     if factor in study.factors or not study.factors:
         return rows[factor]
@@ -238,15 +232,16 @@ def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
 
 
 def _title(figure: Figure, text: str) -> None:
-    """A title above all panels, in as many lines as the width of the figure asks for."""
+    """Write a title above all panels, in as many lines as the width of the figure needs."""
     figure.suptitle(
         "\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))), fontsize=9
     )
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:
-    """Rows of each setting of the other factors, with a label; all together where there are too
-    many.
+    """Return the rows of each setting of the other factors with a label.
+
+    If there are too many settings, all rows are one curve.
     """
     groups = list(done.groupby(others, sort=False)) if others else []
     if len(groups) > MOST_CURVES:
@@ -260,15 +255,14 @@ def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFra
 
 
 def _beside(levels: pd.Series, place: int, count: int) -> pd.Series:
-    """Levels of one of several curves, moved a little, so that their bands do not cover each
-    other."""
+    """Move the levels of one of several curves a little, so that their bands do not overlap."""
     if count == 1 or not pd.api.types.is_numeric_dtype(levels) or not (levels > 0).all():
         return levels
     return levels * BESIDE ** (place - (count - 1) / 2)
 
 
 def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, place: int) -> None:
-    """Rms at each level with its band."""
+    """Draw the rms at each level with its band."""
     groups = pd.Series(values, index=levels.index).groupby(
         levels, sort=pd.api.types.is_numeric_dtype(levels)
     )
@@ -291,8 +285,9 @@ def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, place: int)
 
 
 def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) -> None:
-    """The power law with that exponent through the middle of the data; none where the factor has no
-    powers.
+    """Draw the power law with that exponent through the middle of the data.
+
+    Nothing is drawn if the factor is not positive, because it then has no powers.
     """
     x = pd.to_numeric(factor, errors="coerce").to_numpy(dtype=float)
     if not np.all(x > 0.0):
@@ -310,7 +305,7 @@ def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) 
 
 
 def scale(axes: Axes, factor: pd.Series) -> None:
-    """Logarithmic axes where everything is positive, with numbers that do not touch each other."""
+    """Make axes logarithmic if everything on them is positive, with ticks that do not touch."""
     if pd.api.types.is_numeric_dtype(factor) and (factor > 0).all() and factor.nunique() > 1:
         axes.set_xscale("log")
         levels = (
@@ -319,7 +314,8 @@ def scale(axes: Axes, factor: pd.Series) -> None:
             else _log_ticks(*axes.get_xlim())
         )
         letters = max(len(number(float(value))) for value in levels)
-        _set_ticks(axes.xaxis, _far_apart(levels, *axes.get_xlim(), 0.02 + LETTER * letters))
+        room = 0.02 + LETTER * letters  # the longest number, and a gap
+        _set_ticks(axes.xaxis, _far_apart(levels, *axes.get_xlim(), room))
     drawn = np.concatenate(
         [np.asarray(line.get_ydata(), dtype=float).ravel() for line in axes.lines]
     )
@@ -333,6 +329,7 @@ def scale(axes: Axes, factor: pd.Series) -> None:
         middle = np.concatenate(curves or [drawn])
         low = max(drawn.min(), middle.min() / WIDEST_BAND)
         high = min(drawn.max(), middle.max() * WIDEST_BAND)
+        # 1.08 leaves a margin around the data.
         widen = 1.08 * max(1.0, np.sqrt(LEAST_SPAN * low / high))
         axes.set_ylim(low / widen, high * widen)
         _set_ticks(axes.yaxis, _log_ticks(*axes.get_ylim()))
@@ -342,7 +339,7 @@ def scale(axes: Axes, factor: pd.Series) -> None:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Round numbers between the ends of a logarithmic axis, as many as find room."""
+    """Return round numbers between the ends of a logarithmic axis, as many as have room."""
     decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     inside: list[float] = []
     for places in TICKS:
@@ -350,6 +347,7 @@ def _log_ticks(low: float, high: float) -> list[float]:
         inside = [value for value in found if low <= value <= high]
         if len(inside) <= MOST_TICKS and _far_apart(inside, low, high) == inside:
             return inside
+    # No choice has room, so every k-th of the fewest is taken, with k rounded up.
     return inside[:: -(-len(inside) // MOST_TICKS)]
 
 
@@ -362,8 +360,9 @@ def _set_ticks(axis: Axis, values: list[float]) -> None:
 def _far_apart(
     values: list[float], low: float, high: float, share: float = NEAREST_TICKS
 ) -> list[float]:
-    """Those of ascending values that are this share of a logarithmic axis from the last that was
-    kept, or more.
+    """Return those of ascending values that keep a distance from the last one kept.
+
+    `share` is that distance as a share of a logarithmic axis.
     """
     kept: list[float] = []
     for value in values:

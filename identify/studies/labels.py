@@ -1,12 +1,10 @@
-"""What the columns of a study are called: by their keys with units in tables, and in words in
-figures.
-"""
+"""Names of a study's columns: keys with units for tables, and words for figures."""
 
 import re
 from textwrap import wrap
 
-from identify.studies.design import field_of, valid_keys
 from identify.studies.rows import KINDS
+from identify.studies.study_design import field_of, valid_keys
 from identify.studies.study_file import Study
 
 PRINTED = {"um": "µm", "urad": "µrad"}
@@ -22,14 +20,14 @@ SUFFIXES = {
     "_rad": "rad",
     "_percent": "%",
 }
-"""Units in the ends of names; those of one's own kinds of row say theirs only so."""
+"""Units at the ends of names. Users' own kinds of row state theirs in no other way."""
 
 WIDEST = 36
-"""Letters in a line of a label."""
+"""Largest number of letters in a line of a label."""
 
 
 def factor_unit(path: str) -> str:
-    """Unit of a factor by dotted path; empty where it has none."""
+    """Return the unit of a factor by dotted path, or an empty string if it has none."""
     field = field_of(path)
     if field is None:
         return "s" if path.startswith("options.") and path.endswith("_s") else ""
@@ -41,8 +39,9 @@ def factor_unit(path: str) -> str:
 
 
 def unit_of(name: str, study: Study) -> str:
-    """Unit of a column of a study's table, a factor or a figure; empty where it has none, or where
-    nobody says it.
+    """Return the unit of a factor or figure in a study's table.
+
+    It is empty if the column has no unit, or if none is stated.
     """
     if name == "seconds":
         return "s"
@@ -54,42 +53,39 @@ def unit_of(name: str, study: Study) -> str:
 
 
 def labelled(name: str, study: Study) -> str:
-    """A column's name with its unit in brackets."""
+    """Return a column's name with its unit in brackets."""
     return f"{name} [{unit}]" if (unit := unit_of(name, study)) else name
 
 
 def axis_label(name: str, study: Study, per: str | None = None) -> str:
-    """What a column, or one divided by another, is in words, with its unit in brackets, in lines of
-    WIDEST letters.
+    """Describe a column, or one divided by another, in words with its unit in brackets.
+
+    The text is wrapped to lines of WIDEST letters.
     """
     words = _words(name, study)
     unit = _unit(name, study)
-    if per is not None:  # both in words would be a paragraph
+    # A ratio has the names of its columns, because both in words would fill a paragraph.
+    if per is not None:
         words = f"{_plain_name(name)} / {_plain_name(per)}"
         unit = "/".join(filter(None, (unit, _unit(per, study))))
-    lines = wrap(
-        words[:1].upper() + words[1:] + (f" [{unit}]" if unit else ""),
-        WIDEST,
-        break_long_words=False,
-    )
-    return "\n".join(lines)
+    text = words[:1].upper() + words[1:] + (f" [{unit}]" if unit else "")
+    return "\n".join(wrap(text, WIDEST, break_long_words=False))
 
 
 def setting(path: str, value: object) -> str:
-    """A factor and its value, as a legend shows them: "frame rate 10 Hz"."""
+    """Return a factor and its value as a legend shows them, such as "frame rate 10 Hz"."""
     return " ".join(filter(None, (_plain_name(path), number(value), factor_unit(path))))
 
 
 def number(value: object) -> str:
-    """A number as one writes it, in four digits or all before the point; anything else as it is."""
+    """Format a float with four digits, or all before the point, and other values as they are."""
     if not isinstance(value, float):
         return str(value)
     return f"{value:.4g}" if not 1e4 <= abs(value) < 1e7 else f"{value:.0f}"
 
 
 def _words(name: str, study: Study) -> str:
-    """The first statement of what is said of a column; its name in plain letters where
-    nothing is."""
+    """Return the first part of a column's description, or its name in plain letters without one."""
     columns = KINDS[study.kind].columns if study.kind in KINDS else {}
     if name in columns:
         said = columns[name].meaning
@@ -98,6 +94,7 @@ def _words(name: str, study: Study) -> str:
         field = field_of(name, kind.options if kind else None)
         said = (field.description if field is not None else None) or ""
     first = re.split(r"[;:]", said)[0]
+    # Words such as "the same as above" refer to another column, which a label does not show.
     return _plain_name(name) if not first or first.startswith("the same") else first
 
 
@@ -113,6 +110,6 @@ def _plain_name(name: str) -> str:
 
 
 def _suffix(name: str) -> tuple[str, str]:
-    """A name without the unit at its end, and that unit."""
+    """Split a name into the part before the unit at its end, and that unit."""
     end = next((end for end in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(end)), "")
     return name.removesuffix(end) if end else name, SUFFIXES.get(end, "")

@@ -1,31 +1,32 @@
-"""Whether the rows of a study find room in the memory of this machine, told before the first
-one."""
+"""Check, before the first row, that the rows of a study fit into the memory of this machine."""
 
 import psutil
 
 from identify.errors import StudyError
-from identify.studies.design import Case, prepare
+from identify.scenario import Scenario
 from identify.studies.rows import find_kind
+from identify.studies.study_design import Case, prepare
 from identify.studies.study_file import Range, Study
 
 LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
-"""Factors that decide how long a record or a stretch of a path is."""
+"""Factors that decide the length of a record or of a stretch of a path."""
 
 PROCESS = 0.5e9
-"""Bytes of a process before its first row."""
+"""Memory of a process before its first row, bytes."""
 
 GB = 1e9
 
 
-def check_memory(study: Study, workers: int) -> None:
+def check_memory(study: Study, workers: int, scenario: Scenario | None = None) -> None:
     """Refuse a study whose longest rows, one a worker, need more memory than this machine has.
 
-    Raises StudyError with both, and as `prepare` does.
+    The study varies `scenario`, or else the one it names. Raises StudyError with both numbers, and
+    the errors of `prepare`.
     """
     kind = find_kind(study.kind)
     if kind.memory is None:
         return
-    setup = prepare(study)
+    setup = prepare(study, scenario)
     longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
     case = Case(0, 0, longest)
     row = setup.row_scenario(case), kind.checked(setup.row_options(case))

@@ -1,12 +1,12 @@
-"""The batches of a study on processes of this machine, which no other user can reach.
+"""Batches of a study on processes of this machine, which no other user can reach.
 
-Each process has a pipe of its own to this one, without name or address, and no file. It gets a
-batch, and the next one when what it found is on the disk. Where a process dies, another takes its
-place, and the rows of its batch are computed again when all others are done, each alone. A row that
-then ends its process again is an error of this row.
+Each process is joined to this one by a pipe of its own, which has no name, address or file. It gets
+a batch, and the next one when the rows it found are on the disk. If a process dies, another takes
+its place. The rows of its batch are computed again when all others are done, each alone. A row that
+then ends its process again becomes an error of this row.
 
-`concurrent.futures.ProcessPoolExecutor` ends all processes where one dies, does not say which rows
-that one had, and lets its processes wait without end where this one is killed.
+`concurrent.futures.ProcessPoolExecutor` is not used. If one process dies, it ends all of them and
+does not say which rows that one had. If this process is killed, its processes wait without end.
 """
 
 import os
@@ -20,31 +20,34 @@ import psutil
 
 from identify.errors import StudyError
 from identify.runtime import deaf_offspring, end_with_parent, held
-from identify.studies.design import Case, Finished, Setup
 from identify.studies.memory import GB
 from identify.studies.runner import Batches, Suspects, compute
+from identify.studies.study_design import Case, Finished, Setup
 
 SPAWN = get_context("spawn")
-"""A process begins anew: it inherits no threads, and no locks that they hold."""
+"""Way to start processes anew, so that they inherit neither threads nor the locks these hold."""
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""One thread a process, set before the libraries are loaded: there are as many as cores."""
+"""Variables that limit a process to one thread, set before it loads its libraries.
+
+There are as many processes as cores.
+"""
 
 MEMORY_SHARE = 0.95
-"""How much of its share of the memory a process may take: it ends before the machine does."""
+"""Part of its share of the memory that a process may take. It ends before the machine does."""
 
 LOOK_S = 1.0
-"""How often the memory of the processes is looked at, seconds."""
+"""Interval at which the memory of the processes is checked, s."""
 
 STILLBORN = 3
-"""How many processes may die one after the other before they are ready."""
+"""Number of processes that may die one after the other before they are ready."""
 
 END_S = 10.0
-"""How long a killed process may take to end, seconds."""
+"""Longest time that a killed process may take to end, s."""
 
 
 class ProcessExecutor:
-    """Computes the batches of a study on so many processes, each replaced when it dies."""
+    """Executor of a study's batches on a number of processes, each replaced when it dies."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -55,7 +58,10 @@ class ProcessExecutor:
     def __call__(self, setup: Setup, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches as they are done.
 
-        Raises StudyError: processes cannot be started, or die before they compute anything.
+        Raises
+        ------
+        StudyError
+            Processes cannot be started, or die before they compute anything.
         """
         suspects = Suspects()
         try:
@@ -66,7 +72,8 @@ class ProcessExecutor:
                         yield finished
                 self._start_missing()
         finally:
-            if any(worker.cases for worker in self._workers):  # nobody waits for it any more
+            # Nobody waits for the rows of a process that still computes, so it ends.
+            if any(worker.cases for worker in self._workers):
                 self.close()
 
     def close(self) -> None:
@@ -88,7 +95,10 @@ class ProcessExecutor:
             ) from error
 
     def _hand_out(self, setup: Setup, batches: Batches, suspects: Suspects) -> bool:
-        """Give each idle process a batch, and suspects last, one at a time. False at the end."""
+        """Give each idle process a batch, and suspects last, one at a time.
+
+        Returns False at the end.
+        """
         ready = [worker for worker in self._workers if worker.ready]
         for worker in ready:
             if not worker.cases:
@@ -98,7 +108,10 @@ class ProcessExecutor:
         return not ready or any(worker.cases for worker in ready)
 
     def _heard(self) -> list["_Worker"]:
-        """Processes that are ready, have found something or have died, as far as there are any."""
+        """Return the processes that are ready, have found something or have died.
+
+        It waits LOOK_S at most, and also checks the memory of all processes.
+        """
         if time.monotonic() > self._looked + LOOK_S:
             self._looked = time.monotonic()
             limit = MEMORY_SHARE * psutil.virtual_memory().total / self._count
@@ -108,7 +121,7 @@ class ProcessExecutor:
         return [worker for worker in self._workers if worker.pipe in heard]
 
     def _take(self, worker: "_Worker", batches: Batches, suspects: Suspects) -> list[Finished]:
-        """What a process has found; nothing where it has become ready, or has died."""
+        """Return what a process has found; nothing if it has become ready, or has died."""
         cases = worker.cases
         try:
             finished = worker.receive()
@@ -120,7 +133,7 @@ class ProcessExecutor:
         return finished
 
     def _bury(self, worker: "_Worker", suspects: Suspects) -> list[Finished]:
-        """Make room for another process; the rows that were its second victim are errors."""
+        """Remove a dead process. Rows that have now killed two processes are returned as errors."""
         with held():
             self._workers.remove(worker)
             worker.end()
@@ -135,9 +148,18 @@ class ProcessExecutor:
 
 
 class _Worker:
-    """A process and the pipe to it.
+    """Process of this machine, and the pipe to it.
 
-    ready: it has loaded its libraries. cases: the rows that it computes. fate: how it ends.
+    Attributes
+    ----------
+    ready : bool
+        Whether the process has loaded its libraries.
+    cases : list of Case
+        Rows that it computes now.
+    fate : str
+        Words for its end in an error message.
+    pipe : Connection
+        This side of the pipe.
     """
 
     def __init__(self) -> None:
@@ -153,28 +175,32 @@ class _Worker:
         theirs.close()
 
     def give(self, setup: Setup, cases: list[Case]) -> None:
-        """Have it compute rows; none are no work."""
+        """Hand over rows to compute. An empty list is no work."""
         self.cases = cases
         if cases:
-            with suppress(OSError):  # it has died, which is seen when it is heard
+            # OSError means that it has died, which is seen when it is heard.
+            with suppress(OSError):
                 self.pipe.send((setup, cases))
 
     def receive(self) -> list[Finished]:
-        """What it has found; nothing when it becomes ready. Raises EOFError or OSError: it died."""
+        """Return the rows found, or none when the process becomes ready.
+
+        Raises EOFError or OSError if it has died.
+        """
         finished: list[Finished] = self.pipe.recv()
         self.ready = True
         self.cases = []
         return finished
 
     def keep_below(self, limit: float) -> None:
-        """End it where it takes more memory than the limit, in bytes."""
+        """End the process if it takes more memory than the limit, bytes."""
         with suppress(psutil.Error):
             if psutil.Process(self._process.pid).memory_info().rss > limit:
                 self.fate = f"took more than {limit / GB:.3g} GB of memory"
                 self._process.kill()
 
     def end(self) -> None:
-        """End it, whatever it does."""
+        """End the process, whatever it does."""
         self.pipe.close()
         self._process.kill()
         self._process.join(END_S)
@@ -182,7 +208,7 @@ class _Worker:
 
 @contextmanager
 def local_processes(count: int) -> Iterator[ProcessExecutor]:
-    """Workers: so many new processes on this machine."""
+    """Provide a number of new processes on this machine as workers."""
     executor = ProcessExecutor(count)
     try:
         yield executor
@@ -192,7 +218,7 @@ def local_processes(count: int) -> Iterator[ProcessExecutor]:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Environment of a process that begins in the block."""
+    """Set the environment of the processes that begin in the block to one thread each."""
     before = {name: os.environ[name] for name in THREADS if name in os.environ}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
@@ -208,8 +234,8 @@ def _work(pipe: Connection) -> None:
     end_with_parent()
     import cv2
 
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(1)  # OpenCV does not read the variables of THREADS
     with suppress(EOFError, OSError, KeyboardInterrupt):
-        pipe.send([])
+        pipe.send([])  # no rows: the libraries are loaded, and the process is ready
         while True:
             pipe.send(compute(*pipe.recv()))

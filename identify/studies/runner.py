@@ -1,5 +1,6 @@
-"""A study from its first to its last row: what is not done yet is computed, kept at once, and
-tabulated at the end.
+"""A study from its first to its last row.
+
+Rows that are not done yet are computed and kept at once, and all are tabulated at the end.
 """
 
 import math
@@ -13,13 +14,14 @@ from pathlib import Path
 
 import pandas as pd
 
-from cmmsim.plugins import allow_plugin
+from cmmsim.allowed_plugins import allow_plugin
 from identify.errors import StudyInterrupted
 from identify.progress import Progress
 from identify.runtime import honoured, raise_noted
-from identify.studies.design import Case, Design, Finished, Setup, prepare
+from identify.scenario import Scenario
 from identify.studies.rows import find_kind
 from identify.studies.store import VIEW, Journal, open_folder, resolved
+from identify.studies.study_design import Case, Design, Finished, Setup, prepare
 from identify.studies.study_file import Study
 from identify.studies.table import FIRST, LAST, TABLE, tidy_table, write_table, write_view
 
@@ -80,16 +82,43 @@ def run_study(
     progress: Progress,
     workers: Workers = in_this_process,
     so_far: SoFar = lambda frame: None,
+    scenario: Scenario | None = None,
 ) -> Outcome:
-    """Run a study in its folder, or go on with it there; the same study gives the same figures
-    whatever the workers.
+    """Run a study in its folder, or go on with it there.
 
-    so_far: gets the table of what is done now and then while it runs. Raises StudyError: see
-    `identify.studies.design.prepare` and `identify.studies.store.open_folder`; the disk is full;
-    the workers are lost. Finished rows are kept, and the same call goes on from there. Raises
-    StudyInterrupted: Ctrl-C, likewise.
+    The same study gives the same figures whatever the workers. Finished rows are kept, and the
+    same call goes on from there.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    folder : Path
+        Folder of its files.
+    progress : Progress
+        Where the rows are counted.
+    workers : callable
+        Starts what computes the rows.
+    so_far : callable
+        Gets the table of what is done now and then while the study runs.
+    scenario : Scenario, optional
+        Scenario that the study varies. The default is the one that the study names.
+
+    Returns
+    -------
+    Outcome
+        The table of all rows.
+
+    Raises
+    ------
+    StudyError
+        The study is not valid (see `identify.studies.study_design.prepare`), the folder is not
+        its own (see `identify.studies.store.open_folder`), the disk is full, or the workers are
+        lost.
+    StudyInterrupted
+        Ctrl-C ended it.
     """
-    setup = prepare(study)
+    setup = prepare(study, scenario)
     entry = resolved(study, setup)
     design = Design(study)
     with open_folder(folder, entry, len(design)) as journal:

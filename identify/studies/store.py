@@ -1,13 +1,14 @@
-"""The folder of a study: whose it is, who works on it, and the journal of what is done.
+"""Folder of a study: its owner, the lock while somebody works on it, and the journal of its rows.
 
-``study.json`` is the resolved study with the versions of the software that began it, ``rows.jsonl``
-its finished rows, ``study.parquet`` the table made of them, ``study.nc`` their figures by factors.
+``study.json`` is the resolved study with the versions of the software that began it. ``rows.jsonl``
+holds its finished rows, ``study.parquet`` the table made of them, and ``study.nc`` their figures by
+factors.
 
-The journal is an append-only file of JSON lines, on the disk before the next rows are begun. A line
-is complete or it does not count: whatever ends the program, a line that was written stays, and a
+The journal is an append-only file of JSON lines. Rows are on the disk before the next ones begin. A
+line counts only if it is complete: whatever ends the program, a line that was written stays, and a
 torn last one is cut off when the file is opened again. A database (sqlite3, write-ahead log)
-appends 22,000 rows a second where this appends 9,000, and rows come 100 a second; with one byte of
-its log damaged it silently gave back 99 rows of 200, where this names the line.
+appends 22,000 rows a second where this appends 9,000, and rows come at 100 a second. With one byte
+of its log damaged, the database silently gave back 99 rows of 200, where this names the line.
 """
 
 import json
@@ -24,10 +25,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from cmmsim.files import read_sensor_file
 from identify.errors import StudyError, StudyInterrupted
-from identify.files.atomic import write_text
+from identify.files.atomic import make_folder, take_back, write_text
 from identify.files.lock import LOCK, locked
 from identify.files.versions import same_versions, versions
-from identify.studies.design import Finished, Setup
+from identify.studies.study_design import Finished, Setup
 from identify.studies.study_file import Study
 from identify.studies.table import TABLE, study_in, written
 
@@ -43,9 +44,11 @@ MAY_CHANGE = (
     "study.repeats",
     "scenario.description",
 )
-"""What may change in a study that is continued: it decides no row that is there. Further repeats
-have rows of their own after all others; with fewer, the rows beyond stay in the journal and count
-for nothing."""
+"""Entries that may change in a study that is continued, because they decide no row that is there.
+
+Rows of further repeats come after all others. With fewer repeats, the rows beyond stay in the
+journal and do not count.
+"""
 
 REMEDY = "go on with that version, or name another folder with --out"
 
@@ -53,20 +56,29 @@ FINISHED = TypeAdapter(Finished)
 
 
 class Journal:
-    """Finished rows of a study with ``rows`` rows; a context that closes the file.
+    """Finished rows of a study with ``rows`` rows, as a context that closes the file.
 
-    beyond: how many rows it has of repeats that the study had before.
+    Attributes
+    ----------
+    path : Path
+        The file.
+    beyond : int
+        Number of rows in the file of repeats that the study had before and no longer has.
+    finished : ndarray of bool, shape (rows,)
+        Mark of each row that is done.
     """
 
     def __init__(self, path: Path, rows: int) -> None:
         self.path = path
         self.beyond = 0
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
+        with written(path):
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         self.finished: NDArray[np.bool_] = np.zeros(rows, dtype=bool)
         self._end = 0
         for row, end in self._complete_lines():
             self._note(row)
             self._end = end
+        # A torn last line goes, so that the next row begins a line of its own.
         os.ftruncate(self._file, self._end)
 
     def __enter__(self) -> "Journal":
@@ -76,9 +88,9 @@ class Journal:
         os.close(self._file)
 
     def append(self, rows: list[Finished]) -> None:
-        """Add finished rows; when this returns they are on the disk.
+        """Add finished rows. They are on the disk when this returns.
 
-        Raises StudyError: the disk is full or broken; the file is as it was before.
+        Raises StudyError if the disk is full or broken. The file is then as it was before.
         """
         text = "".join(f"{json.dumps(asdict(row))}\n" for row in rows).encode()
         safe = f"; {self.finished.sum()} rows are safe, and the same command goes on from there"
@@ -86,7 +98,7 @@ class Journal:
             try:
                 os.lseek(self._file, self._end, os.SEEK_SET)
                 left = text
-                while left:
+                while left:  # one call may write only a part
                     left = left[os.write(self._file, left) :]
                 os.fsync(self._file)
             except OSError:
@@ -97,14 +109,15 @@ class Journal:
             self._note(row)
 
     def rows(self) -> Iterator[Finished]:
-        """The finished rows in the order in which they were done."""
+        """Yield the finished rows in the order in which they were done."""
         for row, _ in self._complete_lines():
             if row.number < len(self.finished):
                 yield row
 
     def pending(self) -> Iterator[int]:
-        """Numbers of the rows that are still to be done, ascending; those that are done meanwhile
-        may be among them.
+        """Yield the numbers of the rows still to be done, ascending.
+
+        Whether a row is done is looked up when its number is reached.
         """
         return (number for number in range(len(self.finished)) if not self.finished[number])
 
@@ -115,9 +128,7 @@ class Journal:
             self.beyond += 1
 
     def _complete_lines(self) -> Iterator[tuple[Finished, int]]:
-        """Rows with the place where each line ends, up to the end of the file or to a torn last
-        line.
-        """
+        """Yield rows with the place where each line ends, up to a torn last line."""
         with self.path.open("rb") as file:
             end = 0
             for number, line in enumerate(file, 1):
@@ -136,8 +147,9 @@ class Journal:
 
 
 def resolved(study: Study, setup: Setup) -> dict[str, Any]:
-    """Everything that decides the rows of a study, as JSON has it: its file, and the scenario and
-    sensor it names.
+    """Return everything that decides the rows of a study, as JSON has it.
+
+    It is the study's file, and the scenario and sensor that it names.
     """
     scenario = setup.scenario
     sensor = read_sensor_file(scenario.sensor, scenario.sensor_changes)
@@ -151,35 +163,56 @@ def resolved(study: Study, setup: Setup) -> dict[str, Any]:
 
 @contextmanager
 def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Journal]:
-    """Work on the folder of a resolved study with ``rows`` rows, new or begun before; nobody else
-    may meanwhile.
+    """Work on the folder of a resolved study, new or begun before, while nobody else may.
 
-    What refuses the study before its first row leaves nothing behind that was not there; Ctrl-C
-    leaves a study begun.
+    A study that is refused before its first row leaves nothing behind that was not there. Ctrl-C
+    leaves a study that has begun.
 
-    Raises StudyError: the folder is of another study, in use, holds something else or cannot be
-    made; one of its files is damaged; rows would be added to those of another version of cmmsim.
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    entry : dict
+        The resolved study.
+    rows : int
+        Number of its rows.
+
+    Raises
+    ------
+    StudyError
+        The folder is of another study, in use, holds something else or cannot be made, one of its
+        files is damaged, or rows would be added to those of another version of cmmsim.
     """
     _check_content(folder)
     _check_entries(folder)
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
     new = not (folder / STUDY).exists()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        made = make_folder(folder)
     except OSError as error:
         raise StudyError(
             f"study folder {folder} cannot be made: {error.strerror}; name another with --out"
         ) from error
+    try:
+        with _locked_study(folder, entry, rows, new) as journal:
+            yield journal
+    finally:
+        take_back(made)
+
+
+@contextmanager
+def _locked_study(folder: Path, entry: dict[str, Any], rows: int, new: bool) -> Iterator[Journal]:
+    """Hold the lock of a study's folder; ``new``: the study is not there before."""
     with locked(folder, StudyError):
         try:
             begun = _claim(folder, entry)
             with Journal(folder / JOURNAL, rows) as journal:
+                # A finished study gets no rows, so any version may tabulate it.
                 if not journal.finished.all():
                     same_versions({f"the study in {folder}": begun}, REMEDY)
                 yield journal
         except StudyError as error:
             if new and not _has_rows(folder) and not isinstance(error, StudyInterrupted):
-                _take_back(folder, made)
+                _take_back(folder)
             raise
 
 
@@ -196,8 +229,9 @@ def _check_content(folder: Path) -> None:
 
 
 def _check_entries(folder: Path) -> None:
-    """Refuse what is no file of a study under the name of one: a pipe would be waited for without
-    end, and rows would be written to where a link points.
+    """Refuse links, pipes and the like under the names of a study's files.
+
+    A pipe would be waited for without end, and rows would be written to where a link points.
     """
     for name in (STUDY, JOURNAL, TABLE, VIEW):
         path = folder / name
@@ -206,33 +240,30 @@ def _check_entries(folder: Path) -> None:
 
 
 def _claim(folder: Path, entry: dict[str, Any]) -> dict[str, str]:
-    """Make the folder that of a study, or refuse where it is that of another; versions that began
-    its rows.
+    """Make the folder that of a study, or refuse if it is that of another.
+
+    Returns the versions that began its rows.
     """
     here = _study_file(folder / STUDY)
     stored: dict[str, str] | None = here.pop(VERSIONS, None) if here else None
+    # A study without rows begins with the versions of today.
     begun = stored if stored and _has_rows(folder) else versions()
     for name, found in ((STUDY, here), (TABLE, study_in(folder / TABLE))):
         if found is not None and (others := _differences(found, entry)):
             raise StudyError(
                 f"{folder / name} is of another study, which differs in {', '.join(others[:4])}; "
-                "name another folder "
-                "with --out"
+                "name another folder with --out"
             )
     with written(folder / STUDY):
         write_text(folder / STUDY, json.dumps(entry | {VERSIONS: begun}, indent=1) + "\n")
     return begun
 
 
-def _take_back(folder: Path, made: list[Path]) -> None:
-    """Remove what was made of a study that did not begin: its files, then the folders made for it,
-    the inmost first.
-    """
-    with suppress(OSError):  # where somebody else has put something there meanwhile, it stays
+def _take_back(folder: Path) -> None:
+    """Remove the files of a study that did not begin."""
+    with suppress(OSError):
         for name in (STUDY, JOURNAL, LOCK):
             (folder / name).unlink(missing_ok=True)
-        for path in made:
-            path.rmdir()
 
 
 def _has_rows(folder: Path) -> bool:
@@ -240,7 +271,7 @@ def _has_rows(folder: Path) -> bool:
 
 
 def _study_file(path: Path) -> dict[str, Any] | None:
-    """What a folder says of its study; None where it says nothing."""
+    """Return what a folder states of its study, or None."""
     if not path.exists():
         return None
     try:
@@ -250,7 +281,7 @@ def _study_file(path: Path) -> dict[str, Any] | None:
 
 
 def _differences(one: Any, other: Any, path: str = "") -> list[str]:
-    """Paths at which two resolved studies differ in what decides their rows."""
+    """Return the paths at which two resolved studies differ in what decides their rows."""
     if isinstance(one, dict) and isinstance(other, dict):
         keys = [*one, *(key for key in other if key not in one)]
         return [

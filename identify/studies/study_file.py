@@ -1,5 +1,4 @@
-"""What a user writes: which scenario is varied how, and the laws that its rows should follow, read
-from TOML.
+"""Study files in TOML: the scenario, its variation, and the laws that its rows should follow.
 
 The help of ``cmmsim study`` shows a file. The keys of what is varied are dotted paths:
 ``scenario.`` and a key of a scenario, ``sensor.`` and a key of a sensor file, ``options.`` and an
@@ -21,13 +20,12 @@ from identify.scenario.settings_file import SettingsFiles, one_line
 
 
 class Law(Section):
-    """A law: one of three statements about the rms of a figure over rows, with all other factors
-    held where they are.
+    """Statement about the rms of a figure over rows, with all other factors held fixed.
 
-    exponent: it grows with a numeric factor as ``factor ** exponent``; equals: it is that of
-    another figure; order: it grows along these values of a factor. Valid to ``tolerance``, an
-    amount that the statement itself is known to be off by: of the exponent, or of the logarithm of
-    a ratio.
+    A law states one of three things. ``exponent``: the figure grows with a numeric factor as
+    ``factor ** exponent``. ``equals``: its rms is that of another figure. ``order``: it grows along
+    these values of a factor. ``tolerance`` is the error of the statement itself: of the exponent,
+    or of the logarithm of a ratio.
     """
 
     figure: str = Field(description="figure of the rows, its rms over rows is meant")
@@ -62,12 +60,12 @@ class Law(Section):
 
     @property
     def quantity(self) -> str:
-        """The figure, divided by the other where there is one."""
+        """Figure, divided by the other one if there is one."""
         return self.figure if self.per is None else f"{self.figure} / {self.per}"
 
     @property
     def statement(self) -> str:
-        """What the law says, in a line."""
+        """Statement of the law in one line."""
         if self.equals is not None:
             return f"{self.quantity} = {self.equals}"
         if self.order is not None:
@@ -76,7 +74,7 @@ class Law(Section):
 
     @property
     def expected(self) -> str:
-        """The exponent or ratio that is to be measured, in words."""
+        """Exponent or ratio to be measured, in words."""
         if self.order is not None:
             return "ratio > 1"
         value = "ratio 1" if self.exponent is None else f"{self.exponent:g}"
@@ -84,9 +82,7 @@ class Law(Section):
 
 
 class Range(Section):
-    """A factor of a random sample, drawn evenly between two bounds or evenly between their
-    logarithms.
-    """
+    """Factor of a random sample, uniform between two bounds or between their logarithms."""
 
     low: float
     high: float
@@ -107,7 +103,7 @@ class Range(Section):
 
 
 class Study(Section):
-    """A whole study; load one with `load_study`."""
+    """Content of a study file. Load one with `load_study`."""
 
     name: Name = Field(description="short name, used for folders")
     title: str = Field("", description="what the study asks")
@@ -171,17 +167,20 @@ class Study(Section):
 
     @property
     def rows(self) -> int:
-        """Number of rows: each point once a repeat."""
+        """Number of rows, one for each point and repeat."""
         return self.points * self.repeats
 
     def with_settings(self, settings: Mapping[str, Any]) -> "Study":
-        """Copy with entries replaced by dotted path, such as ``{"repeats": 5,
-        "scenario.timing.latency_s": 0.01}``.
+        """Copy the study with entries replaced by dotted path.
 
-        A key of the scenario, of the sensor or of the options with a list of values, or with a
-        table of low and high, becomes a factor; with any other value it holds in every row.
+        An example is ``{"repeats": 5, "scenario.timing.latency_s": 0.01}``. A key of the scenario,
+        of the sensor or of the options becomes a factor if its value is a list, or a table of low
+        and high. Any other value holds in every row.
 
-        Raises StudyError: no such entry (with the valid names), or a value that does not fit.
+        Raises
+        ------
+        StudyError
+            There is no such entry (the message names valid ones), or a value does not fit.
         """
         data = {"factors": {}, "changes": {}, "options": {}} | self.model_dump(exclude_unset=True)
         single = [
@@ -194,21 +193,15 @@ class Study(Section):
             if path in single:
                 data[path] = value
             elif root in ("scenario", "sensor", "options") and key:
-                place, name = ("options", key) if root == "options" else ("changes", path)
-                for held, old in (
-                    ("factors", path),
-                    (place, name),
-                ):  # and what stands in a table of this name
-                    data[held] = {
-                        key: one
-                        for key, one in data[held].items()
-                        if not f"{key}.".startswith(f"{old}.")
-                    }
-                varied = isinstance(value, list) or (
-                    isinstance(value, dict) and set(value) & set(Range.model_fields)
-                )
-                table, name = ("factors", path) if varied else (place, name)
-                data[table][name] = value
+                place = "options" if root == "options" else "changes"
+                name = key if root == "options" else path
+                data["factors"] = _without(data["factors"], path)
+                data[place] = _without(data[place], name)
+                is_range = isinstance(value, dict) and set(value) & set(Range.model_fields)
+                if isinstance(value, list) or is_range:
+                    data["factors"][path] = value
+                else:
+                    data[place][name] = value
             else:
                 raise StudyError(
                     f"unknown key {path!r} of study {self.name!r}; valid names: "
@@ -233,23 +226,29 @@ STUDIES = SettingsFiles(
 
 
 STARTING = Path(__file__).parent / "starting.toml"
-"""A study file that shows what one may have."""
+"""Study file that shows what one may have."""
 
 
 def load_study(name_or_path: str | Path) -> Study:
-    """Load a built-in study by name, or one from a TOML file, from whose folder its paths start.
+    """Load a built-in study by name, or one from a TOML file.
 
-    Raises StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys
-    of factors and changes are checked by `identify.studies.design`.
+    Paths in a file start from its folder. The keys of factors and changes are checked later, by
+    `identify.studies.study_design`.
+
+    Raises
+    ------
+    StudyError
+        There is no such study (the message names the built-in ones), or the file is not TOML or
+        has wrong content.
     """
     return STUDIES.load(name_or_path)
 
 
 def study_schema() -> dict[str, Any]:
-    """JSON schema of study files, for editors; `built_in/study.schema.json` holds it.
+    """Return the JSON schema of study files, for editors; `built_in/study.schema.json` holds it.
 
-    What is varied stands in tables in tables, whose keys are those of scenarios, sensors and kinds
-    of row.
+    What is varied stands in nested tables. Their keys are those of scenarios, sensors and kinds of
+    row.
     """
     schema = Study.model_json_schema()
     for name in ("changes", "factors"):
@@ -259,12 +258,13 @@ def study_schema() -> dict[str, Any]:
             "description": known["description"],
             "propertyNames": {"pattern": r"^(scenario|sensor|options)(\.|$)"},
         }
+    # Nothing in the schema refers to it any more.
     del schema["$defs"]["Range"]
     return schema
 
 
 def _factor(path: str, value: Any) -> Any:
-    """A list or a range; anything else is a ValueError in words."""
+    """Return a list or a range; raise ValueError in words for anything else."""
     if isinstance(value, (list, Range)):
         return value
     if not isinstance(value, Mapping):
@@ -278,10 +278,13 @@ def _factor(path: str, value: Any) -> Any:
         raise ValueError(f"{path}: {one_line(error, Range)}") from error
 
 
+def _without(values: dict[str, Any], path: str) -> dict[str, Any]:
+    """Copy values by dotted path without that of a path and those in its table."""
+    return {key: value for key, value in values.items() if not f"{key}.".startswith(f"{path}.")}
+
+
 def _by_path(tables: Any, keep: Collection[str] = (), section: str = "") -> Any:
-    """Tables in tables as one table by dotted path; a table with one of the keys ``keep`` is a
-    value.
-    """
+    """Flatten nested tables by dotted path. A table with one of the keys ``keep`` is a value."""
     if not isinstance(tables, Mapping):
         return tables
     found: dict[str, Any] = {}

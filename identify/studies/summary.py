@@ -1,6 +1,6 @@
-"""The summary of a study: `summary.json` and `summary.md`, and figures beside them.
+"""Summary of a study: `summary.json` and `summary.md`, with figures beside them.
 
-Rows that failed are counted and named, and no average has them in it.
+Rows that failed are counted and named. No average includes them.
 """
 
 import math
@@ -24,9 +24,9 @@ from identify.studies.theory import Statistics, Verdict, check_laws
 JSON = "summary.json"
 MARKDOWN = "summary.md"
 NAMED = 20
-"""Failed rows that the summary names one by one."""
+"""Largest number of failed rows, and of reasons, that the summary names."""
 LONGEST = 60
-"""Points in the table of `summary.md`; `summary.json` has all."""
+"""Largest number of points in the table of `summary.md`. `summary.json` has all."""
 
 Points = list[tuple[dict[str, Any], dict[str, Statistics]]]
 """Factors and statistics of points."""
@@ -35,11 +35,32 @@ Points = list[tuple[dict[str, Any], dict[str, Statistics]]]
 def write(
     folder: Path, study: Study, frame: pd.DataFrame, figures: bool = True, others: Others = ()
 ) -> dict[str, Any]:
-    """Write summary.json, summary.md and, where wanted, figures into a study's folder; `frame` is
-    its table.
+    """Write summary.json, summary.md and, if wanted, figures into a study's folder.
 
-    others: names and finished rows of other studies, which are drawn beside its own. Returns what
-    summary.json holds. Raises WriteError.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the study.
+    study : Study
+        The study.
+    frame : DataFrame
+        Its table.
+    figures : bool, optional
+        Whether figures are drawn.
+    others : sequence of (str, DataFrame), optional
+        Names and finished rows of other studies, which are drawn beside its own.
+
+    Returns
+    -------
+    dict
+        Content of summary.json.
+
+    Raises
+    ------
+    WriteError
+        A file cannot be written.
+    StudyError
+        The study chooses a figure that no row has.
     """
     done = frame[frame["error"] == ""]
     names = [
@@ -82,13 +103,13 @@ def write(
 
 
 def main_figures(study: Study, names: list[str]) -> list[str]:
-    """The figures, of those that the rows have, that are drawn and tabulated: those that the study
-    chooses; else the main ones of a built-in kind, or the first six of one's own kind.
+    """Return those of the rows' figures `names` that are drawn and tabulated.
 
-    Raises StudyError: the study chooses one that no row has.
+    They are those that the study chooses, else the main ones of a built-in kind, else the first six
+    of a user's own kind. Raises StudyError if the study chooses one that no row has.
     """
     if study.figures is not None:
-        # of which the first rows may have none
+        # The first rows of a study that still runs may lack a figure of the kind.
         known = KINDS[study.kind].columns if study.kind in KINDS else {}
         missing = [
             name for name in study.figures if names and name not in names and name not in known
@@ -104,14 +125,15 @@ def main_figures(study: Study, names: list[str]) -> list[str]:
 
 
 def _points(study: Study, done: pd.DataFrame, names: list[str]) -> Points:
-    """Factors and statistics of each point that has a row, those of a grid in its order and those
-    of a sample by size.
+    """Return factors and statistics of each point that has a row.
 
-    A sample with single rows is one point as a whole.
+    Points of a grid keep its order, those of a sample are sorted. A sample with single rows is one
+    point as a whole.
     """
     paths = list(study.factors)
     if not len(done):
         return []
+    # Each row of such a sample has a point of its own, and has no band there.
     if not paths or (study.sample is not None and study.repeats == 1):
         return [({}, _statistics(done, names))]
     return [
@@ -121,7 +143,7 @@ def _points(study: Study, done: pd.DataFrame, names: list[str]) -> Points:
 
 
 def _statistics(rows: pd.DataFrame, names: list[str]) -> dict[str, Statistics]:
-    """Of each figure, over the rows that have it."""
+    """Return the statistics of each figure over the rows that have it."""
     values = {name: rows[name].dropna().to_numpy(dtype=float) for name in names}
     return {name: theory.point_statistics(found) for name, found in values.items() if len(found)}
 
@@ -199,11 +221,9 @@ def _table(study: Study, points: Points, shown: list[str]) -> list[str]:
         ]
         cells += [str(count), *(_cell(figures.get(name)) for name in shown)]
         lines.append(f"| {' | '.join(cells)} |")
-    return lines + (
-        [f"\n{len(points) - LONGEST} more points stand in `{JSON}`."]
-        if len(points) > LONGEST
-        else []
-    )
+    if len(points) > LONGEST:
+        lines.append(f"\n{len(points) - LONGEST} more points stand in `{JSON}`.")
+    return lines
 
 
 def _cell(one: Statistics | None) -> str:

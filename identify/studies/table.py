@@ -1,10 +1,10 @@
-"""Finished rows as one tidy table with units: Parquet with the study in its metadata, and a view by
-factors.
+"""Finished rows as one tidy table in Parquet, and a view of them by factors.
 
-Columns: ``row``, ``repeat``, the seed as ``seed_entropy`` and ``seed_spawn_key`` (what
-``numpy.random.SeedSequence`` takes), one a factor under its dotted path, one a figure with its unit
-in the name, ``seconds`` and ``error``. A row that failed has NaN figures and says why in ``error``;
-a figure that rows of one's own do not all have is NaN in others.
+The table holds the study in its metadata. Its columns are ``row``, ``repeat``, the seed as
+``seed_entropy`` and ``seed_spawn_key`` (the arguments of ``numpy.random.SeedSequence``), one for
+each factor under its dotted path, one for each figure with its unit in the name, ``seconds`` and
+``error``. A row that failed has NaN figures, and the reason in ``error``. A figure that only some
+rows of a user's own kind have is NaN in the others.
 """
 
 import io
@@ -25,13 +25,13 @@ from identify.errors import StudyError, WriteError
 from identify.files.atomic import write_bytes, writing
 from identify.files.dataset import write_groups
 from identify.files.versions import versions
-from identify.studies.design import Design, Finished
 from identify.studies.labels import unit_of
+from identify.studies.study_design import Design, Finished
 from identify.studies.study_file import Study
 
 FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
 LAST = ("seconds", "error")
-"""Columns of a study's table before its factors and behind its figures."""
+"""Columns of a study's table after its figures. Those of `FIRST` come before its factors."""
 
 TABLE = "study.parquet"
 STUDY_KEY = b"cmmsim.study"
@@ -39,8 +39,9 @@ VERSIONS_KEY = b"cmmsim.versions"
 
 
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
-    """The table of a study's finished rows, ordered by row. A factor whose values are lists has
-    them as JSON text.
+    """Return the table of a study's finished rows, ordered by row.
+
+    A factor whose values are lists has them as JSON text.
     """
     design = Design(study)
     count = len(design)
@@ -57,7 +58,7 @@ def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
     columns: dict[str, Any] = {
         "row": done,
         "repeat": [case.repeat for case in cases],
-        "seed_entropy": str(study.seed),
+        "seed_entropy": str(study.seed),  # a seed may exceed every integer type of Parquet
         "seed_spawn_key": done,
     }
     columns |= {path: [plain(case.factors[path]) for case in cases] for path in study.factors}
@@ -68,21 +69,18 @@ def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
 
 
 def figure_names(frame: pd.DataFrame, study: Study) -> list[str]:
-    """The columns that are figures of the rows."""
+    """Return the names of the columns that are figures of the rows."""
     return [name for name in frame.columns if name not in {*FIRST, *study.factors, *LAST}]
 
 
 def plain(value: Any) -> Any:
-    """A factor's value as a table holds it."""
+    """Return a factor's value as a table holds it."""
     return json.dumps(value) if isinstance(value, (list, dict)) else value
 
 
 @contextmanager
 def written(path: Path, more: str = "") -> Iterator[None]:
-    """Turn what keeps the block from writing a file into an error of the study.
-
-    more: said behind the reason. Raises StudyError.
-    """
+    """Turn an error of writing in the block into a StudyError, with `more` after the reason."""
     try:
         with writing(path):
             yield
@@ -91,9 +89,9 @@ def written(path: Path, more: str = "") -> Iterator[None]:
 
 
 def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
-    """Write a table as Parquet, whole or not at all; ``entry`` is the resolved study, kept with it.
+    """Write a table as Parquet, whole or not at all, with the resolved study ``entry`` in it.
 
-    Raises StudyError: it cannot be written.
+    Raises StudyError if it cannot be written.
     """
     table = pa.Table.from_pandas(frame, preserve_index=False)
     own = {STUDY_KEY: json.dumps(entry).encode(), VERSIONS_KEY: json.dumps(versions()).encode()}
@@ -105,9 +103,9 @@ def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
 
 
 def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
-    """A study's table and the study, of its `study.parquet`.
+    """Read the table and the study in a `study.parquet`.
 
-    Raises StudyError: no such file, or no table of a study.
+    Raises StudyError if there is no such file, or if it is not the table of a study.
     """
     entry = study_in(Path(path))
     if entry is None:
@@ -120,11 +118,15 @@ def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
 
 
 def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.DataFrame]]:
-    """Names and finished rows of other studies, of their folders, to be shown beside those of a
-    study.
+    """Read names and finished rows of other studies, to be shown beside those of a study.
 
-    A name that is taken gives way to that of the folder, and that to its path. Raises StudyError:
-    no table there, rows of another kind or with other factors, or a folder named twice.
+    If the name of a study is taken, its rows have the name of its folder, or else the path of it.
+
+    Raises
+    ------
+    StudyError
+        A folder has no table, its rows are of another kind or have other factors, or it is named
+        twice.
     """
     found: dict[str, pd.DataFrame] = {}
     for folder in folders:
@@ -141,7 +143,7 @@ def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.Dat
 
 
 def _rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
-    """Name and finished rows of one."""
+    """Read name and finished rows of one study."""
     frame, other = read_table(folder / TABLE)
     if other.kind != study.kind or set(other.factors) != set(study.factors):
         ours, theirs = (
@@ -155,8 +157,9 @@ def _rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
 
 
 def study_in(path: Path) -> dict[str, Any] | None:
-    """The resolved study that a table is of; None where there is no file. Raises StudyError: no
-    table of a study.
+    """Return the resolved study of a table, or None if there is no file.
+
+    Raises StudyError if it is not the table of a study.
     """
     if not path.exists():
         return None
@@ -170,11 +173,10 @@ def study_in(path: Path) -> dict[str, Any] | None:
 
 
 def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
-    """The figures by factors and repeat, with their units as ``attrs``; NaN where a row failed or
-    is not done.
+    """Return the figures by factors and repeat, NaN where a row failed or is not done.
 
-    Dimensions are one a factor (its dotted path) and ``repeat`` for a grid, ``point`` and
-    ``repeat`` for a sample, whose factors are coordinates of ``point``.
+    A grid has one dimension for each factor (its dotted path) and ``repeat``. A sample has
+    ``point`` and ``repeat``, and its factors are coordinates of ``point``. Units are in ``attrs``.
     """
     dimensions = list(study.factors) if study.sample is None else ["point"]
     indexed = frame if study.sample is None else frame.assign(point=frame["row"] % study.points)
@@ -182,6 +184,7 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
     view = xr.Dataset.from_dataframe(figures)
     lists = {path: values for path, values in study.factors.items() if isinstance(values, list)}
     wanted = {path: [plain(value) for value in lists[path]] for path in lists if path in view.dims}
+    # The values come sorted and without those that have no row yet.
     view = view.reindex(wanted | {"repeat": np.arange(study.repeats)})
     if study.sample is not None:
         design = Design(study)
@@ -197,11 +200,10 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
 
 
 def write_view(path: Path, frame: pd.DataFrame, study: Study) -> None:
-    """Write the view of `to_xarray` as netCDF, whole or not at all; `xarray.open_dataset` reads it.
+    """Write the view of `to_xarray` as netCDF, whole or not at all.
 
-    A "/" in a name is a group there, so it is written as "_per_".
-
-    Raises StudyError: it cannot be written.
+    `xarray.open_dataset` reads it. A "/" in a name would be a group there, so it becomes "_per_".
+    Raises StudyError if it cannot be written.
     """
     view = to_xarray(frame, study)
     with written(path):

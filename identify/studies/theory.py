@@ -1,23 +1,21 @@
-"""Whether a study's rows follow the laws that it states: the measured exponent or ratio with its
-interval.
+"""Comparison of a study's rows with the laws it states, by a measured exponent or ratio.
 
-How the mean square of a positive figure depends on other quantities is told by regression of its
-logarithm. The mean square of a row's figure is taken as exp(X beta). The estimate solves X^T (y^2 /
-mean - 1) = 0, the score of a gamma-distributed y^2 with logarithmic link (McCullagh and Nelder
-1989, section 8.3); unlike a straight line through logarithms it says how the mean square itself
-scales, whatever the figure's distribution is and however it changes from row to row. Its covariance
-is the sandwich of that score, so rows need not be alike either.
+A regression of logarithms tells how the mean square of a positive figure depends on other
+quantities. The mean square of a row's figure y is modelled as exp(X beta). The estimate solves X^T
+(y^2 / mean - 1) = 0, the score of a gamma-distributed y^2 with logarithmic link (McCullagh and
+Nelder 1989, section 8.3). Unlike a straight line through logarithms, it tells how the mean square
+itself scales, whatever the distribution of the figure is and however it changes from row to row.
+The covariance is the sandwich of that score, so the rows need not be alike.
 
-The figures of one point of a study have bands that hold 95 % of the time. That of the mean is
-Student's; that of the rms is Student's of the logarithm of the mean square. A chi-square band would
-need to know how many independent errors a row's figure is made of; this one takes their scatter
-from the rows. Counted, it holds the rms of three normal numbers or more in 95 to 97 % of cases from
-two rows on, and that of single normal numbers, the worst case, in 92 % at least. One row alone has
-no band.
+The figures of one point of a study have 95 % bands. The band of the mean is Student's. The band of
+the rms is Student's of the logarithm of the mean square. A chi-square band would need the number of
+independent errors in a row's figure, while this one takes their scatter from the rows. In a count
+it held the rms of three or more normal numbers in 95 to 97 % of cases, from two rows on, and that
+of single normal numbers, the worst case, in at least 92 %. A single row has no band.
 
-A law fails when the interval excludes what the law says, give or take its own tolerance. Else it
-passes, unless the rows are too few to say anything: it is undecided where the interval is wide. At
-99 % one true law in a hundred fails by chance.
+A law fails if the interval excludes its statement, widened by the law's tolerance. Otherwise it
+passes, unless the interval is wide: then the rows are too few to say anything, and it is undecided.
+At 99 % one true law in a hundred fails by chance.
 """
 
 from dataclasses import dataclass
@@ -34,13 +32,21 @@ from identify.studies.study_file import Law, Study
 ITERATIONS = 100
 SETTLED = 1e-10
 SMALLEST = 1e-12
-"""Share of the largest square below which a square counts as that share at the start of the fit."""
+"""Smallest square at the start of the fit, as a share of the largest one."""
 
 
 @dataclass(frozen=True)
 class ScaleRegression:
-    """Coefficients (k,) of the logarithm of the mean square, their covariance (k, k), and the
-    degrees of freedom.
+    """Fit of the logarithm of a mean square.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (k,)
+        Coefficients beta.
+    covariance : ndarray, shape (k, k)
+        Their covariance.
+    freedom : int
+        Degrees of freedom.
     """
 
     coefficients: Array
@@ -48,23 +54,27 @@ class ScaleRegression:
     freedom: int
 
     def interval(self, index: int, confidence: float) -> tuple[float, float]:
-        """Student's interval of one coefficient."""
+        """Return Student's interval of one coefficient."""
         half = reach(confidence, self.freedom) * np.sqrt(self.covariance[index, index])
         return float(self.coefficients[index] - half), float(self.coefficients[index] + half)
 
 
 def reach(confidence: float, freedom: int) -> float:
-    """Half-width of Student's interval in standard deviations; scipy's own interval is NaN where
-    these are zero.
+    """Return the half-width of Student's interval in standard deviations.
+
+    scipy's own interval is NaN if the standard deviation is zero.
     """
     return float(student.ppf(0.5 + 0.5 * confidence, freedom))
 
 
 def scale_regression(squares: Array, design: Array) -> ScaleRegression:
-    """Fit squares (n,), not negative, to exp(design (n, k) @ beta).
+    """Fit non-negative squares (n,) to exp(design (n, k) @ beta).
 
-    Raises StudyError with too few rows, a design that does not tell its columns apart, or figures
-    that are all zero.
+    Raises
+    ------
+    StudyError
+        There are too few rows, the columns of the design are linearly dependent, the figure is
+        zero in every row, or the fit does not converge.
     """
     rows, columns = design.shape
     if rows <= columns:
@@ -82,6 +92,7 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
         change = float(np.abs(design @ step).max())
         if change < SETTLED:
             break
+        # No step changes a mean square by more than a factor of e, so that the fit cannot run away.
         beta = beta + step / max(1.0, change)
     else:
         raise StudyError(f"the fit of the scale has not settled after {ITERATIONS} steps")
@@ -91,11 +102,13 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
 
 
 def _sandwich(design: Array, residuals: Array) -> Array:
-    """Covariance of the coefficients, with residuals enlarged by their leverage (HC3) against few
-    rows.
+    """Return the covariance of the coefficients.
+
+    Residuals are enlarged by their leverage (HC3), because there may be few rows.
     """
     bread = np.linalg.inv(design.T @ design)
     leverage = np.einsum("ni,ij,nj->n", design, bread, design)
+    # A row alone at its level has leverage 1, which would divide by zero.
     scores = design * (residuals / np.maximum(1.0 - leverage, 1e-6))[:, None]
     return np.asarray(bread @ (scores.T @ scores) @ bread, dtype=float)
 
@@ -105,8 +118,20 @@ BAND_CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of `rows` rows: mean, std (n - 1), rms, and the bands of mean and rms; None with a single
-    row.
+    """Statistics of a figure over rows; `std` and the bands are None for a single row.
+
+    Attributes
+    ----------
+    rows : int
+        Number of rows.
+    mean : float
+        Mean.
+    std : float or None
+        Standard deviation with divisor n - 1.
+    rms : float
+        Root mean square.
+    mean_band, rms_band : tuple of float or None
+        Ends of the bands of mean and rms.
     """
 
     rows: int
@@ -118,7 +143,7 @@ class Statistics:
 
 
 def point_statistics(values: Array) -> Statistics:
-    """Statistics of one figure's values (n,), n >= 1, all finite."""
+    """Return the statistics of one figure's values (n,), n >= 1, all finite."""
     count = len(values)
     mean = float(np.mean(values))
     rms = float(np.sqrt(np.mean(values**2)))
@@ -127,6 +152,7 @@ def point_statistics(values: Array) -> Statistics:
     std = float(np.std(values, ddof=1))
     wide = reach(BAND_CONFIDENCE, count - 1)
     half = wide * std / np.sqrt(count)
+    # Standard error of the logarithm of the mean square.
     spread = (
         float(np.linalg.norm(values**2 / np.mean(values**2) - 1.0)) / (count - 1) if rms else 0.0
     )
@@ -138,17 +164,30 @@ def point_statistics(values: Array) -> Statistics:
 
 CONFIDENCE = 0.99
 RESOLUTION = 0.2
-"""Half-width of the interval, of an exponent or of the logarithm of a ratio, beyond which a law is
-not decided.
+"""Largest half-width of an interval that decides a law.
+
+It is that of an exponent, or of the logarithm of a ratio.
 """
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the rows say about a law: verdict "passed", "failed" or "undecided".
+    """Finding of the rows about a law.
 
-    measured, an exponent or a ratio, with its interval low to high; rows that counted; reason where
-    nothing could be measured.
+    Attributes
+    ----------
+    law : Law
+        The law.
+    verdict : str
+        "passed", "failed" or "undecided".
+    measured : float or None
+        Exponent or ratio.
+    low, high : float
+        Ends of its interval.
+    rows : int
+        Number of rows that counted.
+    reason : str
+        Reason why nothing could be measured.
     """
 
     law: Law
@@ -161,7 +200,7 @@ class Verdict:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """The verdict as `summary.json` holds it."""
+        """Verdict as `summary.json` holds it."""
         law = {"statement": self.law.statement, "why": self.law.why, "verdict": self.verdict}
         return (
             law
@@ -171,16 +210,15 @@ class Verdict:
 
 
 def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
-    """A verdict for each law of a study; `frame`: its table, of which rows that failed do not
-    count.
-    """
+    """Return a verdict for each law of a study. `frame` is its table; failed rows do not count."""
     done = frame[frame["error"] == ""]
     return [_check(law, study, done) for law in study.theory]
 
 
 def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows that have all figures of a law. Raises StudyError where none has one of them, with
-    what they have.
+    """Return the rows that have all figures of a law.
+
+    Raises StudyError if no row has one of them, with the figures they have.
     """
     needed = [name for name in (law.figure, law.per, law.equals) if name is not None]
     for name in needed:
@@ -191,8 +229,9 @@ def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def law_data(law: Law, frame: pd.DataFrame) -> Array:
-    """The quantity of a law (n,) in each row, all of which have it. Raises StudyError where it is
-    divided by zero.
+    """Return the quantity of a law (n,) in rows that all have it.
+
+    Raises StudyError if it would be divided by zero.
     """
     values = frame[law.figure].to_numpy(dtype=float)
     return values if law.per is None else values / _divisor(law.per, frame)
@@ -208,9 +247,12 @@ def _divisor(name: str, frame: pd.DataFrame) -> Array:
 
 
 def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    check = (
-        _exponent if law.exponent is not None else _equality if law.equals is not None else _order
-    )
+    if law.exponent is not None:
+        check = _exponent
+    elif law.equals is not None:
+        check = _equality
+    else:
+        check = _order
     try:
         return check(law, study, with_data(law, frame))
     except StudyError as error:
@@ -218,7 +260,7 @@ def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """The figure's mean square as factor ** (2 exponent), beside the other factors."""
+    """Judge that the figure's mean square grows as factor ** (2 exponent), beside other factors."""
     factor = _numeric(str(law.factor), frame)
     design = np.column_stack([_beside(law, study, frame), 2.0 * np.log(factor)])
     fit = scale_regression(law_data(law, frame) ** 2, design)
@@ -230,7 +272,7 @@ def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """The ratio of two figures of the same rows."""
+    """Judge that two figures of the same rows are equal, by their ratio."""
     ratios = law_data(law, frame) / _divisor(str(law.equals), frame)
     fit = scale_regression(ratios**2, np.full((len(frame), 1), 2.0))
     low, high = fit.interval(0, CONFIDENCE)
@@ -240,9 +282,7 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """The smallest step of the logarithm from one value of the factor to the next, beside the other
-    factors.
-    """
+    """Judge that the figure grows along values of the factor, by its smallest logarithmic step."""
     if law.factor not in frame.columns:
         raise StudyError(f"the rows have no factor {law.factor!r}")
     values = list(law.order or [])
@@ -261,15 +301,16 @@ def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, float]:
-    """Of the last coefficients, that which is the least certainly positive: low, middle, high."""
+    """Return low, middle and high of the last coefficients' least certainly positive one."""
     places = range(len(fit.coefficients) - steps, len(fit.coefficients))
     low, k = min((fit.interval(k, CONFIDENCE)[0], k) for k in places)
     return low, float(fit.coefficients[k]), fit.interval(k, CONFIDENCE)[1]
 
 
 def _beside(law: Law, study: Study, frame: pd.DataFrame) -> Array:
-    """Columns for what else varies: a level for each setting of the other factors, or their
-    logarithms in a sample.
+    """Return the columns of the design for everything else that varies.
+
+    A grid has a level for each setting of the other factors, a sample has their logarithms.
     """
     if law.factor not in study.factors and len(study.factors) > 1:
         raise StudyError(f"a law against the figure {law.factor!r} needs a study of one factor")
@@ -283,8 +324,9 @@ def _beside(law: Law, study: Study, frame: pd.DataFrame) -> Array:
 
 
 def _covariates(values: pd.Series) -> Array:
-    """Columns (n, k) of another factor of a sample: its logarithm, or one for each value but the
-    first.
+    """Return the columns (n, k) of another factor of a sample.
+
+    They are its logarithm, or an indicator of each value but the first.
     """
     if pd.api.types.is_numeric_dtype(values) and (values > 0).all():
         return np.log(values.to_numpy(dtype=float))[:, None]
@@ -292,7 +334,7 @@ def _covariates(values: pd.Series) -> Array:
 
 
 def _numeric(name: str, frame: pd.DataFrame) -> Array:
-    """Values (n,) of a factor or figure, all positive."""
+    """Return the values (n,) of a factor or figure, all positive."""
     if name not in frame.columns:
         raise StudyError(f"the rows have no factor or figure {name!r}")
     values = pd.to_numeric(frame[name], errors="coerce").to_numpy(dtype=float)

@@ -1,3 +1,1 @@
-"""Tracking: how well the robot follows motions under a law and a model, with images in the loop
-(`cmmsim track`).
-"""
+"""Tracking of motions under a law and a model, with images in the loop (`cmmsim track`)."""

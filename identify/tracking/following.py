@@ -1,6 +1,4 @@
-"""One run of a robot that follows a motion under a law with a model, by the sensor or by what
-stands for it.
-"""
+"""Runs of a robot that follows a motion under a law with a model."""
 
 from dataclasses import dataclass
 
@@ -18,15 +16,20 @@ from identify.experiment.run import Latencies
 USUAL = Latencies()
 
 NEARLY_EXACT = 1e-3
-"""Share of the noise's covariance that is stated of exact poses: with none an observer has nothing
-to divide by.
+"""Share of the noise's covariance that is stated for exact poses.
+
+An observer cannot divide by a covariance of zero.
 """
 
 
 @dataclass(frozen=True)
 class Followed:
-    """A run: its loop, what was desired of it (N, 6), and what the observer expected of each frame
-    before it saw it: the coordinates (N, m) and their covariances (N, m, m), None without."""
+    """Run of a robot that follows a motion.
+
+    ``desired`` (N, 6) are the desired poses. ``expected`` are the coordinates (N, m) and
+    covariances (N, m, m) that the observer predicted of each frame before it was measured, or None
+    without an observer.
+    """
 
     run: ClosedLoopRun
     desired: Array
@@ -35,17 +38,19 @@ class Followed:
 
     @property
     def errors(self) -> Array:
-        """True less desired poses (N, 6), m and rad."""
+        """True minus desired poses (N, 6) [m, rad]."""
         return self.run.pose - self.desired
 
     @property
     def saturated(self) -> int:
-        """Frames at which an actuator gave all that it has."""
+        """Number of frames at which an actuator was at its torque limit."""
         return saturated_frames(self.run.torque, self.torque_limit)
 
     def normalised_squared_error(self, robot: Robot) -> float | None:
-        """Mean e^T P^-1 e / m of what the observer expected of the robot's true coordinates; None
-        without observer.
+        """Return the normalised squared error of the observer's predictions.
+
+        It is the mean of e^T P^-1 e / m, where e are the errors against the robot's true
+        coordinates and P is their predicted covariance. None without an observer.
         """
         if self.expected is None:
             return None
@@ -57,9 +62,13 @@ class Followed:
 def by_drawing(
     covariance: Array, lost: NDArray[np.bool_], rng: np.random.Generator, exact: bool = False
 ) -> Seen:
-    """By poses drawn about the true ones with a covariance (6, 6), none at lost frames (N,); or by
-    the true ones, which are told to be nearly exact: an observer that takes them for noisy makes
-    less of them than it can."""
+    """Return a measurement by drawn poses, instead of a sensor.
+
+    The poses are drawn about the true ones with a covariance (6, 6), and there is none at lost
+    frames (N,). With ``exact`` they are the true ones, and are stated as nearly exact: an observer
+    that takes them as noisy would make less of them than it can.
+    """
+    # All frames are drawn at once, so that a lost frame does not shift the noise of later ones.
     factor = np.linalg.cholesky(covariance)
     drawn = rng.standard_normal((len(lost), 6)) @ factor.T
 
@@ -80,9 +89,10 @@ def follow(
     seen: Seen,
     latencies: Latencies = USUAL,
 ) -> Followed:
-    """Follow a motion under a law that knows a model; latencies: where they are not the scenario's.
+    """Follow a motion under a law that knows a model.
 
-    Raises what `prepared` does, and LoopFailure: a loop that is lost.
+    ``latencies`` replace those of the scenario. Raises what `prepared` does, and LoopFailure if the
+    loop is lost.
     """
     in_loop = prepared(plant, law, known, motion, seen, latencies.known)
     times = plant.scenario.timing.frame_times(motion.duration_s)
@@ -91,5 +101,6 @@ def follow(
     expected = None
     if in_loop.expected:
         means = np.array([estimate.coordinates for estimate in in_loop.expected])
-        expected = means, np.array([estimate.covariance for estimate in in_loop.expected])
+        covariances = np.array([estimate.covariance for estimate in in_loop.expected])
+        expected = means, covariances
     return Followed(run, reference.poses, expected, in_loop.drives.torque_limit)

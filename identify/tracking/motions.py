@@ -1,8 +1,8 @@
-"""Motions to follow, all from rest: unseen Fourier trajectories, a circle, a square with corners,
-poses of one's own.
+"""Motions to follow, all from rest.
 
+They are unseen Fourier trajectories, a circle, a square with corners, and a user's own poses.
 Circle and square lie in the first two coordinates of the platform, within the box of the scenario's
-excitation, and start at home.
+excitation. They start at home.
 """
 
 from collections.abc import Callable
@@ -24,44 +24,46 @@ from identify.scenario import Scenario
 from identify.trajectory import box_of
 
 COLUMNS = ("t", *POSE_NAMES)
+
 FEWEST_ROWS = 6
-"""That a spline of fifth degree needs."""
+"""Number of rows that a spline of fifth degree needs."""
 
 
 @dataclass(frozen=True)
 class AlongCoordinates:
-    """A motion by its coordinates (N, m) at times (N,), s, given as functions: them and their first
-    two derivatives.
+    """Motion of a platform by functions of time.
+
+    The functions return the coordinates (N, m) at times (N,) [s], and their first and second
+    derivatives.
     """
 
     chart: Chart
     coordinates: tuple[Callable[[Array], Array], ...]
 
     def pose(self, t: Array) -> Array:
-        """Poses (N, 6), m and rad."""
+        """Return the poses (N, 6) [m, rad]."""
         return self.chart.pose(self.coordinates[0](t))
 
     def pose_rate(self, t: Array) -> Array:
-        """Their time derivatives (N, 6)."""
+        """Return the time derivatives (N, 6) of the poses."""
         return self.chart.lifted(self.coordinates[1](t))
 
     def pose_acceleration(self, t: Array) -> Array:
-        """Their second time derivatives (N, 6)."""
+        """Return the second time derivatives (N, 6) of the poses."""
         return self.chart.lifted(self.coordinates[2](t))
 
 
 def motions(
     robot: Robot, scenario: Scenario, seed: int, own: Path | None = None
 ) -> list[NamedMotion]:
-    """The scenario's unseen trajectories, a circle and a square; or only the poses of a file,
-    `read_motion`.
+    """Return the scenario's unseen trajectories, a circle and a square.
 
-    Raises TrajectoryError.
+    With a file ``own``, return only the motion through its poses, see `read_motion`. Raises
+    TrajectoryError.
     """
     if own is not None:
-        return [
-            read_motion(own, robot, of_actuators(robot, scenario.excitation, "max_joint_velocity"))
-        ]
+        fastest = of_actuators(robot, scenario.excitation, "max_joint_velocity")
+        return [read_motion(own, robot, fastest)]
     duration = scenario.validation.duration_s
     unseen = unseen_trajectories(robot, scenario, seed)
     found: list[NamedMotion] = [
@@ -71,6 +73,7 @@ def motions(
     box = box_of(
         robot.geometry.chart, limits.position_amplitude_m, limits.orientation_amplitude_rad
     )
+    # A turn takes the period of the highest harmonic, so that a circle is as fast as that.
     turn_s = 1 / (limits.fundamental_hz * limits.harmonics)
     found.append(NamedMotion("circle", circle(robot, float(box[0]) / 2, turn_s), duration))
     found.append(NamedMotion("corner", square(robot, float(box[:2].min()), duration / 5), duration))
@@ -78,24 +81,21 @@ def motions(
 
 
 def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
-    """Round and round through home with a time for each turn, s, which it reaches smoothly within
-    the first.
+    """Return a motion that goes round a circle through home.
+
+    A turn takes ``turn_s``, in s. The speed rises smoothly within the first ``turn_s``.
     """
     home = robot.coordinates(robot.home_pose)
     speed = 2 * np.pi / turn_s
 
     def angle(t: Array) -> tuple[Array, Array, Array]:
         share = np.clip(t / turn_s, 0.0, 1.0)
-        travelled = share**4 * (
-            2.5 - 3 * share + share**2
-        )  # the integral of the smooth step of fifth degree
+        # The integral of the smooth step of fifth degree.
+        travelled = share**4 * (2.5 - 3 * share + share**2)
         step = share**3 * (10 - 15 * share + 6 * share**2)
         rising = 30 * share**2 * (1 - share) ** 2 / turn_s
-        return (
-            speed * (turn_s * travelled + np.maximum(t - turn_s, 0.0)),
-            speed * step,
-            speed * rising,
-        )
+        turned = speed * (turn_s * travelled + np.maximum(t - turn_s, 0.0))
+        return turned, speed * step, speed * rising
 
     def laid(first: Array, second: Array, base: Array) -> Array:
         rows = np.tile(base, (len(first), 1))
@@ -113,22 +113,25 @@ def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
 
     def acceleration(t: Array) -> Array:
         phi, w, rising = angle(np.asarray(t))
-        return laid(
-            -np.cos(phi) * w**2 - np.sin(phi) * rising,
-            np.cos(phi) * rising - np.sin(phi) * w**2,
-            0 * home,
-        )
+        first = -np.cos(phi) * w**2 - np.sin(phi) * rising
+        second = np.cos(phi) * rising - np.sin(phi) * w**2
+        return laid(first, second, 0 * home)
 
     return AlongCoordinates(robot.geometry.chart, (place, rate, acceleration))
 
 
 def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
-    """From home along the first coordinate, then the second, and back, each edge from rest to rest
-    in a time, s: as a polynomial of fifth degree, whose jerk is at most 60 side / edge_s^3."""
+    """Return a motion along a square from home.
+
+    It goes along the first coordinate, then the second, and back. Each edge takes ``edge_s``, in s,
+    and goes from rest to rest as a polynomial of fifth degree. The jerk is at most 60 side /
+    edge_s^3.
+    """
     home = robot.coordinates(robot.home_pose)
     corners = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
 
     def rows(t: Array, along: Array, base: Array, whole: float) -> Array:
+        # After the last edge, the motion rests at its end, which is home.
         edge = np.clip(np.floor(np.asarray(t) / edge_s).astype(int), 0, 3)
         laid = np.tile(base, (len(edge), 1))
         laid[:, :2] += whole * corners[edge] + along[:, None] * np.diff(corners, axis=0)[edge]
@@ -154,20 +157,29 @@ def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
 
 
 def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
-    """A motion through the poses of a CSV file with the columns t, x, y, z, alpha, beta, gamma, s,
-    m and rad: a spline of fifth degree, at rest and without acceleration at both ends; fastest: a
-    joint may turn or slide, rad/s or m/s.
+    """Read a motion through the poses of a CSV file.
 
-    Raises TrajectoryError: unreadable, columns missing, too few rows, times that do not begin at 0
-    or do not increase, numbers that are not finite, poses that the platform cannot have, or a jump
-    that asks more speed of a joint.
+    Parameters
+    ----------
+    path
+        File with the columns t, x, y, z, alpha, beta, gamma, in s, m and rad. A spline of fifth
+        degree goes through the poses. It is at rest and without acceleration at both ends.
+    robot
+        Robot that is to follow the motion.
+    fastest
+        Largest speed of a joint, in rad/s or m/s.
+
+    Raises
+    ------
+    TrajectoryError
+        The file cannot be read, columns are missing, there are too few rows, the times do not begin
+        at 0 or do not increase, numbers are not finite, the platform cannot have a pose, or a step
+        between rows asks a joint for more speed.
     """
     try:
-        lines = [
-            line.split(",")
-            for line in path.read_text(encoding="utf-8-sig").splitlines()
-            if line.strip()
-        ]
+        # Spreadsheets write a byte order mark, which utf-8-sig skips.
+        text = path.read_text(encoding="utf-8-sig")
+        lines = [line.split(",") for line in text.splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
         raise TrajectoryError(
             f"cannot read the motion {path}: {getattr(error, 'strerror', None) or error}"
@@ -198,6 +210,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
             f"{path}, row {row + 1}: {','.join(lines[row + 1])!r} are not all finite numbers"
         )
     if times[0] != 0 or not (np.diff(times) > 0).all():
+        # The first row whose time does not exceed the one before.
         row = int(np.argmin(np.diff(times, prepend=-1.0) > 0)) if times[0] == 0 else 0
         raise TrajectoryError(
             f"{path}, row {row + 1}: t is {times[row]:g}; times must begin at 0 and increase"
@@ -207,37 +220,40 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
     except DynamicsError as error:
         raise TrajectoryError(f"{path}: {error}") from None
     _check_jumps(path, robot, times, poses, fastest)
-    still = [(1, np.zeros(len(robot.coordinate_names))), (2, np.zeros(len(robot.coordinate_names)))]
+    zeros = np.zeros(len(robot.coordinate_names))
+    still = [(1, zeros), (2, zeros)]
     spline = make_interp_spline(times, robot.coordinates(poses), k=5, bc_type=(still, still))
     end = float(times[-1])
 
     def held(order: int) -> Callable[[Array], Array]:
+        # After the end the platform stands: its place stays, and its derivatives are zero.
         derivative = spline.derivative(order)
         return lambda t: (
             derivative(np.clip(t, 0.0, end))
             * (1.0 if order == 0 else (np.asarray(t) <= end)[:, None])
         )
 
-    return NamedMotion(
-        path.stem, AlongCoordinates(robot.geometry.chart, (held(0), held(1), held(2))), end
-    )
+    motion = AlongCoordinates(robot.geometry.chart, (held(0), held(1), held(2)))
+    return NamedMotion(path.stem, motion, end)
 
 
 def _check_jumps(path: Path, robot: Robot, times: Array, poses: Array, fastest: float) -> None:
-    """What is out of reach is left to who follows the motion: it has no joint coordinates."""
+    """Raise TrajectoryError for a step between rows that is too fast for a joint.
+
+    Poses out of reach have no joint coordinates, and are left to the caller that follows the
+    motion.
+    """
     steps = np.diff(times)
     unit = robot.layout.joint_unit
-    speeds = np.nan_to_num(
-        np.abs(np.diff(workspace.measure(robot, poses).theta, axis=0)) / steps[:, None]
-    )
+    moved = np.abs(np.diff(workspace.measure(robot, poses).theta, axis=0))
+    speeds = np.nan_to_num(moved / steps[:, None])
     row = int(np.argmax(speeds.max(axis=1) > fastest))
     joint = int(np.argmax(speeds[row]))
     jump = np.diff(poses, axis=0)[row]
     if speeds[row, joint] > fastest:
         raise TrajectoryError(
             f"{path}, row {row + 2}: the step from the row before, {np.linalg.norm(jump[:3]):.3g} "
-            "m and "
-            f"{np.linalg.norm(jump[3:]):.3g} rad in {steps[row]:.3g} s, asks joint {joint + 1} for "
-            f"{speeds[row, joint]:.3g} {unit}/s, limit excitation.max_joint_velocity_{unit}_s = "
-            f"{fastest:g}"
+            f"m and {np.linalg.norm(jump[3:]):.3g} rad in {steps[row]:.3g} s, asks joint "
+            f"{joint + 1} for {speeds[row, joint]:.3g} {unit}/s, limit "
+            f"excitation.max_joint_velocity_{unit}_s = {fastest:g}"
         )

@@ -1,5 +1,6 @@
-"""Laws and models side by side on the same motions: tracking error, effort, and what has which
-share of the error.
+"""Comparison of laws and models on the same motions.
+
+It gives the tracking error, the effort, and the shares of the error by cause.
 """
 
 from collections.abc import Sequence
@@ -35,26 +36,26 @@ from identify.files.versions import versions
 from identify.loop_parameters import parameter_column, settled_drive
 from identify.progress import Advance, Progress
 from identify.random_streams import NOISE, TRACKED, child, stream_seed
-from identify.record.law import SERVO
+from identify.record.recorded_law import SERVO
 from identify.scenario import Scenario, load_scenario
 from identify.tracking.following import Followed, by_drawing, follow
 from identify.tracking.motions import motions
 
 MODELS = ("initial", "identified", "true")
-"""The scenario's starting model, the identified one, and the plant's parameters."""
+"""Names of the models: the scenario's starting model, the identified one, and the true plant."""
 
 FIRST_RUN = 2_000_000
-"""Number of the first run, beyond all others."""
+"""Number of the first run, so that its random streams differ from those of all others."""
 
 EXACT = ("sensor", "model", "latency")
-"""What is made exact, one by one, to know its share of the error."""
+"""Parts that are made exact, one by one, to find their share of the error."""
 
 PARTS = ("position", "orientation")
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """What is followed how: all laws with all models by name on all motions."""
+    """Comparison to be run: all laws with all models, by name, on all motions."""
 
     plant: Plant
     sensor: cmmsim.Sensor
@@ -73,11 +74,21 @@ def track(
     run_folder: Path | None = None,
     own: Path | None = None,
 ) -> dict[str, Any]:
-    """The content of track.json. run_folder: of a whole run, whose estimates are the identified
-    model; None: the robot is identified first, as the scenario says. own: a CSV file with poses to
-    follow instead of the usual motions.
+    """Return the content of track.json.
 
-    Raises ScenarioError, TrajectoryError, RecordError and what an identification raises.
+    Parameters
+    ----------
+    run_folder
+        Folder of a whole run, whose estimates are the identified model. With None, the robot is
+        identified first, as the scenario says.
+    own
+        CSV file with poses to follow instead of the usual motions.
+
+    Raises
+    ------
+    ScenarioError, TrajectoryError, RecordError
+        The scenario, a motion or the run folder does not fit. Errors of an identification are
+        raised as they are.
     """
     scenario = with_renderer(scenario)
     plant = build_plant(scenario)
@@ -87,7 +98,8 @@ def track(
             f"--run {run_folder} holds the identified model, and only {', '.join(models)} is "
             "asked for"
         )
-    if set(laws) == {"pid"}:  # which knows no model, so that none is identified
+    if set(laws) == {"pid"}:
+        # This law knows no model, so that none has to be identified.
         models = ["initial"]
     known = {
         name: known_model(plant, name, run_folder)
@@ -95,8 +107,10 @@ def track(
         if name != "identified" or run_folder
     }
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
+    # Any model will do to find out whether a law can follow a motion.
     true = known_model(plant, "true", None)
-    for law in laws:  # refused before the sensor is taught
+    # A law that cannot follow a motion is refused before the sensor is taught, which takes long.
+    for law in laws:
         for motion in followed:
             prepared(plant, law, true, motion, unseen)
     sensor = taught_sensor(scenario, plant.nominal, seed, progress)
@@ -117,9 +131,9 @@ def track(
 
 
 def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel:
-    """A model by its name in `MODELS`; the identified one is that of a folder of a run.
+    """Return a model by its name in `MODELS`. The identified one is that of a run folder.
 
-    Raises RecordError: no result with estimates in the folder, or a run of another robot.
+    Raises RecordError if the folder holds no result with estimates, or a run of another robot.
     """
     robot = plant.nominal
     scenario = plant.scenario
@@ -127,9 +141,8 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
         return KnownModel(plant.parameters, scenario.plant.drive, FITTED)
     if model == "initial":
         law = scenario.model.drive_law
-        return KnownModel(
-            starting_guess(robot, scenario.model.start_parameters, 1.0, drive=law).values, law
-        )
+        guess = starting_guess(robot, scenario.model.start_parameters, 1.0, drive=law)
+        return KnownModel(guess.values, law)
     assert run_folder is not None
     path = run_folder / "result.json"
     own = plant.scenario.robot
@@ -148,7 +161,7 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
 
 
 def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progress) -> KnownModel:
-    """The model from the scenario's excitation."""
+    """Identify the model from the scenario's excitation."""
     scenario = plant.scenario
     if scenario.identification.scale_anchor == "payload":
         raise ScenarioError(
@@ -156,23 +169,20 @@ def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progre
             "DIR"
         )
     trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
-    with progress.stage(
-        "record", scenario.timing.frames(scenario.excitation.duration_s)
-    ) as advance:
+    frames = scenario.timing.frames(scenario.excitation.duration_s)
+    with progress.stage("record", frames) as advance:
         record = excitation_run(plant, sensor, trajectories.excitation, seed, advance).record
     return identified_model(plant, record, progress)
 
 
 def identified_model(plant: Plant, record: xr.Dataset, progress: Progress) -> KnownModel:
-    """The model that a record of a plant gives. Raises what an identification raises."""
+    """Identify the model from a record of a plant. Raises as `identify`."""
     found = identify(record, plant.nominal, plant.scenario, progress)
     return KnownModel(found.estimate, found.drive.law, _fitted_doubt(found.misfit))
 
 
 def _fitted_doubt(misfit: Misfit | None) -> float:
-    """Of a model that was identified: that of a guess where it is not known to explain what was
-    measured.
-    """
+    """Return the doubt of an identified model: that of a guess unless it explains the record."""
     return VAGUE if misfit is None or misfit.significant else FITTED
 
 
@@ -186,9 +196,12 @@ def follow_by_images(
     number: int = 0,
     advance: Advance = lambda n=1: None,
 ) -> tuple[Followed, Seen]:
-    """A motion followed under a law with a model, and by what the loop saw; noise and latencies are
-    those of a seed and of the motion's number, the mean latency and how far exposures are apart
-    those of the seed. Raises as `follow`."""
+    """Follow a motion under a law with a model, with images in the loop.
+
+    Noise and latencies depend on the seed and on the motion's number. The mean latency and the
+    delay between the exposures depend on the seed alone. The second value is what the loop saw.
+    Raises as `follow`.
+    """
     part_exposures(sensor, plant.scenario, seed)
     seen = by_images(
         SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, FIRST_RUN + number), advance)
@@ -210,7 +223,10 @@ def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
 
 
 def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dict[str, Any]:
-    """One law with one model on all motions; None: that of a law which reads none."""
+    """Return the entry of one law with one model on all motions.
+
+    The model is None for a law that reads none.
+    """
     robot = task.plant.robot
     known = task.models[model or next(iter(task.models))]
     errors = []
@@ -218,7 +234,9 @@ def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dic
     effort = []
     normalised = []
     covariances = []
-    frames = saturated = lost = 0
+    frames = 0
+    saturated = 0
+    lost = 0
     for number, motion in enumerate(task.motions):
         try:
             done, seen = follow_by_images(
@@ -226,16 +244,17 @@ def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dic
             )
         except DynamicsError as error:
             if isinstance(error, LoopFailure):
-                frames = frames + error.frame
-                saturated = saturated + error.saturated
+                frames += error.frame
+                saturated += error.saturated
+            # A lost run has figures up to the frame at which it was lost, and no errors.
             told = {
                 "failed": f"{motion.name}: {error}",
                 "frames": frames,
                 "saturated_frames": saturated,
             }
             return told | rms_figures(np.full((1, 6), np.nan))
-        frames = frames + len(done.errors)
-        saturated = saturated + done.saturated
+        frames += len(done.errors)
+        saturated += done.saturated
         errors.append(done.errors)
         lost += int((~done.run.measured_ok).sum())
         effort.append(done.run.torque)
@@ -262,13 +281,16 @@ def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dic
 def _shares(
     task: Tracking, law: str, known: KnownModel, covariance: Array, advance: Advance
 ) -> dict[str, Any]:
-    """Shares of the squared error that go when sensor, model or latency is made exact, and the
-    rest, of positions and orientations; by runs whose poses are drawn with the noise that the
-    sensor stated."""
+    """Return the shares of the squared error by cause, for position and orientation.
+
+    A share is what goes when sensor, model or latency is made exact. The rest has no such cause.
+    The poses of these runs are drawn with the noise that the sensor stated.
+    """
     base = _drawn(task, law, known, covariance, None, advance)
     shares = {}
     for what in EXACT:
         exact = _drawn(task, law, known, covariance, what, advance)
+        # A component that does not move has no error, and a lost run has NaN.
         with np.errstate(invalid="ignore", divide="ignore"):
             left = [
                 np.nansum(exact[part]) / np.nansum(base[part])
@@ -287,15 +309,17 @@ def _drawn(
     exact: str | None,
     advance: Advance,
 ) -> Array:
-    """Mean squared errors (6,) over all motions, with one thing exact."""
+    """Return the mean squared errors (6,) over all motions, with one part exact."""
     plant = task.plant
     if exact == "latency":
         still = dict.fromkeys(("latency_s", "latency_jitter_s", "latency_std_s", "dropout"), 0.0)
         still = {f"timing.{name}": value for name, value in still.items()}
+        # A plant without latency needs another closed loop, and so is built anew.
         plant = build_plant(plant.scenario.with_overrides(still), plant.nominal)
     dropout = plant.scenario.timing.dropout
     squares = []
     for number, motion in enumerate(task.motions):
+        # The same noise for every cause, so that the differences are those of the cause.
         rng = np.random.default_rng(child(task.seed, TRACKED, number))
         lost = rng.random(plant.scenario.timing.frames(motion.duration_s)) < dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")

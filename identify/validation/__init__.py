@@ -1,3 +1,1 @@
-"""Judging against the truth: unseen trajectories, estimators side by side, variation of the
-estimates.
-"""
+"""Validation against the truth on unseen motions, comparison of estimators, and their variation."""

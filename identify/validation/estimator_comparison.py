@@ -1,14 +1,18 @@
-"""Estimators judged on one record against one truth; nothing but this module shows them the truth.
+"""Comparison of estimators on one record against one truth, which only this module shows them.
 
-Figures of merit of Leboutet et al., "Inertial parameter identification in robotics: a survey"
-(Applied Sciences 11(9), 2021; their toolbox BIRDy): distance of the parameters, distance of the
-output, time, iterations, model evaluations. Single parameters cannot be compared, because no motion
-separates them. The parameter distance is the RMS relative error of those base parameters that the
-record shows: which these are follows from the information at the true parameters, so that no
-estimator chooses its own examination. The few that are only just shown decide this RMS, and there a
-fit that leans on the starting guess may look best; so the median, which is that of an ordinary one,
-stands beside it. The gains of the joint PID have their own column. The pose distance is that of the
-closed-loop model from the true plant on unseen trajectories, RMS of the worst axis and run.
+The figures of merit are those of Leboutet et al., "Inertial parameter identification in robotics: a
+survey" (Applied Sciences 11(9), 2021; their toolbox is BIRDy): distance of the parameters, distance
+of the output, time, iterations and model evaluations.
+
+Single parameters cannot be compared, because no motion separates them. The parameter distance is
+the RMS relative error of the base parameters that the record shows. These follow from the
+information at the true parameters, so that no estimator chooses its own examination. The few base
+parameters that are barely shown dominate this RMS, and a fit that leans on the starting guess may
+then look best. The median, that of an ordinary base parameter, therefore stands beside it. The
+gains of the joint PID have their own column.
+
+The pose distance is that of the closed-loop model from the true plant on unseen trajectories, as
+the RMS of the worst axis and run.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,17 +32,16 @@ from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE, group_estimates, identifiability
 from identify.estimation.identification import output_error_problem
 from identify.estimators.estimator import Estimate, Estimator, Evidence, joint_channels
-from identify.experiment.joint_instruments import JointInstruments, measure_joints, read_channels
+from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
-from identify.files.dataset import write_groups
 from identify.files.run_folder import load_result, rms_figures, rms_row
 from identify.loop_parameters import settled_drive, with_drive
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, mixed_generator
 from identify.record.command_times import logged_latencies
 from identify.record.known_geometry import known_geometry
-from identify.record.law import takes_torques
 from identify.record.provenance import RunFiles
+from identify.record.recorded_law import takes_torques
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.plant_sections import AUTO
 from identify.validation.unseen import model_on_record
@@ -48,8 +51,21 @@ START = "starting guess"
 
 @dataclass(frozen=True)
 class Examination:
-    """The truth: parameters (p,), combinations (k, p) of the dynamic ones that the record shows,
-    unseen runs of the plant."""
+    """Truth by which estimators are judged.
+
+    Attributes
+    ----------
+    robot : Robot
+        Robot as it is known.
+    scenario : Scenario
+        Scenario of the record.
+    true : ndarray, shape (p,)
+        True parameters.
+    combinations : ndarray, shape (k, p)
+        Combinations of the dynamic parameters that the record shows.
+    unseen : tuple of (record, truth)
+        Unseen runs of the plant.
+    """
 
     robot: Robot
     scenario: Scenario
@@ -58,7 +74,7 @@ class Examination:
     unseen: tuple[tuple[xr.Dataset, xr.Dataset], ...]
 
     def group_errors(self, parameters: Array) -> Array:
-        """Relative errors (k,) of the base parameters that the record shows."""
+        """Return the relative errors (k,) of the base parameters that the record shows."""
         dynamic = self.robot.layout.dynamic
         true = self.combinations @ self.true[dynamic]
         return np.asarray(
@@ -66,8 +82,11 @@ class Examination:
         )
 
     def pose_distance(self, parameters: Array) -> tuple[float, float]:
-        """RMS of the worst axis and run, um and urad; NaN where the model's loop is unstable, or an
-        estimator gives parameters with which no model runs, such as a gain of zero."""
+        """Return the RMS pose error of the worst axis and run, um and urad.
+
+        It is NaN if the model's loop is unstable, or if no model can have the parameters, such as a
+        gain of zero.
+        """
         rows = []
         for record, truth in self.unseen:
             try:
@@ -81,9 +100,29 @@ class Examination:
 
 @dataclass(frozen=True)
 class Score:
-    """One row of the table. Distances: RMS and median relative errors of groups, RMS of gains, um
-    and urad on unseen trajectories; NaN with a reason in the note where an estimator gave nothing.
-    parameters, std (p,): what it gave, of the parameters with these names."""
+    """Row of the table of estimators.
+
+    Attributes
+    ----------
+    name, title, uses : str
+        Estimator, and the data that it uses.
+    group_distance, group_median : float
+        RMS and median of the relative errors of the base parameters.
+    gain_distance : float
+        RMS of the relative errors of the gains.
+    position_um, orientation_urad : float
+        RMS pose errors of the worst axis and run on unseen trajectories.
+    seconds : float
+        Duration of the estimation.
+    iterations, evaluations : int
+        Iterations and model evaluations.
+    note : str
+        Remark, such as the reason of a failure. All figures then are NaN.
+    parameters, std : ndarray, shape (p,), optional
+        Estimates and their standard deviations.
+    names : tuple of str
+        Names of the parameters.
+    """
 
     name: str
     title: str
@@ -108,11 +147,14 @@ def compare_on_run(
     estimators: Mapping[str, Estimator],
     seed: int,
     progress: Progress,
-) -> list[Score]:
-    """Scores on the record of a run, with joint instruments simulated from its truth, which are
-    kept as instruments.nc.
+) -> tuple[list[Score], xr.Dataset]:
+    """Score estimators on the record of a run.
 
-    Where the PID is known it has the true gains. Raises RecordError for files that are damaged.
+    Joint instruments are simulated from its truth, and returned with the scores. Estimators that
+    need the joint PID have its true gains.
+
+    Raises RecordError for files that are damaged, and EstimationError for a record whose commands
+    are torques.
     """
     folder = files.folder
     record = files.experiment
@@ -121,26 +163,25 @@ def compare_on_run(
     if takes_torques(record):
         raise EstimationError(
             "the commands of this record are torques, and the estimators compared need joint "
-            "commands: record the "
-            "excitation under excitation.law = pid or feedforward"
+            "commands: record the excitation under excitation.law = pid or feedforward"
         )
     if scenario.model.drive == AUTO:
         scenario = with_drive(
             scenario, settled_drive(load_result(folder.result).get("identification"))
         )
     robot = known_geometry(scenario, folder.path).robot
-    channels = folder.path / "instruments.nc"
-    write_groups(channels, {"": instrumented(record, truth, scenario, instruments, seed)})
+    channels = instrumented(record, truth, scenario, instruments, seed)
     unseen = zip(files.validation, read_truth_runs(folder.validation), strict=True)
-    return compare_on_record(
+    scores = compare_on_record(
         (record, truth),
-        read_channels(channels),
+        channels,
         robot,
         scenario,
         list(unseen),
         estimators,
         progress,
     )
+    return scores, channels
 
 
 def instrumented(
@@ -150,7 +191,7 @@ def instrumented(
     instruments: JointInstruments,
     seed: int,
 ) -> xr.Dataset:
-    """What instruments at the joints, whose noise is of a seed, read during a run."""
+    """Return the readings of instruments at the joints during a run, with the noise of a seed."""
     latencies = logged_latencies(record, scenario.timing)
     return measure_joints(
         record, truth, scenario.timing, instruments, mixed_generator(INSTRUMENTS, seed), latencies
@@ -166,8 +207,9 @@ def compare_on_record(
     estimators: Mapping[str, Estimator],
     progress: Progress,
 ) -> list[Score]:
-    """Scores on a record, with its truth and channels of its joints, judged also by unseen (record,
-    truth) pairs.
+    """Score estimators on a record with its truth and the channels of its joints.
+
+    They are also judged on unseen (record, truth) pairs.
     """
     record, truth = experiment
     known = true_parameters(truth)
@@ -181,20 +223,20 @@ def compare_on_record(
 def examination(
     evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Dataset, xr.Dataset]]
 ) -> Examination:
-    """What is asked of the estimators, from the true parameters (p,) and unseen (record, truth)
-    pairs.
+    """Set up the examination from the true parameters (p,) and unseen (record, truth) pairs.
 
-    Raises EstimationError where the record shows no base parameter, or no unseen run is given.
+    Raises EstimationError if the record shows no base parameter, or if there is no unseen run.
     """
     if not unseen:
         raise EstimationError("no unseen trajectory to judge the estimators on")
     robot = evidence.run.robot
     base = structure(robot)
     driven = evidence.problem.driven_by_commands()
+    # A fixed seed: the choice of the judged parameters must not depend on chance.
     uncertainty = estimate_uncertainty(driven, true, np.random.default_rng(0))
     guess = evidence.problem.guess
     groups = group_estimates(base, guess, identifiability(guess, robot), true, uncertainty)
-    # A relative error says nothing of a difference that almost vanishes.
+    # The relative error of a difference that almost vanishes is meaningless.
     shown: NDArray[np.bool_] = groups.identifiable & (
         groups.std < IDENTIFIABLE_SHARE * np.abs(groups.estimate)
     )
@@ -206,18 +248,13 @@ def examination(
 def compare(
     evidence: Evidence, asked: Examination, estimators: Mapping[str, Estimator], progress: Progress
 ) -> list[Score]:
-    """One score for the starting guess and each estimator; one that fails has its reason in the
-    note.
+    """Score the starting guess and each estimator.
+
+    An estimator that fails has the reason in its note.
     """
     guess = evidence.problem.guess
-    scores = [
-        _score(
-            START,
-            Estimator(START, "", lambda given: Estimate(guess.values, guess.std)),
-            evidence,
-            asked,
-        )
-    ]
+    start = Estimator(START, "", lambda given: Estimate(guess.values, guess.std))
+    scores = [_score(START, start, evidence, asked)]
     with progress.stage("estimators", len(estimators)) as advance:
         for name, estimator in estimators.items():
             scores.append(_score(name, estimator, evidence, asked))
@@ -229,10 +266,11 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
     try:
         found = estimator(evidence)
     except (EstimationError, DynamicsError) as error:
-        nothing = (np.nan, np.nan, np.nan, np.nan, np.nan, np.nan)
+        nothing = (np.nan,) * 6
         return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
     pid = asked.robot.layout.joint_pid
     groups = asked.group_errors(found.parameters)
+    # A gain of zero is one that the drive law does not read.
     read = np.flatnonzero(asked.true[pid]) + pid.start
     gains = found.parameters[read] / asked.true[read] - 1
     distances = (
@@ -264,8 +302,9 @@ PANELS = (
 
 
 def estimators_figure(scores: Sequence[Score]) -> Figure:
-    """Points on logarithmic axes, one panel a figure of merit; what does not exist (an unstable
-    model) has none.
+    """Draw the scores on logarithmic axes, one panel a figure of merit.
+
+    A figure that does not exist, such as that of an unstable model, has no point.
     """
     figure = Figure(figsize=(14, 1.2 + 0.42 * len(scores)), layout="constrained")
     places = np.arange(len(scores))[::-1]
@@ -273,6 +312,7 @@ def estimators_figure(scores: Sequence[Score]) -> Figure:
         figure.subplots(1, len(PANELS), sharey=True), PANELS, strict=True
     ):
         values = np.array([factor * getattr(score, field) for score in scores], dtype=float)
+        # Logarithmic axes cannot show zero.
         axes.plot(np.where(values > 0, values, np.nan), places, "o", color="tab:blue")
         axes.set(title=title, xlabel=label, xscale="log")
         axes.grid(alpha=0.3, which="both")

@@ -1,5 +1,6 @@
-"""Validation: plant and models on trajectories that the estimator never saw, and how far apart they
-should be (4.3).
+"""Validation of plant and models on trajectories that the estimator never saw (section 4.3).
+
+It also predicts how far apart the two should be.
 """
 
 from __future__ import annotations
@@ -7,9 +8,9 @@ from __future__ import annotations
 import multiprocessing
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.sharedctypes import Synchronized
 
 import numpy as np
@@ -39,13 +40,15 @@ from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
 from identify.record.command_times import logged_latencies
 from identify.record.known_geometry import KnownGeometry
-from identify.record.law import SERVO, recorded_law
+from identify.record.recorded_law import SERVO, recorded_law
 from identify.record.recording import recorded_reference
 from identify.runtime import cores
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
+from identify.validation.processes import mapped
 
 POLL_S = 0.2
+"""Interval at which the progress of the workers is read, s."""
 
 
 def run_unseen(
@@ -57,17 +60,18 @@ def run_unseen(
     progress: Progress,
     known: KnownGeometry | None = None,
 ) -> list[Experiment]:
-    """Run the plant with images in the loop on every trajectory, in `workers` processes, None: one
-    a core.
+    """Run the plant with images in the loop on every trajectory.
 
-    Every run has its own noise stream, and all share what the sensor was taught: results do not
-    depend on the workers. known: what is known of the geometry, where that is at hand.
+    The work is spread over `workers` processes; None means one a core. Every run has its own noise
+    stream, and all share the taught frames, so the results do not depend on the workers. ``known``
+    is the known geometry, with that of the scenario as its default.
     """
     how = (scenario, seed, taught, known)
     workers = workers or cores()
     numbers = range(1, len(trajectories) + 1)
     frames = scenario.timing.frames(scenario.validation.duration_s) * len(trajectories)
     with progress.stage("validate", frames) as advance:
+        # A pool would only add the start of a process.
         if workers == 1 or len(trajectories) == 1:
             worker = _Worker(*how)
             return [
@@ -75,12 +79,14 @@ def run_unseen(
                 for number, path in zip(numbers, trajectories, strict=True)
             ]
         context = multiprocessing.get_context("spawn")
+        # Workers count frames here, because a callback cannot reach another process.
         counter: Synchronized[int] = context.Value("q", 0)
+        start = partial(_start_worker, counter, *how)
         with (
             _followed(counter, advance),
-            ProcessPoolExecutor(workers, context, _start_worker, (counter, *how)) as pool,
+            mapped(workers, _run_in_worker, numbers, trajectories, start=start) as runs,
         ):
-            return list(pool.map(_run_in_worker, numbers, trajectories))
+            return list(runs)
 
 
 def model_run(
@@ -90,10 +96,12 @@ def model_run(
     reference: Reference,
     latencies: Array | None = None,
 ) -> Array:
-    """Poses (N, 6) of the model on a reference; NaN throughout when its loop is unstable.
+    """Return the poses (N, 6) of the model on a reference; NaN throughout if its loop is unstable.
 
-    latencies (N,): of its commands, s; None: that of the timing. Raises dynamics.DynamicsError for
-    what is no model: parameters of another shape or outside their range, poses out of reach.
+    ``latencies`` (N,) [s] are those of its commands, by default that of the timing.
+
+    Raises dynamics.DynamicsError for parameters of another shape or outside their range, and for
+    poses out of reach.
     """
     try:
         return simulate_servo(
@@ -106,9 +114,13 @@ def model_run(
 def model_on_record(
     robot: Robot, scenario: Scenario, parameters: Array, record: xr.Dataset
 ) -> Array:
-    """Poses (N, 6) of the model on the motion of a record, with the latencies that it logs: in the
-    servo's loop where that made the record, and under the logged commands where another law did;
-    NaN throughout where it is unstable. Raises as `model_run`."""
+    """Return the poses (N, 6) of the model on the motion of a record; NaN if it is unstable.
+
+    The latencies are those that the record logs. The model runs in the servo's loop if that made
+    the record, and under the logged commands if another law did.
+
+    Raises the errors of `model_run`.
+    """
     if recorded_law(record) == SERVO:
         latencies = logged_latencies(record, scenario.timing)
         return model_run(robot, scenario, parameters, recorded_reference(record), latencies)
@@ -120,27 +132,39 @@ def model_on_record(
 
 
 REPETITIONS = 4
-"""Repeated experiments a motion: with hundreds of frames each they know the noise's share of a
-deviation to 5 %.
+"""Number of repeated experiments a motion.
+
+With hundreds of frames each they give the noise's share of a deviation to 5 %.
 """
 
 
 @dataclass(frozen=True)
 class PosePrediction:
-    """The model's poses (N, 6) [m, rad], and the covariance (N, 6, 6) of the plant's true ones
-    about them, of a robot with this chart; zero where that forbids motion.
+    """Predicted poses of the plant with their covariance.
 
-    Three things keep the plant away from the model. The parameters are uncertain: their covariance
-    C comes through the exact sensitivities S of the model's poses as S C S^T. The sensor's noise
-    goes through the servo into the plant's motion, which no model can foretell: its covariance is
-    sampled by repeated experiments on the identified model, and is taken to be the same all along
-    the motion. And what all measured poses have in common, as far as the record states it, and the
-    geometry: the servo takes the platform where such an error does not show, the whole motion with
-    the same draw. What the record of the identification taught of that draw is in poses and
-    covariance.
+    Three causes separate the plant from the model:
 
-    slopes (N, 6, p): sensitivities of the poses, where these are of reference and latencies alone:
-    no frame is lost, and poses have nothing in common.
+    - The parameters are uncertain. Their covariance C acts through the exact sensitivities S of
+      the model's poses as S C S^T.
+    - The sensor's noise moves the plant through the servo, which no model can foresee. Its
+      covariance is sampled by repeated experiments on the identified model, and is taken as
+      constant along the motion.
+    - All measured poses have errors in common, as far as the record states them, and so does the
+      geometry. The servo takes the platform to where such an error does not show, with the same
+      draw all along the motion. Poses and covariance contain what the record of the
+      identification reveals of that draw.
+
+    Attributes
+    ----------
+    chart : Chart
+        Coordinates of the platform.
+    poses : ndarray, shape (N, 6)
+        Predicted poses, m and rad.
+    covariance : ndarray, shape (N, 6, 6)
+        Covariance of the plant's true poses about them; zero where the chart forbids motion.
+    slopes : ndarray, shape (N, 6, p), optional
+        Sensitivities of the poses. They exist if the poses depend on reference and latencies
+        alone, such as where no frame is lost and poses have no errors in common.
     """
 
     chart: Chart
@@ -154,11 +178,11 @@ class PosePrediction:
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), dtype=float)
 
     def normalised_squared_error(self, true: Array) -> float:
-        """Mean over the frames of e^T P^-1 e / m with the error e of the true poses (N, 6) in the m
-        coordinates of the platform: near one where P is right.
+        """Return the mean over the frames of e^T P^-1 e / m.
 
-        Errors of parameters last for the whole motion: of a single run the figure spreads widely
-        about one.
+        The error e of the true poses (N, 6) is taken in the m coordinates of the platform. The
+        figure is near one if the covariance P is right. Errors of parameters last for the whole
+        motion, so the figure of a single run spreads widely about one.
         """
         free = self.chart.basis
         errors = (true - self.poses) @ free
@@ -173,15 +197,29 @@ def predict_poses(
     rng: np.random.Generator,
     learned: Mapping[str, float] | None = None,
 ) -> PosePrediction:
-    """Predict a run with estimated parameters (p,) of covariance (p, p).
+    """Predict a run with estimated parameters.
 
-    learned: estimates, by name, of k errors that the poses of this run have in common with those of
-    the record; then the covariance (p + k, p + k) is theirs, too. Otherwise they are as well known
-    as the run states.
+    Of the run, only the reference, the sensor's covariance and the lost frames count, not the
+    measured poses.
 
-    Of the run only the reference, the sensor's covariance and the lost frames count, not what was
-    measured. Raises LoopFailure where the model, or its repetition with the sensor's noise, is
-    unstable.
+    Parameters
+    ----------
+    run : LoopModel
+        Model of the run.
+    parameters : ndarray, shape (p,)
+        Estimates.
+    covariance : ndarray, shape (p, p) or (p + k, p + k)
+        Their covariance, followed by that of the learned errors.
+    rng : numpy.random.Generator
+        Source of the noise of the repeated experiments.
+    learned : mapping, optional
+        Estimates, by name, of k errors that the poses of this run share with those of the record.
+        If the names are not those of the run, its own statement of these errors is used.
+
+    Raises
+    ------
+    LoopFailure
+        If the model, or its repetition with the sensor's noise, is unstable.
     """
     likely, root, known = _known_in_common(run, covariance, len(parameters), learned or {})
     inside = len(run.errors_had)
@@ -197,6 +235,7 @@ def predict_poses(
     common = run.pose_modes(parameters)
     by_parameters = run.of_all(model.pose_sensitivity)
     slopes = np.concatenate([by_parameters, common @ root], axis=2)
+    # Deviations by noise have mean zero, so their second moment is the covariance.
     spread = slopes @ known @ slopes.transpose(0, 2, 1) + noise.T @ noise / len(noise)
     alone = run.ok.all() and not (run.driven or run.common.all_names or run.payload.any())
     poses = model.pose + common[:, :, inside:] @ likely[inside:]
@@ -206,19 +245,20 @@ def predict_poses(
 def _known_in_common(
     run: LoopModel, covariance: Array, parameters: int, learned: Mapping[str, float]
 ) -> tuple[Array, Array, Array]:
-    """What is known of the errors that a run's poses have in common: the most likely of the
-    independent numbers (k,) of which they are made, what turns k known numbers into these (k, k),
-    and the covariance (p + k, p + k) of parameters and known numbers."""
+    """Knowledge of the errors that a run's poses have in common.
+
+    Returns the most likely values (k,) of the independent numbers that make up these errors, the
+    matrix (k, k) from known numbers to them, and the covariance (p + k, p + k) of parameters and
+    known numbers.
+    """
     names = run.common.all_names
     if names and tuple(learned) == names:
+        # The factor has no inverse where the covariance lacks full rank.
         root = np.asarray(np.linalg.pinv(run.common.whole_factor))
         return root @ np.array([*learned.values()]), root, covariance
     each = np.eye(len(names))
-    return (
-        np.zeros(len(names)),
-        each,
-        np.asarray(block_diag(covariance[:parameters, :parameters], each)),
-    )
+    whole = np.asarray(block_diag(covariance[:parameters, :parameters], each))
+    return np.zeros(len(names)), each, whole
 
 
 def predicted_runs(
@@ -231,14 +271,14 @@ def predicted_runs(
     progress: Progress,
     learned: Mapping[str, float] | None = None,
 ) -> list[PosePrediction]:
-    """What the identified model (p,) with its covariance (p, p) predicts for the plant on the
-    references of records; learned: as of `predict_poses`.
+    """Predict the plant on the references of records from the identified model.
 
-    NaN throughout where its loop is unstable, or too little was measured to know the sensor's
-    noise.
+    The parameters (p,) have covariance (p, p). ``learned`` is as in `predict_poses`. A prediction
+    is NaN throughout if the loop is unstable, or if too few frames were measured to know the
+    sensor's noise.
 
-    Raises RecordError, EstimationError: a record that is damaged, or of another robot, timing or
-    servo. Raises dynamics.DynamicsError: parameters that no model can have.
+    Raises RecordError or EstimationError for a record that is damaged, or is of another robot,
+    timing or servo. Raises dynamics.DynamicsError for parameters that no model can have.
     """
     predictions = []
     with progress.stage("predict", len(records)) as advance:
@@ -261,7 +301,7 @@ def predicted_runs(
 
 
 class _Worker:
-    """One process's plant and sensor; the renderer lives as long as the process."""
+    """Plant and sensor of one process, which keeps the renderer."""
 
     def __init__(
         self, scenario: Scenario, seed: int, taught: cmmsim.Taught, known: KnownGeometry | None
@@ -288,6 +328,7 @@ def _start_worker(
     taught: cmmsim.Taught,
     known: KnownGeometry | None,
 ) -> None:
+    # A process of a pool can only keep its state in the module.
     global _worker, _counter
     _worker = _Worker(scenario, seed, taught, known)
     _counter = counter
@@ -303,7 +344,7 @@ def _run_in_worker(number: int, trajectory: FourierTrajectory) -> Experiment:
 
 @contextmanager
 def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
-    """Pass what the workers have counted on to the progress bar until the context ends."""
+    """Pass the count of the workers on to the progress bar until the context ends."""
     done = 0
     ended = threading.Event()
 
@@ -325,15 +366,14 @@ def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
 
 
 def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed: int = 0) -> Array:
-    """Pose errors (runs, N, 6) [m, rad] of the model with these parameters (p,) against the plant
-    with the true ones.
+    """Return the pose errors (runs, N, 6) [m, rad] of a model against the plant.
 
-    On the scenario's unseen trajectories for this seed; plant and model each with their own
-    friction law and steps. Both see by an ideal sensor, so that only the parameters and what the
-    model leaves out make the error. NaN where the model's loop is unstable, and only there.
+    Both run on the scenario's unseen trajectories for this seed, each with its own friction law and
+    steps. An ideal sensor closes both loops, so the errors come only from the parameters (p,) and
+    from what the model leaves out. They are NaN if, and only if, the model's loop is unstable.
 
-    Raises dynamics.DynamicsError: parameters of another shape, not finite, or outside their range.
-    Raises TrajectoryError: no unseen trajectory keeps the robot's limits.
+    Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
+    range. Raises TrajectoryError if no unseen trajectory keeps the robot's limits.
     """
     values = checked_loop_parameters(robot, parameters, scenario.model.drive_law)
     plant = build_plant(scenario, robot, seed)

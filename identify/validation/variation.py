@@ -1,20 +1,18 @@
-"""Variation of the estimates from one trajectory to the next (the paper's table 5).
+"""Variation of the estimates from one trajectory to the next (table 5 of the paper).
 
-The robot is identified from each of several runs alone. The paper gives its "variation measure" no
-formula; here it is the standard deviation of a parameter's estimates in per cent of their mean.
-Judged are the parameters that every run identifies. Beside it stands what each run's own interval
-makes one expect. All runs share one weighing of the platform and one teaching of the sensor, as in
-the paper: what is wrong with these does not vary.
+The robot is identified from each of several runs alone. The paper gives no formula for its
+"variation measure". Here it is the standard deviation of a parameter's estimates in per cent of
+their mean, over the parameters that every run identifies. Beside it stands the value that the runs'
+own intervals let one expect. As in the paper, all runs share one weighing of the platform and one
+teaching of the sensor, so errors of these do not vary.
 
-What varies most are the masses of the links of `rss6`, which accelerations show. By the information
-of designed runs at the true parameters (noise in the servo left out), the worst is known to 4.6,
-3.5 and 3.1 % from 20, 40 and 60 s at the paper's fundamental of 0.1 Hz, and to 2.4 % from 20 s at
-0.3 Hz, which uses the whole velocity limit of 2 rad/s: faster is worth more than longer.
+The masses of the links of `rss6` vary most. Accelerations show them. By the information of designed
+runs at the true parameters, without noise in the servo, the worst one is known to 4.6, 3.5 and 3.1
+% from 20, 40 and 60 s at the paper's fundamental of 0.1 Hz. From 20 s at 0.3 Hz, which uses the
+whole velocity limit of 2 rad/s, it is known to 2.4 %. Faster is worth more than longer.
 """
 
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -35,20 +33,35 @@ from identify.progress import Progress, SilentProgress
 from identify.random_streams import DESIGN, stream_seed
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
+from identify.validation.processes import mapped
 from identify.validation.unseen import run_unseen
 
 if TYPE_CHECKING:
     import pandas as pd
 
 FEWEST_RUNS = 3
-"""Of fewer runs a standard deviation says nothing."""
+"""Least number of runs of which a standard deviation is meaningful."""
 
 
 @dataclass(frozen=True)
 class Variation:
-    """Of each parameter (p,), SI: mean of the estimates, their standard deviation relative to it,
-    the same as expected from the runs' own intervals, and whether every run identifies it; runs:
-    their number."""
+    """Variation of the parameters (p,).
+
+    Attributes
+    ----------
+    layout : ParameterLayout
+        Names and units of the parameters.
+    mean : ndarray, shape (p,)
+        Means of the estimates, SI.
+    variation : ndarray, shape (p,)
+        Standard deviations of the estimates over the size of their means.
+    expected : ndarray, shape (p,)
+        The same, as the runs' own standard deviations predict it.
+    identified : ndarray of bool, shape (p,)
+        Parameters that every run identifies.
+    runs : int
+        Number of runs.
+    """
 
     layout: ParameterLayout
     mean: Array
@@ -69,7 +82,7 @@ class Variation:
         )
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """One row a parameter: mean, variation, expected, identified."""
+        """Return a table with one row a parameter: mean, variation, expected, identified."""
         import pandas as pd
 
         columns = {
@@ -79,9 +92,9 @@ class Variation:
 
     @property
     def worst(self) -> tuple[str, float]:
-        """The identified parameter that varies most, and its variation.
+        """Name and variation of the identified parameter that varies most.
 
-        Raises EstimationError where no parameter is identified in every run.
+        Raises EstimationError if no parameter is identified in every run.
         """
         if not self.identified.any():
             raise EstimationError(
@@ -92,14 +105,15 @@ class Variation:
 
 
 def variation(results: Sequence[IdentificationResult]) -> Variation:
-    """Variation of estimates from several identifications of one robot.
+    """Return the variation of estimates from several identifications of one robot.
 
-    Raises EstimationError with fewer than three.
+    Raises EstimationError if there are fewer than three.
     """
     check_count(len(results))
     estimates = np.array([r.estimate for r in results])
     stds = np.array([r.std for r in results])
     mean = estimates.mean(axis=0)
+    # A parameter of zero has no relative variation.
     size = np.where(mean == 0, np.nan, np.abs(mean))
     return Variation(
         layout=results[0].layout,
@@ -112,7 +126,7 @@ def variation(results: Sequence[IdentificationResult]) -> Variation:
 
 
 def check_count(runs: int) -> None:
-    """Raise EstimationError where so few runs show no variation."""
+    """Raise EstimationError if there are too few runs to show variation."""
     if runs < FEWEST_RUNS:
         raise EstimationError(f"{runs} runs show no variation, at least {FEWEST_RUNS} are needed")
 
@@ -120,8 +134,9 @@ def check_count(runs: int) -> None:
 def identify_each(
     records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario, progress: Progress
 ) -> list[IdentificationResult]:
-    """Identify from each record alone. Raises as `identify` does, and EstimationError with too few
-    records.
+    """Identify from each record alone.
+
+    Raises the errors of `identify`, and EstimationError if there are too few records.
     """
     check_count(len(records))
     results = []
@@ -135,22 +150,25 @@ def identify_each(
 def designed_runs(
     scenario: Scenario, robot: Robot, seed: int, count: int, workers: int | None, progress: Progress
 ) -> list[Experiment]:
-    """Run the plant with images in the loop on `count` exciting trajectories, each designed from
-    its own random ones.
+    """Run the plant with images in the loop on `count` exciting trajectories.
 
-    As long as the exciting run, by the scenario's method; workers as in `run_unseen`. Raises as the
-    stages `excite` and `record` do.
+    Each trajectory is designed from random candidates of its own by the scenario's method, and is
+    as long as the exciting run. The workers are as in `run_unseen`.
+
+    Raises the errors of the stages `excite` and `record`.
     """
+    # Seeds of their own keep these runs apart from the experiment's.
     own = stream_seed(seed, DESIGN)
     seeds = [stream_seed(own, number) for number in range(count)]
     trajectories = []
     with (
         progress.stage("design the runs", count) as advance,
-        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool,
+        mapped(workers, partial(_designed, scenario), seeds) as found,
     ):
-        for trajectory in pool.map(partial(_designed, scenario), seeds):
+        for trajectory in found:
             trajectories.append(trajectory)
             advance()
+    # `run_unseen` runs for the duration of the validation.
     lasting = scenario.with_overrides({"validation.duration_s": scenario.excitation.duration_s})
     taught = taught_sensor(lasting, robot, own, progress).taught
     return run_unseen(lasting, tuple(trajectories), own, taught, workers, progress)

@@ -1,3 +1,4 @@
-"""A robot checked without any sensor (its model against MuJoCo, its workspace), and a sensor
-without any robot.
+"""Checks of a robot without a sensor, and of a sensor without a robot.
+
+A robot's model is compared with MuJoCo, and its workspace is mapped.
 """

@@ -1,6 +1,4 @@
-"""The acceptance tests of one sensor, one after the other, and their figures as ``acceptance.json``
-holds them.
-"""
+"""Acceptance tests of one sensor, and their figures for ``acceptance.json``."""
 
 import math
 import time
@@ -38,13 +36,15 @@ from identify.progress import Progress
 from identify.random_streams import RESAMPLING, mixed_generator
 
 BLOCK = 10
-"""Neighbouring frames of the bar are resampled together."""
+"""Number of neighbouring frames of the bar that are resampled together."""
 
 
 @dataclass
 class AcceptanceRun:
-    """What is tested, with the limit of the length error, and what came out, by the name of the
-    test; its seconds.
+    """Acceptance tests of a sensor and their results.
+
+    ``limit_um`` is the limit of the length error. ``found`` holds the results and ``seconds`` the
+    durations, by the name of the test.
     """
 
     under_test: SensorUnderTest
@@ -58,8 +58,21 @@ class AcceptanceRun:
 
 @dataclass(frozen=True)
 class Standard:
-    """A test: its name in progress bars and in ``acceptance.json``; its steps in a volume, which it
-    refuses where there is no room; the test itself; its figures for ``acceptance.json``."""
+    """Test of one standard.
+
+    Attributes
+    ----------
+    title
+        Name in progress bars.
+    key
+        Name in ``acceptance.json``.
+    steps
+        Function that returns the number of steps in a volume, and refuses one without room.
+    test
+        Function that runs the test.
+    figures
+        Function that returns the figures for ``acceptance.json``.
+    """
 
     title: str
     key: str
@@ -76,14 +89,28 @@ def prepare(
     standard: str,
     limit_um: float,
 ) -> AcceptanceRun:
-    """A run in which nothing is done yet; everything that can be wrong is checked before anything
-    is drawn.
+    """Prepare a run, and check everything that can be wrong before anything is drawn.
 
-    standard: the name of a test or ``all``; volume: its sides, see `parse_volume`, or the largest
-    that is seen.
+    Parameters
+    ----------
+    sensor
+        Name or file of a sensor.
+    seed
+        Seed of the sensor's noise.
+    renderer
+        Renderer of the images, or None for the sensor's default.
+    volume
+        Sides of the measuring volume, see `parse_volume`, or None for the largest that is seen.
+    standard
+        Name of a test, or ``all``.
+    limit_um
+        Limit of the length error, in µm.
 
-    Raises CmmError: an unknown sensor, renderer or standard, a limit that is no positive number, or
-    a volume that is not seen, breaks a rule or lacks room for the bar.
+    Raises
+    ------
+    CmmError
+        The sensor, renderer or standard is unknown, the limit is not a positive number, or the
+        volume is not seen, breaks a rule or lacks room for the bar.
     """
     if not (math.isfinite(limit_um) and limit_um > 0.0):
         raise AcceptanceError(
@@ -94,23 +121,25 @@ def prepare(
     standards = tuple(STANDARDS) if standard == "all" else (standard,)
     file = read_sensor_file(sensor)
     under_test = SensorUnderTest(file, seed, renderer)
-    found = (
-        common_volume(file.rig)
-        if volume is None
-        else volume_of_size(file.rig, parse_volume(volume))
-    )
+    if volume is None:
+        found = common_volume(file.rig)
+    else:
+        found = volume_of_size(file.rig, parse_volume(volume))
+    # Counting the steps refuses a volume without room for the test.
     for name in standards:
         STANDARDS[name].steps(found)
     return AcceptanceRun(under_test, under_test.renderer_name(), found, standards, limit_um)
 
 
 def parse_volume(text: str) -> np.ndarray:
-    """Sides (3,) [m] of a volume written ``0.6`` (a cube) or ``0.7x0.6x0.6``. Raises
-    AcceptanceError: anything else.
+    """Return the sides (3,) [m] of a volume written ``0.6`` (a cube) or ``0.7x0.6x0.6``.
+
+    Raises AcceptanceError for any other text.
     """
     try:
         sides = np.array([float(part) for part in text.lower().split("x")])
     except ValueError:
+        # An empty array is refused below, with the same message.
         sides = np.zeros(0)
     if len(sides) not in (1, 3) or not np.all(np.isfinite(sides)):
         raise AcceptanceError(
@@ -121,7 +150,7 @@ def parse_volume(text: str) -> np.ndarray:
 
 
 def do(run: AcceptanceRun, progress: Progress) -> None:
-    """Do the tests of a prepared run."""
+    """Run the tests of a prepared run."""
     for name in run.standards:
         standard = STANDARDS[name]
         start = time.perf_counter()
@@ -131,7 +160,7 @@ def do(run: AcceptanceRun, progress: Progress) -> None:
 
 
 def acceptance_entry(run: AcceptanceRun) -> dict[str, Any]:
-    """All figures of a run; a test that was not done is absent."""
+    """Return all figures of a run. A test that was not run is absent."""
     volume = run.volume
     return {
         "sensor": run.under_test.file.name,
@@ -159,7 +188,7 @@ def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
     largest = test.largest
     errors = 1e6 * test.errors
     single = 1e6 * test.single_errors
-    # the lengths of a line share its first sticker: only the lines are independent
+    # The lengths of a line share its first sticker, so that only the lines are independent.
     line_means = 1e6 * np.array(
         [np.mean([length.error for length in test.of_line(line.name)]) for line in test.lines]
     )
@@ -196,6 +225,7 @@ def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
 
 
 def _bar(test: BarTest, run: AcceptanceRun) -> dict[str, Any]:
+    # A random stream of its own, so that intervals do not depend on what else was drawn.
     rng = mixed_generator(RESAMPLING, run.under_test.seed)
     return {
         "bar_length_mm": 1e3 * LENGTH,
@@ -274,3 +304,4 @@ STANDARDS = {
     ),
     "e3124": Standard("latency (ASTM E3124)", "astm_e3124", _circle_steps, latency_test, _latency),
 }
+"""Tests by the names that the command line knows."""

@@ -1,5 +1,6 @@
-"""``acceptance.md``: tables of acceptance tests, ours beside the published figures, and what may be
-compared.
+"""Report of acceptance tests for ``acceptance.md``.
+
+Its tables hold the results beside published figures. A text says what may be compared.
 """
 
 from typing import Any
@@ -33,7 +34,7 @@ instrument is.
 
 
 def acceptance_markdown(entry: dict[str, Any]) -> str:
-    """The whole report of the tests that were done, from the content of ``acceptance.json``."""
+    """Return the report of the tests that were run, from the content of ``acceptance.json``."""
     volume = entry["volume"]
     near, far = volume["depth_from_baseline_mm"]
     sides = " x ".join(f"{side:.0f}" for side in volume["size_mm"])
@@ -41,10 +42,10 @@ def acceptance_markdown(entry: dict[str, Any]) -> str:
         f"# Acceptance of {entry['sensor']}",
         f"Renderer {entry['renderer']}, seed {entry['seed']}. Measuring volume {sides} mm "
         f"({volume['cubic_metres']:.3g} m³, space diagonal {volume['diagonal_mm']:.0f} mm), "
-        f"{near:.0f} to "
-        f"{far:.0f} mm from the middle of the baseline: wholly seen by both cameras.",
+        f"{near:.0f} to {far:.0f} mm from the middle of the baseline: wholly seen by both cameras.",
         *([f"Of the sensor's figures: {entry['note']}."] if entry.get("note") else []),
     ]
+    # Tests that were not run have no entry, and no table.
     makers = {"vdi_2634_1": length_table, "astm_e3064": bar_table, "astm_e3124": latency_table}
     tables = [make(entry[key]) for key, make in makers.items() if key in entry]
     for table in [*tables, published_table(entry)]:
@@ -53,39 +54,38 @@ def acceptance_markdown(entry: dict[str, Any]) -> str:
 
 
 def length_table(test: dict[str, Any]) -> Table:
-    """Lengths of the seven lines: the longest, its share of the diagonal, and the errors."""
+    """Return the lengths of the seven lines and their errors.
+
+    Each line has its lengths, the longest as a share of the space diagonal, and its errors.
+    """
     rows = []
     for line in test["lines"]:
         errors = [length["error_um"] for length in line["lengths"]]
-        rows.append(
-            (
-                line["name"],
-                ", ".join(f"{length['certified_mm']:.0f}" for length in line["lengths"]),
-                number(line["longest_share_of_diagonal"]),
-                ", ".join(f"{error:+.1f}" for error in errors),
-                number(max(abs(error) for error in errors)),
-            )
-        )
-    where, (low, high) = test["largest_error_at"], test["mean_error_interval_um"]
+        certified = ", ".join(f"{length['certified_mm']:.0f}" for length in line["lengths"])
+        share = number(line["longest_share_of_diagonal"])
+        listed = ", ".join(f"{error:+.1f}" for error in errors)
+        largest = number(max(abs(error) for error in errors))
+        rows.append((line["name"], certified, share, listed, largest))
+    where = test["largest_error_at"]
+    low, high = test["mean_error_interval_um"]
     return Table(
         "Lengths in the style of VDI/VDE 2634-1",
         ("line", "lengths [mm]", "longest / diagonal", "errors E [um]", "largest [um]"),
         tuple(rows),
         f"Largest error {test['largest_error_um']:+.1f} um ({where['line']}, "
-        f"{where['length_mm']:.0f} mm), limit "
-        f"± {test['limit_um']:g} um: {'met' if test['met'] else 'MISSED'}. Mean error "
-        f"{test['mean_error_um']:+.2f} um, "
-        f"95 % interval {low:+.2f} to {high:+.2f} um. A length is the mean of "
-        f"{test['exposures_a_length']} exposures; "
-        f"the RMS error of a single one is {number(test['single_exposure_rms_um'])} um, its mean "
-        "square "
+        f"{where['length_mm']:.0f} mm), limit ± {test['limit_um']:g} um: "
+        f"{'met' if test['met'] else 'MISSED'}. Mean error {test['mean_error_um']:+.2f} um, 95 % "
+        f"interval {low:+.2f} to {high:+.2f} um. A length is the mean of "
+        f"{test['exposures_a_length']} exposures; the RMS error of a single one is "
+        f"{number(test['single_exposure_rms_um'])} um, its mean square "
         f"{number(test['variance_ratio'])} times the stated variance.",
     )
 
 
 def bar_table(test: dict[str, Any]) -> Table:
-    """Statistics of the relative pose error of the bar's ends, standing and moving, with 95 %
-    intervals.
+    """Return the statistics of the relative pose error of the bar's ends.
+
+    The bar stands or moves. Intervals are those of 95 %.
     """
     rows = []
     for state in ("standing", "moving"):
@@ -97,11 +97,9 @@ def bar_table(test: dict[str, Any]) -> Table:
             rows.append((f"{state}, {name}", *values, str(figures["count"])))
     note = (
         f"A bar with {test['bar_length_mm']:.0f} mm between the clusters at its ends, moved at up "
-        "to "
-        f"{test['largest_speed_mm_s']:.0f} mm/s with {test['exposure_ms']:g} ms of exposure; in "
-        "brackets 95 % "
-        f"intervals. {test['lost_frames']} of {test['frames']} frames lost. The squared "
-        f"errors are {number(test['variance_ratio'])} times the stated variance."
+        f"to {test['largest_speed_mm_s']:.0f} mm/s with {test['exposure_ms']:g} ms of exposure; in "
+        f"brackets 95 % intervals. {test['lost_frames']} of {test['frames']} frames lost. The "
+        f"squared errors are {number(test['variance_ratio'])} times the stated variance."
     )
     given_up = [f"{run['name']} ({run['given_up']})" for run in test["runs"] if run["given_up"]]
     if given_up:
@@ -118,7 +116,7 @@ def bar_table(test: dict[str, Any]) -> Table:
 
 
 def latency_table(test: dict[str, Any]) -> Table:
-    """Latency of the reports."""
+    """Return the latency of the reports."""
     low, high = test["mean_interval_ms"]
     rows = (
         ("mean", f"{test['mean_ms']:.4f} ({low:.4f} to {high:.4f})"),
@@ -133,15 +131,15 @@ def latency_table(test: dict[str, Any]) -> Table:
         ("from the middle of the exposure to the report", "[ms]"),
         rows,
         f"{test['reports']} reports of a body on a circle, {test['lost_frames']} frames lost; in "
-        "brackets the "
-        "95 % interval.",
+        "brackets the 95 % interval.",
     )
 
 
 def published_table(entry: dict[str, Any]) -> Table:
-    """Our figures above the published ones of the same quantity."""
+    """Return our figures above the published ones of the same quantity."""
     ours = _our_figures(entry)
     rows = []
+    # A dictionary keeps the order of the published figures.
     for quantity in dict.fromkeys(figure["quantity"] for figure in entry["published"]):
         rows += [(quantity, entry["sensor"], value, note) for value, note in ours.get(quantity, ())]
         rows += [
@@ -155,7 +153,7 @@ def published_table(entry: dict[str, Any]) -> Table:
 
 
 def _our_figures(entry: dict[str, Any]) -> dict[str, list[tuple[str, str]]]:
-    """Values and notes of our own figures by quantity."""
+    """Return the values and notes of our own figures by quantity."""
     found: dict[str, list[tuple[str, str]]] = {}
     if test := entry.get("vdi_2634_1"):
         note = f"largest length error, mean of {test['exposures_a_length']} exposures"

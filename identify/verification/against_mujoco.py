@@ -1,13 +1,13 @@
-"""The paper's model validation (section 4.1): this model against MuJoCo in the loop of its figure
-7, and its figure 8.
+"""Comparison of this model with MuJoCo, as in the paper's model validation (section 4.1).
 
-The same joint PID (eq. 31) on both engines follows the joint coordinates of the same exciting
-trajectory (eq. 37); torques come from each engine's own motion. This model goes through the closed
-loop of the experiments, driven by commands; MuJoCo through `mj_step` on the exported MJCF.
+The control loop is that of the paper's figure 7, and the result is drawn like its figure 8. On both
+engines, the same joint PID (eq. 31) follows the joint coordinates of the same exciting trajectory
+(eq. 37). The torques come from each engine's own motion. This model runs in the closed loop of the
+experiments, driven by commands. MuJoCo runs `mj_step` on the exported MJCF.
 
-MuJoCo runs with RK4 and with the PID's stiffness and damping inside its integrator, so that its
-discretisation stays far below what is to be seen; only the integral part is held over a step of
-0.25 ms, at its value in mid-step.
+MuJoCo integrates by RK4, with the stiffness and damping of the PID inside its integrator, so that
+its discretisation error stays far below the differences of interest. Only the integral part is
+constant over a step of 0.25 ms, at its value in the middle of the step.
 """
 
 from collections.abc import Iterator
@@ -30,6 +30,7 @@ from identify.trajectory import FourierTrajectory
 
 PARAMETER_SET = "initial"
 DURATION_S = 10.0
+# Differences from the start of the run have decayed by then.
 STEADY_FROM_S = 2.0
 COMMAND_RATE_HZ = 200.0
 STEPS_PER_COMMAND = 4
@@ -37,14 +38,13 @@ SOLVER = MjcfSolver(timestep_s=2.5e-4, integrator="RK4")
 
 # The paper's excitation (section 4.2) in the box of the reference experiment.
 EXCITATION = Excitation(
-    fundamental_hz=0.1,
-    harmonics=5,
-    position_amplitude_m=0.010,
-    orientation_amplitude_rad=0.040,
+    fundamental_hz=0.1, harmonics=5, position_amplitude_m=0.010, orientation_amplitude_rad=0.040
 )
 
 GOAL_UM = 10.0
 GOAL_URAD = 20.0
+
+# Differences that the paper's figure 8 shows.
 PAPER = {
     "position_max_um": 1250.0,
     "angle_max_urad": 3250.0,
@@ -55,9 +55,12 @@ PAPER = {
 
 @dataclass(frozen=True)
 class EngineRuns:
-    """Both engines over time (N,) [s]: poses (N, 6) [m, rad] of this model, of MuJoCo and of the
-    reference; actuator torques or forces (N, n) [N m, N] of this model and of MuJoCo; MuJoCo's
-    closure error (N,) [m] and link spin (N,) [rad/s]."""
+    """Motion of both engines over time (N,) [s].
+
+    Poses (N, 6) [m, rad] are those of this model, of MuJoCo and of the reference. Actuator torques
+    or forces (N, n) [N m, N] are those of this model and of MuJoCo. ``closure`` (N,) [m] is the
+    closure error of MuJoCo's loops, and ``spin`` (N,) [rad/s] the spin of its links.
+    """
 
     time: Array
     reference: Array
@@ -71,14 +74,15 @@ class EngineRuns:
 
     @property
     def difference(self) -> Array:
-        """MuJoCo's pose less this model's, (N, 6) [m, rad]."""
+        """MuJoCo's pose minus this model's, (N, 6) [m, rad]."""
         return self.mujoco_pose - self.model_pose
 
 
 def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
-    """Run both engines with the set `initial` less its friction (the paper's Table 1 has none).
+    """Run both engines with the parameter set `initial`, without its friction.
 
-    Raises DynamicsError, TrajectoryError: see `compare_engines`.
+    The paper's table 1 has no friction either. Raises DynamicsError or TrajectoryError as
+    `compare_engines`.
     """
     values = robot.parameter_sets[PARAMETER_SET].vector.copy()
     values[robot.layout.coulomb] = 0.0
@@ -93,12 +97,18 @@ def compare_engines(
     duration_s: float,
     progress: Progress | None = None,
 ) -> EngineRuns:
-    """Both engines on the exciting trajectory, each with its own parameters: the dynamic ones (p,),
-    lp, li, ld.
+    """Run both engines on the exciting trajectory, each with its own parameters.
 
-    Raises DynamicsError: MuJoCo is missing or refuses the model, or the loop is unstable. Raises
-    TrajectoryError: no exciting trajectory of this amplitude stays inside the robot's travel.
+    These are the dynamic parameters (p,) and the gains lp, li and ld.
+
+    Raises
+    ------
+    DynamicsError
+        MuJoCo is missing or refuses the model, or the loop is unstable.
+    TrajectoryError
+        No exciting trajectory of this amplitude stays inside the robot's travel.
     """
+    # First of all: MuJoCo is optional, and if it is missing, nothing has to run.
     import_mujoco()
     progress = progress or SilentProgress()
     time = np.arange(round(duration_s * COMMAND_RATE_HZ) + 1) / COMMAND_RATE_HZ
@@ -108,7 +118,8 @@ def compare_engines(
         trajectory = exciting_trajectory(robot)
         reference = closed_loop.Reference(trajectory.pose(time), trajectory.pose_rate(time))
         commands = robot.inverse_kinematics(reference.poses)
-        settings = closed_loop.LoopSettings(  # driven by commands that ramp from one to the next
+        # Without gains, the servo leaves the joints to the commands.
+        settings = closed_loop.LoopSettings(
             closed_loop.ServoGains(0.0, 0.0, 0.0),
             closed_loop.FrameTiming(COMMAND_RATE_HZ, hold="linear"),
             steps_per_frame=STEPS_PER_COMMAND,
@@ -117,16 +128,15 @@ def compare_engines(
             robot, model_parameters, reference, settings, commands
         )
         advance()
-    # Table 1's inertias break the triangle inequality in ways that the motion does not feel
+    # Inertias of table 1 break the triangle inequality in ways that do not change the motion.
     chosen = mujoco_parameters[robot.layout.dynamic]
     joints = robot.layout.joints
     mjcf = mjcf_text(robot, chosen, allow_unphysical_inertia=True, solver=SOLVER)
     engine = MujocoRobot(robot, mjcf)
     rows = np.empty((len(time), 8 + joints))
     with progress.stage("MuJoCo", len(time)) as advance:
-        for frame, row in enumerate(
-            _mujoco_rows(robot, engine, mujoco_parameters, reference, commands)
-        ):
+        steps = _mujoco_rows(robot, engine, mujoco_parameters, reference, commands)
+        for frame, row in enumerate(steps):
             rows[frame] = row
             advance()
     pose = rows[:, :6]
@@ -147,8 +157,9 @@ def compare_engines(
 
 
 def exciting_trajectory(robot: Robot) -> FourierTrajectory:
-    """The first random trajectory of eq. 37 that stays inside the travel; always the same for a
-    robot.
+    """Return the first random trajectory of eq. 37 that stays inside the travel.
+
+    It is always the same for a robot.
     """
     period_s = 1 / EXCITATION.fundamental_hz
     return admissible_trajectories(robot, EXCITATION, period_s, 1, np.random.SeedSequence(0))[0]
@@ -161,11 +172,16 @@ def _mujoco_rows(
     reference: closed_loop.Reference,
     commands: Array,
 ) -> Iterator[Array]:
-    """Pose (6,), torques (n,), closure error and link spin at every command, in a row; the command
-    ramps from the one before to the present one, as in the closed loop with linear hold."""
+    """Yield a row with pose (6,), torques (n,), closure error and link spin at every command.
+
+    Between two commands the command is interpolated linearly, as in the closed loop with linear
+    hold.
+    """
     lp, li, ld = parameters[robot.layout.joint_pid]
+    # A whole number of steps a command.
     steps = round(1 / (COMMAND_RATE_HZ * engine.timestep))
     dt = 1 / (COMMAND_RATE_HZ * steps)
+    # The run starts at rest: the integral part holds the weight.
     integral = robot.static_torque(reference.poses[0], parameters[robot.layout.dynamic]) / li
     engine.put(reference.poses[0], np.zeros(6))
     engine.feed_back(lp, ld)
@@ -175,6 +191,7 @@ def _mujoco_rows(
         torque = lp * (before - engine.joints) + ld * (rate - engine.joint_rates) + li * integral
         yield np.concatenate([engine.pose, torque, [engine.closure_error, engine.link_spin]])
         for step in range(steps):
+            # MuJoCo subtracts lp * joints and ld * rates itself, so that only the rest is applied.
             wanted = before + rate * (step + 0.5) * dt
             start = engine.joints
             engine.step(lp * wanted + ld * rate + li * (integral + dt / 2 * (wanted - start)))
@@ -184,10 +201,14 @@ def _mujoco_rows(
 
 @dataclass(frozen=True)
 class Verdict:
-    """Largest differences between the engines, of the whole run and from STEADY_FROM_S on:
-    distances of the platform [um], lengths of the vector of Euler angle differences [urad],
-    actuator torque or force [N m, N]; MuJoCo's loop closure error [um] and link spin [rad/s]; how
-    far this model is from its reference [um, urad], which is what the PID leaves to see."""
+    """Largest differences between the engines.
+
+    The "max" ones are those of the whole run, the "steady" ones those from STEADY_FROM_S on. They
+    are given as distances of the platform [µm], lengths of the vector of Euler angle differences
+    [µrad] and differences of actuator torque or force [N m, N]. Closure error [µm] and link spin
+    [rad/s] are MuJoCo's. The tracking errors [µm, µrad] are those of this model against its
+    reference, which the PID leaves.
+    """
 
     position_max_um: float
     position_steady_um: float
@@ -201,12 +222,12 @@ class Verdict:
 
     @property
     def met(self) -> bool:
-        """Whether the steady differences are within the goals."""
+        """True if the steady differences are within the goals."""
         return self.position_steady_um <= GOAL_UM and self.angle_steady_urad <= GOAL_URAD
 
 
 def judge(runs: EngineRuns) -> Verdict:
-    """Figures of a comparison."""
+    """Return the figures of a comparison."""
     position, angle = _lengths(runs.difference)
     tracking = _lengths(runs.model_pose - runs.reference)
     steady = runs.time >= STEADY_FROM_S
@@ -224,12 +245,12 @@ def judge(runs: EngineRuns) -> Verdict:
 
 
 def _lengths(difference: Array) -> tuple[Array, Array]:
-    """Lengths (N,) of the position part and of the angle part of pose differences (N, 6)."""
+    """Return the lengths (N,) of the position and angle parts of pose differences (N, 6)."""
     return np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)
 
 
 def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
-    """What `verification.json` holds."""
+    """Return the content of `verification.json`."""
     verdict = judge(runs)
     chosen = robot.parameter_sets[PARAMETER_SET]
     return {
@@ -254,7 +275,10 @@ def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
 
 
 def figure_8(runs: EngineRuns) -> Figure:
-    """Differences of MuJoCo and this model, and how far MuJoCo's loops are open, over time."""
+    """Draw the differences between MuJoCo and this model over time.
+
+    A third panel shows the closure error of MuJoCo's loops.
+    """
     figure = Figure(figsize=(9, 9), layout="constrained")
     position, angle, closure = figure.subplots(3, 1, sharex=True)
     verdict = judge(runs)
@@ -265,13 +289,11 @@ def figure_8(runs: EngineRuns) -> Figure:
     closure.plot(runs.time, 1e6 * runs.closure, linewidth=1, color="black")
     position.set_title(
         f"(a) position: largest {verdict.position_max_um:.2g} um, steady "
-        f"{verdict.position_steady_um:.2g} um "
-        f"(goal {GOAL_UM:g} um; paper 1250 and 100 um)"
+        f"{verdict.position_steady_um:.2g} um (goal {GOAL_UM:g} um; paper 1250 and 100 um)"
     )
     angle.set_title(
         f"(b) angle: largest {verdict.angle_max_urad:.2g} urad, steady "
-        f"{verdict.angle_steady_urad:.2g} urad "
-        f"(goal {GOAL_URAD:g} urad; paper 3250 and 250 urad)"
+        f"{verdict.angle_steady_urad:.2g} urad (goal {GOAL_URAD:g} urad; paper 3250 and 250 urad)"
     )
     closure.set_title(f"(c) MuJoCo's loop closure error: largest {verdict.closure_max_um:.2g} um")
     for axes, label in (

@@ -1,8 +1,7 @@
-"""What a designer wants to know of a robot before it is built or run: each question with its number
-and its limit.
+"""Check of a robot before it is built or run: each question with its number and its limit.
 
-Over the travel: random joint coordinates within the travel limit, and the pose that the robot has
-with them, followed from home. The loop is judged at home, by its linear map from frame to frame,
+Over the travel, random joint coordinates within the travel limit are followed from home to the pose
+that the robot has with them. The loop is judged at home, by its linear map from frame to frame,
 without dry friction.
 """
 
@@ -28,16 +27,19 @@ from identify.progress import Progress, SilentProgress
 from identify.scenario import Excitation, Scenario
 
 SAMPLES = 2000
-"""Joint coordinates over the travel."""
+"""Number of random joint coordinates over the travel."""
 
 UNFELT = 1e-9
-"""Largest share of an acceleration that a change of inertias may make to count as not felt."""
+"""Largest relative change of an acceleration that counts as none."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One answer: the check by name, whether it is within its limit (None where there is none),
-    value, limit and unit, the leg 1..n that it concerns (None: no single one), and a sentence."""
+    """Answer to one question.
+
+    ``ok`` is true if the value is within its limit, or if there is no limit. ``leg`` is the leg
+    1..n that it concerns, or None if it concerns no single one. ``text`` is a sentence.
+    """
 
     check: str
     ok: bool
@@ -48,18 +50,19 @@ class Finding:
     text: str
 
     def entry(self) -> dict[str, Any]:
-        """As it stands in JSON."""
+        """Return the finding as it stands in JSON."""
         return asdict(self)
 
 
 def check_robot(
-    robot: Robot,
-    parameters: Array,
-    scenario: Scenario,
-    progress: Progress | None = None,
+    robot: Robot, parameters: Array, scenario: Scenario, progress: Progress | None = None
 ) -> list[Finding]:
-    """All findings about a robot with all its parameters, in the loop and before the sensor of a
-    scenario, whose `excitation` has the limits of leverage and condition."""
+    """Return all findings about a robot with all its parameters.
+
+    The robot is checked in the control loop of a scenario and in front of its sensor. The
+    scenario's `excitation` has the limits of leverage and condition.
+    """
+    # Each question is a function, so that progress is shown between them.
     questions: list[Callable[[], Iterator[Finding]]] = [
         lambda: _freedoms(robot),
         lambda: _travel(robot, scenario.excitation),
@@ -87,7 +90,7 @@ def _freedoms(robot: Robot) -> Iterator[Finding]:
 
 
 def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
-    """At home, then over the travel: what `workspace.check_motion` judges."""
+    """Judge the robot at home and over the travel, as `workspace.check_motion` does."""
     unit = robot.layout.joint_unit
     limit = robot.travel_limit
     at_home = workspace.measure(robot, robot.home_pose)
@@ -96,6 +99,7 @@ def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
     text = f"joint {leg} is {most:.3g} {unit} from zero at home, of a travel of {limit:g} {unit}"
     yield Finding("travel at home", most <= limit, most, limit, unit, leg, text)
     travel = workspace.measure_travel(robot, SAMPLES)
+    # Samples without a pose are left out of the measures.
     share = len(travel.theta) / SAMPLES
     text = (
         f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a "
@@ -141,6 +145,7 @@ def _assembly(robot: Robot) -> Iterator[Finding]:
         f"{len(modes)} assembly modes found with the joints as at home, no leg folded the other way"
     )
     if len(modes) > 1:
+        # The first mode is home itself, and the others follow by their distance from it.
         turn = Rotation.from_euler("XYZ", home[3:]).inv() * Rotation.from_euler("XYZ", modes[1, 3:])
         text += (
             f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and "
@@ -174,17 +179,20 @@ def _visible(robot: Robot) -> Iterator[Finding]:
 
 
 def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
-    """Inertias that no body has count where the motion feels what would make them possible."""
+    """Judge the inertias.
+
+    Those that no rigid body can have are a fault only if possible ones would change the motion.
+    """
     inertias = physical_inertias(robot.layout, parameters, allow_changes=True)
-    effects = (
-        acceleration_changes(robot, parameters[robot.layout.dynamic], inertias.values)
-        if inertias.changes
-        else {}
-    )
+    effects = {}
+    if inertias.changes:
+        dynamic = parameters[robot.layout.dynamic]
+        effects = acceleration_changes(robot, dynamic, inertias.values)
     largest = max(effects.values(), default=0.0)
     text = "all bodies can exist"
     leg = None
     if inertias.changes:
+        # The body whose correction changes accelerations most names the leg of the finding.
         worst = robot.layout.bodies.index(max(effects, key=effects.__getitem__))
         leg = next(
             (leg + 1 for leg, bodies in enumerate(robot.layout.of_leg) if worst in bodies), None
@@ -204,10 +212,10 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     arguments = robot, parameters, settings, home
     try:
         radius = stability.spectral_radius(*arguments)
-    except DynamicsError as error:  # singular at home, which has been found above
-        yield Finding(
-            "loop", False, None, 1.0, "1", None, f"the loop cannot be judged at home: {error}"
-        )
+    except DynamicsError as error:
+        # The robot is singular at home, which another finding reports.
+        text = f"the loop cannot be judged at home: {error}"
+        yield Finding("loop", False, None, 1.0, "1", None, text)
         return
     at = f"at {timing.frame_rate_hz:g} Hz and {1e3 * timing.latency_s:.3g} ms of latency"
     text = (
@@ -219,15 +227,13 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     gains = settings.servo
     text = (
         f"the servo's gains, kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = "
-        f"{gains.ki:.4g} 1/s, "
+        f"{gains.ki:.4g} 1/s, may be {factor:.3g} times as large until the loop is lost"
     )
-    text += f"may be {factor:.3g} times as large until the loop is lost"
     if not factor > 0:
         text = "the loop is lost with any gains of the servo"
     elif factor < 1:
-        text = text.replace("may be", "must be").replace(
-            " until the loop is lost", " for the loop to hold"
-        )
+        text = text.replace("may be", "must be")
+        text = text.replace(" until the loop is lost", " for the loop to hold")
     yield Finding("gain margin", factor > 1, factor, 1.0, "1", None, text)
     rate = stability.lowest_frame_rate(*arguments)
     text = (
@@ -241,8 +247,9 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
 
 
 def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[Finding]:
-    """What the gains of both loops give, and those of the servo for a bandwidth and a damping that
-    are asked for.
+    """Judge the gains of both loops.
+
+    Gains of the servo are also designed, if the scenario asks for a bandwidth and a damping.
     """
     settings = model_settings(robot, scenario)
     home = robot.home_pose
@@ -254,15 +261,8 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
         torques = torque_figures(model, settings, home, asked)
         limit = largest_bandwidth(model, settings, home, asked)
     except DynamicsError as error:
-        yield Finding(
-            "bandwidth",
-            False,
-            None,
-            None,
-            "rad/s",
-            None,
-            f"the loop cannot be judged at home: {error}",
-        )
+        text = f"the loop cannot be judged at home: {error}"
+        yield Finding("bandwidth", False, None, None, "rad/s", None, text)
         return
     text = (
         f"the servo follows up to {found.bandwidth:.3g} rad/s, with a least damping of "
@@ -279,14 +279,10 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
             gains = design_servo(model, settings, home, wanted, control.servo_damping)
             made = servo_figures(model, replace(settings, servo=gains), home)
             text = (
-                f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give "
-                "a bandwidth of "
+                f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give a "
+                f"bandwidth of {made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, "
+                f"{made.gain_margin:.3g} times these gains lose the loop"
             )
-            text += (
-                f"{made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, "
-                f"{made.gain_margin:.3g} times "
-            )
-            text += "these gains lose the loop"
             yield Finding(
                 "servo by design", made.radius < 1, made.gain_margin, 1.0, "1", None, text
             )
@@ -296,38 +292,33 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
     nyquist = np.pi * settings.timing.frame_rate_hz
     text = (
         f"computed_torque at {w:.3g} rad/s, Kp = {w**2:.4g} 1/s^2 and Kd = "
-        f"{2 * asked.damping * w:.4g} 1/s, "
+        f"{2 * asked.damping * w:.4g} 1/s, has the largest eigenvalue {torques.radius:.4g}, which "
+        "is stable below 1"
     )
-    text += f"has the largest eigenvalue {torques.radius:.4g}, which is stable below 1"
     if torques.radius < 1:
         text += f"; {torques.gain_margin:.3g} times these gains lose it"
     yield Finding("computed torque", torques.radius < 1, torques.radius, 1.0, "1", None, text)
-    known, most = (limit, f"up to {limit:.3g} rad/s") if limit > 0 else (None, "with no bandwidth")
+    known = limit if limit > 0 else None
+    most = f"up to {limit:.3g} rad/s" if limit > 0 else "with no bandwidth"
     text = f"computed_torque is stable {most}"
+    # Commands come once a frame, so that no bandwidth above half the frame rate is searched.
     if limit == nyquist:
         text = f"computed_torque may have up to {nyquist:.3g} rad/s, half the frame rate"
     yield Finding("torque bandwidth", w <= limit, w, known, "rad/s", None, text)
 
 
 def _seen(robot: Robot, scenario: Scenario) -> Iterator[Finding]:
-    """Whether the platform that the scenario's sensor sees is the robot's."""
+    """Judge whether the platform that the scenario's sensor sees is the robot's."""
     outside, away = platform_distances(robot, sensor_file(scenario))
     leg = int(np.argmax(outside))
     limit = OFF_PLATFORM_M
+    most = float(outside[leg])
     text = (
-        f"leg {leg + 1} ends {outside[leg]:.3g} m outside of the platform that sensor "
+        f"leg {leg + 1} ends {most:.3g} m outside of the platform that sensor "
         f"{scenario.sensor} sees"
     )
-    if outside[leg] <= 0:
+    if most <= 0:
         text = f"all legs end on the platform that sensor {scenario.sensor} sees"
-    yield Finding(
-        "sensor's platform",
-        bool(outside[leg] <= limit),
-        float(outside[leg]),
-        limit,
-        "m",
-        leg + 1,
-        text,
-    )
+    yield Finding("sensor's platform", most <= limit, most, limit, "m", leg + 1, text)
     text = f"at home that platform is {away:.3g} m from the robot's"
     yield Finding("sensor's home", away <= limit, away, limit, "m", None, text)

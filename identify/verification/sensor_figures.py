@@ -1,4 +1,4 @@
-"""Figures of a sensor's acceptance tests, of its calibration and of its detectors (PNG)."""
+"""Figures (PNG) of a sensor's acceptance tests, of its calibration and of its detectors."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,16 +26,20 @@ from cmmsim.geometry.pose import apply, invert
 from identify.reporting.figures import panel_grid
 from identify.verification.acceptance import AcceptanceRun
 
+# Two corners of a box share an edge if they differ in one coordinate.
 EDGES = [(a, b) for a in range(8) for b in range(a) if np.sum(CORNERS[a] != CORNERS[b]) == 1]
+
 ARROW_SHARE = 0.06
-"""Of the image width: length of an arrow for a residual of three sigma."""
+"""Length of an arrow for a residual of three sigma, as a share of the image width."""
+
 GRID = 25
-"""Points along the width of the image at which distortion is drawn."""
+"""Number of points along the width of the image at which distortion is drawn."""
 
 
 def acceptance_figures(run: AcceptanceRun) -> dict[str, Figure]:
-    """Figures by name: two of the lengths, two of the bar, one of the latency; none of a test that
-    was not done.
+    """Return the figures of the tests that were run, by name.
+
+    There are two of the lengths, two of the bar and one of the latency.
     """
     figures = {}
     if length := run.found.get("vdi"):
@@ -50,13 +54,13 @@ def acceptance_figures(run: AcceptanceRun) -> dict[str, Figure]:
 
 
 def lines_figure(volume: MeasuringVolume) -> Figure:
-    """The volume with the seven measuring lines; axes in mm."""
+    """Draw the volume with the seven measuring lines. The axes are in mm."""
     curves = {line.name: np.stack([line.start, line.end]) for line in seven_lines(volume)}
     return _in_volume(volume, "Measuring lines (VDI/VDE 2634-1)", curves)
 
 
 def paths_figure(volume: MeasuringVolume) -> Figure:
-    """The volume with the paths of the bar's middle; axes in mm."""
+    """Draw the volume with the paths of the bar's middle. The axes are in mm."""
     to_volume = invert(volume.base_from_volume)
     curves = {
         path.name: apply(
@@ -68,7 +72,7 @@ def paths_figure(volume: MeasuringVolume) -> Figure:
 
 
 def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray]) -> Figure:
-    """Curves (n,3) m in the volume, drawn as a reader sees it: x to the right, depth away, up."""
+    """Draw curves (n, 3) [m] in the volume, with axes to the right, away and up."""
     figure = Figure(figsize=(8, 6.5), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d")
     for a, b in EDGES:
@@ -82,6 +86,7 @@ def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray
         zlabel="−y, up [mm]",
         title=f"{title}\nvolume {volume}, {1e3 * near:.0f} to {1e3 * far:.0f} mm from the baseline",
     )
+    # The axes of the figure are x, z and -y of the volume.
     axes.set_box_aspect(volume.size[[0, 2, 1]], zoom=0.85)
     axes.view_init(elev=16, azim=-72)
     axes.legend(loc="upper left", fontsize="x-small")
@@ -89,13 +94,14 @@ def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray
 
 
 def _as_seen(points: np.ndarray) -> np.ndarray:
-    """x, z and -y (3,n) mm of points (n,3) m."""
+    """Return x, z and -y (3, n) [mm] of points (n, 3) [m]."""
     return 1e3 * (points * [1.0, -1.0, 1.0]).T[[0, 2, 1]]
 
 
 def length_figure(test: LengthTest, limit_um: float) -> Figure:
-    """Length measurement error against length: single exposures as dots, the mean of each length as
-    a line.
+    """Draw the error of the measured lengths against the length.
+
+    Dots are single exposures, and lines are the means of each length.
     """
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     axes = figure.subplots()
@@ -104,6 +110,7 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
         true = np.array([1e3 * length.true for length in lengths])
         single = 1e6 * np.array([length.measured - length.true for length in lengths])
         shown = axes.plot(true, [1e6 * length.error for length in lengths], "o-", label=line.name)
+        # Shifted by up to a few mm, so that the dots of the seven lines do not hide each other.
         axes.plot(
             true[:, None] + 1.5 * (number - 3),
             single,
@@ -117,8 +124,7 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
     axes.set(xlabel="certified length [mm]", ylabel="length measurement error [um]")
     axes.set_title(
         f"VDI/VDE 2634-1: largest error {1e6 * test.largest.error:+.1f} um, limit ± {limit_um:g} "
-        "um (dashes)"
-        "\ndots: single exposures, lines: their mean"
+        "um (dashes)\ndots: single exposures, lines: their mean"
     )
     axes.legend(fontsize="small", ncols=2)
     axes.grid(alpha=0.3)
@@ -126,8 +132,10 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
 
 
 def bar_figure(test: BarTest) -> Figure:
-    """Relative pose error of the bar over time, and its distribution beside the published
-    limits."""
+    """Draw the relative pose error of the bar over time, and its distribution.
+
+    Published limits stand beside the distribution.
+    """
     figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(2, 2, width_ratios=(3, 2))
     for (series, spread), name, unit, columns in zip(
@@ -154,9 +162,7 @@ def bar_figure(test: BarTest) -> Figure:
 
 
 def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: str) -> None:
-    """Share of frames below an error, standing and moving, with published figures as vertical
-    lines.
-    """
+    """Draw the share of frames below an error, with published figures as vertical lines."""
     for moving, word in ((False, "standing"), (True, "moving")):
         magnitudes = np.sort(1e6 * np.linalg.norm(test.errors(moving)[:, columns], axis=1))
         axes.plot(
@@ -165,6 +171,7 @@ def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: st
             label=f"this sensor, {word}",
         )
     for number, figure in enumerate([*published(f"{name}, static"), *published(f"{name}, moving")]):
+        # Published figures are in mm or degrees, and the axis is in µm or µrad.
         value = 1e3 * figure.value if figure.unit == "mm" else 1e6 * np.deg2rad(figure.value)
         state = figure.quantity.split(", ")[1]
         style = ":" if state == "static" else "-."
@@ -177,7 +184,10 @@ def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: st
 
 
 def latency_figure(test: LatencyTest) -> Figure:
-    """Delay of each report, their mean with its interval, and what the sensor file states."""
+    """Draw the delay of each report and their distribution.
+
+    Lines show the interval of the mean, and the latency that the sensor file states.
+    """
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     series, spread = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     found = test.latency
@@ -203,7 +213,7 @@ def latency_figure(test: LatencyTest) -> Figure:
 
 
 def residual_figure(found: Calibration) -> Figure:
-    """Residuals, measured minus computed, as arrows where they were seen."""
+    """Draw the residuals, measured minus computed, as arrows at the measured points."""
     figure, panels = _image_panels(found, f"residuals, sigma {found.adjustment.sigma_px:.3g} px")
     for k, axes in enumerate(panels):
         pixels = found.sightings[k].pixels
@@ -226,7 +236,10 @@ def residual_figure(found: Calibration) -> Figure:
 
 
 def coverage_figure(found: Calibration) -> Figure:
-    """All board points of all images: where none were seen, distortion is extrapolated."""
+    """Draw the board points of all used images.
+
+    Where there are none, the distortion is extrapolated.
+    """
     figure, panels = _image_panels(found, "board points of all used images")
     for k, axes in enumerate(panels):
         seen = found.sightings[k]
@@ -238,13 +251,17 @@ def coverage_figure(found: Calibration) -> Figure:
 
 
 def distortion_figure(found: Calibration) -> Figure:
-    """How far the lenses move each point of the image, in px; white crosses: principal points."""
+    """Draw how far the lenses move each point of the image, in px.
+
+    White crosses are the principal points.
+    """
     figure, panels = _image_panels(found, "lens distortion")
     for axes, camera, name in zip(panels, found.rig.cameras, SIDES, strict=True):
         step = camera.width / GRID
         x, y = np.meshgrid(np.arange(0.0, camera.width, step), np.arange(0.0, camera.height, step))
         pixels = np.stack([x, y], axis=-1)
         ideal, known = camera.undistort(pixels)
+        # Far from the centre, a distortion may have no inverse.
         moved = np.where(known[..., None], pixels - ideal, np.nan)
         length = np.linalg.norm(moved, axis=-1)
         shown = axes.pcolormesh(x, y, length, shading="nearest", cmap="viridis")
@@ -269,8 +286,9 @@ def _image_panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
 
 
 def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
-    """Rms error over noise, logarithmic; one panel for each radius, tilt and point spread, the
-    working point first.
+    """Draw the RMS error of the detectors against the noise, in logarithmic scales.
+
+    Each radius, tilt and point spread has a panel. That of the working point is the first.
     """
     views = list(dict.fromkeys(_view(score.condition) for score in scores))
     figure, panels = panel_grid(len(views), 4.5, 3.2, above=0.8, sharey=True)
@@ -302,7 +320,8 @@ def _condition_panel(axes: Axes, scores: Sequence[Score]) -> None:
     )
     for name in dict.fromkeys(score.detector for score in scores):
         mine = sorted((s for s in scores if s.detector == name), key=lambda s: s.condition.noise)
-        error = np.array([s.rms_px for s in mine])  # infinite where all was lost: not drawn
+        # The error is infinite where every sticker was lost, which is not drawn.
+        error = np.array([s.rms_px for s in mine])
         at = [100.0 * s.condition.noise for s in mine]
         axes.plot(
             at,

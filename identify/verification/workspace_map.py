@@ -1,5 +1,6 @@
-"""Maps of a robot's workspace: planes of poses around home, with travel, reach and conditioning;
-tables and figures.
+"""Maps of a robot's workspace, as figures and as numbers.
+
+A map is a plane of poses around home, with the used travel, the reach and the conditioning.
 """
 
 from dataclasses import dataclass
@@ -17,25 +18,34 @@ from identify.progress import Progress, SilentProgress
 from identify.reporting.figures import COMPONENTS
 
 POINTS = 101
-"""Grid points along each side of a map."""
+"""Number of grid points along each side of a map."""
 
 JOINT_SAMPLES = 20_000
-"""Joint vectors within travel from which the extremes of the whole travel range are taken."""
+"""Number of random joint vectors from which the extremes over the travel are taken."""
 
 COLUMNS = 3
-"""Maps beside each other in a figure."""
+"""Number of maps beside each other in a figure."""
 
 AXES = ("x_m", "y_m", "z_m", "alpha_rad", "beta_rad", "gamma_rad")
 
 
 @dataclass(frozen=True)
 class WorkspacePlane:
-    """One map: two pose components vary (``across``, ``up``: indices 0..5), a third is ``fixed`` at
-    ``value``.
+    """Map in which two pose components vary and a third is fixed.
 
-    ``horizontal`` and ``vertical`` (n,) [m or rad] are the grid lines; ``travel_share`` and
-    ``condition`` (n, n), row by row of ``vertical``, are NaN out of reach; ``reach_margin`` (n, n)
-    is that of the worst leg.
+    Attributes
+    ----------
+    across, up, fixed
+        Indices 0..5 of the components.
+    value
+        Value of the fixed component [m or rad].
+    horizontal, vertical
+        Grid lines (n,) [m or rad].
+    travel_share, condition
+        Used share of the travel limit and condition of the joint Jacobian (n, n), with a row for
+        each entry of ``vertical``. They are NaN out of reach.
+    reach_margin
+        Margin (n, n) of the worst leg.
     """
 
     across: int
@@ -50,15 +60,18 @@ class WorkspacePlane:
 
     @property
     def allowed(self) -> Array:
-        """Where all legs reach with their joints within the travel limit (n, n)."""
+        """Flags (n, n) of poses that all legs reach with their joints within the travel limit."""
         return np.asarray(self.travel_share <= 1)
 
 
 @dataclass(frozen=True)
 class WorkspaceMap:
-    """Planes, range of each coordinate of the platform alone (m, 2) [m, rad from home], and
-    measures at home and of those of JOINT_SAMPLES random joint vectors within travel that have a
-    pose; unit: of the joints."""
+    """Maps of a robot's workspace.
+
+    ``ranges`` (m, 2) [m, rad from home] is the range of each coordinate of the platform alone.
+    ``home`` and ``travel`` are the measures at home, and of those of JOINT_SAMPLES random joint
+    vectors within travel that have a pose. ``unit`` is that of the joints.
+    """
 
     robot: str
     unit: str
@@ -70,7 +83,7 @@ class WorkspaceMap:
     travel: workspace.WorkspaceMeasures
 
     def summary(self) -> dict[str, Any]:
-        """The map in numbers, for JSON; units are in the names."""
+        """Return the map in numbers, for JSON. Units are in the names."""
         return {
             "robot": self.robot,
             f"travel_limit_{self.unit}": self.home.travel_limit,
@@ -91,11 +104,14 @@ class WorkspaceMap:
 def map_workspace(
     robot: Robot, progress: Progress | None = None, points: int = POINTS
 ) -> WorkspaceMap:
-    """Maps of x-y at three heights with home's orientation, of a planar platform at three angles,
-    and of alpha-beta at three gamma with home's position, where the platform can do that.
+    """Map planes of poses around home.
 
-    The sides reach as far from home as the most sensitive joint goes at home's rate within its
-    travel, or 1.3 of that over the characteristic length in rotation.
+    The planes are x-y at three heights, or at three angles for a planar platform, and alpha-beta at
+    three gamma. Those that the platform cannot move in are left out. The other components are those
+    of home.
+
+    A side reaches as far from home as the travel of the most sensitive joint allows, by the
+    Jacobian at home. In rotation, it reaches 1.3 times as far over the characteristic length.
     """
     progress = progress or SilentProgress()
     length = robot.geometry.characteristic_length
@@ -103,13 +119,15 @@ def map_workspace(
     step = robot.travel_limit / float(np.abs(robot.pose_jacobian(robot.home_pose)[:, :3]).max())
     turn = 1.3 * step / length
     layout = [shown for shown in ((0, 1, 2), (0, 1, 5), (3, 4, 5)) if set(shown) <= set(axes)]
+    # The x-y plane at three angles is for planar platforms, which have no height to vary.
     if (0, 1, 2) in layout and (0, 1, 5) in layout:
         layout.remove((0, 1, 5))
     planes = []
     with progress.stage("workspace", 3 * len(layout) + 2) as advance:
         for across, up, fixed in layout:
             for offset in (-0.4, 0.0, 0.4):
-                side, beyond = (step if axis < 3 else turn for axis in (across, fixed))
+                side = step if across < 3 else turn
+                beyond = step if fixed < 3 else turn
                 planes.append(_plane(robot, (across, up, fixed), side, offset * beyond, points))
                 advance()
         ranges = np.array([_range(robot, axis, step if axis < 3 else turn) for axis in axes])
@@ -144,27 +162,23 @@ def _plane(
 
 
 def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[float, float]:
-    """How far one pose component alone goes down and up from home before a joint reaches its travel
-    limit.
-    """
+    """Return how far a pose component goes down and up from home until a joint is at its limit."""
     steps = np.linspace(0, 3 * side, points)
     ends = []
     for sign in (-1.0, 1.0):
-        share = workspace.measure(
-            robot, robot.home_pose + sign * steps[:, None] * np.eye(6)[axis]
-        ).travel_share
+        poses = robot.home_pose + sign * steps[:, None] * np.eye(6)[axis]
+        share = workspace.measure(robot, poses).travel_share
+        # A share that is NaN is out of reach, and outside too.
         outside = ~(share <= 1)
-        ends.append(
-            sign * float(steps[max(int(np.argmax(outside)) - 1, 0)] if outside.any() else steps[-1])
-        )
+        last = max(int(np.argmax(outside)) - 1, 0) if outside.any() else -1
+        ends.append(sign * float(steps[last]))
     return ends[0], ends[1]
 
 
 def _extremes(measures: workspace.WorkspaceMeasures, unit: str) -> dict[str, float]:
+    name = "largest_angle_rad" if unit == "rad" else "largest_length_m"
     return {
-        f"largest_{'angle_rad' if unit == 'rad' else 'length_m'}": float(
-            np.abs(measures.theta).max()
-        ),
+        name: float(np.abs(measures.theta).max()),
         "least_reach_margin": float(measures.reach_margin.min()),
         "least_leverage_J_a1": float(measures.leverage.min()),
         "largest_condition_J_a2": float(measures.platform_condition.max()),
@@ -186,7 +200,7 @@ def _plane_summary(plane: WorkspacePlane) -> dict[str, Any]:
 
 
 def travel_figure(workspace: WorkspaceMap) -> Figure:
-    """Largest joint coordinate as a share of the travel limit."""
+    """Draw the largest joint coordinate as a share of the travel limit."""
     title = (
         f"{workspace.robot}: travel used, largest |θ| / {workspace.home.travel_limit:.4f} "
         f"{workspace.unit}"
@@ -195,7 +209,10 @@ def travel_figure(workspace: WorkspaceMap) -> Figure:
 
 
 def conditioning_figure(workspace: WorkspaceMap) -> Figure:
-    """Condition number of the joint Jacobian with rotations scaled by the characteristic length."""
+    """Draw the condition number of the joint Jacobian.
+
+    Rotations are scaled by the characteristic length.
+    """
     length = f"rotations × {workspace.characteristic_length_m:.3g} m"
     title = f"{workspace.robot}: condition of the joint Jacobian J_ad ({length})"
     return _maps(workspace, "condition", title, "condition of J_ad", LogNorm(1, 30))
@@ -204,7 +221,7 @@ def conditioning_figure(workspace: WorkspaceMap) -> Figure:
 def _maps(
     workspace: WorkspaceMap, quantity: str, title: str, label: str, norm: Normalize
 ) -> Figure:
-    """One panel a plane: colour is the quantity, lines are the travel limit and the reach."""
+    """Draw a panel for each plane: the quantity as colour, travel limit and reach as lines."""
     figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(-(-len(workspace.planes) // COLUMNS), COLUMNS, squeeze=False)
     for axes, plane in zip(panels.flat, workspace.planes, strict=False):
@@ -225,6 +242,7 @@ def _panel(axes: Axes, plane: WorkspacePlane, values: np.ndarray, norm: Normaliz
         (plane.reach_margin, 0.0, "--", "k"),
     ):
         finite = field[np.isfinite(field)]
+        # A level that is nowhere reached has no contour, and matplotlib would warn.
         if finite.size and finite.min() < level < finite.max():
             axes.contour(
                 across, up, field, [level], linestyles=style, colors=colour, linewidths=1.5

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import identify
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR
 from cmmsim.detection.detector import find_detector
 from cmmsim.detector_leaderboard import compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, pose_to_transform
-from cmmsim.plugins import DEFAULT_DETECTOR
 from identify.experiment.sensor_in_loop import make_sensor
 from tests.dynamics.conftest import random_states
 

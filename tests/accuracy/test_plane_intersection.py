@@ -9,12 +9,12 @@ frame that three planes define are the product's.
 import numpy as np
 import pytest
 
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR
 from cmmsim.detection.detector import find_detector
 from cmmsim.detector_leaderboard import compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.plane_frame import frame_from_planes
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
-from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.visibility import sight_lines
 from tests.accuracy.test_own_figures import DETECTOR_GOAL, PLANES_GOAL, TRAVEL
 

@@ -7,11 +7,11 @@ from itertools import product
 import numpy as np
 import pytest
 
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR, DETECTORS
 from cmmsim.detection.detector import find_detector
 from cmmsim.detector_leaderboard import PEERS, Condition, compete, scene_of, working_point
 from cmmsim.errors import CmmError
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.plugins import DEFAULT_DETECTOR, DETECTORS
 
 FILE = read_sensor_file("ctrack780")
 SCENE = scene_of(FILE)

@@ -24,8 +24,8 @@ from cmmsim.acceptance.artefacts import bar_ends, rigid_bar
 from cmmsim.acceptance.latency_test import require_room
 from cmmsim.acceptance.moving_bar import SECONDS
 from cmmsim.acceptance.volume import CORNERS, MARGIN_PX, MeasuringLine
+from cmmsim.files.rig_and_bodies import marked_body, rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.files.setup import marked_body, rig_from_file
 from cmmsim.geometry.pose import apply, pose_to_transform
 
 RIG = read_sensor_file("ctrack780").rig

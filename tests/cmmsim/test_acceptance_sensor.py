@@ -19,8 +19,8 @@ from cmmsim.acceptance import (
 from cmmsim.acceptance.artefacts import rigid_bar
 from cmmsim.acceptance.length_test import length_artefact, lengths_from_first, measure_line
 from cmmsim.acceptance.moving_bar import bar_run, relative_covariance, relative_error
+from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import apply, rotation_exp, transform_to_pose
 from cmmsim.measuring.measurement import lost_measurement
 from tests.cmmsim.sensors import NOISE_FREE

@@ -21,7 +21,7 @@ from cmmsim.calibration.shared_errors import CHANCE, shared_errors
 from cmmsim.calibration.sightings import sightings_of
 from cmmsim.errors import CalibrationError
 from cmmsim.files import read_sensor_file
-from cmmsim.files.setup import rig_from_file
+from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.uncertainty.known_rig import KnownRig
 from tests.cmmsim.sensors import require_regions, require_true, squares
 from tests.cmmsim.test_calibration_adjustment import (

@@ -9,8 +9,8 @@ import pytest
 
 import cmmsim
 from cmmsim.errors import CmmError
+from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, triangulate

@@ -14,8 +14,8 @@ from scipy.stats import kstest
 
 import cmmsim
 from cmmsim.errors import LostError
+from cmmsim.files.rig_and_bodies import marked_body
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.files.setup import marked_body
 from cmmsim.geometry.camera import Distortion
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import (

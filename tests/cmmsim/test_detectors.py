@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cmmsim.allowed_plugins import ALLOWED, DEFAULT_DETECTOR, DETECTORS
 from cmmsim.detection.detector import FitLimits, SpotWindows, find_detector
 from cmmsim.detector_leaderboard import Condition, draw_discs, random_ellipses, scene_of
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.loading import load_sensor
-from cmmsim.plugins import ALLOWED, DEFAULT_DETECTOR, DETECTORS
 from tests.cmmsim.sensors import exact, refused, require_true, squared_errors, squares
 
 SCENE = scene_of(read_sensor_file("ctrack780"))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.files.schema import RightFromLeft
 from cmmsim.files.sensor_file import read_sensor_file, sensor_text
-from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.camera import Distortion
 from cmmsim.geometry.pose import apply, rotation_exp
 from tests.cmmsim.sensors import LEFT, RIGHT, refused

@@ -3,8 +3,10 @@
 import sys
 
 import pytest
+from typer.main import get_command
 
 from identify.__main__ import main
+from identify.commands.app import app
 
 
 def command(*arguments):
@@ -32,3 +34,12 @@ def refusal(error, action, *arguments):
         action(*arguments)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def leaves(group=None, words=()):
+    """Every command, as the words that call it; those of a group, or of all."""
+    for name, one in (group or get_command(app)).commands.items():
+        if hasattr(one, "commands"):
+            yield from leaves(one, (*words, name))
+        else:
+            yield (*words, name)

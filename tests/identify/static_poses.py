@@ -9,8 +9,8 @@ from cmmsim.visibility import sight_lines
 from dynamics import load_robot
 from identify.experiment.plant import misplaced
 from identify.geometry.calibration import PoseModel, Tolerance, calibrate, seen_between
-from identify.geometry.experiment import encoders_of, true_poses
 from identify.geometry.selection import Designer, Limits
+from identify.geometry.static_experiment import encoders_of, true_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.scenario import load_scenario
 

@@ -17,9 +17,9 @@ import pytest
 
 import cmmsim
 from cmmsim.geometry.pose import apply, invert
-from identify.studies.design import Design, prepare
-from identify.studies.rows.sensor import row_sensor
+from identify.studies.rows.row_sensor import row_sensor
 from identify.studies.runner import compute
+from identify.studies.study_design import Design, prepare
 from identify.studies.study_file import STUDIES, load_study
 from identify.studies.table import tidy_table
 from identify.studies.theory import CONFIDENCE, check_laws, scale_regression

@@ -18,16 +18,16 @@ from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
-from identify.experiment.known_rig import stated_covariance
+from identify.experiment.rig_as_known import stated_covariance
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
-from identify.record.common_errors import (
+from identify.record.recording import poses, recorded_reference
+from identify.record.stored_common_errors import (
     CommonErrors,
     Marginal,
     read_common_errors,
     store_common_errors,
 )
-from identify.record.recording import poses, recorded_reference
 from identify.reporting.tables import common_error_table
 from identify.validation.unseen import model_run, predicted_runs
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth

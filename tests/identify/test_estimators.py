@@ -31,7 +31,7 @@ from identify.estimators.least_squares import (
     torque_equations,
     weighted_least_squares,
 )
-from identify.estimators.output_error import known_pid
+from identify.estimators.output_error_routes import known_pid
 from identify.experiment.joint_instruments import (
     JointInstruments,
     frame_mean,

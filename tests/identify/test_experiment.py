@@ -19,14 +19,15 @@ from identify.estimation.explanation import SUSPICIOUS
 from identify.estimation.identification import identify
 from identify.experiment.joint_instruments import measure_joints
 from identify.experiment.plant import build_plant
-from identify.experiment.run import run_experiment, run_plant, taught_sensor
+from identify.experiment.run import run_plant, taught_sensor
 from identify.experiment.sensor_in_loop import make_sensor, robot_meshes, robot_transforms
 from identify.experiment.truth import check_truth, read_truth, true_poses
 from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
 from identify.record.recording import poses
 from identify.scenario import scenario_from_toml
-from identify.studies.rows.sensor import DrawnSensor
+from identify.setup import run_experiment
+from identify.studies.rows.row_sensor import DrawnSensor
 from identify.trajectory import random_trajectory
 from identify.validation.unseen import unseen_errors
 from tests.identify import synthetic

@@ -18,7 +18,7 @@ from identify.estimation.explanation import (
     whiteness,
 )
 from identify.estimation.identification import identify
-from identify.record.common_errors import NONE
+from identify.record.stored_common_errors import NONE
 from tests.identify.synthetic import quick, rss6, run_plant
 
 

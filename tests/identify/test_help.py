@@ -9,28 +9,16 @@ import subprocess
 import sys
 
 import pytest
-from typer.main import get_command
 
 from dynamics import built_in_robots
-from identify.commands.app import app
 from identify.commands.help import BEYOND_LIMIT, NOT_DONE, STATUSES
 from identify.commands.options import BUILT_IN, built_in_names, completion
 from identify.scenario import scenario_names
 from identify.scenario.timing import sensor_names
 from identify.studies.study_file import STUDIES
-from tests.identify.commands import command, one_line
+from tests.identify.commands import command, leaves, one_line
 
-
-def leaves(group, words=()):
-    """Every command with the words that call it."""
-    for name, one in group.commands.items():
-        if hasattr(one, "commands"):
-            yield from leaves(one, (*words, name))
-        else:
-            yield (*words, name)
-
-
-COMMANDS = sorted(leaves(get_command(app)))
+COMMANDS = sorted(leaves())
 
 
 def help_of(words, monkeypatch, capsys):

@@ -11,8 +11,8 @@ from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.model.from_record import identified_model
-from identify.record.law import recorded_law, takes_torques
-from identify.studies.rows.sensor import DrawnSensor
+from identify.record.recorded_law import recorded_law, takes_torques
+from identify.studies.rows.row_sensor import DrawnSensor
 from identify.validation.unseen import model_on_record
 from tests.identify.synthetic import NAMES, SIGMA, quick, rss6, short_run, trajectory
 

@@ -20,7 +20,7 @@ from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.record.payload import store_payload
 from identify.record.recording import poses
-from identify.studies.rows.sensor import DrawnSensor
+from identify.studies.rows.row_sensor import DrawnSensor
 from tests.identify.synthetic import (
     LAYOUT,
     NAMES,

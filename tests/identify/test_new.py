@@ -19,7 +19,7 @@ from identify.record.own_record import record_schema
 from identify.scenario import load_scenario, scenario_names
 from identify.scenario.scenario import scenario_schema
 from identify.schemas import ROOT, SCHEMAS
-from identify.studies.design import prepare
+from identify.studies.study_design import prepare
 from identify.studies.study_file import STARTING, STUDIES, load_study, study_schema
 from tests.identify.commands import command, one_line
 

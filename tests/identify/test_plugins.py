@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.allowed_plugins import ALLOWED, Telling, allow_plugin, allowed_plugins, own_part
 from cmmsim.detection.detector import find_detector
 from cmmsim.imaging.renderer import choose_renderer
-from cmmsim.plugins import ALLOWED, Telling, allow_plugin, allowed_plugins, own_part
 from dynamics import load_robot
 from identify.errors import EstimationError, ScenarioError
 from identify.estimators.estimator import Estimate, find_estimators
 from identify.excitation.criteria import Criterion, criterion_of
 from identify.excitation.motion import unknowns
 from identify.scenario import load_scenario
-from identify.studies.design import Case, prepare
 from identify.studies.runner import compute
+from identify.studies.study_design import Case, prepare
 from identify.studies.study_file import Study
 from tests.identify.commands import command, one_line, refusal
 

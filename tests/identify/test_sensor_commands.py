@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR
 from cmmsim.detector_leaderboard import Condition, compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.plugins import DEFAULT_DETECTOR
 from tests.identify.commands import command, one_line
 
 SENSOR = (Path(cmmsim.__file__).parent / "files" / "sensors" / "ctrack780.toml").read_text(

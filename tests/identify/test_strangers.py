@@ -18,8 +18,8 @@ import pytest
 
 import cmmsim
 from cmmsim.calibration.board import read_board
+from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.files.sensor_file import built_in_names, read_sensor_file, sensor_text
-from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from dynamics import DynamicsError, built_in_robots, load_robot
 from dynamics.engines.mjcf import mjcf_text
@@ -29,14 +29,14 @@ from dynamics.files import LONGEST_NAME, is_name
 from dynamics.robot_file import read_robot_file
 from identify.commands.options import built_in_folder
 from identify.errors import IdentifyError
-from identify.experiment.known_rig import stated_covariance
+from identify.experiment.rig_as_known import stated_covariance
 from identify.loop_parameters import choose_parameters
 from identify.record.csv_record import columns_of
 from identify.record.own_record import read_own_records
 from identify.record.starting import description_text, table_text
 from identify.scenario import load_scenario, scenario_names
 from identify.scenario.scenario import SCENARIOS
-from identify.studies.design import prepare
+from identify.studies.study_design import prepare
 from identify.studies.study_file import STARTING, STUDIES, load_study
 from tests.dynamics.urdf import urdf_of
 from tests.identify.commands import command, one_line, refusal

@@ -21,8 +21,8 @@ from identify.files.versions import OtherVersionsWarning, versions
 from identify.progress import SilentProgress
 from identify.studies import dask_cluster
 from identify.studies.dask_cluster import DaskExecutor, running_cluster
-from identify.studies.design import Case, Finished
 from identify.studies.runner import Batches, run_study
+from identify.studies.study_design import Case, Finished
 from tests.identify.study_rows import (
     ROOT,
     at,

@@ -11,12 +11,12 @@ import pytest
 
 from cmmsim.files.sensor_file import read_sensor_file
 from identify.errors import IdentifyError, StudyError
-from identify.plugins import CRITERIA
+from identify.own_parts import CRITERIA
 from identify.scenario import load_scenario
-from identify.studies.design import Design, overrides, prepare, valid_keys
 from identify.studies.labels import factor_unit
 from identify.studies.rows import find_kind
 from identify.studies.runner import compute
+from identify.studies.study_design import Design, overrides, prepare, valid_keys
 from identify.studies.study_file import STUDIES, Law, load_study
 from tests.identify.commands import refusal
 from tests.identify.study_rows import DARK, KIND, METHOD, small_study

@@ -22,8 +22,8 @@ from identify.experiment.plant import build_plant
 from identify.loop_parameters import model_settings
 from identify.scenario import load_scenario
 from identify.studies.rows import KINDS, find_kind
-from identify.studies.rows.identification import prediction_figures
-from identify.studies.rows.sensor import SENSORS_KEPT, DrawnSensor, exact_sensor
+from identify.studies.rows.identified import prediction_figures
+from identify.studies.rows.row_sensor import SENSORS_KEPT, DrawnSensor, exact_sensor
 from identify.validation.unseen import model_run
 
 NOISELESS = {

@@ -23,9 +23,9 @@ from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from identify.studies import runner
 from identify.studies.dask_cluster import check_workers
-from identify.studies.design import Case, Finished
 from identify.studies.runner import BATCH_SECONDS, LARGEST_BATCH, Batches, compute, run_study
 from identify.studies.store import JOURNAL, LOCK, STUDY, TABLE, VIEW
+from identify.studies.study_design import Case, Finished
 from identify.studies.table import figure_names, read_table, tidy_table, to_xarray, write_view
 from tests.identify.commands import refusal
 from tests.identify.study_rows import DARK, METHOD, journal, row, same_numbers, small_study

@@ -14,8 +14,8 @@ from scipy import stats
 from identify.errors import StudyError
 from identify.studies import figures as figures_of_studies
 from identify.studies import summary
-from identify.studies.design import Design, Finished, prepare
 from identify.studies.figures import FORMATS, factor_figure, laws_figure
+from identify.studies.study_design import Design, Finished, prepare
 from identify.studies.study_file import Law, Range, Study
 from identify.studies.table import tidy_table
 from identify.studies.theory import CONFIDENCE, check_laws, point_statistics, scale_regression

@@ -15,7 +15,7 @@ from identify.experiment.plant import build_plant
 from identify.experiment.run import drawn_latencies
 from identify.files.run_folder import RunFolder, save_result
 from identify.scenario import load_scenario
-from identify.studies.rows.sensor import DrawnSensor
+from identify.studies.rows.row_sensor import DrawnSensor
 from identify.tracking import track as tracking
 from identify.tracking.following import by_drawing, follow
 from identify.tracking.motions import circle, read_motion, square

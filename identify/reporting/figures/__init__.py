@@ -1,4 +1,4 @@
-"""The figures of a run, for print and for its report."""
+"""Figures of a run, for print and for its report."""
 
 from identify.reporting.figures.style import COMPONENTS as COMPONENTS
 from identify.reporting.figures.style import panel_grid as panel_grid

@@ -1,5 +1,7 @@
-"""The parameters of a result: how near they are to the truth, which sums of them motion shows, how
-they go together.
+"""Figures of the parameters of a result.
+
+They show the errors of the parameters, the parts of the base parameters, and the correlations of
+the estimates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +17,9 @@ from identify.reporting.goals import PARAMETER_FRACTION, is_friction_or_pid
 
 
 class RelativeErrors(NamedTuple):
-    """Names, and in per cent of the truth: error and reach of the 95 % interval below and above the
-    estimate, (n,).
+    """Relative errors (n,) of parameters with their names, in per cent of the truth.
+
+    ``below`` and ``above`` are the reach of the 95 % interval below and above the estimate.
     """
 
     names: list[str]
@@ -26,10 +29,10 @@ class RelativeErrors(NamedTuple):
 
 
 def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
-    """Of the identifiable parameters of a result; no reach where there is no interval.
+    """Return the relative errors of the identifiable parameters of a result.
 
-    In per cent of the truth or, where that is not known, of the estimate, whose error then counts
-    as zero.
+    The reach is zero where there is no interval. Where the truth is not known, the values are in
+    per cent of the estimate, whose error then counts as zero.
     """
     shown = {
         n: p
@@ -51,22 +54,26 @@ def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
 
 
 def _size(parameter: dict[str, Any]) -> float | None:
-    """The truth or, where that is not known, the estimate."""
+    """Return the truth or, where that is not known, the estimate."""
     true: float | None = parameter["true"]
     return parameter["estimate"] if true is None else true
 
 
 def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
-    """Relative error of every identified parameter with its 95 % interval, friction and gains
-    apart.
+    """Draw the relative error of every identified parameter with its 95 % interval.
+
+    Friction and gains have a panel of their own.
     """
     judged = {name: p for name, p in parameters.items() if is_friction_or_pid(name)}
     others = {name: p for name, p in parameters.items() if name not in judged}
     groups = {"friction and joint controller": judged, "masses and inertias": others}
     shown = {title: relative_errors(group) for title, group in groups.items()}
+    # Inches: a frame, and a row for each parameter of the larger panel.
     height = max(2.2, 0.9 + 0.19 * max(len(found.names) for found in shown.values()))
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    known = any(p["true"] is not None for p in parameters.values())
+    label = "estimate − truth [% of the truth]"
+    if all(p["true"] is None for p in parameters.values()):
+        label = "95 % interval [% of the estimate]"
     for axes, (title, found) in zip(figure.subplots(1, 2), shown.items(), strict=True):
         rows = np.arange(len(found.names))
         reach = 100 * PARAMETER_FRACTION
@@ -83,9 +90,7 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
         )
         axes.set_yticks(rows, found.names)
         axes.invert_yaxis()
-        axes.set_xlabel(
-            "estimate − truth [% of the truth]" if known else "95 % interval [% of the estimate]"
-        )
+        axes.set_xlabel(label)
         axes.set_title(title)
         axes.grid(visible=False, axis="y")
         if not found.names:
@@ -99,9 +104,12 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
 def group_figure(
     groups: Mapping[str, dict[str, Any]], parameters: Mapping[str, dict[str, Any]]
 ) -> Figure:
-    """Which parameters enter which sum that motion shows, and how much of it they make: one row a
-    sum, one column a parameter, the area of a dot the share of coefficient times starting value;
-    open where it is subtracted. A star marks a sum that is identified."""
+    """Draw which parameters enter which base parameter, and with which share.
+
+    A row is a base parameter that combines several parameters, and a column is a parameter. The
+    area of a dot is the share of coefficient times starting value. It is open where that is
+    subtracted. A star marks an identified base parameter.
+    """
     sums = {name: group for name, group in groups.items() if len(group["coefficients"]) > 1}
     columns = [
         name for name in parameters if any(name in group["coefficients"] for group in sums.values())
@@ -113,8 +121,10 @@ def group_figure(
             for n, weight in group["coefficients"].items()
         }
         whole = sum(abs(part) for part in parts.values()) or 1.0
+        # The share keeps the sign, which the dot shows as filled or open.
         for name, part in parts.items():
             shares[row, columns.index(name)] = part / whole
+    # Parameters that start at zero have no share in any sum.
     used = [k for k in range(len(columns)) if shares[:, k].any()]
     labels = [
         f"{name.removesuffix(' +')} + …{' *' if group['identifiable'] else ''}"
@@ -132,8 +142,11 @@ def group_figure(
 
 
 def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
-    """Correlations (n, n) of estimates: the area of a dot its size, open where negative; a line of
-    text where nothing is identified."""
+    """Draw the correlations (n, n) of the estimates.
+
+    The area of a dot is the size of a correlation. It is open where the correlation is negative.
+    One line of text says so where nothing is identified.
+    """
     side = min(WIDTH, max(3.0, 1.4 + 0.2 * len(names)))
     figure = Figure(figsize=(side + 0.3, side), layout="constrained")
     axes = figure.subplots()
@@ -141,14 +154,16 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
         axes.set_axis_off()
         axes.set_title("No parameter is identified: no correlations")
         return figure
+    # The matrix is symmetric with ones on the diagonal: its lower triangle says all.
     dot_matrix(axes, np.tril(correlations, -1), names, names)
     _key(axes, (1.0, 0.5, 0.1), "correlation", "negative")
     return figure
 
 
 def dot_matrix(axes: Axes, values: Array, rows: Sequence[str], columns: Sequence[str]) -> None:
-    """Values (rows, columns) from -1 to 1 as dots whose area is their size, open where they are
-    negative.
+    """Draw values (rows, columns) from -1 to 1 as dots.
+
+    The area of a dot is the size of its value. It is open where the value is negative.
     """
     axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=6.5)
     axes.set_yticks(range(len(rows)), rows, fontsize=6.5)
@@ -161,10 +176,10 @@ def dot_matrix(axes: Axes, values: Array, rows: Sequence[str], columns: Sequence
 
 
 SMALLEST = 0.004
-"""A value whose dot could not be seen."""
+"""Size of a value whose dot could not be seen."""
 
 LARGEST = 58.0
-"""Area of the dot of one, square points."""
+"""Area of the dot of a value of one, in square points."""
 
 
 def _dots(sizes: Array | float, sign: float) -> dict[str, Any]:
@@ -178,7 +193,8 @@ def _dots(sizes: Array | float, sign: float) -> dict[str, Any]:
 
 
 def _key(axes: Axes, sizes: Sequence[float], of: str, negative: str) -> None:
-    """What the dots mean, above the panel."""
+    """Draw the meaning of the dots above the panel."""
+    # Empty plots put entries into the legend without drawing anything.
     for size in sizes:
         axes.scatter([], [], label=f"{size:g}", **_dots(size, 1.0))
     axes.scatter([], [], label=negative, **_dots(sizes[1], -1.0))

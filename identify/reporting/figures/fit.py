@@ -1,5 +1,6 @@
-"""How well models follow the robot: over a run, component by component, and in one look; and run by
-run.
+"""Figures that show how well models follow the robot.
+
+They show it component by component over a run, in one look, and run by run.
 """
 
 from collections.abc import Sequence
@@ -32,16 +33,16 @@ from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
 from identify.reporting.number_format import number
 
 BAND = 2.0
-"""Predicted standard deviations drawn around an error of zero: 95 % of true errors lie within."""
+"""Predicted standard deviations around an error of zero. They hold 95 % of the true errors."""
 
 BAND_NAME = f"predicted ± {BAND:g} standard deviations"
 
 MARKS = 40
-"""Of the measured poses so many are drawn; the errors beneath are those of every frame."""
+"""Number of measured poses that are drawn. The errors beneath are those of every frame."""
 
 
 class Curve(NamedTuple):
-    """Values (N,) over time in the unit of their panel, and how they are drawn."""
+    """Values (N,) over time in the unit of their panel, and the style of their line."""
 
     name: str
     values: Array
@@ -63,11 +64,12 @@ TRUE: dict[str, Any] = {"color": RED, "linestyle": "-", "linewidth": 1.4}
 
 @dataclass(frozen=True)
 class Fit:
-    """What was measured of a run over its time (N,) [s], and what models do: poses (N, 6) [m, rad].
+    """Measured and modelled poses (N, 6) [m, rad] of a run over its time (N,) [s].
 
-    NaN where a measurement was lost or a model has diverged. initial: of the starting model; std:
-    predicted deviation of the truth from the identified model; noise (6,): standard deviation of
-    one measured pose, as the sensor states it.
+    They are NaN where a measurement was lost or a model has diverged. ``initial`` are the poses of
+    the starting model. ``std`` (N, 6) is the predicted standard deviation of the truth from the
+    identified model. ``noise`` (6,) is the standard deviation of one measured pose, as the sensor
+    states it.
     """
 
     time: Array
@@ -79,7 +81,7 @@ class Fit:
     noise: Array | None = None
 
     def pose_curves(self, i: int) -> list[Curve]:
-        """Component i, in mm or mrad: measurement and models."""
+        """Return measurement and models of component i, in mm or mrad."""
         marked = MEASURED | {"markevery": max(1, len(self.time) // MARKS)}
         curves = [
             ("measured", self.measured, marked),
@@ -90,8 +92,9 @@ class Fit:
         return [Curve(name, 1e3 * poses[:, i], drawn) for name, poses, drawn in curves]
 
     def error_curves(self, i: int) -> list[Curve]:
-        """Errors of the identified model in component i, in µm or µrad, against measurement and
-        truth.
+        """Return the errors of the identified model in component i, in µm or µrad.
+
+        They are taken against the measurement and, where it is known, against the truth.
         """
         curves = [
             Curve("measured − identified", 1e6 * (self.measured - self.identified)[:, i], NOISE)
@@ -103,12 +106,14 @@ class Fit:
         return curves
 
     def pose_range(self, i: int) -> tuple[float, float]:
-        """Range of the measurement, widened for the models by half at most: an unstable one must
-        not hide the rest.
+        """Return the range of the measurement, widened for the models.
+
+        It is widened by half at most on either side, so that an unstable model does not hide the
+        rest.
         """
-        measured, *models = (
-            curve.values[np.isfinite(curve.values)] for curve in self.pose_curves(i)
-        )
+        curves = [curve.values for curve in self.pose_curves(i)]
+        measured, *models = [values[np.isfinite(values)] for values in curves]
+        # A component that stands still has no range: one unit is shown around it.
         low = measured.min()
         high = measured.max()
         reach = (high - low) / 2 or 1.0
@@ -119,7 +124,8 @@ class Fit:
         return low - margin, high + margin
 
     def rms_text(self, i: int) -> str:
-        """RMS of the models against the measurement in component i."""
+        """Format the RMS of the models against the measurement in component i."""
+        # Lost frames do not count, but a model that has diverged does.
         counted = np.isfinite(self.measured).all(axis=1)
         models = [model for model in (self.initial, self.identified) if model is not None]
         values = [rms_row(rms_figures(self.measured - model, counted))[i] for model in models]
@@ -127,14 +133,17 @@ class Fit:
         return f"RMS {' → '.join(shown)} {UNITS[i]}"
 
     def distances(self, first: int) -> list[Curve]:
-        """Length of the error of position (first = 0) [µm] or orientation (3) [µrad]: of both
-        models, and of what the camera measured, against the truth; where none is known, of the
-        models against the measurement."""
-        goal, whose = (
-            (self.truth, "")
-            if self.truth is not None
-            else (self.measured, ", against the measurement")
-        )
+        """Return the lengths of the errors in position (first = 0) [µm] or orientation (3) [µrad].
+
+        The errors are those of both models and of the measurement against the truth. Where that is
+        not known, they are those of the models against the measurement.
+        """
+        if self.truth is None:
+            goal = self.measured
+            whose = ", against the measurement"
+        else:
+            goal = self.truth
+            whose = ""
         poses: dict[str, tuple[Array | None, dict[str, Any]]] = {
             f"starting model{whose}": (self.initial, STARTING),
             f"identified model{whose}": (self.identified, IDENTIFIED),
@@ -149,8 +158,10 @@ class Fit:
 
 
 def fit_figure(fit: Fit) -> Figure:
-    """Measured poses, starting and identified model, and beneath each component what is left of it;
-    as the paper's figures 12 and 13."""
+    """Draw the measured poses and both models, with the errors beneath each component.
+
+    It corresponds to figures 12 and 13 of the paper.
+    """
     shown = moving(fit.identified)
     rows = -(-len(shown) // 3)
     figure = Figure(figsize=(WIDTH, 0.6 + 3.3 * rows), layout="constrained")
@@ -180,8 +191,10 @@ def fit_figure(fit: Fit) -> Figure:
 
 
 def error_figure(fit: Fit) -> Figure:
-    """In one look: how far both models are from the true robot over a run, beside what the cameras
-    measure; from the measurement, beside the noise that the cameras state, where no truth is known.
+    """Draw the errors of both models over a run, in one look.
+
+    Where the truth is known, the errors are taken against it, beside those of the measurement.
+    Otherwise they are taken against the measurement, beside the noise that the cameras state.
     """
     parts = [
         first for first in (0, 3) if any(first <= i < first + 3 for i in moving(fit.identified))
@@ -193,18 +206,20 @@ def error_figure(fit: Fit) -> Figure:
     for axes, first in zip(panels, parts, strict=True):
         _draw(axes, fit.time, fit.distances(first))
         if fit.truth is None and fit.noise is not None:
+            # The curves are lengths of error vectors, and so is this level.
             level = 1e6 * float(np.linalg.norm(fit.noise[first : first + 3]))
             axes.axhline(level, color=GREY, linestyle=":", label="noise of one measured pose")
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(numticks=12))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.set_ylabel("position [µm]" if first == 0 else "orientation [µrad]")
+        # An error that passes through zero would stretch the logarithmic axis without end.
         values = np.concatenate(
             [curve.values[np.isfinite(curve.values)] for curve in fit.distances(first)[-2:]]
         )
-        low = (
-            max(float(np.quantile(values[values > 0], 0.01)), 1e-3) if (values > 0).any() else 1e-3
-        )
+        low = 1e-3
+        if (values > 0).any():
+            low = max(float(np.quantile(values[values > 0], 0.01)), low)
         axes.set_ylim(bottom=low / 2)
     panels[-1].set_xlabel("time [s]")
     legend_above(figure, panels[0], columns=1)
@@ -217,7 +232,7 @@ def _draw(axes: Axes, time: Array, curves: Sequence[Curve]) -> None:
 
 
 def _legend_of(figure: Figure, panels: Sequence[Axes]) -> None:
-    """One legend above of what is in several panels, the measurement first."""
+    """Draw one legend above several panels."""
     entries = {
         label: handle
         for axes in panels
@@ -229,11 +244,14 @@ def _legend_of(figure: Figure, panels: Sequence[Axes]) -> None:
 
 
 HATCHES = ("", "////", "xxxx")
+"""Patterns of the three bars of a run, which differ without colour."""
 
 
 def validation_figure(validation: list[dict[str, Any]]) -> Figure:
-    """RMS of the identified model on each unseen trajectory, against truth and measurement, with
-    what was predicted and the goals."""
+    """Draw the RMS of the identified model on each unseen trajectory.
+
+    It is taken against truth and measurement, and stands beside the prediction and the goals.
+    """
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
@@ -242,6 +260,7 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
             true = [rms_row(run["true"])[i] for run in validation]
             measured = [rms_row(run["measured"])[i] for run in validation]
             predicted = [predicted_row(run)[i] for run in validation]
+            # Three bars a run, side by side: x, y, z or α, β, γ.
             places = runs + 0.25 * (i - first - 1)
             look = {
                 "edgecolor": LINES[i]["color"],
@@ -255,6 +274,7 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
                 label=f"{COMPONENTS[i]}, against the truth",
                 **look,
             )
+            # Marks of all three components look alike, so that one entry in the legend is enough.
             said = i == first
             axes.plot(
                 places,

@@ -1,4 +1,4 @@
-"""What static poses tell of a robot's geometry, and what more of them would."""
+"""Figure of a geometric calibration from static poses."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,13 +10,16 @@ from matplotlib.figure import Figure
 from identify.reporting.figures.style import BLUE, GREY, RED, WIDTH
 
 ROOM = 20.0
-"""Factor by which an axis ends above its curves, for the legend."""
+"""Factor by which an axis ends above its curves, to leave room for the legend."""
 
 
 def geometry_figure(entry: Mapping[str, Any]) -> Figure:
-    """Of the content of a geometry.json: how well each number is known, and its error where the
-    truth is; and by how much poses that were not measured are missed, after so many poses, random
-    and chosen."""
+    """Draw the content of a geometry.json.
+
+    One panel shows the standard deviation of each geometric parameter and, where the truth is
+    known, its error. Where it was computed, a second panel shows the expected error of poses that
+    were not measured against the number of measured ones, random and chosen.
+    """
     several = "random_poses" in entry
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     panels = np.atleast_1d(
@@ -29,17 +32,17 @@ def geometry_figure(entry: Mapping[str, Any]) -> Figure:
 
 
 def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
-    """Standard deviations and errors over the tolerance, one column a kind of number, one point a
-    leg.
-    """
+    """Draw standard deviations and errors over the tolerance: a column a kind, a point a leg."""
     kinds = list(dict.fromkeys(name.partition(".")[2] for name in parameters))
     legs = list(dict.fromkeys(name.partition(".")[0] for name in parameters))
+    # The points of a column are spread over 0.6 of its width, one place a leg.
     at = [
         kinds.index(name.partition(".")[2])
         + 0.6 * (legs.index(name.partition(".")[0]) / len(legs) - 0.4)
         for name in parameters
     ]
     rows = parameters.values()
+    # An estimate that equals the truth has no place on a logarithmic axis.
     missed = [
         (x, p)
         for x, p in zip(at, rows, strict=True)
@@ -51,6 +54,7 @@ def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
     )
     if known:
         axes.plot(*zip(*known, strict=True), "x", color=RED, label="error")
+    # A parameter counts as told if its standard deviation is below a third of the tolerance.
     axes.axhline(1 / 3, color=GREY, linewidth=0.8, linestyle="--")
     axes.annotate(
         "told below",
@@ -69,15 +73,14 @@ def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def _by_count(axes: Axes, entry: Mapping[str, Any]) -> None:
-    """Expected errors of poses that were not measured against the number of poses, random and
-    chosen.
-    """
+    """Draw the expected error of unmeasured poses against the number of random and chosen poses."""
     random = entry["random_poses"]
     chosen = entry["selection"]["chosen"]
     for key, unit, color, line in (
         ("position_rms_um", "position [µm]", BLUE, "-"),
         ("orientation_rms_urad", "orientation [µrad]", RED, "--"),
     ):
+        # Random sets are given for several numbers of poses, the chosen set for one.
         counts = [one["poses"] for one in random]
         values = [_rms(one[key]) for one in random]
         axes.plot(counts, values, line, color=color, label=f"random poses, {unit}")
@@ -92,5 +95,5 @@ def _by_count(axes: Axes, entry: Mapping[str, Any]) -> None:
 
 
 def _rms(values: list[float]) -> float:
-    """Over the components that the platform has."""
+    """Return the RMS over the components that the platform has."""
     return float(np.sqrt(np.mean(np.square(values))))

@@ -1,5 +1,6 @@
-"""What an experiment looks like: the scene above both camera images, and the images with their
-residuals.
+"""Figures of the experiment.
+
+One shows the scene above both camera images. The other shows the images with their residuals.
 """
 
 import numpy as np
@@ -13,18 +14,18 @@ from identify.scene import StereoView, View, Workcell, stereo_figure
 from identify.scene.drawings import FOUND, SIDES, draw_scene, show_image
 
 OVERVIEW = (4.8, 4.9)
-"""Width and height of the overview, inches."""
+"""Width and height of the overview, in inches."""
 
 BENEATH = 0.4
-"""Share of its height that the images take."""
+"""Share of the overview's height that the images take."""
 
 
 def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None) -> Figure:
-    """Robot, stickers and cameras with the platform at a pose (6,), and beneath it what both
-    cameras see of it.
+    """Draw robot, stickers and cameras with the platform at a pose (6,).
 
-    Higher than it is wide, as a phone is. Raises dynamics.UnreachablePoseError,
-    dynamics.ChartError.
+    Beneath stand both camera images, if there is a view. The figure is higher than wide, to fit the
+    screen of a phone. Raises dynamics.UnreachablePoseError or dynamics.ChartError if the robot
+    cannot take the pose.
     """
     width, height = OVERVIEW
     beneath = 0.0 if view is None else BENEATH
@@ -32,6 +33,7 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
     axes = figure.add_axes((0.08, beneath, 0.87, 1 - beneath))
     draw_scene(axes, cell, pose, View(), rays=True, labels=True)
     if view is not None:
+        # The images are squares, in shares of a figure that is not.
         side = (beneath - 0.05) * height / width
         for number, name in enumerate(SIDES):
             axes = figure.add_axes(
@@ -47,12 +49,14 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
 
 
 ARROW = 0.12
-"""Of the image's width: the longest arrow, at most."""
+"""Largest length of an arrow, as a share of the image's width."""
 
 
 def residual_figure(view: StereoView) -> Figure:
-    """Both camera images with the detected ellipses, and how far each detected centre is from the
-    true one: arrows, enlarged, beside one whose length is written in px."""
+    """Draw both camera images with the detected ellipses and the errors of their centres.
+
+    The errors are enlarged arrows. One arrow beside them has its length written in px.
+    """
     errors = np.concatenate(
         [(found.centres - found.expected).reshape(-1, 2) for found in view.found.values()]
     )
@@ -67,8 +71,9 @@ def residual_figure(view: StereoView) -> Figure:
 
 
 def _scale_arrow(axes: Axes, width: int, factor: float, length: float) -> None:
-    """An arrow that stands for a length, px, in the lower left corner of an image."""
-    (left, _), (low, high) = axes.get_xlim(), axes.get_ylim()
+    """Draw an arrow that stands for a length in px, in the lower left corner of an image."""
+    left = axes.get_xlim()[0]
+    low, high = axes.get_ylim()
     foot = left + 0.04 * width, low + 0.05 * (high - low)
     axes.quiver(
         *foot,

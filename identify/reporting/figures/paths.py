@@ -1,5 +1,7 @@
-"""The motion of a run: over time, as a path in space, and how well each of its poses was
-measured."""
+"""Figures of the motion of a run.
+
+They show the motion over time, as a path in space, and how well each pose was measured.
+"""
 
 from itertools import combinations
 from typing import Any
@@ -28,14 +30,13 @@ from identify.reporting.figures.style import (
 )
 
 PARTS = (("position", 0, "mm", "µm"), ("orientation", 3, "mrad", "µrad"))
-"""Halves of a pose: name, first component, units of its motion and of its errors."""
+"""Halves of a pose: name, first component, unit of its motion and unit of its errors."""
 
 
 def excitation_figure(time: Array, poses: Array) -> Figure:
-    """Position and orientation of a trajectory: ``time`` (N,) [s], ``poses`` (N, 6) [m, rad]; as
-    the paper's figure 11.
+    """Draw position and orientation of a trajectory over time, as figure 11 of the paper.
 
-    What does not move is left out.
+    ``time`` (N,) is in s, ``poses`` (N, 6) in m and rad. Components that do not move are left out.
     """
     shown = moving(poses)
     parts = [part for part in PARTS if any(part[1] <= i < part[1] + 3 for i in shown)]
@@ -51,12 +52,15 @@ def excitation_figure(time: Array, poses: Array) -> Figure:
 
 
 MARKED = 10
-"""Times that are marked along a path, at most."""
+"""Largest number of times that are marked along a path."""
 
 
 def path_figure(time: Array, poses: Array) -> Figure:
-    """The path (N, 6) [m, rad] of the platform over the time (N,) [s]: its position and, beside it,
-    its orientation, with the same times marked on both; what does not move is left out."""
+    """Draw the path (N, 6) [m, rad] of the platform over the time (N,) [s].
+
+    Position and orientation stand beside each other, with the same times marked on both. Components
+    that do not move are left out.
+    """
     shown = moving(poses)
     halves = [
         ([i for i in shown if first <= i < first + 3], name, unit) for name, first, unit, _ in PARTS
@@ -65,6 +69,7 @@ def path_figure(time: Array, poses: Array) -> Figure:
     figure = Figure(figsize=(WIDTH if len(halves) > 1 else WIDTH / 1.6, 3.2))
     figure.subplots_adjust(left=0.02, right=0.94, bottom=0.06, top=0.94, wspace=0.12)
     elapsed = time - time[0]
+    # A little before the round time, lest rounding take the frame after it.
     marks = np.searchsorted(
         elapsed, np.arange(0, elapsed[-1], _round_up(elapsed[-1] / MARKED)) - 1e-9
     )
@@ -82,11 +87,8 @@ def path_figure(time: Array, poses: Array) -> Figure:
             "xyz", labels if len(columns) > 1 else ["time [s]", *labels], strict=False
         ):
             getattr(axes, f"set_{axis}label")(label)
-        axes.set_title(
-            f"({'ab'[place - 1]}) {name} from the start"
-            if len(halves) > 1
-            else f"{name} from the start"
-        )
+        letter = f"({'ab'[place - 1]}) " if len(halves) > 1 else ""
+        axes.set_title(f"{letter}{name} from the start")
         if solid:
             _plain_box(axes)
         else:
@@ -96,7 +98,7 @@ def path_figure(time: Array, poses: Array) -> Figure:
 
 
 def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
-    """A path (N, 2 or 3) with numbered times, its start as a square."""
+    """Draw a path (N, 2) or (N, 3) with its times, and its start as a square."""
     axes.plot(*path.T, color=BLUE, linewidth=1.0)
     axes.plot(
         *path[marks[1:]].T,
@@ -114,7 +116,7 @@ def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> 
 
 
 def _plain_box(axes: Axes3D) -> None:
-    """Thin panes without grey, one scale for all axes."""
+    """Give a box thin panes without grey, and one scale for all axes."""
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.pane.set_facecolor((1, 1, 1, 0))
         axis.pane.set_edgecolor(GREY)
@@ -126,42 +128,48 @@ def _plain_box(axes: Axes3D) -> None:
 
 
 COVERED = 0.95
-"""Of what an ellipse covers."""
+"""Probability that an ellipse covers the true pose."""
 
 ELLIPSES = 12
-"""Poses whose ellipses are drawn."""
+"""Number of poses whose ellipses are drawn."""
 
 SHARE = 0.15
-"""Of the path's size: the half axis of the largest ellipse as it is drawn, at most."""
+"""Largest half axis of a drawn ellipse, as a share of the path's size."""
 
 
 def ellipse_figure(
     poses: Array, covariances: Array, shown: list[int], errors: Array | None = None
 ) -> Figure:
-    """How well poses (N, 6) [m, rad] were measured: 95 % ellipses of the covariances (N, 6, 6) that
-    the sensor states, along the path and enlarged, in views of the components that move (`shown`);
-    where the truth is known, with the errors (N, 6) true - measured of these poses, enlarged alike.
-    NaN where a pose was lost."""
+    """Draw 95 % ellipses of the measured poses along the path, enlarged.
+
+    Parameters
+    ----------
+    poses
+        Measured poses (N, 6) [m, rad], NaN where one was lost.
+    covariances
+        Covariances (N, 6, 6) of the poses, as the sensor states them.
+    shown
+        Indices of the components that move. Each pair of them has a view.
+    errors
+        True minus measured poses (N, 6), where the truth is known. They are enlarged alike.
+    """
+    # Lost frames have neither a pose nor a covariance.
     kept = np.flatnonzero(
         np.isfinite(poses).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     )
     chosen = kept[np.linspace(0, len(kept) - 1, min(ELLIPSES, len(kept))).round().astype(int)]
     path = 1e3 * (poses - poses[kept[0]])
-    views = [
-        (
-            part,
-            [
-                list(pair)
-                for pair in combinations([i for i in shown if part[1] <= i < part[1] + 3], 2)
-            ],
-        )
-        for part in PARTS
-    ]
-    views = [(part, pairs) for part, pairs in views if pairs]
+    views = []
+    for part in PARTS:
+        own = [i for i in shown if part[1] <= i < part[1] + 3]
+        pairs = [list(pair) for pair in combinations(own, 2)]
+        if pairs:
+            views.append((part, pairs))
     figure = Figure(figsize=(WIDTH, 0.4 + 2.5 * max(len(views), 1)), layout="constrained")
     grid = figure.subplots(max(len(views), 1), 3, squeeze=False)
     for row, ((name, first, unit, fine), pairs) in zip(grid, views, strict=False):
         half = slice(first, first + 3)
+        # The root of the largest eigenvalue bounds the half axes in every view.
         largest = 1e3 * np.sqrt(REACH * np.linalg.eigvalsh(covariances[chosen, half, half]).max())
         factor = round_down(SHARE * float(np.ptp(path[kept, half], axis=0).max()) / largest)
         for axes, columns in zip(row, pairs, strict=False):
@@ -190,14 +198,14 @@ def ellipse_figure(
         axes.set_visible(False)
     if views:
         legend_above(figure, grid[0, 0], columns=3)
-    figure.draw_without_rendering()  # equal axes change their ticks once they have their place
+    # Axes of equal scale change their ticks once they have their place.
+    figure.draw_without_rendering()
     return figure
 
 
 def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float) -> None:
-    """Ellipses of covariances (n, 2, 2) [SI], enlarged, about measured places (n, 2) [thousandths
-    of it].
-    """
+    """Draw enlarged ellipses of covariances (n, 2, 2) [SI] about centres (n, 2) [mm or mrad]."""
+    # All ellipses are one line with gaps, which makes one entry in the legend and draws faster.
     gap = np.full((1, 2), np.nan)
     rings = [
         c + 1e3 * factor * ellipse_outline(cov) for c, cov in zip(centres, covariances, strict=True)
@@ -208,12 +216,15 @@ def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float
 
 
 REACH = float(chi2.ppf(COVERED, 2))
+"""Squared Mahalanobis distance within which `COVERED` of the poses lie."""
+
 RING = f"holds {100 * COVERED:g} % of true poses"
 
 
 def ellipse_outline(covariance: Array) -> Array:
-    """Outline (n, 2) of the ellipse that covers `COVERED` of a covariance (2, 2)."""
+    """Return the outline (n, 2) of the ellipse that covers `COVERED` of a covariance (2, 2)."""
     angle = np.linspace(0, 2 * np.pi, 49)
+    # The small multiple of the identity lets a singular covariance have a Cholesky root.
     root = np.linalg.cholesky(covariance + 1e-12 * np.trace(covariance) * np.eye(2))
     return np.asarray(
         np.sqrt(REACH) * np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T, dtype=float
@@ -221,9 +232,7 @@ def ellipse_outline(covariance: Array) -> Array:
 
 
 def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
-    """A bar that is so many of the fine unit long in the enlargement; the axes are in the coarse
-    one.
-    """
+    """Draw a bar with its enlarged length in the fine unit, on axes in the coarse unit."""
     look: dict[str, Any] = {
         "frameon": False,
         "sep": 3,
@@ -238,11 +247,12 @@ def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
 
 
 def _round_up(value: float) -> float:
-    """The next higher of 1, 2, 5 times a power of ten."""
+    """Return the next higher of 1, 2 and 5 times a power of ten."""
     return 1.0 / round_down(1.0 / value)
 
 
 def round_down(value: float) -> float:
-    """The next lower of 1, 2, 5 times a power of ten."""
+    """Return the next lower of 1, 2 and 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
+    # The tolerance keeps a value that rounding has moved just below one of the steps.
     return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

@@ -1,8 +1,8 @@
-"""What all figures share: a size and fonts for print, and colours whose curves also differ without
-colour.
+"""Style that all figures share.
 
-Every curve has a line style or a marker of its own. A report replaces the colours by those of its
-reader's screen, so figures take theirs from `PALETTE`, and nowhere else.
+Sizes and fonts are those of print. Every curve has a line style or a marker of its own, so that
+curves also differ without colour. A report replaces the colours by those of the reader's screen.
+Figures therefore take their colours from `PALETTE` only.
 """
 
 import io
@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 from identify.arrays import Array
 
 WIDTH = 7.1
-"""Inches: both columns of a journal's page."""
+"""Width of both columns of a journal's page, in inches."""
 
 COLUMN = 3.5
-"""Inches: one column."""
+"""Width of one column, in inches."""
 
 PALETTE = {
     "ink": "#000000",
@@ -60,7 +60,8 @@ STYLE: Any = {
     "lines.linewidth": 1.1,
     "lines.markersize": 3.5,
     "hatch.linewidth": 0.6,
-    "pdf.fonttype": 42,  # text that stays text
+    # Text stays text: it can be searched and copied.
+    "pdf.fonttype": 42,
     "svg.fonttype": "none",
 }
 
@@ -74,16 +75,17 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": AMBER, "linestyle": "--"},
     {"color": INDIGO, "linestyle": "-."},
 )
-"""One for each component of a pose."""
+"""Line styles of the components of a pose."""
 
 STILL = 1e-9
-"""m, rad: a component whose range is smaller does not move."""
+"""Range in m or rad below which a component counts as still."""
 
 
 def drawn(draw: Callable[[], Figure]) -> Figure:
-    """A figure in this style, laid out once for all files that are made of it."""
+    """Draw a figure in this style, and lay it out once for all files that are made of it."""
     with mpl.rc_context(STYLE):
         figure = draw()
+        # Layout engines move the axes at every drawing, so that files would differ.
         if figure.get_layout_engine():
             figure.draw_without_rendering()
             figure.set_layout_engine("none")
@@ -91,8 +93,9 @@ def drawn(draw: Callable[[], Figure]) -> Figure:
 
 
 def svg_text(figure: Figure, name: str) -> str:
-    """A figure as an <svg> element, whose identifiers begin with a name, so that several may share
-    a page.
+    """Return a figure as an <svg> element.
+
+    Its identifiers begin with the name, so that several figures may share a page.
     """
     with mpl.rc_context(STYLE | {"svg.hashsalt": name}):
         stream = io.StringIO()
@@ -100,21 +103,33 @@ def svg_text(figure: Figure, name: str) -> str:
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    # Identifiers of several figures on one page would collide otherwise.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{name}-", text)
-    text = re.sub(r"(\d\.\d\d)\d+", r"\g<1>", text)  # hundredths of a point
+    # Hundredths of a point are enough, and make a smaller file.
+    text = re.sub(r"(\d\.\d\d)\d+", r"\g<1>", text)
     return re.sub(r"\s*\n\s*", "\n", text)
 
 
 def moving(poses: Array) -> list[int]:
-    """The components of poses (N, 6) [m, rad] that move, NaN being no place."""
+    """Return the indices of the components of poses (N, 6) [m, rad] that move. NaN is ignored."""
     return [i for i in range(6) if np.nanmax(poses[:, i]) - np.nanmin(poses[:, i]) > STILL]
 
 
 def panel_grid(
     count: int, width: float, height: float, above: float = 0.0, **shared: Any
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels of that size, inches, three beside each other, and room above
-    them for a title.
+    """Return a figure with ``count`` panels, three in a row.
+
+    Parameters
+    ----------
+    count
+        Number of panels.
+    width, height
+        Size of a panel, in inches.
+    above
+        Room for a title above the panels, in inches.
+    **shared
+        Arguments of `matplotlib.figure.Figure.subplots`.
     """
     columns = min(count, 3)
     rows = -(-count // columns)
@@ -126,6 +141,6 @@ def panel_grid(
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
-    """The legend of a panel above all of them."""
+    """Draw the legend of one panel above all of them."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, handlelength=3.0)

@@ -1,7 +1,7 @@
 "use strict";
 /* Curves over time in small panels, with a cursor that all of them share. */
 
-/* Round numbers between two values, about so many of them. */
+/* Return about so many round numbers between two values. */
 function roundNumbers(low, high, count) {
   const rough = (high - low) / count;
   const decade = 10 ** Math.floor(Math.log10(rough));
@@ -21,7 +21,7 @@ function element(name, attributes, parent) {
 }
 
 class Panel {
-  /* seek: a function of a time, called where the panel is clicked */
+  /* seek is a function of a time, which is called when the panel is clicked. */
   constructor(parent, name, time, seek) {
     this.time = time;
     this.box = document.createElement("div");
@@ -48,7 +48,7 @@ class Panel {
     return span;
   }
 
-  /* Draw curves anew: each has values, one a frame and NaN where there is none, a colour and a dash pattern. */
+  /* Draw curves anew. Each has values, one a frame and NaN if there is none, a colour and a dash pattern. */
   draw(curves) {
     this.svg.replaceChildren();
     this.box.querySelectorAll(".tick").forEach((span) => span.remove());

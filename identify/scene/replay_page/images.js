@@ -1,15 +1,15 @@
 "use strict";
-/* Both camera images of a frame, with the ellipses that were found in them. */
+/* Camera images of a frame, with the ellipses that were found in them. */
 
 class Images {
-  /* time: a function of a frame: its time in s, or null where nothing moves */
+  /* time is a function of a frame that returns its time in s, or null if nothing moves. */
   constructor(time) {
     this.time = time;
     this.shown = null;
     this.listen();
   }
 
-  /* Magnify an image about the place that is clicked, or show the whole of it again. */
+  /* Magnify an image around the place that is clicked, or show all of it again. */
   listen() {
     document.querySelectorAll(".image button").forEach((button) => {
       button.addEventListener("click", (event) => {
@@ -23,7 +23,7 @@ class Images {
     });
   }
 
-  /* look: images of a frame, their places in the whole images, and what was found in them */
+  /* look holds the images of a frame, their places in the whole images, and the stickers found. */
   show(look) {
     if (look === this.shown) return;
     this.shown = look;

@@ -1,5 +1,6 @@
 "use strict";
-/* The page: one time for scene, images, figures and curves. `window.replay` can be driven from outside. */
+/* Player of the page: one time for scene, images, figures and curves.
+   Other scripts can drive it by `window.replay`. */
 
 const WORDS = {
   legs: "legs", cameras: "cameras and their field of view", rays: "rays to the stickers that were found",
@@ -29,7 +30,7 @@ class Replay {
     this.panels = { poses: [], differences: [] };
   }
 
-  /* A pose [x y z alpha beta gamma] of a kind in a frame, m and rad; null where there is none. */
+  /* Return the pose [x y z alpha beta gamma] of a kind in a frame, in m and rad, or null. */
   pose(kind, frame) {
     const table = this.tables[kind];
     const row = table && Array.from(table.subarray(6 * frame, 6 * frame + 6));
@@ -59,7 +60,7 @@ class Replay {
       this.seek(this.frame);
     });
     this.seek(0);
-    for (let k = 0; k < 2; k += 1) await new Promise(requestAnimationFrame); /* until it has been drawn */
+    for (let k = 0; k < 2; k += 1) await new Promise(requestAnimationFrame); /* until the scene has been drawn */
     this.ready = true;
   }
 
@@ -167,13 +168,13 @@ class Replay {
     });
   }
 
-  /* The frame whose images are shown with a frame: the nearest one that has some. */
+  /* Return the nearest frame with images. */
   look(frame) {
     const away = (look) => Math.abs(look.frame - frame);
     return this.data.looks.reduce((best, look) => (!best || away(look) < away(best) ? look : best), null);
   }
 
-  /* How much differences are enlarged. */
+  /* Return the factor that enlarges differences. */
   times() {
     return Number(document.getElementById("enlarged").value);
   }
@@ -196,7 +197,7 @@ class Replay {
     this.writeFigures();
   }
 
-  /* In the scene itself: what its coloured outlines are, so that a picture of it says so, too. */
+  /* Explain the coloured outlines in the scene itself, so that a picture of it says what they are. */
   writeBadge(times) {
     const badge = document.getElementById("badge");
     badge.hidden = !this.scene || this.data.frames === 1;
@@ -245,7 +246,7 @@ class Replay {
     let [began, from, told] = [performance.now(), this.time[this.frame], this.frame];
     const step = (now) => {
       if (!this.playing) return;
-      if (this.frame !== told) [began, from] = [now, this.time[this.frame]]; /* the slider was moved meanwhile */
+      if (this.frame !== told) [began, from] = [now, this.time[this.frame]]; /* the slider was moved */
       const time = from + (Number(document.getElementById("speed").value) * Math.max(0, now - began)) / 1000;
       this.seek(this.frameAt(time));
       told = this.frame;
@@ -255,7 +256,8 @@ class Replay {
     requestAnimationFrame(step);
   }
 
-  /* What is shown now: time in s, and poses [x y z alpha beta gamma], m and rad, read from the objects in the scene. */
+  /* Return what is shown: time in s, and poses [x y z alpha beta gamma] in m and rad, read from the
+     objects in the scene. */
   shown() {
     return { frame: this.frame, time: this.time[this.frame], ...(this.scene ? this.scene.shown() : {}) };
   }

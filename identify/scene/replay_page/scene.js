@@ -1,11 +1,13 @@
 "use strict";
-/* The scene in space: the bodies of the glTF file, moved to the poses of each frame, in metres and base axes. */
+/* Scene in space: the bodies of the glTF file, moved to the poses of each frame.
+   Lengths are in metres, in the base frame. */
 
 function numbers(text, Kind) {
   return new Kind(Uint8Array.from(atob(text), (character) => character.charCodeAt(0)).buffer);
 }
 
-/* base_from_platform of a pose [x y z alpha beta gamma], R = Rx(alpha) Ry(beta) Rz(gamma), and back. */
+/* Return base_from_platform of a pose [x y z alpha beta gamma], with R = Rx(alpha) Ry(beta) Rz(gamma).
+   poseOf is the inverse. */
 function transformOf(pose) {
   const turn = new THREE.Quaternion().setFromEuler(new THREE.Euler(pose[3], pose[4], pose[5], "XYZ"));
   return new THREE.Matrix4().compose(new THREE.Vector3(...pose), turn, new THREE.Vector3(1, 1, 1));
@@ -17,7 +19,7 @@ function poseOf(matrix) {
   return [place.x, place.y, place.z, turn.x, turn.y, turn.z];
 }
 
-/* Where a pose would be if it differed so many times as much from the true one. */
+/* Return the transform `to`, with its difference from the transform `from` enlarged by a factor. */
 function enlargedTransform(from, to, times) {
   const [place, other, one] = [new THREE.Vector3(), new THREE.Vector3(), new THREE.Vector3()];
   const [turn, turned] = [new THREE.Quaternion(), new THREE.Quaternion()];
@@ -31,7 +33,7 @@ function enlargedTransform(from, to, times) {
   return new THREE.Matrix4().compose(place, turn, new THREE.Vector3(1, 1, 1));
 }
 
-/* A colour of the page as three.js calculates with it. */
+/* Return a colour of the page in the linear space of three.js. */
 function linear(colour) {
   return new THREE.Color(colour).convertSRGBToLinear();
 }
@@ -44,7 +46,7 @@ function canDraw() {
 class Scene {
   constructor(data, figure, poses) {
     this.data = data;
-    this.poses = poses; /* a function of kind and frame: a pose, or null where there is none */
+    this.poses = poses; /* function of kind and frame that returns a pose, or null if there is none */
     this.figure = figure;
     this.rods = numbers(data.rods, Float32Array);
     this.ellipsoids = data.ellipsoid && numbers(data.ellipsoid, Float32Array);
@@ -57,7 +59,7 @@ class Scene {
     this.layers = {};
   }
 
-  /* Read the glTF file and build all else; resolves when the first picture can be drawn. */
+  /* Read the glTF file and build all else. Resolves when the first picture can be drawn. */
   async build(colours) {
     const raw = numbers(this.data.gltf, Uint8Array).buffer;
     const gltf = await new Promise((done, failed) => new THREE.GLTFLoader().parse(raw, "", done, failed));
@@ -131,7 +133,8 @@ class Scene {
     this.layer("rays", this.data.looks.length ? [this.rays] : []);
   }
 
-  /* Exact places of measured and modelled platforms, their enlarged ghosts, and the ellipsoids. */
+  /* Add outlines of the platform at measured and modelled poses, with enlarged differences, and the
+     ellipsoids. The exact groups stay empty: they only keep the poses that shown() reads. */
   addKinds(colours) {
     this.exact = {};
     this.ghosts = {};
@@ -166,7 +169,8 @@ class Scene {
     return mesh;
   }
 
-  /* Move all to a frame; look: the nearest one with images, or null; times: how much differences are enlarged. */
+  /* Move everything to a frame. look is the nearest frame with images, or null. times is the factor that
+     enlarges differences. */
   show(frame, look, times) {
     const drawn = transformOf(this.poses("drawn", frame));
     this.move(this.platform, drawn);
@@ -240,7 +244,7 @@ class Scene {
     object.matrixWorldNeedsUpdate = true;
   }
 
-  /* The poses that the objects have, read from their matrices. */
+  /* Return the poses of the objects, read from their matrices. */
   shown() {
     this.world.updateMatrixWorld(true);
     const found = { drawn: poseOf(this.platform.matrixWorld) };
@@ -269,7 +273,7 @@ class Scene {
     this.draw();
   }
 
-  /* Draw with the browser's next picture, once however often this is called. */
+  /* Draw with the browser's next picture, and only once however often this is called. */
   draw() {
     this.stale = true;
   }

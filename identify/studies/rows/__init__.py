@@ -1,10 +1,10 @@
-"""The kinds of row a study can have: one file each, and a line in ``KINDS``; or ``module:function``
-of a user's own.
+"""Kinds of row that a study can have.
 
-A function of one's own is ``run(scenario, seed)`` or ``run(scenario, seed, options)``: it takes the
-scenario, the row's ``numpy.random.SeedSequence`` and, where the study has any, the options by name,
-and returns the row's figures by name, units in the names. Workers import it, so it must be in a
-module that they find.
+A built-in kind is one file here, and a line in ``KINDS``. A user's own is ``module:function``, a
+function ``run(scenario, seed)`` or ``run(scenario, seed, options)``. It takes the scenario, the
+row's ``numpy.random.SeedSequence`` and, if the study has any, the options by name. It returns the
+row's figures by name, with units in the names. Workers import it, so it must be in a module that
+they find.
 """
 
 import inspect
@@ -12,10 +12,10 @@ from collections.abc import Callable
 from typing import Any
 
 from identify.errors import StudyError
-from identify.plugins import is_own, own_function
+from identify.own_parts import is_own, own_function
 from identify.studies.rows.closed_loop import CLOSED_LOOP
 from identify.studies.rows.estimators import ESTIMATION
-from identify.studies.rows.identification import IDENTIFICATION
+from identify.studies.rows.identified import IDENTIFICATION
 from identify.studies.rows.kind import Kind
 from identify.studies.rows.path_pose import PATH_POSE
 from identify.studies.rows.static_pose import STATIC_POSE
@@ -28,10 +28,10 @@ KINDS: dict[str, Kind] = {
 
 
 def find_kind(name: str) -> Kind:
-    """The kind of that name, built in or of one's own.
+    """Return the kind of that name, built in or a user's own.
 
-    Raises StudyError: no such kind, with the built-in ones; no such module or function, or one that
-    takes other arguments.
+    Raises StudyError if there is no such kind (the message names the built-in ones), module or
+    function, or if the function takes other arguments.
     """
     if is_own(name):
         return _own(name, own_function(name, "kind", StudyError))
@@ -43,7 +43,7 @@ def find_kind(name: str) -> Kind:
 
 
 def _own(name: str, function: Callable[..., Any]) -> Kind:
-    """The kind of a function that takes three arguments, or two and no options."""
+    """Make a kind of a function that takes three arguments, or two and no options."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # written in C: it does not say

@@ -1,6 +1,6 @@
-"""Rows of kind `closed_loop`: the plant follows an unseen trajectory with the images in the loop.
+"""Rows of kind `closed_loop`: the plant follows an unseen trajectory with images in the loop.
 
-Each row draws a trajectory in the scenario's box and runs it for `validation.duration_s`; sensor,
+Each row draws a trajectory in the scenario's box and runs it for `validation.duration_s`. Sensor,
 timing, servo and plant are the scenario's. The sensor teaches itself, seeded by the row, unless
 exact teaching is asked for.
 """
@@ -32,7 +32,7 @@ from identify.studies.rows.kind import (
     Row,
     unwatched,
 )
-from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
+from identify.studies.rows.row_sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 
 EXPERIMENT = 0
 TRAJECTORY = 1
@@ -56,7 +56,7 @@ COLUMNS = {
 
 
 class ClosedLoopOptions(Section):
-    """How the sensor was taught."""
+    """Options of rows of kind `closed_loop`."""
 
     teaching: Teaching = Field(
         "sensor", description="by the sensor itself, seeded by the row, or exact"
@@ -85,12 +85,14 @@ READS = Reads(
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoopOptions) -> Row:
-    """One row. Raises EstimationError where no frame was measured, LoopFailure, and what the sensor
-    raises.
+    """Compute one row.
+
+    Raises EstimationError if no frame was measured, LoopFailure, and the errors of the sensor.
     """
     scenario = unwatched(scenario)
     robot = load_robot(scenario.robot)
     number = stream_seed(seed, EXPERIMENT)
+    # A sensor that is given no teaching teaches itself.
     taught = exactly_taught(sensor_file(scenario)) if options.teaching == "exact" else None
     sensor = make_sensor(scenario, robot, number, taught)
     duration = scenario.validation.duration_s

@@ -1,6 +1,4 @@
-"""Whether stated intervals hold: of what a record identifies, and of the poses that its model
-predicts.
-"""
+"""Coverage of stated intervals of identified quantities, and of poses predicted by the model."""
 
 from collections.abc import Iterator, Sequence
 
@@ -14,7 +12,7 @@ from identify.experiment.run import Experiment
 from identify.experiment.truth import true_poses
 from identify.progress import SilentProgress
 from identify.studies.rows.kind import Row
-from identify.studies.rows.sensor import rms_um
+from identify.studies.rows.row_sensor import rms_um
 from identify.validation.unseen import PosePrediction, predicted_runs
 
 
@@ -24,9 +22,26 @@ def coverage(
     unseen: Sequence[Experiment],
     predicted: Sequence[PosePrediction],
 ) -> Row:
-    """How many intervals of what is identified hold the truth, how many true coordinates on unseen
-    trajectories are where they are predicted, and how far from the true positions the predicted
-    ones are."""
+    """Count how often stated intervals contain the truth.
+
+    Parameters
+    ----------
+    result : IdentificationResult
+        Estimates with their intervals.
+    plant : Plant
+        The true robot.
+    unseen : sequence of Experiment
+        Runs of the unseen trajectories.
+    predicted : sequence of PosePrediction
+        Prediction of each of these runs.
+
+    Returns
+    -------
+    Row
+        Number and share of the intervals of identified quantities that contain the truth, share of
+        true coordinates on unseen trajectories within their predicted interval, and rms error of
+        the predicted positions.
+    """
     held = [inside for *_, identified, inside in quantities(result, plant.parameters) if identified]
     errors = np.concatenate(
         [true_poses(one.truth) - of.poses for one, of in zip(unseen, predicted, strict=True)]
@@ -47,7 +62,7 @@ def coverage(
 def predictions(
     result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int
 ) -> list[PosePrediction]:
-    """What the identified model predicts on all unseen trajectories."""
+    """Predict the poses of all unseen trajectories by the identified model."""
     records = [one.record for one in unseen]
     estimated = result.estimate, result.whole_covariance
     return predicted_runs(
@@ -64,10 +79,14 @@ def predictions(
 def quantities(
     result: IdentificationResult, truth: Array
 ) -> Iterator[tuple[str, float, float, bool, bool]]:
-    """Every parameter and every group of several, given the true parameters (p,): name, error in
-    standard deviations, relative standard deviation, whether it counts as identified, and whether
-    its 95 % interval holds the truth."""
+    """Yield every parameter, and every group of several, with its error.
+
+    Each entry is name, error in standard deviations, relative standard deviation, whether it counts
+    as identified, and whether its 95 % interval contains the truth. `truth` holds the true
+    parameters (p,).
+    """
     groups = result.groups
+    # A group of one parameter is that parameter, which counts already.
     several = np.count_nonzero(groups.combinations, axis=1) > 1
     parameters = (result.names, truth, result.intervals, np.ones(len(truth), dtype=bool))
     combined = (
@@ -78,6 +97,8 @@ def quantities(
     )
     for found, (names, true, intervals, counted) in ((result, parameters), (groups, combined)):
         for k in np.flatnonzero(counted):
-            error, std, (low, high) = found.estimate[k] - true[k], found.std[k], intervals[k]
+            error = found.estimate[k] - true[k]
+            std = found.std[k]
+            low, high = intervals[k]
             inside = bool(low <= true[k] <= high)
             yield names[k], error / std, std / abs(true[k]), bool(found.identifiable[k]), inside

@@ -1,9 +1,8 @@
-"""Rows of kind `estimators`: a record, and how far from the truth each of several estimators comes
-with it.
+"""Rows of kind `estimators`: errors of several estimators on the same record.
 
-The record is that of kind `identification`; instruments at the joints are simulated from its truth,
-for those estimators that need them. All of a row's estimators have the same record, so that rows
-compare them as pairs.
+The record is that of kind `identification`. Instruments at the joints are simulated from its truth
+for the estimators that need them. All estimators of a row have the same record, so rows compare
+them as pairs.
 """
 
 import math
@@ -13,10 +12,10 @@ from pydantic import Field, field_validator
 
 from identify.estimators.estimator import find_estimators
 from identify.experiment.joint_instruments import instruments_of
-from identify.plugins import ESTIMATORS
+from identify.own_parts import ESTIMATORS
 from identify.progress import SilentProgress
 from identify.scenario import Scenario
-from identify.studies.rows.identification import READS, RecordOptions, memory, recorded
+from identify.studies.rows.identified import READS, RecordOptions, memory, recorded
 from identify.studies.rows.kind import Column, Kind, Row
 from identify.validation.estimator_comparison import START, Score, compare_on_record, instrumented
 
@@ -39,17 +38,24 @@ FIGURES = {
         1.0,
         None,
     ),
-    "orientation_urad": ("urad", "orientation of the same", 1.0, None),
+    "orientation_urad": (
+        "urad",
+        "orientation of the model on unseen trajectories, rms of the worst axis and run",
+        1.0,
+        None,
+    ),
     "seconds": ("s", "time of the estimate", 1.0, None),
 }
-"""Figures of each estimator by the ends of their names: unit, meaning, factor and, where it
-differs, the score's field."""
+"""Unit, meaning, factor and score's field of each figure, by the end of its name.
+
+Without a field, it is the end of the name.
+"""
 
 STARTING = START.replace(" ", "_")
 
 
 class EstimatorOptions(RecordOptions):
-    """How the record is made, and who estimates."""
+    """Options of rows of kind `estimators`."""
 
     estimators: list[str] = Field(
         [], description="names, or module:function of one's own; none: all built-in ones"
@@ -70,8 +76,10 @@ COLUMNS = {
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: EstimatorOptions) -> Row:
-    """One row; what an estimator does not give is left out. Raises EstimationError and what
-    experiment and sensor raise."""
+    """Compute one row, without the figures that an estimator does not give.
+
+    Raises EstimationError, and the errors of experiment and sensor.
+    """
     made = recorded(scenario, seed, options)
     robot = made.plant.nominal
     run = made.excitation
@@ -90,6 +98,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Estimator
 
 
 def _figures(score: Score) -> Row:
+    # An estimator of one's own is called module:function.
     name = score.name.replace(" ", "_").replace(":", ".")
     return {
         f"{name}_{end}": factor * getattr(score, field or end)

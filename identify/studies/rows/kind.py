@@ -1,6 +1,4 @@
-"""What a kind of row is: how a row is computed, its figures with units, its options, and the keys
-that it reads.
-"""
+"""Definition of a kind of row: its function, its figures, its options, and the keys it reads."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -21,8 +19,17 @@ from identify.studies.study_file import Range, Study
 
 @dataclass(frozen=True)
 class Idle:
-    """Keys that do nothing where all of `where` hold: dotted paths with what is asked of their
-    values; `why`, in words behind "where"."""
+    """Keys that have no effect under a condition.
+
+    Attributes
+    ----------
+    keys : tuple of str
+        Dotted paths, or sections.
+    where : mapping of str to callable
+        Condition: for each dotted path a test of its value. All must hold.
+    why : str
+        The condition in words that follow "where".
+    """
 
     keys: tuple[str, ...]
     where: Mapping[str, Callable[[Any], bool]]
@@ -31,10 +38,16 @@ class Idle:
 
 @dataclass(frozen=True)
 class Reads:
-    """What a kind reads: `keys`, dotted paths, or sections that end in a dot; not `but`; not always
-    `idle`.
+    """Keys that a kind reads, beside all of its options.
 
-    It reads all of its options.
+    Attributes
+    ----------
+    keys : tuple of str
+        Dotted paths, or sections that end in a dot.
+    but : tuple of str
+        Exceptions from these.
+    idle : tuple of Idle
+        Keys that it does not always read.
     """
 
     keys: tuple[str, ...]
@@ -42,7 +55,7 @@ class Reads:
     idle: tuple[Idle, ...] = ()
 
     def covers(self, path: str) -> bool:
-        """Whether the kind ever reads a dotted path."""
+        """Tell whether the kind ever reads a dotted path."""
         return path.startswith("options.") or (among(path, self.keys) and not among(path, self.but))
 
     def __str__(self) -> str:
@@ -54,12 +67,12 @@ class Reads:
 
 
 def among(path: str, keys: tuple[str, ...]) -> bool:
-    """Whether a path is one of the keys, or in a section or a table of them."""
+    """Tell whether a path is one of the keys, or in a section or table of them."""
     return any(path == key or path.startswith(f"{key.removesuffix('.')}.") for key in keys)
 
 
 def timing(*names: str) -> tuple[str, ...]:
-    """Both paths of keys of a scenario's ``[timing]``: there, and in the sensor's file."""
+    """Return both paths of keys of a scenario's ``[timing]``: there, and in the sensor's file."""
     return tuple(
         path
         for name in names
@@ -76,15 +89,17 @@ SENSOR = (
     "sensor.platform.",
     "sensor.base.",
 )
-"""All of a sensor's file but its timing and its labels; a scenario always says itself what draws.
+"""Keys of a sensor's file except timing, labels and renderer.
+
+The renderer is left out because a scenario always states its own.
 """
 
 PICTURES = ("scenario.sensor", "scenario.renderer", "scenario.pose_method", *SENSOR)
-"""What pictures, and the poses measured in them, depend on beside the timing."""
+"""Keys beside the timing on which pictures depend, and the poses measured in them."""
 
 BOX = ("scenario.excitation.position_amplitude_m", "scenario.excitation.orientation_amplitude_rad")
 PATH = ("scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", *BOX)
-"""What draws a pose in the scenario's box, and a path in it."""
+"""Keys by which a pose in the scenario's box is drawn, and a path in it."""
 
 LIMITS = (
     "scenario.excitation.travel_margin_rad",
@@ -94,7 +109,7 @@ LIMITS = (
     "scenario.excitation.least_leverage",
     "scenario.excitation.most_condition",
 )
-"""What decides whether such a path is admissible."""
+"""Keys that decide whether such a path is admissible."""
 
 NOISE_OFF = Idle(
     tuple(f"sensor.camera.{name}" for name in ("dark_noise", "prnu", "dsnu", "pattern_seed")),
@@ -123,7 +138,7 @@ PLANT = (
         "scenario.plant.joint_stiffness_N_m is not given: the joints are rigid",
     ),
 )
-"""Keys of a plant that does not have what they belong to."""
+"""Keys without effect where the plant lacks the part to which they belong."""
 
 
 BESIDE = (
@@ -141,31 +156,44 @@ BESIDE = (
     "scenario.validation.duration_s",
     "scenario.rig.watch",
 )
-"""What may stand among the changes of any kind: labels, what draws if anything does, who watches
-the cameras if anybody does, and what a scenario checks against its frame rate, for a change of that
-may need one of these."""
+"""Keys that may stand among the changes of any kind.
+
+They are labels, the renderer, who watches the cameras, and all that a scenario checks against its
+frame rate, because a change of that may need one of these.
+"""
 
 
 def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) -> None:
-    """Refuse factors, changes and options that the kind never reads, or that do nothing with all
-    values of the others.
+    """Refuse factors, changes and options that rows never read, or that have no effect in any row.
 
-    It is told from what each kind says of itself, at no cost: to see that a factor changes no
-    figure, a row would have to be computed once more for each factor and for each change.
-    ``first``: the scenario of the first row, ``options``: its options, with their defaults.
+    This relies on what each kind states of itself, which costs nothing. To see that a factor
+    changes no figure, a row would have to be computed once more for each factor and each change.
 
-    Raises StudyError: with all that the kind does read, or with the setting that leaves them
-    without effect.
+    Parameters
+    ----------
+    study : Study
+        The study.
+    reads : Reads
+        Keys that its kind reads.
+    first : Scenario
+        Scenario of the first row.
+    options : BaseModel
+        Options of the first row, with their defaults.
+
+    Raises
+    ------
+    StudyError
+        With all that the kind does read, or with the setting that leaves a key without effect.
     """
     settings = {f"factors.{path}": path for path in study.factors}
+    # Changes may hold some keys that rows do not read, see BESIDE.
     settings |= {f"changes.{path}": path for path in study.changes if not among(path, BESIDE)}
     settings |= {path: path for path in (f"options.{name}" for name in study.options)}
     for setting, path in settings.items():
         if not reads.covers(path):
             raise StudyError(
                 f"{setting} does nothing: rows of kind {study.kind!r} do not read it; they read "
-                f"{reads}, and their "
-                "options"
+                f"{reads}, and their options"
             )
         for idle in reads.idle:
             if among(path, idle.keys) and all(
@@ -179,9 +207,11 @@ def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) 
 def _always(
     holds: Callable[[Any], bool], path: str, study: Study, first: Scenario, options: BaseModel
 ) -> bool:
-    """Whether something holds of a path's value in all rows; no where another sensor may say
-    otherwise.
+    """Tell whether something holds of a path's value in all rows.
+
+    It is false if another sensor of the study may state another value.
     """
+    # A key of the timing may stand in the scenario or in the sensor's file.
     both = next((pair for pair in _SPELLINGS if path in pair), (path,))
     for one in both:
         if one in study.factors:
@@ -202,19 +232,26 @@ _SPELLINGS = [timing(name) for name in IN_FILE]
 
 
 Row = dict[str, float]
+"""Figures of a row by name."""
 
 
 def unwatched(scenario: Scenario) -> Scenario:
-    """The scenario with nobody who watches its cameras: of what a watch finds no figure of a row
-    speaks.
-    """
+    """Return the scenario without a watch on its cameras. No figure of a row depends on a watch."""
     return scenario.with_overrides({"rig.watch": "none"})
 
 
 @dataclass(frozen=True)
 class Column:
-    """Unit of a figure, what it is, and whether it is among the main ones: those that a summary
-    shows and draws.
+    """Figure of a row.
+
+    Attributes
+    ----------
+    unit : str
+        Its unit, "1" if it has none.
+    meaning : str
+        What it is, in words.
+    main : bool
+        Whether a summary shows and draws it.
     """
 
     unit: str
@@ -224,13 +261,30 @@ class Column:
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of row. `compute(scenario, seed, options)` gives a row's figures by name: the same
-    arguments the same row, whatever was computed before.
+    """Kind of row of a study.
 
-    memory(scenario, options): bytes that a row holds at once; None where that is little. A built-in
-    kind also says `what` a row is, its `columns`, the model of its `options` and what it `reads`. A
-    function of one's own says none of this: its rows tell its figures, and it may take any options,
-    or none.
+    A user's own kind has only a name and a function. Its rows tell its figures, and it may take any
+    options, or none.
+
+    Attributes
+    ----------
+    name : str
+        Name in study files.
+    compute : callable
+        Function (scenario, seed, options) that returns a row's figures by name. The same arguments
+        give the same row, whatever was computed before.
+    what : str
+        What a row is, in words.
+    columns : mapping of str to Column
+        Figures of a row.
+    options : type or None
+        Model of the options.
+    reads : Reads or None
+        Keys that rows read.
+    takes_options : bool
+        Whether there may be options.
+    memory : callable or None
+        Function (scenario, options) that returns the bytes a row holds at once. None if few.
     """
 
     name: str
@@ -243,14 +297,14 @@ class Kind:
     memory: Callable[[Scenario, Any], float] | None = None
 
     def checked(self, options: Mapping[str, Any]) -> Any:
-        """The options as `compute` takes them, with their defaults. Raises StudyError with the
-        valid names.
+        """Return the options as `compute` takes them, with their defaults.
+
+        Raises StudyError with the valid names.
         """
         if options and not self.takes_options:
             raise StudyError(
                 f"kind {self.name!r} takes no options, got {', '.join(options)}; a function that "
-                "does is "
-                "run(scenario, seed, options)"
+                "does is run(scenario, seed, options)"
             )
         if self.options is None:
             return options
@@ -262,5 +316,5 @@ class Kind:
     def row(
         self, scenario: Scenario, seed: np.random.SeedSequence, options: Mapping[str, Any]
     ) -> Mapping[str, float]:
-        """One row. Raises StudyError for wrong options, and what the row meets."""
+        """Compute one row. Raises StudyError for wrong options, and the errors of the row."""
         return self.compute(scenario, seed, self.checked(options))

@@ -1,12 +1,11 @@
-"""Rows of kind `path_pose`: the sensor alone follows a platform along a random path of the
-scenario's excitation.
+"""Rows of kind `path_pose`: the sensor alone follows a platform along a random path.
 
-Exposure, latency, its jitter and dropout act as the scenario says. A row is a short stretch from a
-random instant of the path. Its pictures are measured together: stickers are looked for where the
-path has them, as they move along it, and no picture is searched or tracked. A measured pose counts
-as that in the middle of its exposure. Beside its error a row gives that of the pose in use: the
-last one that had arrived, held until the next one arrives. Teaching is exact unless asked for
-otherwise.
+The path is one of the scenario's excitation. Exposure, latency, its jitter and dropout act as the
+scenario states. A row is a short stretch from a random instant of the path. Its pictures are
+measured together: stickers are looked for where the path has them, as they move along it, and no
+picture is searched or tracked. A measured pose counts as that in the middle of its exposure. Beside
+its error a row gives that of the pose in use, the last one that has arrived, which is held until
+the next one arrives. Teaching is exact unless asked for otherwise.
 """
 
 import numpy as np
@@ -20,7 +19,13 @@ from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
 from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, timing
-from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um, row_sensor
+from identify.studies.rows.row_sensor import (
+    POSE_COLUMNS,
+    Teaching,
+    pose_figures,
+    rms_um,
+    row_sensor,
+)
 from identify.trajectory import FourierTrajectory
 
 DRAWN_PATH = 0
@@ -46,7 +51,7 @@ COLUMNS = {
 
 
 class PathPoseOptions(Section):
-    """How much a row looks at."""
+    """Options of rows of kind `path_pose`."""
 
     stretch_s: float = Field(
         0.5, gt=0, le=3600, description="time along the path, at least two frames"
@@ -68,12 +73,14 @@ READS = Reads(
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseOptions) -> Row:
-    """One row. Raises EstimationError where fewer than two poses were measured, and what the sensor
-    raises.
+    """Compute one row.
+
+    Raises EstimationError if fewer than two poses were measured, and the errors of the sensor.
     """
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
     path = drawn_trajectory(rng, Chart("free", tuple(eye.sensor.home)), scenario.excitation)
+    # The path repeats itself after one period of the fundamental frequency.
     start = rng.uniform(0.0, 1.0 / scenario.excitation.fundamental_hz)
     frames = max(2, scenario.timing.frames(options.stretch_s))
     times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)
@@ -100,22 +107,24 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
 
 
 def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_s: float) -> Array:
-    """Errors (m, 6) of the pose in use from the first arrival to the last; poses come into use in
-    their order.
+    """Return the errors (m, 6) of the pose in use from the first arrival to the last.
+
+    Poses come into use in their order.
     """
     arrivals = np.maximum.accumulate(arrivals)
     count = max(1, round(INSTANTS_PER_FRAME * float(arrivals[-1] - arrivals[0]) / period_s))
+    # Instants are the middles of equal steps of time.
     instants = arrivals[0] + (np.arange(count) + 0.5) / count * (arrivals[-1] - arrivals[0])
     in_use = np.searchsorted(arrivals, instants, side="right") - 1
     return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
 
 
 FRAME = 4.3e3
-"""Bytes held of each frame, as was measured with up to 1,800,000 frames."""
+"""Bytes held for each frame, as measured with up to 1,800,000 frames."""
 
 
 def memory(scenario: Scenario, options: PathPoseOptions) -> float:
-    """Bytes held to follow a stretch of a path."""
+    """Return the memory needed to follow a stretch of a path, bytes."""
     return FRAME * scenario.timing.frames(options.stretch_s)
 
 

@@ -1,10 +1,9 @@
-"""Rows of kind `static_pose`: the sensor alone looks at a platform that stands still at a pose
-drawn in the box.
+"""Rows of kind `static_pose`: the sensor alone looks at a platform that stands still.
 
-The box is the scenario's excitation amplitude around the sensor's home pose. Each row draws one
-pose (or several) and takes several pictures of it. Stickers are looked for where a tracker would
-expect them, a little beside the true place; no picture is searched as a whole. The timing's dropout
-loses pictures, and changes nothing in the others. Teaching is exact unless asked for otherwise: the
+Each row draws one pose (or several) in the scenario's excitation box around the sensor's home pose,
+and takes several pictures of it. Stickers are looked for where a tracker would expect them, a
+little beside the true place, and no picture is searched as a whole. The timing's dropout loses
+pictures, and changes nothing in the others. Teaching is exact unless asked for otherwise, so that
 rows show observation noise alone.
 """
 
@@ -33,7 +32,7 @@ from identify.studies.rows.kind import (
     Row,
     timing,
 )
-from identify.studies.rows.sensor import (
+from identify.studies.rows.row_sensor import (
     POSE_COLUMNS,
     RowSensor,
     Teaching,
@@ -47,8 +46,9 @@ SENSOR = 1
 DROPOUT = 2
 TOGETHER = 256  # pictures that are drawn and measured at once
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
-"""Standard deviation [m, rad] of the pose near which a picture's stickers are looked for: what a
-tracker predicts.
+"""Standard deviation of the pose, m and rad, near which a picture's stickers are looked for.
+
+It is the error of a tracker's prediction.
 """
 
 COLUMNS = {
@@ -86,7 +86,7 @@ COLUMNS = {
 
 
 class StaticPoseOptions(Section):
-    """How much a row looks at."""
+    """Options of rows of kind `static_pose`."""
 
     poses: int = Field(1, ge=1, le=10_000, description="poses drawn a row")
     captures: int = Field(
@@ -124,8 +124,18 @@ READS = Reads(
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a picture of a pose gave: error (6,) and covariance (6, 6) of the pose, and what
-    `_sticker_errors` says.
+    """Result of a picture of a pose.
+
+    Attributes
+    ----------
+    pose : int
+        Number of the pose.
+    error : ndarray, shape (6,)
+        Error of the measured pose.
+    covariance : ndarray, shape (6, 6)
+        Its stated covariance.
+    points, centres : ndarray
+        Errors of the stickers, see `_sticker_errors`.
     """
 
     pose: int
@@ -136,8 +146,9 @@ class _Seen:
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPoseOptions) -> Row:
-    """One row. Raises EstimationError, with a reason, where every picture was lost, and what the
-    sensor raises.
+    """Compute one row.
+
+    Raises EstimationError, with a reason, if every picture was lost, and the errors of the sensor.
     """
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, POSES))
@@ -155,7 +166,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
     planned = _pictures(eye.sensor.home, box, (options.poses, captures), rng)
     while together := list(islice(planned, TOGETHER)):
         poses, near = (np.array(values) for values in list(zip(*together, strict=True))[1:])
-        # those that drop out are measured, too, so that the next have the noise they had
+        # Pictures that drop out are measured too, so that the next ones keep their noise.
         for (number, pose, _), measured in zip(
             together, eye.sensor.measure_each(poses, near), strict=True
         ):
@@ -176,8 +187,11 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
 def _pictures(
     home: Array, box: Array, count: tuple[int, int], rng: np.random.Generator
 ) -> Iterator[tuple[int, Array, Array]]:
-    """Of each of so many poses, and so many pictures of it: its number, the pose (6,), and that
-    near which stickers are looked for."""
+    """Yield for each picture the number of its pose, the pose (6,), and the predicted pose (6,).
+
+    Stickers are looked for near the predicted pose. `count` holds the number of poses, and of
+    pictures of each.
+    """
     for number in range(count[0]):
         pose = home + box * rng.uniform(-1.0, 1.0, 6)
         for _ in range(count[1]):
@@ -185,8 +199,11 @@ def _pictures(
 
 
 def _sticker_errors(eye: RowSensor, seen: cmmsim.Measurement, pose: Array) -> tuple[Array, Array]:
-    """Of the stickers seen: [distance, error along the line of sight, error across it] (k, 3), m,
-    and the errors of their centres in both images (2, k, 2), px."""
+    """Return the errors of the stickers seen.
+
+    They are distance, error along the line of sight and error across it (k, 3), m, and the errors
+    of their centres in both images (2, k, 2), px.
+    """
     estimator = eye.sensor.estimator
     index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
     places = apply(cmmsim.pose_to_transform(pose), eye.truth.platform_places[index])
@@ -220,6 +237,7 @@ def _row(eye: RowSensor, seen: list[_Seen], captures: int) -> Row:
         "mean_orientation_rms_urad": rms_um(means[:, 3:]),
         "sight_m": float(points[:, 0].mean()),
         "point_depth_rms_um": rms_um(points[:, 1]),
+        # The error across the line of sight has two axes.
         "point_lateral_rms_um": rms_um(points[:, 2]) / float(np.sqrt(2.0)),
         "centre_rms_px": float(np.sqrt(np.mean(centres**2))),
         "disparity_rms_px": float(np.sqrt(np.mean((centres[0, :, 0] - centres[1, :, 0]) ** 2))),

@@ -1,9 +1,8 @@
-"""Rows of kind `tracking`: the plant follows unseen trajectories under a law with a model, and
-under `pid` beside it.
+"""Rows of kind `tracking`: the plant follows unseen trajectories under a law that knows a model.
 
-Both see the same motions with the same noise. The model is the starting one, that identified from a
-record of the row's own, or the true one; or one between the truth and the starting model; or, in
-all parameters, wrong by a share.
+Beside it the plant follows them under `pid`, the same motions with the same noise. The model is the
+starting one, one identified from a record of the row's own, or the true one. It may also be one
+between the truth and the starting model, or be wrong by a share in all parameters.
 """
 
 from dataclasses import replace
@@ -21,7 +20,7 @@ from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
-from identify.studies.rows.identification import designed_trajectories, robot_named
+from identify.studies.rows.identified import designed_trajectories, robot_named
 from identify.studies.rows.kind import (
     NOISE_OFF,
     PICTURES,
@@ -32,7 +31,7 @@ from identify.studies.rows.kind import (
     Row,
     unwatched,
 )
-from identify.studies.rows.sensor import rms_um
+from identify.studies.rows.row_sensor import rms_um
 from identify.tracking.following import Followed
 from identify.tracking.motions import motions
 from identify.tracking.track import follow_by_images, identified_model, known_model
@@ -48,8 +47,8 @@ COLUMNS = {
     "orientation_rms_urad": Column(
         "urad", "deviation of the true from the desired orientation, rms", main=True
     ),
-    "pid_position_rms_um": Column("um", "that of the position under the law pid, rms"),
-    "pid_orientation_rms_urad": Column("urad", "that of the orientation under the law pid, rms"),
+    "pid_position_rms_um": Column("um", "position's deviation under the law pid, rms"),
+    "pid_orientation_rms_urad": Column("urad", "orientation's deviation under the law pid, rms"),
     "position_share_percent": Column(
         "%", "position's deviation over that under the law pid", main=True
     ),
@@ -60,20 +59,26 @@ COLUMNS = {
         "1", "mean squared error of the observer over the stated one"
     ),
     "starting_position_excess_um": Column(
-        "um", "that with the starting model less this, of the position", main=True
+        "um", "position's deviation with the starting model less that with the row's", main=True
     ),
-    "starting_orientation_excess_urad": Column("urad", "and of the orientation", main=True),
+    "starting_orientation_excess_urad": Column(
+        "urad",
+        "orientation's deviation with the starting model less that with the row's",
+        main=True,
+    ),
     "true_position_ratio": Column(
-        "1", "this over that with the true model, of the position", main=True
+        "1", "position's deviation over that with the true model", main=True
     ),
-    "true_orientation_ratio": Column("1", "and of the orientation", main=True),
+    "true_orientation_ratio": Column(
+        "1", "orientation's deviation over that with the true model", main=True
+    ),
     "effort_rms": Column("N m or N", "torque or force of the actuators, rms"),
     "lost_frames": Column("1", "frames that the sensor lost"),
 }
 
 
 class TrackingOptions(Section):
-    """Who leads the robot, and what is known of it."""
+    """Options of rows of kind `tracking`: the law, and the model that it knows."""
 
     law: str = Field(
         "feedforward", description="pid, feedforward, computed_torque, or module:function"
@@ -123,7 +128,7 @@ READS = Reads(
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingOptions) -> Row:
-    """One row. Raises what sensor, identification and laws raise, such as LoopFailure."""
+    """Compute one row. Raises the errors of sensor, identification and laws (LoopFailure)."""
     number = stream_seed(seed, EXPERIMENT)
     robot = robot_named(scenario.robot)
     scenario = unwatched(scenario)
@@ -137,6 +142,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
         model = replace(
             model, parameters=model.parameters * (1.0 + options.off * signs), doubt=VAGUE
         )
+    # A circle and a square follow the unseen trajectories, and do not count here.
     unseen = motions(robot, scenario, number)[: scenario.validation.count]
 
     def followed(law: str, known: KnownModel) -> list[Followed]:
@@ -159,7 +165,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
 
 
 def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptions) -> KnownModel:
-    """The model that the law knows."""
+    """Return the model that the law knows."""
     if options.model_error is not None:
         start, truth = (known_model(plant, name, None) for name in ("initial", "true"))
         between = truth.parameters + options.model_error * (start.parameters - truth.parameters)
@@ -179,7 +185,8 @@ def _against(done: list[Followed], start: list[Followed], truth: list[Followed])
     row: Row = {}
     for name, axes, unit in AXES:
         own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
-        if with_truth:  # not of coordinates that the platform does not have
+        # A coordinate that the platform lacks has no error, by which nothing could be divided.
+        if with_truth:
             row |= {
                 f"starting_{name}_excess_{unit}": with_start - own,
                 f"true_{name}_ratio": own / with_truth,

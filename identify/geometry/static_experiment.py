@@ -1,9 +1,8 @@
-"""The simulated calibration: a robot whose geometry is off stands at poses, encoders and the
-optical CMM read it.
+"""Simulated calibration: encoders and sensor read a robot that stands still with a wrong geometry.
 
-Its joints go where they are told, in the coordinates of its encoders; so the platform stands where
-the true geometry puts it, and an encoder's offset is part of that geometry. Poses are measured
-through images, or drawn with the noise that the sensor states for one image.
+Its joints go where they are sent, in the coordinates of its encoders. The platform then stands
+where the true geometry puts it, and an encoder's offset is part of that geometry. Poses are
+measured through images, or drawn with the noise that the sensor states for one image.
 """
 
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import ENCODERS, NOISE, STATIC_NOISE, child, stream_seed
-from identify.record.common_errors import CommonErrors, kind_of
+from identify.record.stored_common_errors import CommonErrors, kind_of
 from identify.scenario import Scenario
 from identify.scenario.sections import Geometry
 
@@ -36,15 +35,17 @@ FIRST_POSE_RUN = 2_000_000
 
 
 REST = 1e-3
-"""Share of the travel by which friction keeps joints from where they are sent; encoders say where
-that is.
+"""Share of the travel by which friction keeps joints from where they are sent.
+
+The encoders read where they stop.
 """
 
 
 @dataclass(frozen=True)
 class Encoders:
-    """Encoders of a robot's joints: noise of one reading, step, and standard deviation of offsets,
-    rad or m.
+    """Encoders of a robot's joints, rad or m.
+
+    They have noise of one reading, a step, and a standard deviation of their offsets.
     """
 
     noise: float
@@ -52,37 +53,37 @@ class Encoders:
     offset: float
 
     def mean_std(self, readings: int) -> float:
-        """Standard deviation of the mean of readings of a joint that stands still.
+        """Return the standard deviation of the mean of readings of a joint that stands still.
 
-        The step's error is that of a sawtooth, and noise smooths it: of its k-th wave, 1 / (pi k)
-        steps high, readings with noise of s steps keep exp(-2 (pi k s)^2) in their mean.
+        The rounding error is a sawtooth, and noise smooths it. Its k-th harmonic is 1 / (pi k)
+        steps high. The mean of readings with noise of s steps keeps exp(-2 (pi k s)^2) of it.
         """
         if not self.resolution:
             return self.noise / readings**0.5
+        # Harmonics fall off as 1 / k^2, so thirty are enough.
         waves = np.pi * np.arange(1, 30)
         steps = self.noise / self.resolution
         kept = self.resolution**2 * np.sum(np.exp(-4 * (waves * steps) ** 2) / waves**2) / 2
         return float(np.sqrt(kept + (self.noise**2 + self.resolution**2 / 12 - kept) / readings))
 
     def read(self, joints: Array, readings: int, rng: np.random.Generator) -> Array:
-        """Means (N, n) of readings of joint coordinates (N, n)."""
+        """Return the means (N, n) of readings of joint coordinates (N, n)."""
         each = joints + self.noise * rng.standard_normal((readings, *joints.shape))
         step = self.resolution
         return np.asarray((step * np.round(each / step) if step else each).mean(axis=0))
 
 
 def encoders_of(robot: Robot, settings: Geometry) -> Encoders:
-    """The encoders of a scenario's calibration, for a robot whose actuators turn or slide."""
+    """Return the encoders of a scenario's calibration, for actuators that turn or slide."""
     return Encoders(
-        *(
-            of_actuators(robot, settings, f"encoder_{name}")
-            for name in ("noise", "resolution", "offset")
-        )
+        noise=of_actuators(robot, settings, "encoder_noise"),
+        resolution=of_actuators(robot, settings, "encoder_resolution"),
+        offset=of_actuators(robot, settings, "encoder_offset"),
     )
 
 
 def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> Array:
-    """Where the true robot stands (N, 6) when its encoders show joints (N, n).
+    """Return the poses (N, 6) of the true robot when its encoders show joints (N, n).
 
     Raises EstimationError, naming the pose, for one that it cannot reach.
     """
@@ -94,8 +95,18 @@ def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> 
 
 @dataclass(frozen=True)
 class Sighted:
-    """Means of frames at poses (N, 6), their covariances (N, 6, 6), which poses were seen (N,), and
-    lost frames.
+    """Measured static poses.
+
+    Attributes
+    ----------
+    poses : ndarray, shape (N, 6)
+        Means of the frames, m and rad.
+    covariances : ndarray, shape (N, 6, 6)
+        Covariances of the means.
+    seen : ndarray, shape (N,)
+        Poses with at least one frame.
+    lost : int
+        Number of lost frames.
     """
 
     poses: Array
@@ -107,10 +118,10 @@ class Sighted:
 def measured(
     sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, seed: int, progress: Progress
 ) -> Sighted:
-    """Poses measured through images.
+    """Measure poses through images.
 
-    The share of the stated variance that frames at rest do not scatter by, such as the errors of
-    drawing and of detection, does not average: it stays whole in the covariance of a mean.
+    Only the share of the stated variance that frames at rest scatter by is averaged. Constant
+    errors, such as those of drawing and detection, stay whole in the covariance of the mean.
     """
     means = np.full_like(poses, np.nan)
     stated = np.full((len(poses), 6, 6), np.nan)
@@ -128,23 +139,24 @@ def measured(
                 counts[row] = len(values)
                 stated[row] = covariances.mean(axis=0)
                 away = values - means[row]
-                scatter += (
-                    float(np.sum(away * np.linalg.solve(stated[row], away.T).T)) / away.shape[1]
-                )
+                weighted = np.linalg.solve(stated[row], away.T).T
+                scatter += float(np.sum(away * weighted)) / away.shape[1]
                 spare += len(values) - 1
     seen = counts > 0
+    # A single frame shows no scatter, and then nothing averages.
     share = min(scatter / spare, 1.0) if spare else 0.0
     kept = 1 - share * (1 - 1 / np.maximum(counts, 1))
-    return Sighted(
-        means, stated * kept[:, None, None], seen, int(len(poses) * frames - counts.sum())
-    )
+    lost = int(len(poses) * frames - counts.sum())
+    return Sighted(means, stated * kept[:, None, None], seen, lost)
 
 
 def _frames_at(
     sensor: cmmsim.Sensor, pose: Array, bodies: Mapping[str, Array], frames: int
 ) -> tuple[Array, Array]:
-    """Poses (k, 6) and covariances (k, 6, 6) of the frames at a pose that gave one: images are
-    searched as a whole until they give one, in all others stickers are looked for near that."""
+    """Poses (k, 6) and covariances (k, 6, 6) of the frames that were not lost at a pose.
+
+    Whole images are searched until one gives a pose. All later frames look for stickers near it.
+    """
     left = frames
     while left:
         first = sensor.measure(pose, bodies)
@@ -169,13 +181,15 @@ def drawn(
     rng: np.random.Generator,
     progress: Progress,
 ) -> Sighted:
-    """Poses without images: one frame a pose says the covariance, and the mean is drawn with a
-    `frames`-th of it; and so are one error of the frames with what teaching says of them, and one
-    of the cameras where they are not exact."""
+    """Draw measured poses without images.
+
+    One frame at each pose gives its covariance. The mean of `frames` frames is drawn with that over
+    `frames`. One error of the frames, with the covariance of teaching, and one of inexact cameras
+    are drawn for all poses.
+    """
     taught = sensor.taught
-    offset = FrameKnowledge(
-        taught.base_covariance, taught.platform_covariance
-    ).root @ rng.standard_normal(12)
+    known = FrameKnowledge(taught.base_covariance, taught.platform_covariance)
+    offset = known.root @ rng.standard_normal(12)
     covariances = np.full((len(poses), 6, 6), np.nan)
     seen = np.zeros(len(poses), dtype=bool)
     with progress.stage("draw poses", len(poses)) as advance:
@@ -193,21 +207,19 @@ def drawn(
 
 
 def camera_errors(sensor: cmmsim.Sensor, poses: Array) -> Array | None:
-    """What cameras that are known only so well add to poses (N, 6) at rest: (N, 6, k) for each of k
-    independent errors of variance one, the same for all poses; None where they are exact."""
-    found = (
-        sensor.common_errors(poses, np.zeros_like(poses))
-        if sensor.method == "registration"
-        else None
-    )
-    if found is None or not (
-        kept := [k for k, name in enumerate(found.names) if kind_of(name) == "rig"]
-    ):
+    """Return the shift (N, 6, k) of poses (N, 6) at rest by k independent camera errors.
+
+    Each error has variance one and is the same for all poses. None stands for exact cameras.
+    """
+    if sensor.method != "registration":
         return None
+    found = sensor.common_errors(poses, np.zeros_like(poses))
+    kept = [k for k, name in enumerate(found.names) if kind_of(name) == "rig"]
+    if not kept:
+        return None
+    names = tuple(found.names[k] for k in kept)
     within = found.covariance[np.ix_(kept, kept)]
-    return CommonErrors(
-        tuple(found.names[k] for k in kept), found.changes[:, :, kept], within
-    ).modes
+    return CommonErrors(names, found.changes[:, :, kept], within).modes
 
 
 def stand_at(
@@ -220,11 +232,34 @@ def stand_at(
     seed: int,
     progress: Progress,
 ) -> tuple[StaticPoses, int]:
-    """What encoders and sensor say where the true robot stops that is sent to joint coordinates (N,
-    n), near poses `start` (N, 6) of the nominal one; and the number of frames that were lost. Poses
-    without any are left out.
+    """Measure the true robot where it stops when it is sent to joint coordinates (N, n).
 
-    Raises EstimationError, naming the pose, for one that the true robot cannot reach.
+    Parameters
+    ----------
+    robot : Robot
+        Nominal robot.
+    scenario : Scenario
+        Scenario with the settings of the calibration.
+    sensor : cmmsim.Sensor
+        Taught sensor.
+    deviations : ndarray, shape (g,)
+        True geometric numbers less the nominal ones.
+    joints, start : ndarray, shapes (N, n) and (N, 6)
+        Joint coordinates, and the poses of the nominal robot there.
+    seed : int
+        Seed of the experiment.
+    progress : Progress
+        Receiver of the progress.
+
+    Returns
+    -------
+    tuple of StaticPoses and int
+        Readings at the poses that were seen, and the number of lost frames.
+
+    Raises
+    ------
+    EstimationError
+        If the true robot cannot reach a pose. The message names it.
     """
     settings = scenario.geometry
     taught = sensor.taught

@@ -1,8 +1,4 @@
-"""Commands about a sensor alone: tested like a real instrument, and its detectors beside their
-bound.
-
-Heavy imports are late.
-"""
+"""Commands about a sensor alone: its test like a real instrument, and its detectors."""
 
 import math
 from dataclasses import asdict
@@ -108,12 +104,11 @@ def acceptance(
 
 
 def _print_acceptance(entry: dict[str, Any], folder: Path) -> None:
-    """One line a test, and where the report is."""
+    """Print one line for each test, and the place of the report."""
     if (test := entry.get("vdi_2634_1")) is not None:
         typer.echo(
             f"length error: largest {test['largest_error_um']:+.1f} um, limit ± "
-            f"{test['limit_um']:g} um: "
-            f"{'met' if test['met'] else 'MISSED'}"
+            f"{test['limit_um']:g} um: {'met' if test['met'] else 'MISSED'}"
         )
     if (test := entry.get("astm_e3064")) is not None:
         for state in ("standing", "moving"):
@@ -121,9 +116,8 @@ def _print_acceptance(entry: dict[str, Any], folder: Path) -> None:
             orientation = test[state]["orientation_urad"]
             typer.echo(
                 f"{state} bar: position {position['rms']:.1f} um RMS, {position['maximum']:.0f} "
-                "largest; "
-                f"orientation {orientation['rms']:.0f} urad RMS, {orientation['maximum']:.0f} "
-                "largest"
+                f"largest; orientation {orientation['rms']:.0f} urad RMS, "
+                f"{orientation['maximum']:.0f} largest"
             )
     if (test := entry.get("astm_e3124")) is not None:
         low, high = test["mean_interval_ms"]
@@ -201,6 +195,7 @@ def detectors(
     said = {"sensor": file.name, "seed": seed, "draws": draws, "confidence": CONFIDENCE}
     entry = {**said, "working_point": _columns(at_work), "scores": rows}
     figure = detectors_figure(scores, at_work)
+    # RFC 4180 ends the lines of CSV by CR and LF.
     table = pd.DataFrame(rows).to_csv(index=False, na_rep="nan", lineterminator="\r\n")
     save_files(folder, {"detectors.csv": table, "detectors.json": entry, "detectors.png": figure})
     tell(entry, json, quiet, lambda: _print_scores(scores, file.name, folder))
@@ -216,17 +211,19 @@ def _columns(condition: "Condition") -> dict[str, float]:
 
 
 def _row(score: "Score") -> dict[str, Any]:
-    """A score as a flat row; the first of each file is the working point's."""
+    """Return a score as a flat row."""
     figures = asdict(score)
     del figures["condition"]
     return {"detector": figures.pop("detector"), **_columns(score.condition), **figures}
 
 
 def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:
-    """One row a condition: the bound, then the rms error of each detector; the working point's row
-    in words below.
+    """Print one row for each condition, with the bound and the rms error of each detector.
+
+    The row of the working point is also told in words below.
     """
     names = list(dict.fromkeys(score.detector for score in scores))
+    # Scores come condition by condition, each with the detectors in the same order.
     together = [scores[k : k + len(names)] for k in range(0, len(scores), len(names))]
     print_table(
         (
@@ -245,14 +242,13 @@ def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:
     for s in together[0]:
         typer.echo(
             f"{s.detector}: {s.ratio:.3f} times the bound at the working point, 95 % interval "
-            f"{s.ratio_low:.3f} to "
-            f"{s.ratio_high:.3f}; {s.bias_px:.5f} px without noise"
+            f"{s.ratio_low:.3f} to {s.ratio_high:.3f}; {s.bias_px:.5f} px without noise"
         )
     typer.echo(f"files: {folder}")
 
 
 def _cells(scores: list["Score"]) -> tuple[str, ...]:
-    """A row of the table: the scores of all detectors under one condition."""
+    """Return a row of the table: the scores of all detectors under one condition."""
     seen = _columns(scores[0].condition)
     return (
         f"{seen['radius_px']:.3g}",

@@ -1,6 +1,4 @@
-"""`cmmsim geometry` from a scenario to its outcome: choose poses, measure them, calibrate, judge on
-unseen ones.
-"""
+"""Run of `cmmsim geometry`: choose poses, measure them, calibrate, and judge on unseen poses."""
 
 import numpy as np
 
@@ -12,10 +10,10 @@ from identify.experiment.run import taught_sensor
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.geometry.calibration import PoseModel, Tolerance, calibrate
 from identify.geometry.encoders import check_encoders
-from identify.geometry.experiment import encoders_of, stand_at, true_poses
 from identify.geometry.observability import check_enough
 from identify.geometry.outcome import GeometryOutcome
 from identify.geometry.selection import Candidates, Designer, Limits
+from identify.geometry.static_experiment import encoders_of, stand_at, true_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
@@ -27,11 +25,17 @@ from identify.scenario import Scenario
 def run_geometry(
     scenario: Scenario, seed: int, progress: Progress, measurements: StaticPoses | None = None
 ) -> GeometryOutcome:
-    """Calibrate the geometry of a scenario's robot, simulated, or from measurements of one's own.
+    """Calibrate the geometry of a scenario's robot, simulated or from a user's own measurements.
 
-    Raises EstimationError: too few poses, with how many are needed and for what; loops that do not
-    close. RecordError: encoders that read something else than the joints. UnreachablePoseError: a
-    measured pose out of reach.
+    Raises
+    ------
+    EstimationError
+        If the loops do not close, or if there are too few poses. The message then says how many
+        are needed and for which numbers.
+    RecordError
+        If the encoders read something else than the joints.
+    UnreachablePoseError
+        If a measured pose is out of reach.
     """
     scenario = with_renderer(scenario)
     robot = load_robot(scenario.robot)
@@ -44,15 +48,15 @@ def run_geometry(
         data = measurements
         check_encoders(robot, data)
         designer = _designer(robot, scenario, data.frames, data.covariances.mean(axis=0), None)
-        among = designer.candidates(
-            settings.candidates, np.random.default_rng(child(seed, STATIC_POSES))
-        )
+        rng = np.random.default_rng(child(seed, STATIC_POSES))
+        among = designer.candidates(settings.candidates, rng)
     else:
         sight = sight_lines(scenario.sensor, scenario.sensor_changes)
         designer = _designer(robot, scenario, *_expected(robot, scenario), sight)
         chosen, among = _choose(designer, scenario, seed, progress)
         true = true_deviations(robot, scenario, seed)
-        true_poses(robot, true, chosen.joints, chosen.poses)  # refused before the sensor is taught
+        # Refuses poses out of reach before the sensor is taught, which takes time.
+        true_poses(robot, true, chosen.joints, chosen.poses)
         sensor = taught_sensor(scenario, robot, seed, progress)
         data, lost = stand_at(
             robot, scenario, sensor, true, chosen.joints, chosen.poses, seed, progress
@@ -71,8 +75,11 @@ def run_geometry(
 def calibrated_for_a_run(
     scenario: Scenario, seed: int, progress: Progress
 ) -> tuple[GeometryOutcome, KnownGeometry]:
-    """The calibration that precedes a run whose geometry is `calibrated`, and what is known after
-    it. Raises as `run_geometry`."""
+    """Calibrate the geometry before a run that needs it.
+
+    Returns the outcome, and the geometry that is known after it. Raises the errors of
+    `run_geometry`.
+    """
     outcome = run_geometry(scenario, seed, progress)
     nominal = outcome.calibration.nominal
     found = outcome.calibration.robot.geometry
@@ -101,8 +108,9 @@ def _designer(
 
 
 def _expected(robot: Robot, scenario: Scenario) -> tuple[FrameKnowledge, Array]:
-    """What is known of the frames before they are taught, and the covariance (6, 6) of a pose's
-    mean at home.
+    """Knowledge of the frames before teaching, and the expected covariance (6, 6) of a pose's mean.
+
+    The covariance is that at home.
     """
     changes = scenario.sensor_changes
     nothing = np.zeros((6, 6))
@@ -115,7 +123,7 @@ def _expected(robot: Robot, scenario: Scenario) -> tuple[FrameKnowledge, Array]:
 def _choose(
     designer: Designer, scenario: Scenario, seed: int, progress: Progress
 ) -> tuple[Candidates, Candidates]:
-    """The poses, and the candidates that they were chosen from."""
+    """Poses to measure, and the candidates from which they were chosen."""
     settings = scenario.geometry
     rng = np.random.default_rng(child(seed, STATIC_POSES))
     with progress.stage("choose poses", settings.poses + 1) as advance:

@@ -163,7 +163,8 @@ def find(
     if name in built_in:
         module, _, attribute = built_in[name].partition(":")
         return getattr(importlib.import_module(module), attribute)
-    part, said = own_part(option, name), f"{option} {name!r}"
+    part = own_part(option, name)
+    said = f"{option} {name!r}"
     found = Telling(said, part, CmmError)() if isinstance(part, type) else part
     _, does, *figures = fields(kind)
     function = getattr(found, does.name) if isinstance(found, kind) else found

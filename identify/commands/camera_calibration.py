@@ -1,4 +1,4 @@
-"""The command ``cmmsim calibrate``. Heavy imports are late."""
+"""Command ``cmmsim calibrate``."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -38,8 +38,7 @@ def calibrate(
             "--sensor",
             metavar="NAME|FILE",
             help="Optional: sensor whose file takes the cameras; with --render, whose cameras "
-            "render, ctrack780 "
-            "where it is left out.",
+            "render, ctrack780 where it is left out.",
             autocompletion=completion("sensor"),
         ),
     ] = None,
@@ -70,8 +69,7 @@ def calibrate(
             "--halves",
             min=1,
             help="Also calibrate so often from two random halves of the pictures, and say whether "
-            "these agree as they "
-            "state: ten times tell.",
+            "these agree as they state: ten times tell.",
         ),
     ] = None,
     render: Annotated[
@@ -154,8 +152,8 @@ def calibrate(
                 "--distortion": distortion,
                 "--fix-aspect": fix_aspect or None,
                 "--min-images": min_images,
+                "--halves": halves,
             },
-            **{"--halves": halves},
         )
         chosen = None if board is None else read_board(board)
         _render(folder, sensor or "ctrack780", chosen, render, seed or 0, progress, quiet)
@@ -165,11 +163,8 @@ def calibrate(
             "a calibration draws no random numbers without --render or --halves", **{"--seed": seed}
         )
     if left is None or right is None or board is None:
-        missing = (
-            ["LEFT"] * (left is None)
-            + ["RIGHT"] * (right is None)
-            + ["--board FILE"] * (board is None)
-        )
+        needed = {"LEFT": left, "RIGHT": right, "--board FILE": board}
+        missing = [argument for argument, value in needed.items() if value is None]
         raise ScenarioError(f"missing {', '.join(missing)}; cmmsim calibrate --help shows examples")
     given: dict[str, Any] = {"distortion": distortion, "min_images": min_images}
     options = CalibrationOptions(
@@ -196,8 +191,7 @@ def calibrate(
 
 
 def _require_none(reason: str, **given: object) -> None:
-    """Raise ScenarioError naming the arguments that are given although they would change
-    nothing."""
+    """Raise ScenarioError that names the arguments given although they would change nothing."""
     if names := [name for name, value in given.items() if value is not None]:
         raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
 
@@ -205,13 +199,12 @@ def _require_none(reason: str, **given: object) -> None:
 def _view(
     left: Path, right: Path, board: "Board", template: "SensorTemplate | None", progress: Progress
 ) -> "tuple[list[PairView], tuple[int, int]]":
-    """What all pairs of pictures show of the board, and their size."""
+    """Find the board in all pairs of pictures. Return what they show of it, and their size."""
     from cmmsim.calibration import pair_images, read_grey, view_pairs
 
     files = pair_images(left, right)
-    if (
-        template is not None
-    ):  # what cannot be written is refused before the search, which takes minutes
+    # What cannot be written is refused before the search, which takes minutes.
+    if template is not None:
         height, width = read_grey(files[0].left).shape
         template.require_size((width, height))
     with progress.stage("find the board", len(files)) as advance:
@@ -221,8 +214,10 @@ def _view(
 def _write(
     folder: Path, found: "Calibration", template: "SensorTemplate | None", content: dict[str, Any]
 ) -> list[str]:
-    """All files, made before the first is written; a line where no sensor can have these
-    cameras."""
+    """Write all files, made before the first is written.
+
+    Returns a line for the user if no sensor can have these cameras.
+    """
     from cmmsim.calibration import require_sensor, rig_tables
     from cmmsim.errors import SensorFileError
     from identify.verification.sensor_figures import (
@@ -240,7 +235,8 @@ def _write(
     drawn = {f"{name}.png": draw(found) for name, draw in figures.items()}
     files = {"rig.toml": rig_tables(found), "calibration.json": content, **drawn}
     if sensor is not None:
-        try:  # it may be based on a file that it names as seen from the folder
+        try:
+            # It is checked in the folder, because it may name the file it is based on from there.
             save_files(folder, {"sensor.toml": sensor, **files}, require_sensor)
         except SensorFileError as error:
             save_files(folder, files)
@@ -259,7 +255,7 @@ def _render(
     progress: Progress,
     quiet: bool,
 ) -> None:
-    """Pictures in left/ and right/, and board.toml beside them: all of them, or nothing."""
+    """Write pictures into left/ and right/, and board.toml beside them: all of them, or nothing."""
     import cv2
     import numpy as np
 
@@ -307,9 +303,7 @@ def _print_summary(found: "Calibration", apart: "Halves | None", folder: Path) -
     if apart is not None:
         typer.echo(
             f"halves of the pictures differ by {apart.mean_square:.2f} times the variance that "
-            "they state, on average "
-            f"over {len(apart.squares)} splits; 1 is expected, give or take {apart.chance:.2f} in "
-            "a single split: "
-            f"{apart.verdict}"
+            f"they state, on average over {len(apart.squares)} splits; 1 is expected, give or take "
+            f"{apart.chance:.2f} in a single split: {apart.verdict}"
         )
     typer.echo(f"calibration: {folder}")

@@ -1,10 +1,9 @@
-"""Rows of kind `identification`: a record, the parameters identified from it, and how far they are
-from the truth.
+"""Rows of kind `identification`: a record, the parameters identified from it, and their errors.
 
-The sensor is `drawn` unless images are asked for: Gaussian noise of the covariance that the
-scenario's sensor states at the home pose, so that the sensor's entries act on it. The exciting and
-the unseen trajectories are those of `trajectory_seed`, the same in all rows: rows differ by their
-factors and their noise. With images the sensor teaches itself, seeded by the row.
+Unless images are asked for, the sensor is `drawn`: it adds Gaussian noise of the covariance that
+the scenario's sensor states at the home pose, so the entries of the sensor take effect. With images
+the sensor teaches itself, seeded by the row. The exciting and the unseen trajectories are those of
+`trajectory_seed`, the same in all rows. Rows thus differ by their factors and their noise only.
 """
 
 from dataclasses import dataclass, replace
@@ -47,7 +46,7 @@ from identify.studies.rows.kind import (
     timing,
     unwatched,
 )
-from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
+from identify.studies.rows.row_sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
 from identify.validation.unseen import PosePrediction, model_on_record
 
@@ -57,8 +56,13 @@ CHOSEN = {
     "viscous": ("viscous friction", "viscous"),
     "gains": ("joint gains", "joint_pid"),
 }
-"""Parameters that a record always shows, so that their spread follows the noise, with their slice
-of the layout; rms over each set."""
+"""Sets of parameters over which an rms is taken, with their slice of the layout.
+
+A record always shows these, so their spread follows the noise.
+"""
+
+UNAWARE = "the same figure, identified without the errors that all frames have in common"
+"""Meaning of the figures `unaware_`. Labels show their names, as "the same" needs its context."""
 
 COLUMNS = {
     "frames": Column("1", "frames of the record"),
@@ -86,7 +90,7 @@ COLUMNS = {
     "intervals": Column(
         "1", "quantities that the record identifies: parameters, and groups of several"
     ),
-    "covered_percent": Column("%", "of their 95 % intervals, those that hold the truth", main=True),
+    "covered_percent": Column("%", "share of their 95 % intervals that hold the truth", main=True),
     "noise_ratio": Column(
         "1",
         "mean squared residual over the variance of the noise; 1 where noise is all that is left",
@@ -105,27 +109,21 @@ COLUMNS = {
         "urad", "error of the model's orientation on unseen trajectories, rms over axes", main=True
     ),
     "poses_covered_percent": Column(
-        "%", "of true coordinates on unseen trajectories, those within the 95 % predicted"
+        "%", "share of true coordinates on unseen trajectories within the predicted 95 % intervals"
     ),
     "predicted_position_rms_um": Column(
         "um",
         "error of the predicted position there, with what the record taught of sensor and geometry",
     ),
-    "unaware_intervals": Column("1", "the same without a word of what all frames have in common"),
-    "unaware_covered_percent": Column(
-        "%", "the same without a word of what all frames have in common"
-    ),
-    "unaware_poses_covered_percent": Column(
-        "%", "the same without a word of what all frames have in common"
-    ),
-    "unaware_predicted_position_rms_um": Column(
-        "um", "the same without a word of what all frames have in common"
-    ),
+    "unaware_intervals": Column("1", UNAWARE),
+    "unaware_covered_percent": Column("%", UNAWARE),
+    "unaware_poses_covered_percent": Column("%", UNAWARE),
+    "unaware_predicted_position_rms_um": Column("um", UNAWARE),
 }
 
 
 class RecordOptions(Section):
-    """How the record is made."""
+    """Options that say how the record is made."""
 
     sensor: Literal["drawn", "images"] = Field(
         "drawn", description="noise of the stated covariance, or images"
@@ -136,12 +134,11 @@ class RecordOptions(Section):
 
 
 class IdentificationOptions(RecordOptions):
-    """How the record is made, and what is identified from it."""
+    """Options of rows of kind `identification`."""
 
     unaware: bool = Field(
         False,
-        description="identify also without a word of what is not exact: cameras, teaching, "
-        "clocks, geometry",
+        description="identify also as if cameras, teaching, clocks and geometry were exact",
     )
 
 
@@ -149,12 +146,10 @@ DRAWN = {"options.sensor": lambda sensor: sensor == "drawn"}
 READS = Reads(
     ("scenario.", *SENSOR, "sensor.timing."),
     but=(
-        *(
-            "scenario.name",
-            "scenario.description",
-            "scenario.sensor_note",
-            "scenario.identification.qr_threshold",
-        ),
+        "scenario.name",
+        "scenario.description",
+        "scenario.sensor_note",
+        "scenario.identification.qr_threshold",
         "scenario.rig.watch",
     ),
     idle=(
@@ -190,8 +185,11 @@ READS = Reads(
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a row identifies from: the plant, its run of the exciting trajectory and all records, of
-    which that is the first, and its runs of the unseen trajectories; number: the seed of them all.
+    """Runs from which a row identifies.
+
+    `excitation` is the plant's run of the exciting trajectory, `unseen` its runs of the unseen
+    ones. `records` are all records to identify from, the first of which is that of `excitation`.
+    `number` is the seed of them all.
     """
 
     plant: Plant
@@ -202,7 +200,7 @@ class Recorded:
 
 
 def recorded(scenario: Scenario, seed: np.random.SeedSequence, options: RecordOptions) -> Recorded:
-    """Run the plant of a row with its sensor. Raises what experiment and sensor raise."""
+    """Run the plant of a row with its sensor. Raises the errors of experiment and sensor."""
     number = stream_seed(seed, EXPERIMENT)
     scenario = unwatched(scenario)
     plant = build_plant(scenario, robot_named(scenario.robot), number)
@@ -229,11 +227,12 @@ def recorded(scenario: Scenario, seed: np.random.SeedSequence, options: RecordOp
 def compute(
     scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions
 ) -> Row:
-    """One row. Raises EstimationError and what experiment and sensor raise."""
+    """Compute one row. Raises EstimationError, and the errors of experiment and sensor."""
     made = recorded(scenario, seed, options)
     plant = made.plant
     unseen = made.unseen
     result = identify_record(made.records, plant.nominal, scenario)
+    # The model is run with the law of the drives that was identified.
     plant = replace(plant, scenario=with_drive(scenario, result.drive.law))
     row = _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
     predicted = predictions(result, plant, unseen, made.number)
@@ -255,12 +254,13 @@ def _unseen_figures(
     unseen: list[Experiment],
     predicted: list[PosePrediction],
 ) -> Row:
-    """Errors of the identified model on unseen trajectories, by what was predicted there."""
+    """Return the errors of the identified model on unseen trajectories."""
     robot = plant.nominal
     scenario = plant.scenario
     settings = model_settings(robot, scenario)
     models = []
     for of, one in zip(predicted, unseen, strict=True):
+        # Such a prediction is the identified model's own run, which need not be done again.
         if of.slopes is not None:
             models.append((of.poses, of.slopes))
             continue
@@ -303,9 +303,8 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     true_groups = groups.combinations @ truth[result.layout.dynamic]
     seen = groups.identifiable
     row["identified_groups"] = int(seen.sum())
-    if (
-        seen.any()
-    ):  # a wrong model identifies nothing, and the row has its other figures all the same
+    # A wrong model identifies nothing, and the row has its other figures all the same.
+    if seen.any():
         normalised = (groups.estimate - true_groups)[seen] / groups.std[seen]
         row["group_std_percent"] = 100.0 * float(
             np.median(groups.std[seen] / np.abs(true_groups[seen]))
@@ -317,13 +316,14 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
 def prediction_figures(
     models: list[tuple[Array, Array]], covariance: Array, true: list[Array]
 ) -> Row:
-    """What the error of parameters, estimated with a covariance (p, p), makes of the model's
-    positions, and what the covariance states of it: by poses (N, 6) of the estimated model, their
-    slopes (N, 6, p), and poses of the true one.
+    """Compare the model's position errors with those that the covariance of its parameters states.
 
-    Every direction in which the parameters can err counts as much as it shows; so the figure has
-    the scatter of many errors, where that of a few parameters that err together has the scatter of
-    hardly two.
+    Every direction in which the parameters can err counts as much as it shows in the positions. The
+    figure therefore has the scatter of many errors. That of a few parameters that err together
+    would have the scatter of hardly two.
+
+    `models` holds the estimated model's poses (N, 6) on each trajectory and their slopes (N, 6, p),
+    `covariance` (p, p) is that of the parameters, and `true` holds the true model's poses (N, 6).
     """
     squares = []
     stated = []
@@ -347,13 +347,16 @@ def _drawn(scenario: Scenario) -> DrawnSensor:
 
 @lru_cache(maxsize=4)
 def robot_named(name: str) -> Robot:
-    """A robot, loaded once a process."""
+    """Load a robot, once a process."""
     return load_robot(name)
 
 
 def designed_trajectories(scenario: Scenario, seed: int) -> TrajectorySet:
-    """The trajectories of a scenario, which know neither the plant nor what is known of the rig:
-    rows that differ in these share them."""
+    """Design the trajectories of a scenario, or return those designed before.
+
+    The design knows neither the plant nor what is known of the rig. Rows that differ only in these
+    share their trajectories.
+    """
     design = {"rig": Rig(), "plant": PlantSwitches(), "renderer": "auto"}
     return _designed(scenario.model_copy(update=design).to_toml(), seed)
 
@@ -365,12 +368,13 @@ def _designed(scenario_toml: str, seed: int) -> TrajectorySet:
 
 
 HELD = 5
-"""Sensitivities of all poses by all parameters that a row holds at once."""
+"""Number of arrays that a row holds at once, each the size of all poses' sensitivities."""
 
 
 def memory(scenario: Scenario, options: object) -> float:
-    """Bytes held to identify from the records of a scenario, as was measured with up to 24,000
-    frames.
+    """Return the memory needed to identify from the records of a scenario, bytes.
+
+    It was measured with up to 24,000 frames.
     """
     parameters = len(robot_named(scenario.robot).layout.names)
     return HELD * 8.0 * 6 * parameters * scenario.timing.frames(scenario.excitation.duration_s)

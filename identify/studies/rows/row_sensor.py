@@ -1,9 +1,9 @@
-"""The sensor of a row: taught exactly or by itself, or one without images, whose noise is drawn;
-its figures.
+"""Sensors of rows, and their figures.
 
-It is built once a process for each content of a sensor file. A row that is taught exactly depends
-on nothing that another row left behind: every picture has a noise stream of its own, begun by
-`start_run`. So a sensor from the cache gives the same numbers as a new one.
+A sensor is taught exactly or by itself, or has no images and draws its noise. One that is taught
+exactly is built once a process for each content of a sensor file. Its rows depend on nothing that
+other rows left behind, because every picture has a noise stream of its own, begun by `start_run`. A
+sensor from the cache thus gives the same numbers as a new one.
 """
 
 from collections.abc import Mapping
@@ -24,17 +24,31 @@ from identify.scenario import Scenario
 from identify.studies.rows.kind import Column, Row
 
 SENSORS_KEPT = 16
-"""Sensors a process keeps; one of them takes about a megabyte."""
+"""Number of sensors that a process keeps. One takes about a megabyte."""
 
 Teaching = Literal["exact", "sensor"]
-"""``exact``: frames and sticker places without error, so that rows show observation noise alone;
-``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s a row)."""
+"""Way of teaching.
+
+``exact``: frames and sticker places have no error, so rows show observation noise alone.
+``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s a row).
+"""
 
 
 @dataclass(frozen=True)
 class RowSensor:
-    """A sensor and what it cannot know: truth, a teaching without error; middle (3,), that of the
-    baseline in the base frame, m; rim: radiance half-way between a sticker and its ring."""
+    """Sensor of a row, and facts that it cannot know.
+
+    Attributes
+    ----------
+    sensor : cmmsim.Sensor
+        The sensor.
+    truth : cmmsim.Taught
+        Teaching without error.
+    middle : ndarray, shape (3,)
+        Middle of the baseline in the base frame, m.
+    rim : float
+        Radiance half-way between a sticker and its ring.
+    """
 
     sensor: cmmsim.Sensor
     truth: cmmsim.Taught
@@ -43,8 +57,9 @@ class RowSensor:
 
 
 def row_sensor(scenario: Scenario, teaching: Teaching, seed: int) -> RowSensor:
-    """The sensor of a scenario without the robot's links in its view, at the beginning of a run of
-    its own.
+    """Return the sensor of a scenario at the beginning of a run of its own.
+
+    The robot's links are not in its view.
     """
     file = sensor_file(scenario)
     if teaching == "exact":
@@ -57,7 +72,7 @@ def row_sensor(scenario: Scenario, teaching: Teaching, seed: int) -> RowSensor:
 
 @lru_cache(maxsize=SENSORS_KEPT)
 def exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
-    """The sensor of a file's content, taught exactly; a process keeps the last ones."""
+    """Return the sensor of a file's content, taught exactly. A process keeps the last ones."""
     file = SensorFile.model_validate_json(file_json)
     return _built(file, method, renderer, exactly_taught(file), 0)
 
@@ -71,10 +86,9 @@ def _built(
 
 
 class DrawnSensor:
-    """Measures as a `cmmsim.Sensor` does, without images: Gaussian noise of a covariance (6, 6) [m,
-    rad], and dropout.
+    """Stand-in for a `cmmsim.Sensor` without images: Gaussian noise and dropout.
 
-    Fast, and with known statistics.
+    It is fast and has known statistics. The covariance (6, 6) of the noise is in m and rad.
     """
 
     sees_bodies = False
@@ -95,9 +109,8 @@ class DrawnSensor:
         obstacles: Mapping[str, Array] | None = None,
         pose_rate: ArrayLike | None = None,
     ) -> cmmsim.Measurement:
-        """The pose (6,) with noise; what stands in the way and how fast it moves make no
-        difference.
-        """
+        """Return the pose (6,) with noise. Obstacles and speed make no difference."""
+        # The noise of a dropped frame is drawn as well, so that the next ones keep theirs.
         noise = self._factor @ self._rng.standard_normal(6)
         dropped = self._rng.random() < self._dropout
         if dropped:
@@ -106,13 +119,14 @@ class DrawnSensor:
 
 
 def rms_um(errors: Array) -> float:
-    """Root mean square in 1e-6 of the unit: over all entries, so per axis and frame."""
+    """Return the root mean square over all entries (per axis and frame) in 1e-6 of their unit."""
     return 1e6 * float(np.sqrt(np.mean(np.square(errors))))
 
 
 def stated_um(covariances: Array) -> tuple[float, float]:
-    """Rms standard deviation per axis of position [um] and orientation [urad] of covariances (n, 6,
-    6).
+    """Return the rms standard deviations per axis of covariances (n, 6, 6).
+
+    They are that of the position, um, and that of the orientation, urad.
     """
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     return 1e6 * float(np.sqrt(variances[:, :3].mean())), 1e6 * float(
@@ -134,12 +148,13 @@ POSE_COLUMNS = {
         "urad", "error of the measured orientation, as the sensor's covariance states it"
     ),
 }
-"""What every row says that has measured poses in it."""
+"""Figures of every row with measured poses."""
 
 
 def pose_figures(errors: Array, covariances: Array) -> Row:
-    """The figures of POSE_COLUMNS of errors (n, 6) [m, rad] and stated covariances (n, 6, 6), n >=
-    1.
+    """Return the figures of POSE_COLUMNS.
+
+    Errors have shape (n, 6), stated covariances (n, 6, 6), in m and rad, with n >= 1.
     """
     figures = (rms_um(errors[:, :3]), rms_um(errors[:, 3:]), *stated_um(covariances))
     return dict(zip(POSE_COLUMNS, figures, strict=True))

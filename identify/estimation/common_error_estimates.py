@@ -1,10 +1,10 @@
-"""What a record says of the errors that all its poses have in common: self-calibration, as a
-by-product.
+"""Estimates of the errors that all poses of a record have in common.
 
-With residuals r = model - measured in standard deviations of the noise, their Jacobian J by the
-parameters and the modes M of the common errors, parameters p and errors z (of unit variance
-beforehand) minimise |r + J dp + M z|^2 + |z|^2 with what is known of p. The parameters' search has
-z eliminated; at its optimum z = -(1 + M^T M)^-1 M^T r.
+They are a by-product of the identification, a self-calibration. Let r = model - measured be the
+residuals in standard deviations of the noise, J their Jacobian with respect to the parameters, and
+M the modes of the common errors. Parameters p and errors z, of unit variance beforehand, minimise
+|r + J dp + M z|^2 + |z|^2 with what is known of p. The search for the parameters has z eliminated.
+At its optimum z = -(1 + M^T M)^-1 M^T r.
 """
 
 from collections.abc import Sequence
@@ -19,8 +19,12 @@ from identify.model.loop_model import LoopModel
 
 @dataclass(frozen=True)
 class CommonErrorEstimates:
-    """names of the errors of one record, each ending with its unit; prior_std and estimate (k,) of
-    each, covariance (k, k), and that of the robot's parameters with them (p, k)."""
+    """Estimates of the common errors of one record.
+
+    names: those of the k errors, each ending with its unit. prior_std, estimate (k,): standard
+    deviations beforehand, and estimates. covariance (k, k): that of the estimates. with_parameters
+    (p, k): covariance of the robot's parameters with them.
+    """
 
     names: tuple[str, ...]
     prior_std: Array
@@ -30,18 +34,19 @@ class CommonErrorEstimates:
 
     @property
     def std(self) -> Array:
-        """Standard deviations (k,)."""
+        """Standard deviations (k,) of the estimates."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def learned(self) -> dict[str, float]:
-        """The estimate of each by its name."""
+        """Estimates by their names."""
         return dict(zip(self.names, self.estimate.tolist(), strict=True))
 
 
 def most_likely(run: LoopModel, parameters: Array) -> Array:
-    """The common errors (k,) of a run `with_common_errors` at the optimum (p,), in standard
-    deviations beforehand.
+    """Return the most likely common errors (k,) of a run `with_common_errors` at the optimum (p,).
+
+    They are in standard deviations beforehand.
     """
     assert run.marginal is not None
     missed = run.without_common_errors().misses(parameters).ravel() - run.marginal.had
@@ -49,15 +54,18 @@ def most_likely(run: LoopModel, parameters: Array) -> Array:
 
 
 def most_likely_of(modes: Array, missed: Array) -> Array:
-    """Those (k,) with modes (m, k) of residuals (m,), all in standard deviations of the noise
-    alone.
+    """Return the most likely errors (k,) by their modes (m, k) and the residuals (m,).
+
+    Modes and residuals are in standard deviations of the noise alone.
     """
+    # normal equations of |missed + M z|^2 + |z|^2
     return np.asarray(-np.linalg.solve(np.eye(modes.shape[1]) + modes.T @ modes, modes.T @ missed))
 
 
 def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[Array]:
-    """Of each run of a problem `with_common_errors`, the most likely ones (k,) of those that a
-    model can have.
+    """Return the most likely errors (k,) of each run of a problem `with_common_errors`.
+
+    They are those that a model can contain.
     """
     return [
         np.zeros(0) if run.marginal is None else most_likely(run, parameters)[: len(run.errors_had)]
@@ -66,9 +74,11 @@ def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[A
 
 
 def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
-    """The first run of each draw of errors in common to all poses, and what makes the numbers of
-    all runs (k,), record by record, of those of these alone (k, d). Records that state the same
-    errors, equally well known, share a draw."""
+    """Return the first run of each draw of common errors, and how the errors of all runs follow.
+
+    Records that state the same errors, equally well known, share a draw. A matrix (k, d) makes the
+    numbers of all runs (k,), record by record, of those of these first runs (d,).
+    """
     firsts: list[LoopModel] = []
     for run in runs:
         if not any(run.common.known_as(first.common) for first in firsts):
@@ -80,14 +90,17 @@ def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
             return np.eye(own)
         if not own or not run.common.known_as(first.common):
             return np.zeros((own, other))
+        # the same errors, but each run has directions of its own that it notices
         return np.asarray(np.linalg.pinv(run.common.whole_factor) @ first.common.whole_factor)
 
     return firsts, np.vstack([np.hstack([made_of(run, first) for first in firsts]) for run in runs])
 
 
 def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Array]:
-    """Covariance (p, p) of an estimate that each kind of errors in common to all poses of a record
-    makes; moved (p, k): what each of their numbers makes of it, run by run."""
+    """Return the covariance (p, p) of an estimate that each kind of common errors makes.
+
+    moved (p, k): effect of each of their numbers on the estimate, run by run.
+    """
     of_common: dict[str, Array] = {}
     for run in runs:
         own, moved = np.split(moved, [run.whitened_modes.shape[2]], axis=1)
@@ -99,9 +112,11 @@ def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Arr
 def common_error_estimates(
     problem: OutputErrorProblem, parameters: Array, whole: Array
 ) -> CommonErrorEstimates:
-    """What the first record of a problem `with_common_errors` says at its optimum (p,) of what its
-    poses have in common; whole (p + k, p + k): covariance of parameters and of that, in standard
-    deviations beforehand."""
+    """Return what the first record of a problem `with_common_errors` says of its common errors.
+
+    parameters (p,): the optimum. whole (p + k, p + k): covariance of the parameters, and of the
+    common errors in standard deviations beforehand.
+    """
     run = problem.runs[0]
     count = len(parameters)
     if run.marginal is None:

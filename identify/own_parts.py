@@ -1,18 +1,18 @@
 """Parts that can be chosen by name: built-in ones, and a user's own as ``module:function``.
 
 To build one in, write it in a file of its own and name it here as ``module:function``. Nothing is
-imported before it is chosen, so that every room can look here. A user's own runs only where its
-module is allowed, see `cmmsim.plugins`.
+imported before it is chosen, so every room can look here. A user's own part runs only if its module
+is allowed, see `cmmsim.allowed_plugins`.
 """
 
 import importlib
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
+from cmmsim.allowed_plugins import Telling as Telling
+from cmmsim.allowed_plugins import is_own as is_own
+from cmmsim.allowed_plugins import own_part
 from cmmsim.errors import CmmError
-from cmmsim.plugins import Telling as Telling
-from cmmsim.plugins import is_own as is_own
-from cmmsim.plugins import own_part
 from identify.errors import IdentifyError, ScenarioError
 
 CRITERIA = {
@@ -22,18 +22,20 @@ CRITERIA = {
 """Criteria of exciting trajectories, see `identify.excitation.criteria`."""
 
 ESTIMATORS = {
-    "closed_loop": "identify.estimators.output_error:closed_loop",
-    "command_driven": "identify.estimators.output_error:command_driven",
-    "known_pid": "identify.estimators.output_error:known_pid",
-    "warm_start": "identify.estimators.output_error:warm_start_alone",
+    "closed_loop": "identify.estimators.output_error_routes:closed_loop",
+    "command_driven": "identify.estimators.output_error_routes:command_driven",
+    "known_pid": "identify.estimators.output_error_routes:known_pid",
+    "warm_start": "identify.estimators.output_error_routes:warm_start_alone",
     "torque_ls": "identify.estimators.least_squares:least_squares",
     "torque_wls": "identify.estimators.least_squares:weighted_least_squares",
     "torque_iv": "identify.estimators.errors_in_variables:instrumental_variables",
     "torque_tls": "identify.estimators.errors_in_variables:total_least_squares",
     "encoders": "identify.estimators.least_squares:encoder_route",
 }
-"""Estimators that `cmmsim estimators` compares, in the order of its table, see
-`identify.estimators.estimator`."""
+"""Estimators that `cmmsim estimators` compares, in the order of its table.
+
+See `identify.estimators.estimator`.
+"""
 
 
 LAWS = {
@@ -52,14 +54,26 @@ def check_choice(
 ) -> None:
     """Refuse a name that is neither built in nor ``module:function``.
 
-    Raises `error`, with the valid names.
+    Parameters
+    ----------
+    given : str
+        The name.
+    what : str
+        Noun for the error message, such as "law".
+    built_in : mapping
+        Built-in parts by name.
+    error : type, optional
+        Exception that is raised, with the valid names.
     """
     if given not in built_in and not is_own(given):
         raise error(f"unknown {what} {given!r}; valid: {', '.join(built_in)}, or module:function")
 
 
 def chosen(given: str, what: str, built_in: Mapping[str, str]) -> Callable[..., Any]:
-    """Part of a built-in name, or a user's own. Raises ScenarioError where there is none such."""
+    """Return the built-in part of a name, or a user's own.
+
+    The arguments are those of `check_choice`. Raises ScenarioError if there is no such part.
+    """
     check_choice(given, what, built_in)
     if given not in built_in:
         return own_function(given, what, ScenarioError)
@@ -68,10 +82,22 @@ def chosen(given: str, what: str, built_in: Mapping[str, str]) -> Callable[..., 
 
 
 def own_function(name: str, what: str, error: type[IdentifyError]) -> Callable[..., Any]:
-    """Function that ``module:function`` names; what: what it is to be, "kind" or "estimator".
+    """Return the function that ``module:function`` names.
 
-    Raises `error`: a module that is not allowed to run, with what to type; no such module or
-    function; something that cannot be called.
+    Parameters
+    ----------
+    name : str
+        ``module:function``.
+    what : str
+        Noun for the error message, such as "kind" or "estimator".
+    error : type
+        Exception that is raised.
+
+    Raises
+    ------
+    error
+        The module is not allowed to run (the message says what to type), the module or the
+        function does not exist, or what is named cannot be called.
     """
     try:
         function = own_part(what, name)

@@ -53,7 +53,8 @@ def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
 def _camera(calibrated: Calibrated | None, nominal: PinholeCamera, name: str) -> PinholeCamera:
     if calibrated is None:
         return nominal
-    (focal_x, focal_y), size = calibrated.focal_px, (nominal.width, nominal.height)
+    focal_x, focal_y = calibrated.focal_px
+    size = (nominal.width, nominal.height)
     lens = Distortion(*calibrated.distortion)
     camera = PinholeCamera(focal_x, *calibrated.centre_px, *size, focal_y / focal_x, lens)
     _require_whole_image(camera, name)

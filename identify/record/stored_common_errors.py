@@ -1,14 +1,18 @@
-"""What all measured poses of a record have in common: errors of cameras and taught frames that are
-known only so well.
+"""Errors that all measured poses of a record have in common.
 
-They are one draw d a run, with a covariance, and move the measured poses by J(pose) d. A record
-states J of every frame and the covariance beside its poses. An estimator that whitens poses by the
-noise alone takes such an error for one of the model. Here it is marginalised: with noise of unit
-covariance and modes M = J L, L L^T the covariance of d, residuals have the covariance 1 + M M^T,
-and with M = U S V^T their whitener is 1 - U (1 - (1 + S^2)^-1/2) U^T. That is the same as
-estimating d beside everything else, d known beforehand by its covariance. Where M is not the same
-for all d, as of a latency, or of cameras within a servo, the model is given the most likely d, and
-M taken there.
+Cameras and taught frames are known only so well. Their errors d are drawn once a run, with a
+covariance, and move the measured poses by J(pose) d. A record states J of every frame and the
+covariance beside its poses.
+
+An estimator that whitens poses by the noise alone takes such an error for one of the model. Here
+the error is marginalised. With noise of unit covariance and modes M = J L, where L L^T is the
+covariance of d, the residuals have the covariance 1 + M M^T. With M = U S V^T their whitener is
+
+    1 - U (1 - (1 + S^2)^-1/2) U^T.
+
+That is the same as estimating d beside everything else, with d known beforehand by its covariance.
+M may depend on d, as for a latency, or for cameras within a servo. The model then contains the most
+likely d, and M is taken there.
 """
 
 from dataclasses import dataclass
@@ -21,8 +25,8 @@ from scipy.linalg import block_diag
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
-from identify.record.covariance import covariance_fault, factor, noticed_directions
 from identify.record.geometry_errors import GeometryErrors
+from identify.record.pose_covariance import covariance_fault, factor, noticed_directions
 
 CHANGES = "common_error"
 COVARIANCE = "common_error_covariance"
@@ -31,11 +35,25 @@ LATENCY = "timing.latency_s"
 
 @dataclass(frozen=True)
 class CommonErrors:
-    """names of the errors, each ending with its unit; changes (N, 6, k) of the measured poses per
-    unit of each; covariance (k, k) of what is true minus what is known. latency_std: of the mean
-    latency of the frames, s, which only a model of the loop can turn into poses; and so it is with
-    the geometry of the robot, None where that is exact. whitener (6, 6): that of the poses' noise,
-    which says which directions of the errors they notice; None: all."""
+    """Common errors of the measured poses, and their covariance.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the k errors, each ending with its unit.
+    changes : ndarray, shape (N, 6, k)
+        Change of the measured poses per unit of each error.
+    covariance : ndarray, shape (k, k)
+        Covariance of the true values about the known ones.
+    latency_std : float
+        Standard deviation of the mean latency of the frames, s. Only a model of the loop can turn
+        it into poses.
+    geometry : GeometryErrors, optional
+        Errors of the robot's geometry, which need such a model, too. None where it is exact.
+    whitener : ndarray, shape (6, 6), optional
+        Whitener of the poses' noise, which tells the directions of the errors that poses notice.
+        None: they notice all.
+    """
 
     names: tuple[str, ...]
     changes: Array
@@ -46,21 +64,19 @@ class CommonErrors:
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all errors, behind those of the poses the latency's and those of the
-        geometry."""
+        """Names of all errors: of the poses, then of the latency, then of the geometry."""
         latency = (LATENCY,) if self.latency_std else ()
         return (*self.names, *latency, *(self.geometry.names if self.geometry else ()))
 
     @property
     def whole_factor(self) -> Array:
-        """`factor` of all errors."""
+        """`factor` of all errors, in the order of `all_names`."""
         latency = [np.full((1, 1), self.latency_std)] if self.latency_std else []
-        return np.asarray(
-            block_diag(self.factor, *latency, *([self.geometry.factor] if self.geometry else []))
-        )
+        geometry = [self.geometry.factor] if self.geometry else []
+        return np.asarray(block_diag(self.factor, *latency, *geometry))
 
     def known_as(self, other: "CommonErrors") -> bool:
-        """Whether these are the errors that others are, and as well known."""
+        """Tell whether other errors are the same, and equally well known."""
         pairs = [(self.covariance, other.covariance)]
         if self.geometry and other.geometry:
             pairs.append((self.geometry.covariance, other.geometry.covariance))
@@ -68,11 +84,15 @@ class CommonErrors:
         return same and all(np.array_equal(*pair) for pair in pairs)
 
     def by_kind(self, modes: Array) -> dict[str, Array]:
-        """Of what independent numbers of standard deviation one, whose factor is `whole_factor`, do
-        (..., k), the part of each kind (..., k); errors of one kind say nothing of those of
-        another."""
+        """Split effects of the errors by their kinds (`kind_of`).
+
+        modes (..., k): effects of k independent numbers of standard deviation one, whose factor is
+        `whole_factor`. The part of each kind has the same shape. Errors of different kinds are
+        taken as independent.
+        """
         root = self.whole_factor
         kinds = np.array([kind_of(name) for name in self.all_names])
+        # back to each error in its own unit, where kinds stand apart
         per_error = modes @ np.linalg.pinv(root)
         return {
             kind: (per_error * (kinds == kind)) @ root for kind in dict.fromkeys(kinds.tolist())
@@ -80,14 +100,15 @@ class CommonErrors:
 
     @property
     def factor(self) -> Array:
-        """L (k, k) with L L^T the covariance; with a whitener, its columns that are noticed most
-        come first.
+        """Factor L (k, k) with L L^T the covariance.
+
+        With a whitener, the columns that poses notice most come first.
         """
         return self._noticed[0]
 
     @property
     def noticed(self) -> int:
-        """How many columns of the factor poses notice."""
+        """Number of columns of the factor that poses notice."""
         return self._noticed[1]
 
     @cached_property
@@ -101,20 +122,28 @@ class CommonErrors:
 
     @cached_property
     def modes(self) -> Array:
-        """Errors (N, 6, k) of the measured poses, for each of k independent numbers of standard
-        deviation one.
-        """
+        """Errors (N, 6, k) of the measured poses for k independent numbers of unit variance."""
         return np.asarray(self.changes @ self.factor)
 
 
 NONE = CommonErrors((), np.zeros((0, 6, 0)), np.zeros((0, 0)))
+"""Common errors of a record that states none."""
 
 
 @dataclass(frozen=True)
 class Marginal:
-    """What whitens residuals of unit covariance that have modes M (m, k) in common: their
-    directions U (m, k), and seen: S (k,), the standard deviations along them. had (m,): what the
-    model that leaves the residuals has of the modes itself, which counts as none."""
+    """Whitener of residuals of unit covariance that have modes in common.
+
+    Attributes
+    ----------
+    modes : ndarray, shape (m, k)
+        Modes of the m residuals.
+    had : ndarray, shape (m,)
+        Part of the residuals that is due to the common errors that the model contains. It counts as
+        no error.
+    directions, seen : ndarray, shapes (m, k) and (k,)
+        Directions U of the modes, and the standard deviations S along them.
+    """
 
     modes: Array
     had: Array
@@ -123,18 +152,19 @@ class Marginal:
 
     @classmethod
     def of(cls, modes: Array, had: Array | float = 0.0) -> "Marginal":
-        """From whitened modes (m, k) of m residuals, and what the model has of them (m,)."""
+        """Return the whitener for modes (m, k) and `had` (m,), as for the class."""
         directions, seen, _ = np.linalg.svd(modes, full_matrices=False)
         return cls(modes, np.broadcast_to(had, len(modes)), directions, seen)
 
     def whiten(self, rows: Array) -> Array:
-        """Residuals (m,) or their derivatives (m, p) with a covariance of one."""
+        """Whiten residuals (m,) or their derivatives (m, p)."""
+        # the whitener is applied by its few directions; as a matrix it would be (m, m)
         along = (1.0 - 1.0 / np.sqrt(1.0 + self.seen**2)) * (self.directions.T @ rows).T
         return np.asarray(rows - self.directions @ along.T)
 
 
 def store_common_errors(record: xr.Dataset, errors: CommonErrors) -> None:
-    """Keep what all poses of a record have in common beside them."""
+    """Store the common errors of a record's poses with it."""
     record[CHANGES] = xr.DataArray(
         errors.changes,
         dims=("time", "pose_component", "common_error_name"),
@@ -156,11 +186,10 @@ def store_common_errors(record: xr.Dataset, errors: CommonErrors) -> None:
 
 
 def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErrors:
-    """What all poses of a record have in common, of these kinds (`kind_of`); NONE where it states
-    nothing.
+    """Return the common errors of a record that are of these kinds (`kind_of`), or NONE.
 
-    Raises RecordError: one of the two without the other, another shape, numbers that are not
-    finite, no covariance.
+    Raises RecordError if one of the two variables is missing, a shape is wrong, a number is not
+    finite, or the covariance is not valid.
     """
     given = [name for name in (CHANGES, COVARIANCE) if name in record]
     if not given:
@@ -177,8 +206,7 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
     if changes.shape != expected or covariance.shape != (len(names),) * 2:
         raise RecordError(
             f"{CHANGES} has shape {changes.shape} and {COVARIANCE} {covariance.shape}, must be "
-            f"{expected} and "
-            f"{(len(names),) * 2}"
+            f"{expected} and {(len(names),) * 2}"
         )
     if not np.isfinite(changes).all():
         raise RecordError(f"{CHANGES} is not finite")
@@ -191,7 +219,7 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
 
 
 def kind_of(name: str) -> str:
-    """Kind of a common error by its name: rig, teaching, exposure, latency or geometry."""
+    """Return the kind of a common error: rig, teaching, exposure, latency or geometry."""
     kinds = {
         "taught": "teaching",
         "exposure": "exposure",

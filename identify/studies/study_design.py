@@ -1,11 +1,10 @@
-"""What a study varies: its keys, values and laws, checked before any row is computed, and what
-holds in each row.
+"""Design of a study: all of its rows, and the checks before any of them is computed.
 
-Rows are numbered repeat by repeat, and within a repeat point by point, the last factor fastest. The
-seed of row n is the n-th child that ``numpy.random.SeedSequence(seed).spawn`` gives. So neither the
-machines, nor the order of work, nor further repeats change the numbers of a row; nor do further
-points of a sample, as long as there are no repeats. No row is kept, so that a large grid takes no
-memory.
+Rows are numbered repeat by repeat, and within a repeat point by point, with the last factor varying
+fastest. The seed of row n is the n-th child that ``numpy.random.SeedSequence(seed).spawn`` gives.
+The numbers of a row therefore depend neither on the machines, nor on the order of work, nor on
+further repeats. Without repeats they do not depend on further points of a sample either. Rows are
+made when they are asked for, so a large grid takes no memory.
 """
 
 import difflib
@@ -21,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from cmmsim import CmmError, Sensor
+from cmmsim.allowed_plugins import allowed_plugins
 from cmmsim.files import SensorFile
-from cmmsim.plugins import allowed_plugins
 from identify.errors import ScenarioError, StudyError
 from identify.experiment.sensor_in_loop import sensor_file, with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
@@ -33,21 +32,29 @@ from identify.studies.rows.kind import Kind, check_read
 from identify.studies.study_file import Law, Range, Study
 
 ROOTS = ("scenario.", "sensor.", "options.")
-"""How factors begin, and figures do not."""
+"""Prefixes of the names of factors. No figure has one of them."""
 
 SENSOR_CHANGES = "sensor_changes"
-"""The table of a scenario into which the keys ``sensor.`` go."""
+"""Table of a scenario that takes the keys ``sensor.`` of a study."""
 
 NEAREST = 4
-"""Valid names that a refusal gives."""
+"""Number of valid names in an error message."""
 
 STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One row that is to be computed: its number, its repeat, and the value of each factor by
-    dotted path.
+    """Row to be computed.
+
+    Attributes
+    ----------
+    number : int
+        Number of the row.
+    repeat : int
+        Number of its repeat.
+    factors : dict
+        Value of each factor by dotted path.
     """
 
     number: int
@@ -57,7 +64,19 @@ class Case:
 
 @dataclass(frozen=True)
 class Finished:
-    """A row that is done: its figures, or in one line why there are none; the seconds it took."""
+    """Row that is done.
+
+    Attributes
+    ----------
+    number : int
+        Number of the row.
+    figures : dict
+        Its figures by name; empty if it failed.
+    seconds : float
+        Time it took, s.
+    error : str
+        Reason of the failure in one line; empty if there was none.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT | ConfigDict(extra="forbid")
 
@@ -69,8 +88,19 @@ class Finished:
 
 @dataclass(frozen=True)
 class Setup:
-    """What all rows of a study share: kind, scenario with the changes of all rows, options,
-    seed."""
+    """Everything that the rows of a study share.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of row.
+    scenario : Scenario
+        Scenario with the changes of all rows.
+    options : dict
+        Options of the kind that hold in all rows.
+    seed : int
+        Seed of the study.
+    """
 
     kind: str
     scenario: Scenario
@@ -80,23 +110,23 @@ class Setup:
     """Modules whose parts may run, also on other machines."""
 
     def row_scenario(self, case: Case) -> Scenario:
-        """The scenario of a row. Raises ScenarioError where its factors contradict each other."""
+        """Return the scenario of a row. Raises ScenarioError if its factors conflict."""
         return self.scenario.with_overrides(overrides(case.factors))
 
     def row_options(self, case: Case) -> dict[str, Any]:
-        """The options of a row."""
+        """Return the options of a row."""
         varied = {
             path: value for path, value in case.factors.items() if path.startswith("options.")
         }
         return self.options | {path.partition(".")[2]: value for path, value in varied.items()}
 
     def row_seed(self, number: int) -> np.random.SeedSequence:
-        """The seed of a row."""
+        """Return the seed of a row."""
         return child(self.seed, number)
 
 
 class Design:
-    """All rows of a study."""
+    """Sequence of all rows of a study."""
 
     def __init__(self, study: Study) -> None:
         self._study = study
@@ -105,7 +135,7 @@ class Design:
         return self._study.rows
 
     def case(self, number: int) -> Case:
-        """The row of a number."""
+        """Return the row of a number."""
         repeat, point = divmod(number, self._study.points)
         return Case(
             number, repeat, self._drawn(point) if self._study.sample else self._on_grid(point)
@@ -126,7 +156,7 @@ class Design:
 
     @cached_property
     def _shares(self) -> np.ndarray:
-        """Where each point (points, factors) lies between the ends of each factor, in [0, 1)."""
+        """Position of each point (points, factors) between the ends of each factor, in [0, 1)."""
         rng = mixed_generator(SAMPLED_POINTS, self._study.seed)
         return rng.random((self._study.points, len(self._study.factors)))
 
@@ -134,10 +164,11 @@ class Design:
         values = self._study.factors[path]
         if isinstance(values, list):
             return values[int(share * len(values))]
-        # a table is read where the module of one's own kind may not be
+        # A user's own kind has no model of its options, and its module may be missing here.
         kind = KINDS.get(self._study.kind)
         field = field_of(path, kind.options if kind else None)
         if field is not None and field.annotation is int:
+            # Both ends are drawn, as often as any other integer.
             return int(values.low) + int(share * (values.high - values.low + 1))
         if values.scale == "log":
             return float(values.low * (values.high / values.low) ** share)
@@ -145,7 +176,7 @@ class Design:
 
 
 def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of ``scenario.`` and ``sensor.`` as overrides of a scenario."""
+    """Return the settings ``scenario.`` and ``sensor.`` as overrides of a scenario."""
     found = {}
     for path, value in settings.items():
         root, _, key = path.partition(".")
@@ -156,23 +187,35 @@ def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def prepare(study: Study) -> Setup:
+def prepare(study: Study, given: Scenario | None = None) -> Setup:
     """Check a study's keys, values, kind and laws, and load what its rows share.
 
-    The first row is checked as a whole. Values that contradict each other only in other rows are
-    errors of these.
+    The first row is checked as a whole. Values that contradict each other only in other rows become
+    errors of these rows.
 
-    Raises StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid
-    ones; a wrong value; a key that the kind's rows do not read; a sensor that the statistical
-    renderer was not proved for. Raises ScenarioError: no such scenario, or changes that contradict
-    it.
+    Parameters
+    ----------
+    study : Study
+        The study.
+    given : Scenario, optional
+        Scenario that it varies. The default is the one that the study names.
+
+    Raises
+    ------
+    StudyError
+        The scenario does not exist, or the changes contradict it. The kind, a key, an option, or a
+        figure or factor of a law is unknown (the message names valid ones). A value is wrong, rows
+        of this kind do not read a key, or the statistical renderer was not proved for the sensor.
+    ScenarioError
+        The factors of the first row contradict each other.
     """
     kind = find_kind(study.kind)
     kind.checked(study.options)
     _check_keys(study, kind)
-    try:  # what draws the images is decided here, once for all machines
+    try:
+        # The renderer is chosen here, once for all machines.
         scenario = with_renderer(
-            load_scenario(study.scenario).with_overrides(overrides(study.changes))
+            (given or load_scenario(study.scenario)).with_overrides(overrides(study.changes))
         )
     except ScenarioError as error:
         raise StudyError(f"scenario of the study: {error}") from error
@@ -198,12 +241,11 @@ def prepare(study: Study) -> Setup:
 
 
 def _check_proved(scenario: Scenario) -> None:
-    """Refuse a sensor for which frames without images were not proved, where the scenario's have
-    none.
-    """
+    """Refuse a sensor for which the statistical renderer was not proved, if that is chosen."""
     if scenario.renderer != "statistical":
         return
     try:
+        # A sensor builds its cameras, and refuses them, when they are first asked for.
         _ = Sensor(sensor_file(scenario), renderer=scenario.renderer).camera
     except CmmError as error:
         raise StudyError(f"the first row's sensor: {error}") from error
@@ -221,6 +263,7 @@ def _check_keys(study: Study, kind: Kind) -> None:
         _check_values(path, values.ends if isinstance(values, Range) else values, kind)
         if not isinstance(values, list):
             continue
+        # TOML writes a number as 1 or as 1.0, and True is an int in Python.
         types = {
             "number" if type(value) in (int, float) else type(value).__name__ for value in values
         }
@@ -228,6 +271,7 @@ def _check_keys(study: Study, kind: Kind) -> None:
             raise StudyError(
                 f"factors.{path} = {values} has values of several kinds: {', '.join(sorted(types))}"
             )
+        # Lists cannot be in a set, but their texts can.
         if len({repr(value) for value in values}) < len(values):
             raise StudyError(
                 f"factors.{path} = {values} has a value twice; repeats = N computes every point N "
@@ -236,8 +280,9 @@ def _check_keys(study: Study, kind: Kind) -> None:
 
 
 def _check_values(path: str, values: list[Any], kind: Kind) -> None:
-    """Refuse a path that does not exist and values that are not of its type; options of one's own
-    kind may be any.
+    """Refuse a path that does not exist, and values that are not of its type.
+
+    Options of a user's own kind may be any.
     """
     if kind.options is None and path.startswith("options."):
         return
@@ -260,10 +305,10 @@ def _check_values(path: str, values: list[Any], kind: Kind) -> None:
 
 @lru_cache(maxsize=8)
 def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
-    """Every dotted path that a study may vary, with its field; `options`: the model of a kind's
-    options, if it has one.
+    """Return every dotted path that a study may vary, with its field.
 
-    A path is one of a scenario, of a sensor file, or of the options.
+    A path is one of a scenario, of a sensor file, or of `options`, the model of a kind's options if
+    it has one.
     """
     found = _leaves(Scenario, "scenario.") | _leaves(SensorFile, "sensor.")
     for path in (f"scenario.{SENSOR_CHANGES}", "sensor.based_on"):
@@ -272,8 +317,9 @@ def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
 
 
 def field_of(path: str, options: type[BaseModel] | None = None) -> FieldInfo | None:
-    """The field of a dotted path that a study may vary, or of a number by its name in a table of
-    such; None: none.
+    """Return the field of a dotted path that a study may vary, or None.
+
+    The path may also be that of a number by its name in a table of a scenario.
     """
     tables = (f"scenario.{table}." for table in numbers_by_name())
     entry = FieldInfo(annotation=float) if path.startswith(tuple(tables)) else None
@@ -281,23 +327,25 @@ def field_of(path: str, options: type[BaseModel] | None = None) -> FieldInfo | N
 
 
 def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
-    """Fields that are no sections, by dotted path."""
+    """Return the fields that are not sections, by dotted path."""
     found: dict[str, FieldInfo] = {}
     for name, field in model.model_fields.items():
         kinds = (field.annotation, *get_args(field.annotation))
         inner = next((a for a in kinds if isinstance(a, type) and issubclass(a, BaseModel)), None)
+        # A list of sections is one value, since no dotted path leads to its entries.
         listed = getattr(field.annotation, "__origin__", None) is list
-        found |= (
-            {f"{prefix}{name}": field}
-            if inner is None or listed
-            else _leaves(inner, f"{prefix}{name}.")
-        )
+        if inner is None or listed:
+            found[f"{prefix}{name}"] = field
+        else:
+            found |= _leaves(inner, f"{prefix}{name}.")
     return found
 
 
 def _nearest(name: str, known: Collection[str]) -> str:
-    """The valid names with the same last part or spelled alike, else the first of the same root or
-    of all, in words.
+    """Suggest valid names in words.
+
+    They are those with the same last part or a similar spelling, else the first of the same root,
+    else the first of all.
     """
     last = [key for key in known if key.rpartition(".")[2] == name.rpartition(".")[2]]
     alike = difflib.get_close_matches(name, known, n=NEAREST, cutoff=0.5)
@@ -307,11 +355,10 @@ def _nearest(name: str, known: Collection[str]) -> str:
 
 
 def _check_law(law: Law, study: Study, figures: list[str]) -> None:
-    """Refuse a law of figures that rows do not have, or of factors and values that the study does
-    not vary.
+    """Refuse a law about figures that rows do not have, or about factors and values not varied.
 
-    The figures of a kind of one's own are not known before its rows are; there are none, and they
-    are not checked.
+    The figures of a user's own kind are unknown before its rows are computed. `figures` is then
+    empty, and they are not checked.
     """
     for key in ("figure", "per", "equals"):
         name = getattr(law, key)

@@ -1,5 +1,6 @@
-"""Output error in its variants: the paper's, driven by the logged commands, with known gains; and
-its warm start.
+"""Output error in its variants, and its linear warm start alone.
+
+The variants are that of the paper, one driven by the logged commands, and one with known gains.
 """
 
 import time
@@ -22,22 +23,24 @@ KNOWN = 1e-6
 
 @estimator("output error, unknown PID", uses="poses")
 def closed_loop(evidence: Evidence) -> Estimate:
-    """Closed-loop output error with unknown PID, as in the paper; warm start and command-driven
-    search before it.
+    """Estimate by closed-loop output error with unknown PID, as in the paper.
+
+    A warm start and the command-driven search precede it.
     """
     return _searched(evidence, evidence.problem, "closed_loop")
 
 
 @estimator("output error, command driven", uses="poses")
 def command_driven(evidence: Evidence) -> Estimate:
-    """Output error of the model driven by the logged commands."""
+    """Estimate by output error of the model driven by the logged commands."""
     return _searched(evidence, evidence.problem, "command_driven")
 
 
 @estimator("output error, known PID", uses="poses, gains")
 def known_pid(evidence: Evidence) -> Estimate:
-    """Closed-loop output error with the joint PID's gains known. Raises EstimationError where they
-    are not.
+    """Estimate by closed-loop output error with known gains of the joint PID.
+
+    Raises EstimationError if the gains are not known.
     """
     if evidence.known_gains is None:
         raise EstimationError(
@@ -47,6 +50,7 @@ def known_pid(evidence: Evidence) -> Estimate:
     values = guess.values.copy()
     std = guess.std.copy()
     gains = guess.layout.joint_pid
+    # gains that the law does not read stay fixed at zero
     read = ~guess.fixed[gains]
     values[gains] = np.where(read, evidence.known_gains, 0.0)
     std[gains] = np.where(read, KNOWN * np.abs(evidence.known_gains), std[gains])
@@ -56,8 +60,9 @@ def known_pid(evidence: Evidence) -> Estimate:
 
 @estimator("linear warm start alone", uses="poses")
 def warm_start_alone(evidence: Evidence) -> Estimate:
-    """The linear closed-loop equation with the logged commands, solved once; no standard
-    deviations.
+    """Estimate by the linear closed-loop equation with the logged commands, without a search.
+
+    The estimate has no standard deviations.
     """
     began = time.perf_counter()
     parameters = linear_warm_start(evidence.problem, evidence.scenario)
@@ -74,8 +79,6 @@ def _searched(evidence: Evidence, problem: OutputErrorProblem, method: str) -> E
     std = estimate_uncertainty(
         found[-1].linearised(), last.parameters, mixed_generator(ROUTES_UNCERTAINTY)
     ).std
-    counts = (
-        sum(one.solution.iterations for one in found),
-        sum(one.solution.evaluations for one in found),
-    )
-    return Estimate(last.parameters, std, seconds, *counts, last.stop_reason)
+    iterations = sum(one.solution.iterations for one in found)
+    evaluations = sum(one.solution.evaluations for one in found)
+    return Estimate(last.parameters, std, seconds, iterations, evaluations, last.stop_reason)

@@ -1,4 +1,4 @@
-"""The command ``track``: what a model is worth to a controller. Heavy imports are late."""
+"""Command ``track``: the benefit of a model to a control law."""
 
 from math import isfinite
 from pathlib import Path
@@ -22,7 +22,7 @@ from identify.commands.options import (
 )
 from identify.errors import ScenarioError
 from identify.files.run_folder import new_run_folder, save_files
-from identify.plugins import LAWS
+from identify.own_parts import LAWS
 from identify.progress import print_table, terminal_progress
 
 ALL = "all"
@@ -68,9 +68,10 @@ def track(
     The simulated robot follows the scenario's unseen trajectories, a circle and a square, with
     images in the loop: under the paper's servo (pid), with joint commands shaped by the inverse
     dynamics (feedforward), or with torques (computed_torque). The law knows the starting model, the
-    identified one, or the truth. Told are the errors of the true poses, the effort, and how much of
-    the squared error would go if the sensor, the model or the latency were exact. The scenario's
-    [control] says whether an observer predicts the pose, and what the actuators take and give.
+    identified one, or the truth. The results are the errors of the true poses, the effort, and how
+    much of the squared error would go if the sensor, the model or the latency were exact. The
+    scenario's [control] says whether an observer predicts the pose, and what the actuators take and
+    give.
 
     Reads a scenario; the folder of a whole run, if one is named; and, if named, a CSV file of poses
     with the columns t, x, y, z, alpha, beta, gamma in s, m and rad. It writes track.json and
@@ -108,6 +109,7 @@ def track(
 
 
 def _each(given: list[str], every: tuple[str, ...]) -> list[str]:
+    # A dict drops the names that are given twice, and keeps their order.
     return list(dict.fromkeys(name for one in given for name in (every if one == ALL else (one,))))
 
 
@@ -119,7 +121,7 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
     done = [run for run in entry["runs"] if "failed" not in run]
     if done:
         _print_tables(done, entry["effort_unit"])
-    # the error of a command that lost all says the first
+    # If all runs are lost, the error of the command names the first.
     for run in entry["runs"] if done else entry["runs"][1:]:
         if "failed" in run:
             typer.echo(f"lost: {_called(run)}: {run['failed']}")

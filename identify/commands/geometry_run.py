@@ -1,6 +1,4 @@
-"""The command ``geometry``: where a robot's joints, axes and zero angles are. Heavy imports are
-late.
-"""
+"""Command ``geometry``: calibration of a robot's joints, axes and zero angles."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,7 +61,7 @@ def geometry(
       cmmsim run quick --set geometry.known=runs/geometry-0/robot.toml
     """
     from dynamics import load_robot
-    from identify.geometry.run import run_geometry
+    from identify.geometry.before_a_run import run_geometry
     from identify.geometry.static_poses import read_static_poses
     from identify.reporting.figures.geometry_calibration import geometry_figure
     from identify.reporting.figures.style import drawn, svg_text
@@ -97,8 +95,7 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
     print_table(header, rows, (), "rms error of poses that were not measured")
     told = [name for name, one in entry["parameters"].items() if one["observable"]]
     typer.echo(
-        f"{len(told)} of {len(entry['parameters'])} geometric numbers are told by "
-        f"{entry['poses']} poses; "
-        f"{len(entry['cannot_be_told'])} combinations cannot be told"
+        f"{len(told)} of {len(entry['parameters'])} geometric numbers are told by {entry['poses']} "
+        f"poses; {len(entry['cannot_be_told'])} combinations cannot be told"
     )
     typer.echo(f"files: {folder}")

@@ -1,8 +1,4 @@
-"""Commands about a robot alone: what its motion can show, where it can go, its model in other
-engines.
-
-Heavy imports are late.
-"""
+"""Commands about a robot alone: its base parameters, its workspace, its model in other engines."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,13 +18,13 @@ if TYPE_CHECKING:
     from identify.estimation.base_parameters import BaseParameters
 
 THRESHOLD = 1e-3
-"""Entries of R below it count as zero in the paper (section 4.2)."""
+"""Magnitude of an entry of R below which the paper counts it as zero (section 4.2)."""
 
 PAPERS = "rss6"
-"""The robot of the paper, beside which alone its numbers stand."""
+"""Robot of the paper. The paper's numbers are printed only with this one."""
 
 DECADES = (0, 3, 6)
-"""Units in which the paper's threshold is tried: the regressor in N, kN, MN."""
+"""Decimal exponents of the units in which the paper's threshold is tried: N, kN, MN."""
 
 
 def base_parameters(
@@ -37,7 +33,7 @@ def base_parameters(
     """Print which combinations of its dynamic parameters a robot's motion can show at all.
 
     A parameter that stands alone can be identified by itself, one in a sum only as part of it, and
-    the unseen ones by no motion. All of it up to one common factor where only poses are measured.
+    the unseen ones by no motion. Where only poses are measured, one common factor stays unknown.
 
     Reads a robot file. Writes nothing but the JSON, which has the coefficients of each combination.
 
@@ -54,6 +50,7 @@ def base_parameters(
     found = base.base_parameters(matrix, chosen.layout)
     singular = base.rank_by_singular_values(matrix)
     angle = base.angle_to_singular_vectors(matrix, found)
+    # The paper's threshold has a unit, so what it finds depends on the units of the matrix.
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
     entry = _groups(found, singular, angle)
     tell(
@@ -72,19 +69,17 @@ def _print_groups(
     typer.echo(f"No motion shows: {', '.join(found.unseen) or 'none of them, all are shown'}.")
     typer.echo(
         f"The {len(found.names)} parameters make {found.rank} base parameters, which are all that "
-        "a motion can show; "
-        f"singular values find {singular}. What is independent stands out of the others by "
-        f"{found.gap[1]:.1e} of its "
-        f"length or more, what is not by {found.gap[0]:.1e} at most; both ways find the same "
-        f"groups to {angle:.1e} rad."
+        f"a motion can show; singular values find {singular}. What is independent stands out of "
+        f"the others by {found.gap[1]:.1e} of its length or more, what is not by "
+        f"{found.gap[0]:.1e} at most; both ways find the same groups to {angle:.1e} rad."
     )
     tried = ", ".join(f"{count} in units of {unit:g} N" for unit, count in counts.items())
+    # The joint controller has three gains, which the printed count adds.
     left = len(found.names) - len(found.unseen)
     typer.echo(
         f"The paper's rule, a diagonal of R above {THRESHOLD:g} without scaling, depends on the "
-        "units, and finds "
-        f"{tried}. Deleting only what no motion shows leaves {left} parameters, {left + 3} with "
-        "the gains of the joint "
+        f"units, and finds {tried}. Deleting only what no motion shows leaves {left} parameters, "
+        f"{left + 3} with the gains of the joint "
         f"controller{'; its table lists 49' if papers else ''}."
     )
 
@@ -154,10 +149,9 @@ def _print_workspace(summary: dict[str, Any], folder: Path) -> None:
     worst = summary["whole_travel"]
     typer.echo(
         "over the whole travel the actuators' leverage on their legs is at least "
-        f"{worst['least_leverage_J_a1']:.3f}; "
-        "the condition number of the legs' directions (J_a2) is at most "
-        f"{worst['largest_condition_J_a2']:.2f}, and "
-        f"that of the whole Jacobian (J_ad) {worst['largest_condition_J_ad']:.2f}"
+        f"{worst['least_leverage_J_a1']:.3f}; the condition number of the legs' directions (J_a2) "
+        f"is at most {worst['largest_condition_J_a2']:.2f}, and that of the whole Jacobian (J_ad) "
+        f"{worst['largest_condition_J_ad']:.2f}"
     )
     typer.echo(f"maps: {folder}")
 
@@ -232,8 +226,9 @@ def mjcf(
 
 
 def _changes(robot: "Robot", parameters: "Array") -> list[str]:
-    """Lines: the inertias that the export changed, and by how much that changes the robot's
-    accelerations.
+    """Describe, in lines, the inertias that the export changed.
+
+    Each line tells how much the change alters the robot's accelerations.
     """
     from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 
@@ -243,6 +238,7 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
     effects = acceleration_changes(robot, parameters, inertias.values)
     said = {}
     for body, change in inertias.changes.items():
+        # An effect below 1e-9 is rounding.
         felt = f"accelerations differ by up to {100 * effects[body]:.2g} %"
         said[body] = f"{change}; {felt if effects[body] > 1e-9 else 'the motion does not feel it'}"
     return [f"changed {line}" for line in grouped(said)]
@@ -281,9 +277,8 @@ def verify_model(
         goal = entry["goal"]
         raise VerificationError(
             f"model and MuJoCo differ by {found['position_steady_um']:.3g} um and "
-            f"{found['angle_steady_urad']:.3g} urad"
-            f", more than {goal['position_steady_um']:g} um and {goal['angle_steady_urad']:g} "
-            f"urad; see {folder}"
+            f"{found['angle_steady_urad']:.3g} urad, more than {goal['position_steady_um']:g} um "
+            f"and {goal['angle_steady_urad']:g} urad; see {folder}"
         )
 
 

@@ -1,4 +1,4 @@
-"""The commands of an experiment: a whole run, or its stages one by one. Heavy imports are late."""
+"""Commands of an experiment: a whole run, or its stages one by one."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,7 +33,7 @@ from identify.files.run_folder import (
 from identify.progress import print_warnings, terminal_progress
 
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
-"""What the first two stages leave."""
+"""Files that the first two stages leave."""
 
 
 def run(
@@ -73,6 +73,7 @@ def run(
     """
     chosen = chosen_scenario(scenario, settings, robot)
     path = out or Path("runs") / f"{chosen.name}-{seed}"
+    # An experiment that was begun in this folder goes on, so its files may be there.
     begun = _pipeline().is_begun(chosen, seed, path)
     folder = context.with_resource(new_run_folder(path, BEGUN if begun else UNFINISHED))
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
@@ -143,6 +144,7 @@ def excite(
     """
     chosen = chosen_scenario(scenario, settings, robot)
     name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
+    # What an interrupted search has left may be replaced.
     may_hold = () if compare else UNFINISHED
     folder = context.with_resource(new_run_folder(out or Path("runs") / name, may_hold))
     if compare:
@@ -192,8 +194,7 @@ def identify(
             "--record",
             metavar="FILE",
             help="Identify from a record of your own, netCDF or CSV; a second one of the same "
-            "robot under a known "
-            "load, where that fixes the scale.",
+            "robot under a known load, where that fixes the scale.",
             show_default=False,
         ),
     ] = None,
@@ -240,6 +241,7 @@ def identify(
         )
     else:
         folder = RunFolder(out)
+        # No trajectories were designed for a record of one's own.
         folder.require(*(PLANNED[:1] if folder.holds_own_record else PLANNED))
         context.with_resource(working_in(out))
         _pipeline().identify(out, progress, chosen)
@@ -297,21 +299,21 @@ def report(
 
 
 def _warned(folder: RunFolder) -> dict[str, Any]:
-    """The result of a run; says what its identification warns of."""
+    """Load the result of a run, and print the warnings of its identification."""
     result = load_result(folder.result)
     print_warnings(result["identification"].get("warnings", []))
     return result
 
 
 def _summary() -> Any:
-    """What a run says of itself, imported late as the stages are."""
+    """Import the summary of a run late, as the stages are."""
     from identify.reporting import tables as run_summary
 
     return run_summary
 
 
 def _pipeline() -> Any:
-    """The stages, imported late: ``cmmsim --help`` must not wait for CasADi and OpenGL."""
+    """Import the stages late: ``cmmsim --help`` must not wait for CasADi and OpenGL."""
     from identify import pipeline
 
     return pipeline

@@ -1,7 +1,8 @@
-"""The rig as the estimator knows it: exactly, as calibrated from pictures of a board, or as well as
-a calibration says, that of a file or what fifteen photographs leave.
+"""Stereo rig as the estimator knows it.
 
-The cameras that take the pictures are the sensor file's in each case.
+It is known exactly, as calibrated from pictures of a board, or with a stated covariance: that of a
+calibration file, or that of a calibration by fifteen photographs. The cameras that take the
+pictures are always those of the sensor file.
 """
 
 from dataclasses import replace
@@ -16,7 +17,7 @@ import cmmsim
 from cmmsim.calibration import PairView, board_poses, calibrate, default_board, render_pairs
 from cmmsim.calibration.board_detection import find_board
 from cmmsim.files import SensorFile
-from cmmsim.files.setup import rig_from_file
+from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.radiometry.noise import CameraNoise
@@ -28,24 +29,28 @@ from identify.progress import Progress, SilentProgress
 from identify.scenario import Scenario
 
 LARGEST_RATIO = 1.5
-"""Of the focal lengths and baselines of two rigs, one over the other, of which one may be
-calibrated for the other.
-"""
-ANGLE, SHARE = np.deg2rad(10.0), 0.1
-"""By which the directions of such may differ, and their principal points, of the image's size."""
+"""Largest ratio of focal lengths, and of baselines, of two rigs that count as alike."""
+ANGLE = np.deg2rad(10.0)
+"""Largest angle [rad] between the right cameras, or the baselines, of two rigs that are alike."""
+SHARE = 0.1
+"""Largest distance of the principal points of such rigs, as a share of the image's size."""
 
 
 def known_rig(
     scenario: Scenario, file: SensorFile, rng: np.random.Generator, progress: Progress | None = None
 ) -> KnownRig | None:
-    """What is known of the rig of a scenario's sensor file; None where it is known exactly.
+    """Return the rig of a scenario's sensor file as the estimator knows it.
 
-    `calibrated`: a board is drawn in front of the true cameras, found in the pictures and
-    calibrated from. A path, or `photographs`: the rig that one calibration with that covariance
-    would have found. Raises ScenarioError for a file that holds no calibration, or that of another
-    rig, CalibrationError where the pictures do not determine the cameras.
+    None stands for exact knowledge.
+
+    With `calibrated`, the true cameras take pictures of a board, from which they are calibrated.
+    With a path, or `photographs`, the rig is drawn from the covariance of such a calibration.
+
+    Raises ScenarioError for a file that holds no calibration, or one of another rig. Raises
+    CalibrationError if the pictures do not determine the cameras.
     """
-    section, (rig, _) = scenario.rig, rig_from_file(file.rig)
+    section = scenario.rig
+    rig, _ = rig_from_file(file.rig)
     if section.exact:
         return None
     exposure = section.right_later_std_s
@@ -67,8 +72,9 @@ def known_rig(
 def calibrated_rig(
     file: SensorFile, pairs: int, rng: np.random.Generator, progress: Progress
 ) -> KnownRig:
-    """The rig of a sensor file as calibrated from pictures of a board of dots, drawn by the
-    analytic renderer.
+    """Calibrate the rig of a sensor file from pictures of a board of dots.
+
+    The analytic renderer draws them.
     """
     source = cmmsim.Sensor(file, renderer="analytic")
     rig = source.rig
@@ -88,18 +94,17 @@ def calibrated_rig(
 
 
 def _as_read(image: NDArray[np.unsignedinteger[Any]], noise: CameraNoise) -> NDArray[np.uint8]:
-    """An image (h, w) in 8 bit, as pictures of a board are read from files."""
+    """An image (h, w) in 8 bits, as pictures of a board are read from files."""
     if image.dtype == np.uint8:
         return image
     return np.asarray(np.round(image * (255.0 / noise.white_level)), dtype=np.uint8)
 
 
 def stated_covariance(path: Path, rig: StereoRig) -> Array:
-    """Covariance (24, 24) of the parameters of a rig from a calibration.json of it, or of one like
-    it.
+    """Return the covariance (24, 24) of a rig's parameters from a calibration.json.
 
-    Raises ScenarioError: no such file, no calibration in it, or that of other cameras (what
-    differs, and how much).
+    Raises ScenarioError if there is no such file, if it holds no calibration, or if that is of
+    another rig. The message says what differs and by how much.
     """
     try:
         text = read_text(path, str(path), ScenarioError)
@@ -113,8 +118,7 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ScenarioError(
             f"rig.known = {str(path)!r} is neither exact, calibrated, photographs, nor the "
-            "calibration.json of "
-            f"`cmmsim calibrate`: {type(error).__name__} {error}"
+            f"calibration.json of `cmmsim calibrate`: {type(error).__name__} {error}"
         ) from None
     if list(names) != list(PARAMETER_NAMES) or matrix.shape != (len(PARAMETER_NAMES),) * 2:
         raise ScenarioError(
@@ -137,14 +141,13 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
 
 
 def _other_rig(estimates: Array, rig: StereoRig) -> str:
-    """In what calibrated parameters (24,) are not those of a rig like this one; empty where they
-    are.
-    """
+    """Difference between calibrated parameters (24,) and a rig; empty if they are alike."""
 
     def both(name: str) -> tuple[float, float]:
         index = PARAMETER_NAMES.index(name)
         return float(estimates[index]), float(rig.parameters[index])
 
+    # The last six parameters are translation and rotation vector of right_from_left.
     places = [(Rotation.from_rotvec(one[21:]), one[18:21]) for one in (estimates, rig.parameters)]
     turned = (places[0][0].inv() * places[1][0]).magnitude()
     lengths = [float(np.linalg.norm(place)) for _, place in places]

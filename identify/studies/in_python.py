@@ -1,0 +1,122 @@
+"""Studies without a study file: a scenario, what is varied, and a table of the outcome."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from identify.errors import StudyError
+from identify.progress import Progress, SilentProgress
+from identify.runtime import cores
+from identify.scenario import Scenario, load_scenario
+from identify.studies.memory import check_memory
+from identify.studies.processes import local_processes
+from identify.studies.runner import in_this_process, run_study
+from identify.studies.study_file import Study as StudyFile
+
+BOOKKEEPING = ("row", "seed_entropy", "seed_spawn_key", "seconds", "error")
+"""Columns of the table of a study's folder that are no figures."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """A scenario that is varied and repeated.
+
+    Parameters
+    ----------
+    scenario : Scenario or str
+        Scenario, or name or path of one.
+    vary : mapping
+        Lists of values by dotted path: ``scenario.`` and a key of a scenario, ``sensor.`` and a
+        key of a sensor file, or ``options.`` and an option of the kind.
+    repeats : int
+        Number of rows at each setting.
+    kind : str
+        Kind of the rows, or ``module:function`` of an allowed module.
+    changes : mapping
+        Values that hold in every row, by dotted path.
+    seed : int
+        Seed of all rows.
+
+    Raises
+    ------
+    StudyError
+        A value does not fit.
+
+    Examples
+    --------
+    >>> import identify
+    >>> scenario = identify.load_scenario("quick", renderer="statistical")
+    >>> noise = {"sensor.camera.dark_noise": [13.0, 26.0]}
+    >>> study = identify.Study(scenario, kind="static_pose", vary=noise, repeats=2)
+    >>> len(study.run(workers=0))
+    4
+    """
+
+    scenario: Scenario | str
+    vary: Mapping[str, list[Any]] = field(default_factory=dict)
+    repeats: int = 1
+    kind: str = "identification"
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    seed: int = 0
+
+    def run(
+        self,
+        workers: int | None = None,
+        folder: Path | str | None = None,
+        progress: Progress | None = None,
+    ) -> pd.DataFrame:
+        """Compute all rows, and return them as a table.
+
+        Parameters
+        ----------
+        workers : int, optional
+            Number of processes, 0 for this one alone. The default is one for each core. A script
+            that asks for processes calls this below ``if __name__ == "__main__":``.
+        folder : str or Path, optional
+            Folder in which finished rows are kept; the same call goes on from there. Without one
+            nothing is kept.
+        progress : Progress, optional
+            Where the rows are counted.
+
+        Returns
+        -------
+        pandas.DataFrame
+            A row for each setting and repeat: the factors by their paths, and the figures.
+
+        Raises
+        ------
+        StudyError
+            The study is not valid, or a row failed.
+        StudyInterrupted
+            Ctrl-C ended it.
+        """
+        scenario = self.scenario
+        if not isinstance(scenario, Scenario):
+            scenario = load_scenario(scenario)
+        study = self._file(scenario)
+        count = cores() if workers is None else workers
+        check_memory(study, max(count, 1), scenario)
+        computing = partial(local_processes, count) if count else in_this_process
+        with tempfile.TemporaryDirectory(prefix="cmmsim-study-") as temporary:
+            place = Path(temporary) / "study" if folder is None else Path(folder)
+            outcome = run_study(
+                study, place, progress or SilentProgress(), computing, scenario=scenario
+            )
+        if outcome.failures:
+            raise StudyError(
+                f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}"
+            )
+        return outcome.frame.drop(columns=[*BOOKKEEPING])
+
+    def _file(self, scenario: Scenario) -> StudyFile:
+        """Return what a study file of this study would hold."""
+        study = StudyFile(name=scenario.name, kind=self.kind, scenario=scenario.name)
+        options = {"seed": self.seed, "repeats": self.repeats}
+        return study.with_settings({**self.changes, **self.vary, **options})

@@ -1,0 +1,54 @@
+"""Work shared out among processes of this machine that never outlive their command."""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context, resource_tracker
+from typing import Any, TypeVar
+
+from identify.runtime import deaf_offspring, end_with_parent, held
+
+R = TypeVar("R")
+
+
+@contextmanager
+def mapped(
+    count: int | None,
+    function: Callable[..., R],
+    *tasks: Iterable[Any],
+    start: Callable[[], object] | None = None,
+) -> Iterator[Iterator[R]]:
+    """Yield what a function makes of tasks, in their order, computed in new processes.
+
+    The processes never hear Ctrl-C. They end at once when an exception such as Ctrl-C leaves the
+    block, and when this process is gone.
+
+    Parameters
+    ----------
+    count : int, optional
+        Number of processes. None means one a core.
+    function : callable
+        Function of one item of each of the tasks.
+    *tasks : iterables
+        Arguments of the function.
+    start : callable, optional
+        Function that each process calls first.
+    """
+    resource_tracker.ensure_running()  # its start in the deaf block would unblock Ctrl-C
+    others = set(active_children())
+    with ProcessPoolExecutor(count, get_context("spawn"), _begin, (start,)) as pool:
+        try:
+            with deaf_offspring():  # the pool starts its processes when it gets the tasks
+                found = pool.map(function, *tasks)
+            yield found
+        except BaseException:
+            with held():
+                for process in set(active_children()) - others:
+                    process.kill()
+            raise
+
+
+def _begin(start: Callable[[], object] | None) -> None:
+    end_with_parent()
+    if start is not None:
+        start()
