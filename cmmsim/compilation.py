@@ -59,6 +59,13 @@ def _save_closed(save: Callable[..., None], *what: object) -> None:
     os.umask(umask | OTHERS)
     try:
         save(*what)
+    except OSError as error:
+        warnings.warn(
+            f"kernels cannot be kept ({error.strerror}), so that every process compiles anew; name "
+            "another folder with NUMBA_CACHE_DIR",
+            CompilationWarning,
+            stacklevel=2,
+        )
     finally:
         os.umask(umask)
 

@@ -105,10 +105,8 @@ class Sensor:
 
     def __repr__(self) -> str:
         state = "not yet taught" if self._taught is None else "taught"
-        return (
-            f"Sensor({self.name!r}, method {self.method!r}, renderer {self._asked_renderer!r}, "
-            f"{state})"
-        )
+        how = f"method {self.method!r}, renderer {self._asked_renderer!r}"
+        return f"Sensor({self.name!r}, {how}, {state})"
 
     @property
     def name(self) -> str:

@@ -29,8 +29,8 @@ def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any
     """Error of a run that ended early, with the leg that is to blame for a pose out of reach."""
     why = FAILURES[status]
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
-        stopped = now.known.inputs[: problem.sizes.coordinates]
-        at = problem.robot.pose(stopped if status == LEFT_REACH else record.measured[frame])
+        last = now.known.inputs[: problem.sizes.coordinates]
+        at = problem.robot.pose(last if status == LEFT_REACH else record.measured[frame])
         margin = problem.robot.reach_margin(at)
         leg = int(np.argmin(margin))
         why += f" leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"

@@ -1,7 +1,10 @@
 """Command ``cmmsim``: its commands by group, its first help, and its handling of errors."""
 
+import errno
+import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from typing import Annotated
 
@@ -20,7 +23,7 @@ from identify.commands.scene import replay, show
 from identify.commands.sensor_tests import acceptance, detectors
 from identify.commands.study import study
 from identify.commands.tracking_runs import track
-from identify.errors import IdentifyError, VerificationError
+from identify.errors import IdentifyError, VerificationError, WriteError
 from identify.runtime import stoppable
 
 HELP = """
@@ -41,6 +44,9 @@ Examples:
   cmmsim COMMAND --help                what a command reads, writes and returns
 """
 
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a file that finds no room on its disk, or is larger than a file may be."""
+
 app = typer.Typer(
     name="cmmsim",
     cls=Commands,
@@ -59,17 +65,31 @@ def main() -> None:
     """
     warnings.showwarning = _show_warning
     try:
-        app()
+        with _printing():
+            app()
     except Exception as error:
         # An unknown error is a defect, whose traceback is wanted.
-        if not (is_known(error) or _is_full_output(error)):
+        if not is_known(error):
             raise
-        said = "cannot write standard output: " if _is_full_output(error) else ""
-        reason = (error.strerror if said and isinstance(error, OSError) else None) or str(error)
-        typer.echo(f"error: {said}{' '.join(reason.split())}", err=True)
+        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
         raise SystemExit(
             BEYOND_LIMIT if isinstance(error, VerificationError) else NOT_DONE
         ) from None
+
+
+@contextmanager
+def _printing() -> Iterator[None]:
+    """Raise WriteError if standard output is a file that finds no more room."""
+    try:
+        yield
+    except OSError as error:
+        # All other files are written in blocks that name them, see `identify.files.atomic`.
+        if error.filename is not None or error.errno not in NO_ROOM:
+            raise
+        # Python would else write the rest at its end, and fail once more.
+        with suppress(OSError):
+            sys.stdout.close()
+        raise WriteError(f"cannot write standard output: {error.strerror}") from None
 
 
 def _show_warning(

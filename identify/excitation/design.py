@@ -101,9 +101,7 @@ def design_trajectories(
         candidates = random_candidates(robot, scenario, settings.candidates, seed, check)
         problem = search_problem(robot, scenario, candidates, advance)
     found = SEARCHES[settings.method](problem, child(seed, SEARCH), progress)
-    index = log_observability(
-        robot, problem.unknowns, settings.duration_s, problem.unknowns.of(candidates[0])
-    )
+    index = log_observability(robot, problem.unknowns, settings.duration_s, problem.candidates[0])
     indices = [
         observability_index(index, problem.unknowns.of(trajectory)) for trajectory in candidates
     ]

@@ -144,7 +144,8 @@ def test_a_run_too_short_to_show_every_parameter_has_no_index():
     assert (
         alone.observability_index
         == alone.first_index
-        == pytest.approx(chosen.first_index, rel=1e-9)
+        # the scale is that of the best candidate, rounded to 1e-8 so that all processors agree
+        == pytest.approx(chosen.first_index, rel=1e-8)
     )
     assert chosen.observability_index > max(alone.observability_index, chosen.median_index)
     assert designed(duration_s=0.6).observability_index == 0.0

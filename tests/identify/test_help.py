@@ -94,7 +94,7 @@ def test_json_goes_to_a_file_beside_the_table_or_to_standard_output_in_its_place
     assert entry == json.loads((tmp_path / "a.json").read_text())
     assert entry["rank"] == len(entry["groups"])
     assert command("base-parameters", "rrr3", "--json", tmp_path, "--quiet") == NOT_DONE
-    assert "name another file with --json" in one_line(capfd.readouterr().err)
+    assert "Is a directory; name another place" in one_line(capfd.readouterr().err)
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
