@@ -165,12 +165,24 @@ def log_index(columns: ca.MX, combinations: Array, typical: Array, samples: int)
     # Powers of two scale without rounding.
     lengths = 2.0 ** np.rint(np.log2(np.linalg.norm(typical, axis=1)))
     factor = qr((typical / lengths[:, None]).T, mode="r")[0][:rank]
-    inverse = agreed(solve_triangular(factor, np.eye(rank))) / lengths[:, None]
+    inverse = _rounded_triangle(solve_triangular(factor, np.eye(rank))) / lengths[:, None]
     scaled = ca.DM(inverse.T) @ columns
     constant = np.linalg.slogdet(combinations @ combinations.T)[1]
     constant -= 2 * np.log(np.abs(np.diag(inverse))).sum()
     determinant = log_determinant(rank)(scaled @ scaled.T)
     return (determinant + float(agreed(constant))) / (2 * rank) - np.log(samples) / 2
+
+
+def _rounded_triangle(inverse: Array) -> Array:
+    """Round an inverse triangle as `agreed` does, and keep it regular.
+
+    A motion that hardly shows some parameter has entries so large that others on the diagonal are
+    rounded to zero. These are rounded by their own size.
+    """
+    rounded = agreed(inverse)
+    for k in np.flatnonzero(np.diag(rounded) == 0.0):
+        rounded[k, k] = agreed(inverse[k, k : k + 1])[0]
+    return rounded
 
 
 def observability_index(logarithm: ca.Function, z: Array) -> float:
