@@ -46,23 +46,28 @@ def compiled(function: F) -> Dispatcher[F]:
         return kernel
     if not _ours_alone(Path(kernel._cache.cache_path), Path(function.__code__.co_filename).parent):
         return njit(**options)(function)
-    kernel._cache.save_overload = partial(_save_closed, kernel._cache.save_overload)
+    kernel._cache.save_overload = partial(
+        _save_closed, kernel._cache.save_overload, kernel._cache.cache_path
+    )
     # numba asks only whether the function's own file has changed, but kernels call kernels of
     # other files
     kernel._cache._cache_file._source_stamp = _stamp()
     return kernel
 
 
-def _save_closed(save: Callable[..., None], *what: object) -> None:
-    """Have numba write files that others cannot write to, whatever the user's umask."""
+def _save_closed(save: Callable[..., None], folder: str, *what: object) -> None:
+    """Have numba write files that others cannot write to, whatever the user's umask.
+
+    Where they cannot be written, a warning says so.
+    """
     umask = os.umask(OTHERS)
     os.umask(umask | OTHERS)
     try:
         save(*what)
     except OSError as error:
         warnings.warn(
-            f"kernels cannot be kept ({error.strerror}), so that every process compiles anew; name "
-            "another folder with NUMBA_CACHE_DIR",
+            f"kernels cannot be kept in {folder} ({error.strerror}), so that every process "
+            "compiles anew; name another folder with NUMBA_CACHE_DIR",
             CompilationWarning,
             stacklevel=2,
         )

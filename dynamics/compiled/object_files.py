@@ -4,6 +4,7 @@ import os
 import stat
 import tempfile
 import warnings
+from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -52,6 +53,7 @@ def save_object(name: str, content: bytes) -> None:
     written.
     """
     path = cache_folder() / name
+    missing = [folder for folder in path.parents if not folder.exists()]
     beside = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -63,6 +65,9 @@ def save_object(name: str, content: bytes) -> None:
     except OSError as error:
         if beside is not None:
             Path(beside).unlink(missing_ok=True)
+        with suppress(OSError):  # one into which another process has written meanwhile stays
+            for folder in missing:
+                folder.rmdir()
         text = (
             f"machine code cannot be kept in {path.parent} ({error.strerror}), so that every "
             "process compiles anew"

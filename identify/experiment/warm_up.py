@@ -1,16 +1,20 @@
 """Compilation of robots, closed loop and sensor before a run, in parallel."""
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
+from multiprocessing.queues import SimpleQueue
 
 import numpy as np
 
+from cmmsim.compilation import CompilationWarning
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import RateSensor, Reference, prepare
-from identify.errors import IdentifyError
+from dynamics.compiled.object_files import CacheWarning
+from identify.errors import IdentifyError, WriteError
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import taught_sensor
 from identify.experiment.sensor_in_loop import SensorInLoop, with_renderer
@@ -39,7 +43,8 @@ def warm_up(scenario: Scenario, progress: Progress, robots: tuple[str, ...] = ()
 
     Each task has a process of its own, because LLVM compiles on one core. All cores are used.
 
-    Raises the errors of a run before its first frame, and IdentifyError if a process dies.
+    Raises the errors of a run before its first frame, IdentifyError if a process dies, and
+    WriteError if code cannot be kept.
     """
     scenario = with_renderer(scenario)
     build_plant(scenario)
@@ -79,7 +84,11 @@ def _compile_named(name: str) -> None:
 def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
     """Do named tasks, each in a new process, as many at a time as there are cores."""
     spawn = get_context("spawn")
-    waiting = [spawn.Process(target=task, name=name, daemon=True) for name, task in tasks.items()]
+    unkept = spawn.SimpleQueue()
+    waiting = [
+        spawn.Process(target=_do, args=(task, unkept), name=name, daemon=True)
+        for name, task in tasks.items()
+    ]
     running: list[SpawnProcess] = []
     try:
         while waiting or running:
@@ -96,10 +105,23 @@ def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
                         f"compiling {process.name} failed: its process ended with status "
                         f"{process.exitcode}"
                     )
+                if not unkept.empty():
+                    raise WriteError(unkept.get())
                 advance()
     finally:
         for process in running:
             process.kill()
+
+
+def _do(task: Task, unkept: "SimpleQueue[str]") -> None:
+    """Do a task, and put what it warns of code that cannot be kept into a queue."""
+    with warnings.catch_warnings(record=True) as given:
+        task()
+    for one in given:
+        if issubclass(one.category, (CacheWarning, CompilationWarning)):
+            unkept.put(str(one.message))
+        else:
+            warnings.showwarning(one.message, one.category, one.filename, one.lineno)
 
 
 def _nearby(plant: Plant) -> Reference:

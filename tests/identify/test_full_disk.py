@@ -12,19 +12,26 @@ import resource
 import shlex
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, wraps
 from importlib import import_module, resources
+from importlib.util import module_from_spec, spec_from_file_location
+from multiprocessing import get_context
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from cmmsim.compilation import CompilationWarning
 from dynamics import load_robot
+from dynamics.compiled.object_files import DIGEST, load_object, save_object
+from identify.experiment import warm_up
 from identify.files import atomic
 from identify.files.atomic import figure_bytes
 from identify.files.run_folder import as_json
@@ -63,7 +70,7 @@ LARGE = "size=64m,nr_inodes=10000"
 SHORT = (
     "quick --set renderer=analytic --set excitation.duration_s=2.0 --set excitation.candidates=2"
     " --set identification.max_iterations=1 --set validation.duration_s=1.0"
-    " --set validation.count=3"
+    " --set validation.count=1"
 )
 PLAN = (
     "identify.stages.plan.untaught_sensor",
@@ -371,7 +378,7 @@ def made(tmp_path_factory):
     (folder / "motion.csv").write_text(motion(), encoding="utf-8")
     pictures = ("--sensor", folder / "small.toml", "--board", folder / "board.toml", "--quiet")
     out = ("--out", folder / "pictures")
-    assert command("calibrate", "--render", 8, *pictures, *out) == 0
+    assert command("calibrate", "--render", 4, *pictures, *out) == 0
     assert command("export", "mjcf", "ups6", "--out", folder / "ups6.xml", "--quiet") == 0
     robot = load_robot("ups6")
     urdf, closures = urdf_of(robot, robot.nominal_parameters, False)
@@ -535,8 +542,9 @@ def full_disk(case, disk, folder, capsys, count):
             check_goes_on(case, place, folder, whole)
 
 
-def test_every_command_is_in_the_table():
-    assert {case.words for case in CASES.values()} == {" ".join(words) for words in COMMANDS}
+def test_every_command_is_in_the_table_or_writes_the_cache_alone():
+    written = {case.words for case in CASES.values()} | {"warm-up"}
+    assert written == {" ".join(words) for words in COMMANDS}
 
 
 @pytest.mark.slow
@@ -643,3 +651,83 @@ def test_a_place_that_is_gone_when_it_is_written_to_is_one_line_and_is_not_made_
         assert call(case, place, made) == 1
     assert str(place) in one_line(capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == [place]
+
+
+OBJECTS = [f"code{number}" for number in range(4)]
+
+
+def keep_code(*_):
+    """Stand for the compilation of a robot, which takes half a minute: keep code of some size."""
+    for name in OBJECTS:
+        save_object(name, bytes(3 * PAGE - DIGEST))
+
+
+@pytest.fixture
+def quick_warm_up(disk, monkeypatch):
+    """The module of a warm-up that keeps code on the disk; its processes find it replaced."""
+    monkeypatch.setenv("CMMSIM_CACHE", str(disk.path / "new" / "code"))
+    monkeypatch.setattr(warm_up, "get_context", lambda _: get_context("fork"))
+    monkeypatch.setattr(warm_up, "_compile_plant", keep_code)
+    monkeypatch.setattr(warm_up, "_compile_sensor", lambda *_: None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [*(f"size={k * PAGE}" for k in range(1, 11)), "ro"])
+def test_warm_up_ends_in_one_line_where_code_finds_no_room_and_keeps_what_is_whole(
+    options, disk, quick_warm_up, capfd
+):
+    """Four files take twelve pages."""
+    disk.empty()
+    disk.change(options)
+    assert command("warm-up", "quick", "--quiet") == 1
+    reason = os.strerror(errno.EROFS if options == "ro" else errno.ENOSPC)
+    said = one_line(capfd.readouterr().err)
+    assert f"cannot be kept in {disk.path / 'new' / 'code'} ({reason})" in said
+    kept = {path.name for path in disk.path.glob("new/code/*")}
+    assert kept <= set(OBJECTS)
+    assert all(load_object(name) is not None for name in kept)
+    assert kept or not content(disk.path)
+    disk.change(f"rw,size={4 * 3 * PAGE}")
+    assert command("warm-up", "quick", "--quiet") == 0
+    assert {path.name for path in disk.path.glob("new/code/*")} == set(OBJECTS)
+
+
+@pytest.mark.slow
+def test_a_kernel_that_finds_no_room_in_the_cache_is_a_warning_and_computes(disk):
+    disk.empty()
+    source = disk.path / "kernel_on_a_full_disk.py"
+    source.write_text(
+        "from cmmsim.compilation import compiled\n\n\n"
+        "@compiled\ndef doubled(x):\n    return 2 * x\n"
+    )
+    found = spec_from_file_location(source.stem, source)
+    module = module_from_spec(found)
+    found.loader.exec_module(module)
+    before = content(disk.path)
+    disk.change(f"size={used(disk.path)[0] * PAGE}")
+    with pytest.warns(CompilationWarning, match=f"kept in {disk.path}.*No space left on device"):
+        assert module.doubled(21) == 42
+    assert content(disk.path) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "line",
+    ["--help", "study --show pixel_noise", "base-parameters rrr3", "base-parameters rrr3 --json -"],
+)
+def test_standard_output_on_a_full_disk_is_one_line(line, capsys, monkeypatch):
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert command(*line.split()) == 1
+        assert full.closed
+    said = one_line(capsys.readouterr().err)
+    assert said == f"error: cannot write standard output: {NO_ROOM}\n"
+
+
+@pytest.mark.slow
+def test_a_process_whose_standard_output_is_full_says_no_more_at_its_end():
+    words = [sys.executable, "-m", "identify", "study", "--show", "pixel_noise"]
+    with Path("/dev/full").open("wb") as full:
+        ended = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert ended.returncode == 1
+    assert ended.stderr == f"error: cannot write standard output: {NO_ROOM}\n"
