@@ -1,4 +1,4 @@
-"""Errors of measured poses with the built-in detector and with one's own."""
+"""Compare the errors of measured poses with the built-in detector and with your own."""
 
 import numpy as np
 

@@ -8,7 +8,7 @@ THRESHOLD = 0.3  # of the contrast between dark ring and sticker
 
 
 def find_centres(given):
-    """SpotWindows -> DetectedCentres: centres in px of the whole image, with covariances."""
+    """Find the centres in SpotWindows, in px of the whole image, with their covariances."""
     windows = given.windows.astype(float)  # (n, h, h) grey values
     flat = windows.reshape(len(windows), -1)
     dark, bright = np.percentile(flat, 50, axis=1), flat.max(axis=1)
@@ -19,7 +19,7 @@ def find_centres(given):
     x = (weights.sum(axis=1) @ ticks) / total
     y = (weights.sum(axis=2) @ ticks) / total
 
-    # What the noise of the grey values does to the centroid, to first order.
+    # Covariance of the centroid from the noise of the grey values, to first order.
     dx = (ticks[None, None, :] - x[:, None, None]) * (weights > 0) / total[:, None, None]
     dy = (ticks[None, :, None] - y[:, None, None]) * (weights > 0) / total[:, None, None]
     slopes = np.stack([dx, dy], axis=1)  # (n, 2, h, h)
@@ -29,4 +29,4 @@ def find_centres(given):
     return DetectedCentres(np.stack([x, y], axis=1) + given.corners, covariances, good)
 
 
-find_centres.bias_px = 0.012  # its error without noise, which the covariance does not hold
+find_centres.bias_px = 0.012  # its error without noise, which the covariance does not contain

@@ -1,4 +1,4 @@
-"""Write the record of runs/quick-0 as mine.csv, as a laboratory would have logged it."""
+"""Write the record of runs/quick-0 as mine.csv, as a laboratory would log it."""
 
 import numpy as np
 import pandas as pd

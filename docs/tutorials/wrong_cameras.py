@@ -1,4 +1,4 @@
-"""What cameras that are as wrong as a calibration leaves them do to measured poses."""
+"""Errors of measured poses with cameras that are as inexact as a calibration leaves them."""
 
 import json
 from pathlib import Path
