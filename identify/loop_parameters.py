@@ -1,4 +1,4 @@
-"""Closed loop of a scenario: its settings and its parameters."""
+"""Closed loop around a plant or a model: its settings and its parameters."""
 
 import json
 import sys
@@ -14,33 +14,24 @@ from dynamics.errors import ParameterError
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
-from identify.scenario import Model, Plant, Scenario
-from identify.scenario.plant_sections import AUTO, FILTERED
+from identify.scenario import Model, Plant, Timing
+from identify.scenario.plant_sections import FILTERED, Control, Servo
 from identify.scenario.section import ACTUATOR_KEYS, Section
 
 NOMINAL = "initial"
 """Parameter set that is used if none is named."""
 
 
-def model_settings(robot: Robot, scenario: Scenario) -> LoopSettings:
-    """Return the settings of the loop around the estimator's model.
-
-    The latency is the mean one where no record says when commands acted. Raises the errors of
-    `loop_settings`.
-    """
-    return loop_settings(robot, scenario, scenario.model)
-
-
-def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> LoopSettings:
+def loop_settings(
+    robot: Robot, servo: Servo, timing: Timing, control: Control, side: Plant | Model
+) -> LoopSettings:
     """Return the settings of the loop around the plant or the model.
 
-    Servo, timing and torque limit are the scenario's. Friction law, drive law and integration steps
-    are those of the plant or the model.
+    The latency is the mean one. Friction law, drive law and integration steps are those of the
+    plant or the model, and only the torque limit is taken from `control`.
 
     Raises ScenarioError for a constant of the other kind of actuators.
     """
-    servo = scenario.servo
-    timing = scenario.timing
     smoothing = of_actuators(robot, side, "smoothing_velocity")
     stribeck = of_actuators(robot, side, "stribeck_velocity")
     return LoopSettings(
@@ -48,24 +39,15 @@ def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> Loop
         timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
         friction=FrictionLaw(side.friction, smoothing, side.static_ratio, stribeck),
         steps_per_frame=side.steps_per_frame,
-        drives=Drives(
-            torque_limit=of_actuators(robot, scenario.control, "torque_limit"),
-            law=side.drive_law,
-            filter_time=side.derivative_filter_s if side.drive_law == FILTERED else None,
-        ),
+        drives=drives_of(side, of_actuators(robot, control, "torque_limit")),
     )
 
 
-def with_drive(scenario: Scenario, law: DriveName) -> Scenario:
-    """Return the scenario with an identified drive law, if its model leaves it to the record."""
-    if scenario.model.drive != AUTO:
-        return scenario
-    return scenario.with_overrides(drive_settings(law))
-
-
-def drive_settings(law: DriveName) -> dict[str, str | None]:
-    """Return the settings, by dotted path, of a model with this drive law."""
-    return {"model.drive": law} | ({} if law == FILTERED else {"model.derivative_filter_s": None})
+def drives_of(side: Plant | Model, torque_limit: float | None) -> Drives:
+    """Return the drives of the plant or the model with a torque limit, N m or N."""
+    law = side.drive_law
+    filter_time = side.derivative_filter_s if law == FILTERED else None
+    return Drives(torque_limit=torque_limit, law=law, filter_time=filter_time)
 
 
 def settled_drive(identification: Any) -> DriveName:

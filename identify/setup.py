@@ -27,7 +27,6 @@ from identify.experiment.run import excitation_run, teach, untaught_sensor
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.files.atomic import write_bytes
 from identify.files.dataset import POSE, netcdf
-from identify.loop_parameters import with_drive
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import integer_seed
 from identify.record import recording
@@ -160,7 +159,7 @@ class Setup:
         """
         if not isinstance(result, IdentificationResult):
             raise EstimationError(f"{result!r} is no result: identify.identify(record) gives one")
-        scenario = with_drive(self.scenario, result.drive.law)
+        scenario = self.scenario.with_drive(result.drive.law)
         return UnseenErrors(unseen_errors(result.estimate, self.robot, scenario, self.seed))
 
 

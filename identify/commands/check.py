@@ -65,8 +65,10 @@ def check(
       cmmsim check ups6 --set control.servo_bandwidth_rad_s=4.0
     """
     from dynamics import load_robot
-    from identify.loop_parameters import NOMINAL, check_parameter_set
-    from identify.verification.robot_check import check_robot
+    from identify.experiment.law_in_loop import feedback
+    from identify.experiment.sensor_in_loop import sensor_file
+    from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
+    from identify.verification.robot_check import Surroundings, check_robot
 
     chosen = load_robot(robot)
     given = chosen_scenario(scenario, settings, None)
@@ -75,7 +77,15 @@ def check(
     )
     check_parameter_set(chosen, name)
     values = chosen.parameter_sets[name].vector
-    findings = check_robot(chosen, values, given, terminal_progress(quiet))
+    around = Surroundings(
+        settings=loop_settings(chosen, given.servo, given.timing, given.control, given.model),
+        control=given.control,
+        feedback=feedback(given),
+        limits=given.excitation,
+        sensor=given.sensor,
+        sensor_file=sensor_file(given),
+    )
+    findings = check_robot(chosen, values, around, terminal_progress(quiet))
     failed = [finding for finding in findings if not finding.ok]
     rows = [
         (

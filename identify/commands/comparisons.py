@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -235,6 +236,7 @@ def variation(
       cmmsim variation --out fast --designed 10
     """
     from dynamics import load_robot
+    from identify.estimation.identification import identify
     from identify.files.dataset import netcdf
     from identify.record.provenance import RunFiles
     from identify.record.recording import run_groups
@@ -262,7 +264,8 @@ def variation(
         seen.check_made_of("validation.nc")
         records = seen.validation
         origin = "unseen"
-    found = variation_of(identify_each(records, robot, scenario, progress))
+    identify_one = partial(identify, robot=robot, scenario=scenario)
+    found = variation_of(identify_each(records, identify_one, progress))
     table = tables.variation_table(found)
     entry = tables.variation_entry(found, origin)
     files = {

@@ -14,7 +14,7 @@ costs are divided by its misfit, so that a record that no law explains rules non
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,9 +25,8 @@ from identify.errors import EstimationError
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import Search, output_error_searches
 from identify.estimation.warm_start import linear_warm_start
-from identify.loop_parameters import drive_settings
 from identify.progress import Progress, SilentProgress
-from identify.scenario import Scenario
+from identify.scenario import Model
 from identify.scenario.plant_sections import AUTO
 
 SURE = 0.95
@@ -84,30 +83,30 @@ class DriveChoice:
 
 
 def choose_drive(
-    problem_of: Callable[[Scenario], OutputErrorProblem],
-    scenario: Scenario,
+    problem_of: Callable[[DriveName], OutputErrorProblem],
+    model: Model,
     progress: Progress,
     in_loop: bool = True,
 ) -> DriveChoice:
-    """Return the law that a scenario names or, if it leaves that open, the most probable one.
+    """Return the law that a model names or, if it leaves that open, the most probable one.
 
-    problem_of: returns the output-error problem of a scenario that names a law. in_loop: False if
-    no law acted in the record. Raises EstimationError if no law gives a model that runs.
+    problem_of: function that returns the output-error problem under a law. in_loop: False if no law
+    acted in the record. Raises EstimationError if no law gives a model that runs.
     """
-    law = scenario.model.drive_law
+    law = model.drive_law
     if not in_loop:
         return DriveChoice(law, {law: 1.0}, in_loop)
-    if scenario.model.drive != AUTO:
+    if model.drive != AUTO:
         return DriveChoice(law, {law: 1.0})
-    laws = scenario.model.drives_considered
+    laws = model.drives_considered
+    first = {}
+    failed = []
     with progress.stage("laws of the drives", 2 * len(laws)) as advance:
-        first = {}
-        failed = []
         for law in laws:
-            own = _asking(scenario, law, FIRST)
             try:
-                problem = problem_of(own)
-                first[law] = _searched(problem, own, linear_warm_start(problem, own))
+                problem = problem_of(law)
+                early = replace(problem, stop=replace(problem.stop, max_iterations=FIRST))
+                first[law] = _searched(early, linear_warm_start(problem))
             # a law under which no model runs is out, and the others decide
             except (EstimationError, DynamicsError) as error:
                 failed.append(f"{law}: {error}")
@@ -117,31 +116,23 @@ def choose_drive(
                 f"no law of the drives gives a model that runs: {'; '.join(failed)}"
             )
         limit = HOPELESS * min(one.solution.costs[-1] for one in first.values())
-        found = {}
-        for law, one in first.items():
-            if one.solution.costs[-1] <= limit:
-                own = _asking(scenario, law, scenario.identification.max_iterations)
-                found[law] = evidence(_searched(problem_of(own), own, one.solution.parameters))
+        found = {
+            law: evidence(_searched(problem_of(law), one.solution.parameters))
+            for law, one in first.items()
+            if one.solution.costs[-1] <= limit
+        }
         # laws that were left out count as searched
         advance(len(laws))
     return DriveChoice(*_weighed(found, laws))
 
 
-def _asking(scenario: Scenario, law: DriveName, iterations: int) -> Scenario:
-    """Return the scenario of the search for one law, under the logged commands."""
-    searched = {
-        "identification.method": "command_driven",
-        "identification.max_iterations": iterations,
-    }
-    return scenario.with_overrides({**drive_settings(law), **searched})
-
-
-def _searched(problem: OutputErrorProblem, scenario: Scenario, start: Array) -> Search:
+def _searched(problem: OutputErrorProblem, start: Array) -> Search:
     """Search for the optimum under the logged commands.
 
     Raises EstimationError if no model runs.
     """
-    return output_error_searches(problem, scenario, start, SilentProgress())["command_driven"]
+    found = output_error_searches(problem, start, closed_loop=False, progress=SilentProgress())
+    return found["command_driven"]
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,6 @@ from identify.estimation.explanation import Explanation
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import StartingGuess, friction, holding_torque
 from identify.estimation.scale_anchor import ScaleAnchor
-from identify.scenario import Scenario
 
 IDENTIFIABLE_SHARE = 0.5
 """Share of the guess's standard deviation, and of the size, that may be left in doubt.
@@ -322,12 +321,15 @@ class Judgement:
 
 def judge(
     problem: OutputErrorProblem,
-    scenario: Scenario,
+    qr_threshold: float,
     solution: Solution,
     uncertainty: Uncertainty,
     explanation: Explanation,
 ) -> Judgement:
-    """Judge what a search found, by its uncertainty and by how well it explains the records."""
+    """Judge what a search found, by its uncertainty and by how well it explains the records.
+
+    qr_threshold: that of `rank_by_threshold` for the groups that the references excite.
+    """
     robot = problem.runs[0].robot
     guess = problem.guess
     estimate = solution.parameters
@@ -351,6 +353,10 @@ def judge(
         uncertainty.covariance,
         problem.bounds,
     )
+    excited = [
+        reference_regressor(run.robot, run.reference, run.settings.timing.frame_rate_hz)
+        for run in problem.runs
+    ]
     of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return Judgement(
         identifiable=criterion.judge(each, uncertainty.covariance),
@@ -363,7 +369,7 @@ def judge(
         groups=group_estimates(base, guess, criterion, estimate, uncertainty),
         group_intervals=bounded.intervals(group_rows(base)),
         conditioning=conditioned,
-        base_rank=_excited_rank(problem, scenario),
+        base_rank=rank_by_threshold(np.concatenate(excited), qr_threshold),
         active_bounds=bounded.active_bounds,
         warnings=(
             *of_the_records,
@@ -374,10 +380,3 @@ def judge(
             *scale_warnings(problem.anchor, gain_left, float(prior_share[gain])),
         ),
     )
-
-
-def _excited_rank(problem: OutputErrorProblem, scenario: Scenario) -> int:
-    """Return the number of independent groups that the references excite, by the paper's rule."""
-    rate_hz = scenario.timing.frame_rate_hz
-    excited = [reference_regressor(run.robot, run.reference, rate_hz) for run in problem.runs]
-    return rank_by_threshold(np.concatenate(excited), scenario.identification.qr_threshold)

@@ -1,7 +1,7 @@
 """Identification of one record: linear warm start, output error, uncertainty, identifiability.
 
-Sees the record, the robot's geometry and starting guess, and the scenario's model side; never the
-sensor, the plant's settings or the truth.
+It sees the record, the robot's geometry and starting guess, and the scenario's model side. It never
+sees the sensor, the plant's settings or the truth.
 """
 
 import time
@@ -10,12 +10,11 @@ from dataclasses import replace
 
 import xarray as xr
 
-from dynamics import DynamicsError, Robot
-from dynamics.closed_loop.start_state import (
-    checked_loop_parameters,
-)
+from dynamics import DynamicsError, Robot, load_robot
+from dynamics.closed_loop.start_state import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.base_parameters import structure
+from identify.estimation.bounded_least_squares import StopCriteria
 from identify.estimation.common_error_estimates import common_error_estimates
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.drive_choice import choose_drive
@@ -23,12 +22,11 @@ from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
-from identify.estimation.prior import StartingGuess, model_guess
+from identify.estimation.prior import model_guess
 from identify.estimation.result import IdentificationResult
 from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
-from identify.loop_parameters import with_drive
-from identify.model.from_record import identified_model
+from identify.model.from_record import ModelSide, identified_model, model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.command_times import command_time_warnings
@@ -38,6 +36,7 @@ from identify.record.provenance import recorded_scenario, recorded_seed
 from identify.record.recorded_law import SERVO, recorded_law
 from identify.runtime import one_thread
 from identify.scenario import Scenario
+from identify.scenario.sections import Identification
 
 
 @one_thread
@@ -92,33 +91,41 @@ def identify(
     if not records:
         raise EstimationError("no record to identify from")
     scenario = recorded_scenario(records[0]) if scenario is None else scenario
-    if robot is None and isinstance(scenario, Scenario):
-        robot = known_geometry(scenario).robot
-    scenario = under_its_law(scenario, records)
-    problem = output_error_problem(records, robot, scenario)
+    _check_type(scenario, Scenario, "identify.load_scenario")
+    if robot is None:
+        robot = known_geometry(load_robot(scenario.robot), scenario.geometry).robot
+    _check_type(robot, Robot, "dynamics.load_robot")
+    settings = scenario.identification
+    # the model can close the loop of the servo, and under any other law gets the logged commands
+    by_servo = all(recorded_law(record) == SERVO for record in records)
+    closed_loop = by_servo and settings.method == "closed_loop"
+    side = model_side(robot, scenario)
+    problem = output_error_problem(records, side, settings)
     in_loop = not any(run.settings.drives.torques for run in problem.runs)
     drive = choose_drive(
-        lambda named: output_error_problem(records, robot, named), scenario, progress, in_loop
+        lambda law: output_error_problem(records, side.with_drive(law), settings),
+        side.model,
+        progress,
+        in_loop,
     )
     if drive.asked:
-        scenario = with_drive(scenario, drive.law)
-        problem = output_error_problem(records, robot, scenario)
+        problem = output_error_problem(records, side.with_drive(drive.law), settings)
     rng = mixed_generator(UNCERTAINTY, recorded_seed(records[0]))
     chosen = time.perf_counter()
-    warm = linear_warm_start(problem, scenario)
+    warm = linear_warm_start(problem)
     warmed = time.perf_counter()
-    searches = output_error_searches(problem, scenario, warm, progress)
+    searches = output_error_searches(problem, warm, closed_loop, progress)
     searched = time.perf_counter()
-    method = scenario.identification.method
-    solution = searches[method].solution
-    judged = searches[method].linearised()
+    by_commands = searches["command_driven"]
+    last = searches["closed_loop"] if closed_loop else by_commands
+    solution = last.solution
+    judged = last.linearised()
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
-    by_commands = searches["command_driven"]
-    driven = judged if method == "command_driven" else by_commands.linearised()
+    driven = by_commands.linearised() if closed_loop else judged
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
-    judgement = judge(problem, scenario, solution, uncertainty, explained)
-    told = (*command_time_warnings(records, scenario.timing), *drift_warnings(records))
+    judgement = judge(problem, settings.qr_threshold, solution, uncertainty, explained)
+    told = (*command_time_warnings(records, side.timing), *drift_warnings(records))
     ended = time.perf_counter()
     return IdentificationResult(
         layout=robot.layout,
@@ -150,59 +157,52 @@ def identify(
     )
 
 
-def under_its_law(scenario: Scenario, records: Sequence[xr.Dataset]) -> Scenario:
-    """The scenario with the method that fits the law under which a record was made: the model can
-    close the loop of the servo, and under any other law gets the logged commands."""
-    if all(recorded_law(record) == SERVO for record in records):
-        return scenario
-    return scenario.with_overrides({"identification.method": "command_driven"})
+def _check_type(given: object, kind: type, loader: str) -> None:
+    if not isinstance(given, kind):
+        raise EstimationError(f"{given!r} is no {kind.__name__}: {loader}(name or path) gives one")
 
 
 def output_error_problem(
-    records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario
+    records: Sequence[xr.Dataset], side: ModelSide, settings: Identification
 ) -> OutputErrorProblem:
-    """The output-error problem of one or several records; the first brings the scale anchor.
+    """Return the output-error problem of one or several records.
 
-    Raises RecordError: no scale anchor, or no such poses. Raises EstimationError: no robot or
-    scenario; a record that does not fit, or cannot carry an identification. Raises ScenarioError:
-    no such starting guess, or one that no model has.
+    The first record brings the scale anchor.
+
+    Raises
+    ------
+    RecordError
+        A record has no scale anchor, or no such poses.
+    EstimationError
+        A record does not fit, or cannot carry an identification.
+    ScenarioError
+        There is no such starting guess, or no model has it.
     """
-    for given, kind, loader in (
-        (robot, Robot, "dynamics.load_robot"),
-        (scenario, Scenario, "identify.load_scenario"),
-    ):
-        if not isinstance(given, kind):
-            raise EstimationError(
-                f"{given!r} is no {kind.__name__}: {loader}(name or path) gives one"
-            )
-    found = [identified_model(record, robot, scenario) for record in records]
-    runs = tuple(replace(run, groups=structure(robot).rigid_groups) for run in found)
+    robot = side.robot
+    groups = structure(robot).rigid_groups
+    runs = tuple(replace(identified_model(record, side), groups=groups) for record in records)
     anchor = read_anchor(records[0], robot.layout)
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(
             f"the scale anchor is a payload, and the {len(runs)} records have all the same load: "
-            "one with and one "
-            "without it are needed"
+            "one with and one without it are needed"
         )
-    return OutputErrorProblem(
-        runs, _guess(robot, scenario), anchor, scenario.identification.physical_consistency
-    )
-
-
-def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
-    """The scenario's starting guess. Raises ScenarioError where the robot has none of the name, or
-    no model has it.
-    """
-    settings = scenario.identification
-    law = scenario.model.drive_law
-    guess = model_guess(robot, scenario)
+    guess = model_guess(robot, side.model, settings)
     try:
-        checked_loop_parameters(robot, guess.values, law)
+        checked_loop_parameters(robot, guess.values, side.model.drive_law)
     except DynamicsError as error:
         known = ", ".join(settings.prior) or "nothing"
         raise ScenarioError(
-            f"no model has the starting guess (set {scenario.model.start_parameters!r}, known "
-            f"beforehand: {known}): "
-            f"{error}"
+            f"no model has the starting guess (set {side.model.start_parameters!r}, known "
+            f"beforehand: {known}): {error}"
         ) from None
-    return guess
+    return OutputErrorProblem(
+        runs=runs,
+        guess=guess,
+        anchor=anchor,
+        low_pass=side.low_pass,
+        stop=StopCriteria(
+            settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations
+        ),
+        physical=settings.physical_consistency,
+    )

@@ -33,7 +33,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import effective_command, running_integral
 from identify.filtering import filtered_derivatives
 from identify.model.loop_model import LoopModel
-from identify.scenario import Scenario
+from identify.scenario import Filter
 
 SEGMENT_S = 0.5
 """Length of a segment, s.
@@ -133,18 +133,17 @@ def segments(run: LoopModel) -> list[Segment]:
     return found
 
 
-def measured_states(chain: list[Segment], parameters: Array, scenario: Scenario) -> Array:
+def measured_states(chain: list[Segment], parameters: Array, low_pass: Filter) -> Array:
     """Return the states (segments, s) at the starts of a run's segments.
 
     They are filtered poses and rates, and what the joint PID has integrated since the start, where
     it held the model with parameters (p,) at rest.
     """
     run = chain[0].run
-    rate_hz = scenario.timing.frame_rate_hz
-    filtering = scenario.filter
+    rate_hz = run.settings.timing.frame_rate_hz
     measured = run.robot.geometry.chart.coordinates(run.without_gaps())
-    place, rate, _ = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
-    _, _, command_integral = effective_command(run.logged, scenario, run.latencies)
+    place, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
+    _, _, command_integral = effective_command(run, low_pass)
     angle_integral = running_integral(run.robot.inverse_kinematics(run.robot.pose(place)), rate_hz)
     servo = run.settings.servo
     drives = run.settings.drives

@@ -16,23 +16,28 @@ import numpy as np
 
 from dynamics import DynamicsError
 from identify.arrays import Array, triangular_factor
+from identify.estimation.bounded_least_squares import StopCriteria
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
 from identify.estimation.prior import StartingGuess, prior_residuals
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.model.loop_model import LoopModel
+from identify.scenario import Filter
 
 
 @dataclass(frozen=True)
 class OutputErrorProblem:
     """Least-squares problem in a robot's parameters over one or several records.
 
-    It is solved by `bounded_least_squares.minimise`. With `physical` only bodies that can exist are
-    allowed.
+    It is solved by `bounded_least_squares.minimise`, until one of the criteria `stop` holds.
+    low_pass: filter of measured poses for the linear fits, by which a search starts. With
+    `physical` only bodies that can exist are allowed.
     """
 
     runs: tuple[LoopModel, ...]
     guess: StartingGuess
     anchor: ScaleAnchor
+    low_pass: Filter
+    stop: StopCriteria
     physical: bool = False
 
     @property

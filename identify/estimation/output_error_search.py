@@ -20,7 +20,6 @@ from identify.estimation.common_error_estimates import most_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.progress import Advance, Progress
-from identify.scenario import Scenario
 
 LINEARISATIONS = 6
 """Largest number of linearisations in the common errors."""
@@ -54,41 +53,39 @@ class Search:
 
 
 def output_error_searches(
-    problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
+    problem: OutputErrorProblem, warm: Array, closed_loop: bool, progress: Progress
 ) -> dict[str, Search]:
     """Search from the warm start (p,), and return the searches by name in their order.
 
-    The last one is that of the scenario's method. Raises EstimationError if no model runs.
+    closed_loop: True if the last search is that of the closed loop, False if it is the
+    command-driven one. Raises EstimationError if no model runs.
     """
     found = {}
     driven = problem.driven_by_commands()
     start = runnable_start(driven, warm)
     if start is None:
-        found["multiple_shooting"] = Search(driven, shoot(driven, scenario, warm, progress))
+        found["multiple_shooting"] = Search(driven, shoot(driven, warm, progress))
         start = found["multiple_shooting"].solution.parameters
-    settings = scenario.identification
-    closed_loop = settings.method == "closed_loop"
     told = any(run.common.all_names for run in problem.runs)
-    with progress.stage("identify", (1 + closed_loop + told) * settings.max_iterations) as advance:
+    most = (1 + closed_loop + told) * problem.stop.max_iterations
+    with progress.stage("identify", most) as advance:
         starts = [start]
         if told:
-            found["noise_alone"] = Search(driven, search(driven, start, scenario, advance))
+            found["noise_alone"] = Search(driven, search(driven, start, advance))
             starts = [found["noise_alone"].solution.parameters, start, problem.guess.values]
-        found["command_driven"] = searched = search_with_common_errors(
-            driven, starts, scenario, advance
-        )
+        found["command_driven"] = searched = search_with_common_errors(driven, starts, advance)
         if closed_loop:
             # the closed loop begins with the errors that the commands have shown
             problem = problem.having(
                 most_likely_errors(searched.problem, searched.solution.parameters)
             )
             start = _closed_loop_start(problem, searched.solution.parameters)
-            found["closed_loop"] = search_with_common_errors(problem, [start], scenario, advance)
+            found["closed_loop"] = search_with_common_errors(problem, [start], advance)
     return found
 
 
 def search_with_common_errors(
-    problem: OutputErrorProblem, starts: list[Array], scenario: Scenario, advance: Advance
+    problem: OutputErrorProblem, starts: list[Array], advance: Advance
 ) -> Search:
     """Minimise a problem with its common errors, from the best of some parameters (p,).
 
@@ -96,47 +93,38 @@ def search_with_common_errors(
     repeated until these settle.
     """
     problem, start = _with_common_errors(problem, starts)
-    solution = search(problem, start, scenario, advance)
+    solution = search(problem, start, advance)
     for _ in range(LINEARISATIONS if problem.bends else 0):
         errors = most_likely_errors(problem, solution.parameters)
         if problem.has(errors, SETTLED):
             break
         problem = problem.having(errors).with_common_errors(solution.parameters)
         # the progress was told of one search only
-        again = search(problem, solution.parameters, scenario, lambda n=1: None)
+        again = search(problem, solution.parameters, lambda n=1: None)
         counted = solution.evaluations + again.evaluations
         solution = replace(again, costs=solution.costs + again.costs[1:], evaluations=counted)
     return Search(problem, solution)
 
 
-def search(
-    problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance
-) -> Solution:
+def search(problem: OutputErrorProblem, start: Array, advance: Advance) -> Solution:
     """Minimise one output-error problem from parameters (p,), within its bounds."""
-    settings = scenario.identification
-    criteria = StopCriteria(
-        settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations
-    )
-    return _within_bounds(problem, problem, start, criteria, advance)
+    return _within_bounds(problem, problem, start, problem.stop, advance)
 
 
-def shoot(
-    problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
-) -> Solution:
+def shoot(problem: OutputErrorProblem, warm: Array, progress: Progress) -> Solution:
     """Find parameters with which the command-driven model runs, by multiple shooting.
 
     It starts from warm start or starting guess. Raises EstimationError if no model runs segment by
     segment, or none that does so runs over the whole records.
     """
-    settings = scenario.identification
-    criteria = StopCriteria(CLOSE_ENOUGH, settings.parameter_tolerance, settings.max_iterations)
+    criteria = replace(problem.stop, cost_tolerance=CLOSE_ENOUGH)
     chains = [segments(run) for run in problem.runs]
     for start in _candidates(problem, warm):
-        states = [measured_states(chain, start, scenario) for chain in chains]
+        states = [measured_states(chain, start, problem.low_pass) for chain in chains]
         shooting = MultipleShooting(problem, chains, states)
         if not np.isfinite(shooting.cost(start)):
             continue
-        with progress.stage("multiple shooting", settings.max_iterations) as advance:
+        with progress.stage("multiple shooting", criteria.max_iterations) as advance:
             solution = _within_bounds(shooting, problem, start, criteria, advance)
         if np.isfinite(problem.cost(solution.parameters)):
             return solution

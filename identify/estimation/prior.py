@@ -17,7 +17,8 @@ from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import check_parameter_set
-from identify.scenario import PriorValue, Scenario
+from identify.scenario import Model, PriorValue
+from identify.scenario.sections import Identification
 
 
 @dataclass(frozen=True)
@@ -87,10 +88,11 @@ def starting_guess(
     return guess
 
 
-def model_guess(robot: Robot, scenario: Scenario) -> StartingGuess:
-    """Return the starting guess of a scenario's model. Raises ScenarioError as `starting_guess`."""
-    settings = scenario.identification
-    model = scenario.model
+def model_guess(robot: Robot, model: Model, settings: Identification) -> StartingGuess:
+    """Return the starting guess of a model, with what the settings say of its parameters.
+
+    Raises ScenarioError as `starting_guess`.
+    """
     return starting_guess(
         robot, model.start_parameters, settings.start_std, settings.prior, model.drive_law
     )

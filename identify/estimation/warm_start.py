@@ -29,7 +29,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
-from dynamics import Robot
+from dynamics.closed_loop import FrameTiming
 from dynamics.closed_loop.command_schedule import acting_times
 from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array, triangular_factor
@@ -40,7 +40,7 @@ from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import Marginal
-from identify.scenario import Scenario
+from identify.scenario import Filter
 
 EDGE_FRACTION = 0.02
 """Share of the record left out at either end, where filtered derivatives are poor."""
@@ -52,7 +52,7 @@ REWEIGHTINGS = 3
 """Number of solutions of a fit. Each takes the size of the residual from the one before."""
 
 
-def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
+def linear_warm_start(problem: OutputErrorProblem) -> Array:
     """Fit parameters (p,) to the measured poses and commands of the problem's runs.
 
     Each run has its own starting torques. What a known payload adds stands on the right side, as do
@@ -65,7 +65,7 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
     pid = guess.layout.joint_pid
     drives = problem.runs[0].settings.drives
     law = drives.joint_law(guess.values[pid])
-    matrix, right, common = _stacked(problem, scenario, law)
+    matrix, right, common = _stacked(problem, law)
     lower = np.concatenate([np.zeros(count), np.full(matrix.shape[1] - count, -np.inf)])
     rows = _condensed(matrix, right, common)
     for _ in range(REWEIGHTINGS):
@@ -77,7 +77,7 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
         noise = max(noise * float(np.sqrt(np.sum(left**2) / len(right))), 1e-9)
         if law.lx:  # the columns of a cascade depend on its gains
             law = drives.joint_law(np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
-            matrix, right, common = _stacked(problem, scenario, law)
+            matrix, right, common = _stacked(problem, law)
             rows = _condensed(matrix, right, common)
     return np.maximum(solution[:count], 0.0)
 
@@ -90,9 +90,7 @@ def _condensed(matrix: Array, right: Array, common: Array) -> Array:
     return np.column_stack([matrix, right]) if common.shape[1] else triangular_factor(matrix, right)
 
 
-def _stacked(
-    problem: OutputErrorProblem, scenario: Scenario, law: JointLaw
-) -> tuple[Array, Array, Array]:
+def _stacked(problem: OutputErrorProblem, law: JointLaw) -> tuple[Array, Array, Array]:
     """Return the equations of all runs, N m or N.
 
     They are the matrix (rows, p + n runs), the right side (rows,), and the common errors (rows, k).
@@ -105,17 +103,14 @@ def _stacked(
     count = len(layout.names)
     joints = layout.joints
     for place, run in enumerate(runs):
-        latencies = run.latencies
-        balance, slipping = joint_balance(
-            run.robot, run.without_gaps(), run.logged, scenario, law, latencies
-        )
+        balance, slipping = joint_balance(run, run.without_gaps(), problem.low_pass, law)
         columns = balance[slipping]
         if run.settings.drives.torques:
             # torques that were commanded need no gains: they stand on the right side
             columns[:, layout.joint_pid] = 0.0
             matrices.append(columns[:, :count])
-            felt = effective_command(run.logged, scenario, latencies)[0][slipping]
-            right.append(felt - columns[:, :count] @ run.payload)
+            felt, _, _ = effective_command(run, problem.low_pass)
+            right.append(felt[slipping] - columns[:, :count] @ run.payload)
             common.append(np.zeros((len(columns), 0)))
             continue
         matrix = np.zeros((len(columns), count + joints * len(runs)))
@@ -123,11 +118,11 @@ def _stacked(
         matrix[:, count + joints * place :][:, :joints] = columns[:, count:]
         matrices.append(matrix)
         right.append(-columns[:, :count] @ run.payload)
-        common.append(_common_torques(run, problem.guess, scenario)[slipping])
+        common.append(_common_torques(run, problem.guess, problem.low_pass)[slipping])
     return np.concatenate(matrices), np.concatenate(right), np.concatenate(common)
 
 
-def _common_torques(run: LoopModel, guess: StartingGuess, scenario: Scenario) -> Array:
+def _common_torques(run: LoopModel, guess: StartingGuess, low_pass: Filter) -> Array:
     """Return the torques (N, n, k), N m or N, that common errors add to the balance of every joint.
 
     They are those of one standard deviation of each error of poses, geometry and latency, with the
@@ -140,34 +135,31 @@ def _common_torques(run: LoopModel, guess: StartingGuess, scenario: Scenario) ->
     if common.geometry:
         moved.append(common.geometry.joints(run.without_gaps()))
     if common.latency_std:
-        _, rate, _ = effective_command(run.logged, scenario, run.latencies)
+        _, rate, _ = effective_command(run, low_pass)
         moved.append(common.latency_std * rate[:, :, None])
     if not moved:
         return np.zeros((*run.logged.shape, 0))
     lp, li, _ = guess.values[guess.layout.joint_pid]
     angle = np.concatenate(moved, axis=2)
-    integral = running_integral(angle, scenario.timing.frame_rate_hz)
+    integral = running_integral(angle, run.settings.timing.frame_rate_hz)
     return np.concatenate([lp * angle, li * integral], axis=2)
 
 
 def joint_balance(
-    robot: Robot,
-    measured: Array,
-    commands: Array,
-    scenario: Scenario,
-    law: JointLaw,
-    latencies: Array | None = None,
+    run: LoopModel, poses: Array, low_pass: Filter, law: JointLaw
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the torque balance of every joint, and where joints slip.
 
     Parameters
     ----------
-    measured, commands : ndarray, shapes (N, 6) and (N, n)
-        Poses and commands.
+    run : LoopModel
+        Model of the run, with its logged commands.
+    poses : ndarray, shape (N, 6)
+        Poses of the run without gaps, such as the measured ones.
+    low_pass : Filter
+        Filter of poses and commands.
     law : JointLaw
         Law of the drives.
-    latencies : ndarray, shape (N,), optional
-        Latencies of the commands, s. The default is that of the timing.
 
     Returns
     -------
@@ -178,11 +170,12 @@ def joint_balance(
     slipping : ndarray of bool, shape (N, n)
         Frames at which a joint slips.
     """
-    rate_hz = scenario.timing.frame_rate_hz
-    cutoff_hz = scenario.filter.cutoff_hz
-    order = scenario.filter.order
+    robot = run.robot
+    rate_hz = run.settings.timing.frame_rate_hz
     chart = robot.geometry.chart
-    coordinates = filtered_derivatives(chart.coordinates(measured), rate_hz, cutoff_hz, order)
+    coordinates = filtered_derivatives(
+        chart.coordinates(poses), rate_hz, low_pass.cutoff_hz, low_pass.order
+    )
     pose = chart.pose(coordinates[0])
     pose_rate = chart.lifted(coordinates[1])
     acceleration = chart.lifted(coordinates[2])
@@ -192,12 +185,12 @@ def joint_balance(
     torque_map = np.linalg.inv(robot.joint_jacobian(pose) @ chart.basis).transpose(0, 2, 1)
     angle = robot.inverse_kinematics(pose)
     velocity = np.einsum("nij,nj->ni", robot.joint_jacobian(pose), twist)
-    command, command_rate, integral = effective_command(commands, scenario, latencies)
+    command, command_rate, integral = effective_command(run, low_pass)
     angle_integral = running_integral(angle, rate_hz)
-    count = len(measured)
+    count = len(poses)
     joints = robot.layout.joints
     start = np.broadcast_to(-np.eye(joints), (count, joints, joints))
-    rate = low_pass(law.rate_weight * command_rate - velocity, law.filter_time, rate_hz)
+    rate = first_order(law.rate_weight * command_rate - velocity, law.filter_time, rate_hz)
     pid = np.stack([command - angle, integral - angle_integral, rate], axis=2)
     by_gains = law.reads * pid - law.lx_by * angle[:, :, None]
     columns = np.concatenate([torque_map @ regressor, -by_gains, start], axis=2)
@@ -208,22 +201,19 @@ def joint_balance(
     return columns, slipping
 
 
-def effective_command(
-    commands: Array, scenario: Scenario, latencies: Array | None = None
-) -> tuple[Array, Array, Array]:
+def effective_command(run: LoopModel, low_pass: Filter) -> tuple[Array, Array, Array]:
     """Return the filtered command as the joints feel it, its rate, and its integral, at the frames.
 
     The rate is that which the joint PID sees: the difference of two commands, held. A held command
-    lags by half a frame, a ramped one by a whole frame. latencies (N,): those of the commands, s,
-    if not all have that of the timing.
+    lags by half a frame, a ramped one by a whole frame.
     """
-    if latencies is not None:
-        return _acted(commands, scenario, latencies)
-    timing = scenario.timing
-    filtering = scenario.filter
+    commands = run.logged
+    timing = run.settings.timing
+    if run.latencies is not None:
+        return _acted(commands, timing, low_pass, run.latencies)
     rate_hz = timing.frame_rate_hz
-    period = timing.frame_period_s
-    smooth = zero_phase_filter(commands, rate_hz, filtering.cutoff_hz, filtering.order)
+    period = 1.0 / rate_hz
+    smooth = zero_phase_filter(commands, rate_hz, low_pass.cutoff_hz, low_pass.order)
     times = np.arange(len(commands)) * period
     spline = make_interp_spline(times, smooth, k=5)
     # mean lag of what acts, over the period that follows a command
@@ -233,16 +223,16 @@ def effective_command(
     return felt, rate, running_integral(felt, rate_hz)
 
 
-def _acted(commands: Array, scenario: Scenario, latencies: Array) -> tuple[Array, Array, Array]:
+def _acted(
+    commands: Array, timing: FrameTiming, low_pass: Filter, latencies: Array
+) -> tuple[Array, Array, Array]:
     """Return `effective_command` of commands that each arrive after a latency of its own.
 
     What acts from one arrival to the next is integrated, and the filtered rates of the integrals
     are returned.
     """
-    timing = scenario.timing
-    filtering = scenario.filter
     rate_hz = timing.frame_rate_hz
-    period = timing.frame_period_s
+    period = 1.0 / rate_hz
     times = np.arange(len(commands), dtype=float) * period
     arrivals = acting_times(times, latencies)
     newest = np.maximum(np.searchsorted(arrivals, times, side="right") - 1, 0)
@@ -263,13 +253,13 @@ def _acted(commands: Array, scenario: Scenario, latencies: Array) -> tuple[Array
         )
         integral = so_far[newest] + since(newest, times - arrivals[newest])
         held = make_interp_spline(times, integral, k=5).derivative()(times)
-        return zero_phase_filter(held, rate_hz, filtering.cutoff_hz, filtering.order)
+        return zero_phase_filter(held, rate_hz, low_pass.cutoff_hz, low_pass.order)
 
     command = felt(commands, float(timing.hold == "linear"))
     return command, felt(differences * rate_hz, 0.0), running_integral(command, rate_hz)
 
 
-def low_pass(samples: Array, time_constant: float, rate_hz: float) -> Array:
+def first_order(samples: Array, time_constant: float, rate_hz: float) -> Array:
     """Filter samples (N, ...) by a low-pass filter of first order, with its time constant in s.
 
     A time constant of zero changes nothing. The filter has held the value of the first sample

@@ -110,8 +110,9 @@ def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters
             f"no instruments: the model of the present estimate does not run: {error}"
         ) from None
     noise_free = replace(evidence.run, logged=simulated.command)
+    problem = evidence.problem
     return torque_equations(
-        noise_free, simulated.pose, simulated.torque, evidence.scenario, equations.slipping
+        problem, noise_free, simulated.pose, simulated.torque, equations.slipping
     ).matrix
 
 
@@ -230,7 +231,7 @@ def _drawn_errors(evidence: Evidence, equations: TorqueEquations, noise: Array) 
     for _ in range(DRAWS):
         moved = poses + rng.standard_normal(poses.shape) @ factor.T
         read = channels.torque + channels.torque_std * rng.standard_normal(channels.torque.shape)
-        other = torque_equations(run, moved, read, evidence.scenario, equations.slipping)
+        other = torque_equations(evidence.problem, run, moved, read, equations.slipping)
         differences = np.column_stack(
             [other.matrix - equations.matrix, other.right - equations.right]
         )

@@ -18,7 +18,6 @@ from identify.errors import EstimationError, RecordError
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.own_parts import ESTIMATORS, Telling, check_choice, chosen, is_own
-from identify.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,6 @@ class Evidence:
     """
 
     problem: OutputErrorProblem
-    scenario: Scenario
     channels: JointChannels | None = None
     known_gains: Array | None = None
 

@@ -25,13 +25,13 @@ from dynamics import DynamicsError
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.estimation.warm_start import REWEIGHTINGS, bounded_fit, joint_balance
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter
 from identify.model.loop_model import LoopModel
-from identify.scenario import Scenario
 
 FREE_TORQUE = {False: 1e3, True: 1e6}
 """Standard deviation of a starting torque, N m, or of a force of prismatic joints (True), N.
@@ -80,27 +80,26 @@ class TorqueEquations:
 
 
 def torque_equations(
+    problem: OutputErrorProblem,
     run: LoopModel,
     poses: Array,
     torque: Array,
-    scenario: Scenario,
     slipping: NDArray[np.bool_] | None = None,
 ) -> TorqueEquations:
     """Return the equations of poses (N, 6) and torques (N, n) of a run with its logged commands.
 
-    The torques are in N m or N. slipping (N, n): frames and joints of the rows. The default is
-    those at which a joint slips.
+    The torques are in N m or N. problem: filter, and gains of a cascade about which its torque is
+    linear. slipping (N, n): frames and joints of the rows. The default is those at which a joint
+    slips.
     """
-    timing = scenario.timing
-    filtering = scenario.filter
+    low_pass = problem.low_pass
+    rate_hz = run.settings.timing.frame_rate_hz
     layout = run.robot.layout
-    guess = run.robot.parameter_sets[scenario.model.start_parameters]
-    law = run.settings.drives.joint_law(guess.joint_pid)
-    balance, found = joint_balance(run.robot, poses, run.logged, scenario, law, run.latencies)
+    law = run.settings.drives.joint_law(problem.guess.values[layout.joint_pid])
+    balance, found = joint_balance(run, poses, low_pass, law)
     rows = found if slipping is None else slipping
     columns = balance[rows]
-    smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)
-    felt = smooth[rows]
+    felt = zero_phase_filter(torque, rate_hz, low_pass.cutoff_hz, low_pass.order)[rows]
     dynamic = layout.dynamic
     others = slice(layout.dynamic.stop, None)
     matrix = np.zeros((2 * len(columns), columns.shape[1]))
@@ -109,7 +108,7 @@ def torque_equations(
     joint = np.nonzero(rows)[1]
     # the torque of a known payload stands on the right side
     right = np.concatenate([felt - columns[:, dynamic] @ run.payload[dynamic], felt])
-    correlation = max(1.0, timing.frame_rate_hz / (2 * filtering.cutoff_hz))
+    correlation = max(1.0, rate_hz / (2 * low_pass.cutoff_hz))
     kind = np.concatenate([joint, joint + layout.joints])
     return TorqueEquations(layout, matrix, right, kind, correlation, rows)
 
@@ -205,7 +204,7 @@ def measured_equations(evidence: Evidence, poses: Array | None = None) -> Torque
     run = evidence.run
     torque = evidence.joint_channels().torque
     moved = run.without_gaps() if poses is None else poses
-    return torque_equations(run, moved, torque, evidence.scenario)
+    return torque_equations(evidence.problem, run, moved, torque)
 
 
 def fit_equations(

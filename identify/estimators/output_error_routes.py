@@ -27,13 +27,13 @@ def closed_loop(evidence: Evidence) -> Estimate:
 
     A warm start and the command-driven search precede it.
     """
-    return _searched(evidence, evidence.problem, "closed_loop")
+    return _searched(evidence.problem, closed_loop=True)
 
 
 @estimator("output error, command driven", uses="poses")
 def command_driven(evidence: Evidence) -> Estimate:
     """Estimate by output error of the model driven by the logged commands."""
-    return _searched(evidence, evidence.problem, "command_driven")
+    return _searched(evidence.problem, closed_loop=False)
 
 
 @estimator("output error, known PID", uses="poses, gains")
@@ -55,7 +55,7 @@ def known_pid(evidence: Evidence) -> Estimate:
     values[gains] = np.where(read, evidence.known_gains, 0.0)
     std[gains] = np.where(read, KNOWN * np.abs(evidence.known_gains), std[gains])
     known = replace(guess, values=values, std=std)
-    return _searched(evidence, replace(evidence.problem, guess=known), "closed_loop")
+    return _searched(replace(evidence.problem, guess=known), closed_loop=True)
 
 
 @estimator("linear warm start alone", uses="poses")
@@ -65,15 +65,14 @@ def warm_start_alone(evidence: Evidence) -> Estimate:
     The estimate has no standard deviations.
     """
     began = time.perf_counter()
-    parameters = linear_warm_start(evidence.problem, evidence.scenario)
+    parameters = linear_warm_start(evidence.problem)
     return Estimate(parameters, None, time.perf_counter() - began, REWEIGHTINGS, 0)
 
 
-def _searched(evidence: Evidence, problem: OutputErrorProblem, method: str) -> Estimate:
+def _searched(problem: OutputErrorProblem, closed_loop: bool) -> Estimate:
     began = time.perf_counter()
-    scenario = evidence.scenario.with_overrides({"identification.method": method})
-    warm = linear_warm_start(problem, evidence.scenario)
-    found = list(output_error_searches(problem, scenario, warm, SilentProgress()).values())
+    warm = linear_warm_start(problem)
+    found = list(output_error_searches(problem, warm, closed_loop, SilentProgress()).values())
     seconds = time.perf_counter() - began
     last = found[-1].solution
     std = estimate_uncertainty(

@@ -59,7 +59,7 @@ from identify.excitation.motion import (
     sample_times,
     tracked_motion,
 )
-from identify.loop_parameters import model_settings
+from identify.model.from_record import model_side
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -99,7 +99,7 @@ class Knowledge:
 def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
     """Return the scenario's starting guess with its prior, scale anchor and sensor."""
     settings = scenario.identification
-    guess = model_guess(robot, scenario)
+    guess = model_guess(robot, scenario.model, settings)
     prior = np.eye(len(robot.layout.names))
     anchor = settings.scale_anchor
     if anchor in MEASURED_PARAMETER:
@@ -126,7 +126,7 @@ def log_information(
             robot,
             known.guess.values,
             trajectory.reference(times),
-            model_settings(robot, scenario),
+            model_side(robot, scenario).settings,
         )
     except LoopFailure as error:
         raise TrajectoryError(

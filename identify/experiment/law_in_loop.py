@@ -16,7 +16,7 @@ from identify.arrays import Array
 from identify.errors import ScenarioError, TrajectoryError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop
-from identify.loop_parameters import model_settings
+from identify.model.from_record import model_side
 from identify.own_parts import LAWS, Telling, chosen, is_own
 from identify.scenario import Scenario
 from identify.scenario.plant_sections import FILTERED
@@ -131,7 +131,7 @@ def prepared(
         check_motion(robot, desired, times, **scenario.excitation.singularity_limits)
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
-    settings = model_settings(robot, scenario)
+    settings = model_side(robot, scenario).settings
     if known.drive is not None:
         stated = scenario.model.derivative_filter_s or scenario.plant.derivative_filter_s
         filter_time = stated if known.drive == FILTERED else None

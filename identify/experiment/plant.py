@@ -217,8 +217,8 @@ def build_plant(
     """
     nominal = nominal or load_robot(scenario.robot)
     switches = scenario.plant
-    known = known or known_geometry(scenario, nominal=nominal)
-    settings = loop_settings(nominal, scenario, switches)
+    known = known or known_geometry(nominal, scenario.geometry)
+    settings = loop_settings(nominal, scenario.servo, scenario.timing, scenario.control, switches)
     stiffness = of_actuators(nominal, switches, "joint_stiffness")
     if stiffness is not None:
         inertia, damping = (

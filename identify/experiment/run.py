@@ -182,7 +182,8 @@ def run_plant(
     if law != SERVO:
         motion = NamedMotion("the trajectory", trajectory, duration_s)
         # The law knows no more than an experimenter: starting model and stated load.
-        model = model_guess(plant.nominal, scenario).values + (0.0 if load is None else load.stated)
+        guess = model_guess(plant.nominal, scenario.model, scenario.identification)
+        model = guess.values + (0.0 if load is None else load.stated)
         in_loop = prepared(plant, law, KnownModel(model), motion, by_images(eye), latencies.known)
     done = plant.run(reference, RateSensor(eye.measure), latencies.true, true_load, in_loop)
     record = _record(plant, reference, done, eye, seed, latencies.known)

@@ -3,13 +3,14 @@
 A record that cannot carry an identification is refused, see `identify.record.checks`.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 
 from dynamics import Robot
-from identify.loop_parameters import model_settings
+from dynamics.closed_loop import LoopSettings
+from identify.loop_parameters import drives_of, loop_settings
 from identify.model.loop_model import LoopModel
 from identify.model.torque_model import torque_model
 from identify.record.checks import (
@@ -19,6 +20,7 @@ from identify.record.checks import (
     check_origin,
     check_reference,
     checked_covariance,
+    fewest_frames,
 )
 from identify.record.command_times import logged_latencies
 from identify.record.drift import drift_warnings
@@ -28,10 +30,64 @@ from identify.record.plausibility import check_plausible
 from identify.record.recorded_law import takes_torques
 from identify.record.recording import poses, recorded_reference
 from identify.record.stored_common_errors import CommonErrors, read_common_errors
-from identify.scenario import Scenario
+from identify.scenario import Filter, Model, Scenario, Timing
+from identify.scenario.plant_sections import DriveName
 
 
-def identified_model(record: xr.Dataset, robot: Robot, scenario: Scenario) -> LoopModel:
+@dataclass(frozen=True)
+class ModelSide:
+    """Robot and loop as the estimator knows them, and how it reads a record.
+
+    Attributes
+    ----------
+    robot : Robot
+        Robot with its known geometry.
+    settings : LoopSettings
+        Settings of the loop around the model. The latency is the mean one where no record says
+        when commands acted.
+    model : Model
+        Parameter set that a search starts from, and the law of the drives, which may be open.
+    timing : Timing
+        Timing of the frames. Beside that of `settings`, it says how well the latency is known.
+    low_pass : Filter
+        Filter of the measured poses in all fits that are linear.
+    nuisances : tuple of str
+        Kinds of errors that all poses have in common, and that are estimated beside the parameters.
+    fewest_frames : int
+        Number of frames that a record needs at least to carry an identification.
+    """
+
+    robot: Robot
+    settings: LoopSettings
+    model: Model
+    timing: Timing
+    low_pass: Filter
+    nuisances: tuple[str, ...]
+    fewest_frames: int
+
+    def with_drive(self, law: DriveName) -> "ModelSide":
+        """Return the same with an identified law of the drives, if the model leaves that open."""
+        model = self.model.with_drive(law)
+        drives = drives_of(model, self.settings.drives.torque_limit)
+        return replace(self, model=model, settings=replace(self.settings, drives=drives))
+
+
+def model_side(robot: Robot, scenario: Scenario) -> ModelSide:
+    """Return the model's side of a scenario. Raises ScenarioError as `loop_settings`."""
+    model = scenario.model
+    timing = scenario.timing
+    return ModelSide(
+        robot=robot,
+        settings=loop_settings(robot, scenario.servo, timing, scenario.control, model),
+        model=model,
+        timing=timing,
+        low_pass=scenario.filter,
+        nuisances=tuple(scenario.identification.nuisances),
+        fewest_frames=fewest_frames(timing, scenario.filter, scenario.excitation),
+    )
+
+
+def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     """Return the model of a record that can carry an identification.
 
     Raises
@@ -41,18 +97,18 @@ def identified_model(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Lo
         channel is constant, or that the reference stands still, is faster than the frames can
         show, does not begin at rest, or is in other units or frames than the robot's.
     """
-    check_origin(record, robot, scenario)
-    check_length(record.sizes["time"], scenario)
-    run = _model(record, robot, scenario)
-    check_reference(run.reference, scenario)
-    check_channels(robot.geometry.chart, run.measured, run.logged, run.ok)
+    check_origin(record, side.robot, side.timing, side.settings.servo)
+    check_length(record.sizes["time"], side.fewest_frames, side.timing.frame_rate_hz)
+    run = _model(record, side)
+    check_reference(run.reference, side.timing.frame_rate_hz)
+    check_channels(side.robot.geometry.chart, run.measured, run.logged, run.ok)
     # torques cannot be compared with joint coordinates
     joint_commands = None if run.settings.drives.torques else run.logged
-    check_plausible(robot, run.reference, run.measured, run.ok, joint_commands)
+    check_plausible(side.robot, run.reference, run.measured, run.ok, joint_commands)
     return run
 
 
-def predicting_model(record: xr.Dataset, robot: Robot, scenario: Scenario) -> LoopModel:
+def predicting_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     """Return the model of a record that is long enough for a prediction at least.
 
     Raises
@@ -65,18 +121,19 @@ def predicting_model(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Lo
         The record is of another robot, timing or servo, or the covariance of its poses is not
         symmetric and positive definite.
     """
-    check_origin(record, robot, scenario)
-    return _model(record, robot, scenario)
+    check_origin(record, side.robot, side.timing, side.settings.servo)
+    return _model(record, side)
 
 
-def _model(record: xr.Dataset, robot: Robot, scenario: Scenario) -> LoopModel:
-    """Combine what a record holds with what the scenario says of the model."""
+def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
+    """Combine what a record of this robot and loop holds with what the estimator knows of them."""
+    robot = side.robot
     ok = record["measured_ok"].values.astype(bool)
     check_good_share(ok, drift_warnings([record]))
     load, load_std = recorded_payload(record, robot.layout)
     run = LoopModel(
         robot=robot,
-        settings=model_settings(robot, scenario),
+        settings=side.settings,
         reference=recorded_reference(record),
         measured=poses(record, "measured"),
         ok=ok,
@@ -84,21 +141,19 @@ def _model(record: xr.Dataset, robot: Robot, scenario: Scenario) -> LoopModel:
         logged=np.asarray(record["command"].values, dtype=float),
         payload=load,
         payload_std=load_std,
-        acted=logged_latencies(record, scenario.timing),
+        acted=logged_latencies(record, side.timing),
     )
-    run = replace(run, common=_common_errors(record, scenario, run))
-    if not takes_torques(record):
-        return run
-    return torque_model(run, scenario)
+    run = replace(run, common=_common_errors(record, side, run))
+    return torque_model(run, side.low_pass) if takes_torques(record) else run
 
 
-def _common_errors(record: xr.Dataset, scenario: Scenario, run: LoopModel) -> CommonErrors:
-    """Common errors of the poses that a scenario has estimated beside the parameters."""
-    kinds = tuple(scenario.identification.nuisances)
+def _common_errors(record: xr.Dataset, side: ModelSide, run: LoopModel) -> CommonErrors:
+    """Return the common errors of the poses that are estimated beside the parameters."""
+    kinds = side.nuisances
     geometry = None
     covariance = read_geometry_covariance(record, run.robot) if "geometry" in kinds else None
     if covariance is not None:
         geometry = GeometryErrors(run.robot, covariance, run.reference.poses, run.whitener)
-    latency_std = scenario.timing.latency_std_s if "latency" in kinds else 0.0
+    latency_std = side.timing.latency_std_s if "latency" in kinds else 0.0
     of_poses = read_common_errors(record, kinds)
     return replace(of_poses, latency_std=latency_std, geometry=geometry, whitener=run.whitener)

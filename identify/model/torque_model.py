@@ -26,7 +26,7 @@ from dynamics.closed_loop import (
 from identify.arrays import Array
 from identify.filtering import filtered_derivatives
 from identify.model.loop_model import LoopModel
-from identify.scenario import Scenario
+from identify.scenario import Filter
 
 SPAN_S = 0.5
 """Length of a span, s. One twice as long is e^3.5 times as sensitive to its start."""
@@ -263,14 +263,13 @@ class TorqueModel(LoopModel):
         )
 
 
-def torque_model(run: LoopModel, scenario: Scenario) -> TorqueModel:
+def torque_model(run: LoopModel, low_pass: Filter) -> TorqueModel:
     """Return the model of a recorded run whose commands are torques, and which begins at rest."""
     drives = Drives(torques=True, torque_limit=run.settings.drives.torque_limit)
     chart = run.robot.geometry.chart
-    rate_hz = scenario.timing.frame_rate_hz
-    filtering = scenario.filter
+    rate_hz = run.settings.timing.frame_rate_hz
     measured = chart.coordinates(run.without_gaps())
-    place, rate, _ = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
+    place, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
     rate[0] = 0.0  # the run begins at rest, whatever the filter says at its end
     starts = np.hstack([place, rate])[span_edges(len(run.ok), rate_hz)[:-1]]
     parts = {name: getattr(run, name) for name in LoopModel.__dataclass_fields__}

@@ -5,6 +5,7 @@ with what it found. Frames are counted from 0.
 """
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 import xarray as xr
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot
-from dynamics.closed_loop import Reference
+from dynamics.closed_loop import Reference, ServoGains
 from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.errors import EstimationError
@@ -20,7 +21,7 @@ from identify.files.dataset import POSE, as_number, shown
 from identify.filtering import SPLINE_DEGREE, padding_samples
 from identify.record.provenance import check_robot, recorded_scenario
 from identify.record.recording import check_record, poses
-from identify.scenario import Scenario
+from identify.scenario import Excitation, Filter, Timing
 from identify.trajectory import FourierTrajectory
 
 MINIMUM_GOOD_SHARE = 0.5
@@ -43,7 +44,7 @@ class TooFewFramesError(EstimationError):
     """Error for a record most of whose frames were lost."""
 
 
-def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
+def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoGains) -> None:
     """Check that a record is whole, of this robot, and made with the model's timing and servo.
 
     Raises
@@ -61,45 +62,42 @@ def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
             f"{robot.layout.joints}"
         )
     recorded = recorded_scenario(record)
-    for section in ("timing", "servo"):
-        theirs = getattr(recorded, section).model_dump()
-        ours = getattr(scenario, section).model_dump()
-        for key, value in theirs.items():
+    for section, ours in (("timing", timing.model_dump()), ("servo", asdict(servo))):
+        for key, value in getattr(recorded, section).model_dump().items():
             if value != ours[key]:
                 raise EstimationError(
                     f"the record was made with {section}.{key} = {value!r}, the scenario says "
                     f"{ours[key]!r}"
                 )
-    _check_stated_rate(record, scenario.timing.frame_rate_hz)
-    steps = np.diff(np.asarray(record["time"].values, dtype=float)) * scenario.timing.frame_rate_hz
-    # a time of NaN must not pass, which `>` would let
-    if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
-        worst = int(np.abs(steps - 1).argmax())
-        raise EstimationError(
-            f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of "
-            f"{scenario.timing.frame_rate_hz:g} Hz apart: frames are missing in the record; keep "
-            "lost ones with measured_ok = 0"
-        )
-
-
-def _check_stated_rate(record: xr.Dataset, rate_hz: float) -> None:
-    """Check that a frame rate stated beside the scenario is the scenario's, Hz."""
+    rate_hz = timing.frame_rate_hz
     stated = record.attrs.get("frame_rate_hz", rate_hz)
     if not abs(as_number(stated) - rate_hz) <= ROUNDING * rate_hz:
         raise EstimationError(
             f"the record contradicts itself: its attribute frame_rate_hz is {shown(stated)}, and "
             f"timing.frame_rate_hz of its attribute scenario is {rate_hz:g}"
         )
+    steps = np.diff(np.asarray(record["time"].values, dtype=float)) * rate_hz
+    # a time of NaN must not pass, which `>` would let
+    if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
+        worst = int(np.abs(steps - 1).argmax())
+        raise EstimationError(
+            f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of {rate_hz:g} Hz "
+            "apart: frames are missing in the record; keep lost ones with measured_ok = 0"
+        )
 
 
-def check_trajectory(record: xr.Dataset, trajectory: FourierTrajectory, scenario: Scenario) -> None:
-    """Check that the reference is the exciting trajectory (eq. 37) at the scenario's frames."""
-    asked = scenario.timing.frame_times(scenario.excitation.duration_s)
+def check_trajectory(
+    record: xr.Dataset, trajectory: FourierTrajectory, timing: Timing, duration_s: float
+) -> None:
+    """Check that the reference is the exciting trajectory (eq. 37) at all frames of its duration.
+
+    duration_s: that of the excitation.
+    """
+    asked = timing.frame_times(duration_s)
     if record.sizes["time"] != len(asked):
         raise EstimationError(
             f"the record has {record.sizes['time']} frames, and the scenario asks for {len(asked)} "
-            f"(excitation.duration_s = {scenario.excitation.duration_s:g} s): it is of another "
-            "experiment"
+            f"(excitation.duration_s = {duration_s:g} s): it is of another experiment"
         )
     gap = np.abs(poses(record, "reference") - trajectory.pose(asked))
     if not gap.max() <= ROUNDING:
@@ -111,7 +109,7 @@ def check_trajectory(record: xr.Dataset, trajectory: FourierTrajectory, scenario
         )
 
 
-def check_reference(reference: Reference, scenario: Scenario) -> None:
+def check_reference(reference: Reference, rate_hz: float) -> None:
     """Check that the reference moves, and that its poses are the integral of its rates.
 
     A motion faster than half the frame rate looks like a slow one in the poses. Its rates reveal
@@ -126,7 +124,7 @@ def check_reference(reference: Reference, scenario: Scenario) -> None:
         )
     if len(poses) <= SPLINE_DEGREE:  # no spline goes through so few
         return
-    times = np.arange(len(poses)) * scenario.timing.frame_period_s
+    times = np.arange(len(poses)) * (1.0 / rate_hz)
     integral = make_interp_spline(times, rates, k=SPLINE_DEGREE).antiderivative()
     # the range of the difference does not depend on the constant of integration
     gap = np.ptp(integral(times) - poses, axis=0)
@@ -135,26 +133,27 @@ def check_reference(reference: Reference, scenario: Scenario) -> None:
         raise EstimationError(
             f"the reference's {POSE[worst]} travels {travel[worst]:.3g}, and its rate makes it "
             f"another motion, up to {gap[worst]:.3g} away: it has harmonics above half of "
-            f"{scenario.timing.frame_rate_hz:g} Hz, or the rate is not its derivative"
+            f"{rate_hz:g} Hz, or the rate is not its derivative"
         )
 
 
-def check_length(frames: int, scenario: Scenario, what: str = "the record has") -> None:
-    """Check that a record has enough frames.
+def fewest_frames(timing: Timing, low_pass: Filter, excitation: Excitation) -> int:
+    """Return the number of frames that a record needs at least.
 
-    It needs one period of the highest harmonic, and what the filter takes at its ends. The message
-    begins with `what`.
+    They are one period of the highest harmonic, and what the filter takes at the ends.
     """
-    timing = scenario.timing
-    filtering = scenario.filter
-    needed = max(
-        padding_samples(timing.frame_rate_hz, filtering.cutoff_hz, filtering.order) + 1,
-        timing.frames(1 / (scenario.excitation.fundamental_hz * scenario.excitation.harmonics)),
+    return max(
+        padding_samples(timing.frame_rate_hz, low_pass.cutoff_hz, low_pass.order) + 1,
+        timing.frames(1 / (excitation.fundamental_hz * excitation.harmonics)),
     )
-    if frames < needed:
+
+
+def check_length(frames: int, fewest: int, rate_hz: float, what: str = "the record has") -> None:
+    """Check that a record has at least the `fewest_frames`. The message begins with `what`."""
+    if frames < fewest:
         raise EstimationError(
-            f"{what} {frames} frames ({frames / timing.frame_rate_hz:.3g} s), at least {needed} "
-            "are needed: one period of the highest harmonic, and what the filter takes at its ends"
+            f"{what} {frames} frames ({frames / rate_hz:.3g} s), at least {fewest} are needed: one "
+            "period of the highest harmonic, and what the filter takes at its ends"
         )
 
 

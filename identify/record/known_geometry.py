@@ -11,7 +11,7 @@ from identify.errors import RecordError, ScenarioError
 from identify.files.dataset import read_covariance
 from identify.files.seal import check_toml
 from identify.record.pose_covariance import covariance_fault
-from identify.scenario import Scenario
+from identify.scenario.sections import Geometry
 
 FOLDER = "geometry"
 """Folder within a run that holds the run's own calibration."""
@@ -34,18 +34,13 @@ class KnownGeometry:
     covariance: Array | None = None
 
 
-def known_geometry(
-    scenario: Scenario, folder: Path | None = None, nominal: Robot | None = None
-) -> KnownGeometry:
-    """Return the geometry that a scenario's estimator knows.
+def known_geometry(nominal: Robot, settings: Geometry, folder: Path | None = None) -> KnownGeometry:
+    """Return the geometry of a robot as the settings have it known.
 
     It is that of the robot file, of an earlier calibration, or of the calibration in a run's
-    folder. nominal: the scenario's robot, if it is loaded already. Calibrated robots share its
-    functions. Raises ScenarioError if the file does not exist, the covariance beside it is missing
-    or not valid, or the calibration is of another robot.
+    folder. Raises ScenarioError if the file does not exist, the covariance beside it is missing or
+    not valid, or the calibration is of another robot.
     """
-    nominal = nominal or load_robot(scenario.robot)
-    settings = scenario.geometry
     if settings.exact:
         return KnownGeometry(nominal)
     path = Path(settings.known)
@@ -65,7 +60,7 @@ def known_geometry(
             f"{said} is neither exact, calibrated, nor a robot.toml of `cmmsim geometry` with "
             f"{COVARIANCE}: {error}"
         ) from None
-    _check_same(said, found, nominal, scenario)
+    _check_same(said, found, nominal, settings)
     if names != nominal.geometry.number_names:
         raise ScenarioError(
             f"{said}: {COVARIANCE} is not of the geometric numbers of {nominal.name}"
@@ -78,7 +73,7 @@ def known_geometry(
     )
 
 
-def _check_same(said: str, found: Robot, nominal: Robot, scenario: Scenario) -> None:
+def _check_same(said: str, found: Robot, nominal: Robot, settings: Geometry) -> None:
     """Raise ScenarioError, with the number that differs, for a calibration of another robot."""
     there = found.geometry
     here = nominal.geometry
@@ -86,7 +81,6 @@ def _check_same(said: str, found: Robot, nominal: Robot, scenario: Scenario) -> 
         raise ScenarioError(
             f"{said} is of another robot: {found.name} has other legs than {nominal.name}"
         )
-    settings = scenario.geometry
     tolerances = [
         settings.tolerance_m if unit == "m" else settings.tolerance_rad
         for unit in here.number_units

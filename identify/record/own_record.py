@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.interpolate import make_interp_spline
 
-from dynamics import Robot, load_robot
+from dynamics import load_robot
 from dynamics.files import is_file, is_name, parse_toml, read_text
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
@@ -27,7 +28,7 @@ from identify.record.recording import build_record, read
 from identify.scenario import Scenario
 from identify.scenario.scenario import SCENARIOS, scenario_schema
 from identify.scenario.section import Section, quantity
-from identify.scenario.sections import LOAD_UNITS
+from identify.scenario.sections import LOAD_UNITS, Identification, Payload
 from identify.scenario.settings_file import one_line
 
 DESCRIPTION = "record"
@@ -101,7 +102,7 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
     record = build_record(
         time=table.groups["time"][:, 0] - start,
         reference_pose=table.groups["reference"],
-        reference_rate=_rates(table, scenario),
+        reference_rate=_rates(table, scenario.timing.frame_period_s),
         # a pose in a row that says it was lost is not taken
         measured_pose=np.where(ok[:, None], poses, np.nan),
         measured_covariance=_covariances(table, measured, ok),
@@ -114,9 +115,9 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
         prismatic=robot.layout.prismatic,
     )
     record.attrs["title"] = f"Record of {path.name}"
-    _state_anchor(record, scenario, measured, description_file(path))
+    _state_anchor(record, scenario.identification, measured, description_file(path))
     if measured.under_payload:
-        _state_payload(record, robot, scenario)
+        _state_payload(record, robot.layout, scenario.payload)
     return record, scenario
 
 
@@ -172,13 +173,13 @@ def _measured_ok(table: Table) -> NDArray[np.bool_]:
     return whole & (stated == 1)
 
 
-def _rates(table: Table, scenario: Scenario) -> Array:
+def _rates(table: Table, frame_period_s: float) -> Array:
     """Return the rates (N, 6) of the reference: stated, or of a spline through its poses."""
     poses = table.groups["reference"]
     # too few rows for a spline are refused later, with the length of the record
     if "rate" in table.groups or len(poses) < 6:
         return table.groups.get("rate", np.zeros_like(poses))
-    times = np.arange(len(poses)) * scenario.timing.frame_period_s
+    times = np.arange(len(poses)) * frame_period_s
     return np.asarray(make_interp_spline(times, poses, k=5).derivative()(times), dtype=float)
 
 
@@ -202,9 +203,10 @@ def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Arr
     return np.tile(np.diag(std**2), (len(ok), 1, 1))
 
 
-def _state_anchor(record: xr.Dataset, scenario: Scenario, measured: Measured, source: Path) -> None:
+def _state_anchor(
+    record: xr.Dataset, settings: Identification, measured: Measured, source: Path
+) -> None:
     """Store with a record what fixes the scale of its parameters."""
-    settings = scenario.identification
     record.attrs["scale_anchor"] = settings.scale_anchor
     if settings.scale_anchor in ("payload", "prior"):
         return
@@ -219,11 +221,11 @@ def _state_anchor(record: xr.Dataset, scenario: Scenario, measured: Measured, so
     }
 
 
-def _state_payload(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
+def _state_payload(record: xr.Dataset, layout: ParameterLayout, payload: Payload) -> None:
     """Store with a record the load that the platform carried, and how well it is known."""
-    load: Mapping[str, Any] = scenario.payload.model_dump()
+    load: Mapping[str, Any] = payload.model_dump()
     vectors = []
     for std in ("", "_std"):
         mass, *moments = (load[f"{figure}{std}_{unit}"] for figure, unit in LOAD_UNITS.items())
-        vectors.append(payload_vector(robot.layout, mass, (moments[0], moments[1], moments[2])))
-    store_payload(record, robot.layout, *vectors)
+        vectors.append(payload_vector(layout, mass, (moments[0], moments[1], moments[2])))
+    store_payload(record, layout, *vectors)

@@ -250,6 +250,13 @@ class Model(_Friction):
         """Law of the drives. Where the record is to decide, it is the paper's until then."""
         return "pid" if self.drive == "auto" else self.drive
 
+    def with_drive(self, law: DriveName) -> "Model":
+        """Return a copy with an identified law of the drives, if the model leaves that open."""
+        if self.drive != AUTO:
+            return self
+        filter_time = self.derivative_filter_s if law == FILTERED else None
+        return self.model_copy(update={"drive": law, "derivative_filter_s": filter_time})
+
     @property
     def drives_considered(self) -> tuple[DriveName, ...]:
         """Laws of the drives that `auto` chooses from."""

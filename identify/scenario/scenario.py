@@ -14,7 +14,7 @@ from dynamics.files import Name
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
 from identify.scenario.parameter_names import check_parameter_names
-from identify.scenario.plant_sections import Control, Model, Plant, Servo
+from identify.scenario.plant_sections import Control, DriveName, Model, Plant, Servo
 from identify.scenario.section import Section
 from identify.scenario.sections import (
     GEOMETRY_KNOWN,
@@ -29,6 +29,18 @@ from identify.scenario.sections import (
 )
 from identify.scenario.settings_file import SettingsFiles, to_toml
 from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, sensor_names
+
+ESTIMATOR_SECTIONS = ("identification", "model", "filter")
+"""Sections of a scenario that only the estimator reads.
+
+They may change after the record was made. All others may not.
+"""
+
+RECORDED = ("identification.scale_anchor", "identification.anchor_std")
+"""Settings of these sections that the record depends on.
+
+The record holds what its scale anchor measured.
+"""
 
 
 class Scenario(Section):
@@ -175,6 +187,34 @@ class Scenario(Section):
             _replace(data, path, value)
         return SCENARIOS.from_dict(data, f"scenario {self.name!r}")
 
+    def with_estimator_settings(self, overrides: Mapping[str, Any]) -> "Scenario":
+        """Return a record's scenario with other settings of the estimator, by dotted path.
+
+        Raises ScenarioError if the record was made with a setting (with the sections allowed), or
+        as `with_overrides` does.
+        """
+        for path in overrides:
+            section, _, name = path.partition(".")
+            if section not in ESTIMATOR_SECTIONS or not name or path in RECORDED:
+                allowed = ", ".join(f"{allowed}.*" for allowed in ESTIMATOR_SECTIONS)
+                raise ScenarioError(
+                    f"{path!r} cannot be set for an identification: the record was made with the "
+                    f"rest of the scenario; allowed: {allowed}, except {' and '.join(RECORDED)}"
+                )
+        return self.with_overrides(overrides) if overrides else self
+
+    def estimator_settings(self) -> dict[str, Any]:
+        """Return all settings of the estimator by dotted path, without those that are not set."""
+        return {
+            f"{section}.{name}": value
+            for section in ESTIMATOR_SECTIONS
+            for name, value in getattr(self, section).model_dump(exclude_none=True).items()
+        }
+
+    def with_drive(self, law: DriveName) -> "Scenario":
+        """Return a copy with an identified law of the drives, if its model leaves that open."""
+        return self.model_copy(update={"model": self.model.with_drive(law)})
+
     def to_toml(self) -> str:
         """Return TOML text with every default written out with its unit.
 
@@ -291,42 +331,3 @@ def _replace(data: dict[str, Any], path: str, value: Any) -> None:
         data.pop(key, None)
     else:
         data[key] = value
-
-
-SECTIONS = ("identification", "model", "filter")
-"""Sections of a scenario that only the estimator reads.
-
-They may change after the record was made. All others may not.
-"""
-
-RECORDED = ("identification.scale_anchor", "identification.anchor_std")
-"""Settings of these sections that the record depends on.
-
-The record holds what its scale anchor measured.
-"""
-
-
-def with_estimator_settings(scenario: Scenario, overrides: Mapping[str, Any]) -> Scenario:
-    """Return a record's scenario with other settings of the estimator, by dotted path.
-
-    Raises ScenarioError if the record was made with a setting (with the sections allowed), or as
-    `with_overrides` does.
-    """
-    for path in overrides:
-        section, _, name = path.partition(".")
-        if section not in SECTIONS or not name or path in RECORDED:
-            allowed = ", ".join(f"{allowed}.*" for allowed in SECTIONS)
-            raise ScenarioError(
-                f"{path!r} cannot be set for an identification: the record was made with the rest "
-                f"of the scenario; allowed: {allowed}, except {' and '.join(RECORDED)}"
-            )
-    return scenario.with_overrides(overrides) if overrides else scenario
-
-
-def estimator_settings(scenario: Scenario) -> dict[str, Any]:
-    """Return all settings of the estimator by dotted path, without those that are not set."""
-    return {
-        f"{section}.{name}": value
-        for section in SECTIONS
-        for name, value in getattr(scenario, section).model_dump(exclude_none=True).items()
-    }

@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from cmmsim.errors import CmmError
+from dynamics import load_robot
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.experiment.truth import read_truth, true_poses
@@ -133,7 +134,7 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
 def _cell(run: RunFolder, record: xr.Dataset, notes: list[str]) -> Workcell:
     """Return robot and sensor of a run, or the robot alone with a note if there is no sensor."""
     scenario = load_scenario(run.whole_scenario)
-    robot = known_geometry(scenario, run.path).robot
+    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, run.path).robot
     check_robot(record, robot)
     try:
         return workcell_of_scenario(scenario, robot)

@@ -8,6 +8,7 @@ from typing import Any
 
 import xarray as xr
 
+from dynamics import load_robot
 from identify.arrays import Array
 from identify.estimation import identification
 from identify.estimation.result import IdentificationResult
@@ -19,7 +20,7 @@ from identify.files.run_folder import (
     rms_figures,
 )
 from identify.files.versions import versions
-from identify.loop_parameters import with_drive
+from identify.model.from_record import model_side
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.drift import DRIFT, read_finding
@@ -30,7 +31,6 @@ from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, digest
 from identify.record.recording import build_model_run, model_groups
 from identify.scenario import Scenario, load_scenario
-from identify.scenario.scenario import estimator_settings, with_estimator_settings
 from identify.stages.plan import check_planned, open_run, record_files, scenario_file
 from identify.validation.unseen import model_on_record
 
@@ -53,7 +53,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     else:
         _, planned, trajectories, _ = open_run(folder)
         seed = trajectories.seed
-    scenario = with_estimator_settings(planned, settings or {})
+    scenario = planned.with_estimator_settings(settings or {})
     files = RunFiles(run_folder)
     names = record_files(scenario)
     run_folder.require(*names)
@@ -77,9 +77,9 @@ def identify_own(
     """
     run_folder = RunFolder(folder)
     contents, stated = read_own_records(list(paths))
-    scenario = with_estimator_settings(stated, settings)
+    scenario = stated.with_estimator_settings(settings)
     records = dict(zip(RECORDS, contents, strict=False))
-    known = known_geometry(scenario)
+    known = known_geometry(load_robot(scenario.robot), scenario.geometry)
     for one in contents:
         if known.covariance is not None and GEOMETRY_COVARIANCE not in one:
             store_geometry_covariance(one, known.robot, known.covariance)
@@ -117,14 +117,13 @@ def _identified(
     folder: Path | None = None,
 ) -> _Identified:
     began = time.perf_counter()
-    robot = known_geometry(scenario, folder).robot
+    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, folder).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
     first = next(iter(records.values()))
     # The models run with the drive law that was identified.
-    scenario = with_drive(scenario, result.drive.law)
+    side = model_side(robot, scenario).with_drive(result.drive.law)
     before, after = (
-        model_on_record(robot, scenario, values, first)
-        for values in (result.initial, result.estimate)
+        model_on_record(side, values, first) for values in (result.initial, result.estimate)
     )
     return _Identified(records, result, (before, after), time.perf_counter() - began)
 
@@ -158,7 +157,7 @@ def _identified_files(
         {
             "scenario": scenario.name,
             "seed": seed,
-            "settings": estimator_settings(scenario),
+            "settings": scenario.estimator_settings(),
             "date": str(seen.attrs.get("created", ""))[:10] or None,
             "versions": versions(),
             ENTRY: made_of,

@@ -6,7 +6,7 @@ from pathlib import Path
 import xarray as xr
 
 import cmmsim
-from dynamics import Robot
+from dynamics import Robot, load_robot
 from identify.errors import EstimationError
 from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, build_plant
@@ -22,7 +22,7 @@ from identify.geometry.before_a_run import calibrated_for_a_run
 from identify.geometry.outcome import GeometryOutcome
 from identify.loop_parameters import check_parameter_set
 from identify.progress import Progress
-from identify.record.checks import check_length, check_trajectory
+from identify.record.checks import check_length, check_trajectory, fewest_frames
 from identify.record.known_geometry import FOLDER, KnownGeometry, known_geometry
 from identify.record.provenance import RECORDS
 from identify.scenario import Scenario, load_scenario
@@ -83,7 +83,7 @@ def open_run(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, KnownGeo
         run_folder,
         scenario,
         load_trajectories(run_folder.trajectories),
-        known_geometry(scenario, folder),
+        known_geometry(load_robot(scenario.robot), scenario.geometry, folder),
     )
 
 
@@ -92,7 +92,7 @@ def _calibrated(
 ) -> tuple[GeometryOutcome | None, KnownGeometry]:
     """Calibration of the geometry before a run, if there is one, and the known geometry."""
     if scenario.geometry.known != "calibrated":
-        return None, known_geometry(scenario)
+        return None, known_geometry(load_robot(scenario.robot), scenario.geometry)
     return calibrated_for_a_run(scenario, seed, progress)
 
 
@@ -101,7 +101,8 @@ def check_planned(
 ) -> None:
     """Raise EstimationError if a file's record does not follow the planned trajectory."""
     try:
-        check_trajectory(record, trajectories.excitation, scenario)
+        duration_s = scenario.excitation.duration_s
+        check_trajectory(record, trajectories.excitation, scenario.timing, duration_s)
     except EstimationError as error:
         raise EstimationError(f"{file}: {error}") from None
 
@@ -117,7 +118,8 @@ def _designed(plant: Plant, seed: int, progress: Progress) -> TrajectorySet:
     robot = plant.nominal
     check_length(
         scenario.timing.frames(scenario.excitation.duration_s),
-        scenario,
+        fewest_frames(scenario.timing, scenario.filter, scenario.excitation),
+        scenario.timing.frame_rate_hz,
         "excitation.duration_s gives",
     )
     check_parameter_set(robot, scenario.model.start_parameters)

@@ -18,7 +18,8 @@ from identify.files.run_folder import (
     load_result,
     result_json,
 )
-from identify.loop_parameters import settled_drive, with_drive
+from identify.loop_parameters import settled_drive
+from identify.model.from_record import model_side
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
@@ -65,18 +66,16 @@ def validate(
     files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
     covariance = files.covariance_of(robot)
     models = _identified_models(robot, run_folder, result)
-    scenario = with_drive(scenario, settled_drive(result["identification"]))
+    side = model_side(robot, scenario).with_drive(settled_drive(result["identification"]))
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(
         scenario, trajectories.validation, trajectories.seed, taught, workers, progress, known
     )
     records = [files.experiment, *(run.record for run in runs)]
-    model_poses = [
-        [model_on_record(robot, scenario, values, seen) for values in models] for seen in records
-    ]
+    model_poses = [[model_on_record(side, values, seen) for values in models] for seen in records]
     found = result["identification"].get("nuisance_estimates", {})
     predictions = predicted_runs(
-        robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress, found
+        side, records[1:], models[1], covariance, trajectories.seed, progress, found
     )
     # The exciting run was fitted, so nothing is predicted for it.
     deviations = [None, *(prediction.std for prediction in predictions)]

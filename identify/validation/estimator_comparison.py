@@ -23,7 +23,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dynamics import DynamicsError, Robot
+from dynamics import DynamicsError, load_robot
 from dynamics.errors import ParameterError, SimulationError
 from identify.arrays import Array
 from identify.errors import EstimationError
@@ -35,15 +35,17 @@ from identify.estimators.estimator import Estimate, Estimator, Evidence, joint_c
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
 from identify.files.run_folder import load_result, rms_figures, rms_row
-from identify.loop_parameters import settled_drive, with_drive
+from identify.loop_parameters import settled_drive
+from identify.model.from_record import ModelSide, model_side
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, mixed_generator
 from identify.record.command_times import logged_latencies
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RunFiles
 from identify.record.recorded_law import takes_torques
-from identify.scenario import Scenario, load_scenario
+from identify.scenario import Timing, load_scenario
 from identify.scenario.plant_sections import AUTO
+from identify.scenario.sections import Identification
 from identify.validation.unseen import model_on_record
 
 START = "starting guess"
@@ -55,10 +57,8 @@ class Examination:
 
     Attributes
     ----------
-    robot : Robot
-        Robot as it is known.
-    scenario : Scenario
-        Scenario of the record.
+    side : ModelSide
+        Robot and loop as they are known.
     true : ndarray, shape (p,)
         True parameters.
     combinations : ndarray, shape (k, p)
@@ -67,15 +67,14 @@ class Examination:
         Unseen runs of the plant.
     """
 
-    robot: Robot
-    scenario: Scenario
+    side: ModelSide
     true: Array
     combinations: Array
     unseen: tuple[tuple[xr.Dataset, xr.Dataset], ...]
 
     def group_errors(self, parameters: Array) -> Array:
         """Return the relative errors (k,) of the base parameters that the record shows."""
-        dynamic = self.robot.layout.dynamic
+        dynamic = self.side.robot.layout.dynamic
         true = self.combinations @ self.true[dynamic]
         return np.asarray(
             (self.combinations @ parameters[dynamic] - true) / np.abs(true), dtype=float
@@ -90,7 +89,7 @@ class Examination:
         rows = []
         for record, truth in self.unseen:
             try:
-                poses = model_on_record(self.robot, self.scenario, parameters, record)
+                poses = model_on_record(self.side, parameters, record)
             except (ParameterError, SimulationError):
                 return float("nan"), float("nan")
             rows.append(rms_row(rms_figures(poses - true_poses(truth))))
@@ -165,18 +164,18 @@ def compare_on_run(
             "the commands of this record are torques, and the estimators compared need joint "
             "commands: record the excitation under excitation.law = pid or feedforward"
         )
+    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, folder.path).robot
+    side = model_side(robot, scenario)
     if scenario.model.drive == AUTO:
-        scenario = with_drive(
-            scenario, settled_drive(load_result(folder.result).get("identification"))
-        )
-    robot = known_geometry(scenario, folder.path).robot
-    channels = instrumented(record, truth, scenario, instruments, seed)
+        result = load_result(folder.result)
+        side = side.with_drive(settled_drive(result.get("identification")))
+    channels = instrumented(record, truth, scenario.timing, instruments, seed)
     unseen = zip(files.validation, read_truth_runs(folder.validation), strict=True)
     scores = compare_on_record(
         (record, truth),
         channels,
-        robot,
-        scenario,
+        side,
+        scenario.identification,
         list(unseen),
         estimators,
         progress,
@@ -187,22 +186,22 @@ def compare_on_run(
 def instrumented(
     record: xr.Dataset,
     truth: xr.Dataset,
-    scenario: Scenario,
+    timing: Timing,
     instruments: JointInstruments,
     seed: int,
 ) -> xr.Dataset:
     """Return the readings of instruments at the joints during a run, with the noise of a seed."""
-    latencies = logged_latencies(record, scenario.timing)
+    latencies = logged_latencies(record, timing)
     return measure_joints(
-        record, truth, scenario.timing, instruments, mixed_generator(INSTRUMENTS, seed), latencies
+        record, truth, timing, instruments, mixed_generator(INSTRUMENTS, seed), latencies
     )
 
 
 def compare_on_record(
     experiment: tuple[xr.Dataset, xr.Dataset],
     channels: xr.Dataset,
-    robot: Robot,
-    scenario: Scenario,
+    side: ModelSide,
+    settings: Identification,
     unseen: Sequence[tuple[xr.Dataset, xr.Dataset]],
     estimators: Mapping[str, Estimator],
     progress: Progress,
@@ -213,15 +212,18 @@ def compare_on_record(
     """
     record, truth = experiment
     known = true_parameters(truth)
-    true = np.array([known[name] for name in robot.layout.names])
-    problem = output_error_problem([record], robot, scenario)
-    gains = true[robot.layout.joint_pid]
-    evidence = Evidence(problem, scenario, joint_channels(channels, record), gains)
-    return compare(evidence, examination(evidence, true, unseen), estimators, progress)
+    layout = side.robot.layout
+    true = np.array([known[name] for name in layout.names])
+    problem = output_error_problem([record], side, settings)
+    evidence = Evidence(problem, joint_channels(channels, record), true[layout.joint_pid])
+    return compare(evidence, examination(evidence, side, true, unseen), estimators, progress)
 
 
 def examination(
-    evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Dataset, xr.Dataset]]
+    evidence: Evidence,
+    side: ModelSide,
+    true: Array,
+    unseen: Sequence[tuple[xr.Dataset, xr.Dataset]],
 ) -> Examination:
     """Set up the examination from the true parameters (p,) and unseen (record, truth) pairs.
 
@@ -229,7 +231,7 @@ def examination(
     """
     if not unseen:
         raise EstimationError("no unseen trajectory to judge the estimators on")
-    robot = evidence.run.robot
+    robot = side.robot
     base = structure(robot)
     driven = evidence.problem.driven_by_commands()
     # A fixed seed: the choice of the judged parameters must not depend on chance.
@@ -242,7 +244,7 @@ def examination(
     )
     if not shown.any():
         raise EstimationError("the record shows no base parameter: there is nothing to compare")
-    return Examination(robot, evidence.scenario, true, base.combinations[shown], tuple(unseen))
+    return Examination(side, true, base.combinations[shown], tuple(unseen))
 
 
 def compare(
@@ -268,7 +270,8 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
     except (EstimationError, DynamicsError) as error:
         nothing = (np.nan,) * 6
         return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
-    pid = asked.robot.layout.joint_pid
+    layout = asked.side.robot.layout
+    pid = layout.joint_pid
     groups = asked.group_errors(found.parameters)
     # A gain of zero is one that the drive law does not read.
     read = np.flatnonzero(asked.true[pid]) + pid.start
@@ -285,7 +288,7 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
         estimator.uses,
         *distances,
         **vars(found),
-        names=asked.robot.layout.names,
+        names=layout.names,
     )
 
 

@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 
 import cmmsim
 from dynamics import Robot
-from dynamics.closed_loop import LoopFailure, Reference, simulate_servo
+from dynamics.closed_loop import LoopFailure, LoopSettings, Reference, simulate_servo
 from dynamics.closed_loop.start_state import (
     checked_loop_parameters,
 )
@@ -32,8 +32,7 @@ from identify.excitation.design import unseen_trajectories
 from identify.experiment.plant import build_plant
 from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import make_sensor
-from identify.loop_parameters import model_settings
-from identify.model.from_record import predicting_model
+from identify.model.from_record import ModelSide, model_side, predicting_model
 from identify.model.loop_model import LoopModel
 from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
@@ -91,7 +90,7 @@ def run_unseen(
 
 def model_run(
     robot: Robot,
-    scenario: Scenario,
+    settings: LoopSettings,
     parameters: Array,
     reference: Reference,
     latencies: Array | None = None,
@@ -104,16 +103,12 @@ def model_run(
     poses out of reach.
     """
     try:
-        return simulate_servo(
-            robot, parameters, reference, model_settings(robot, scenario), latencies=latencies
-        ).pose
+        return simulate_servo(robot, parameters, reference, settings, latencies=latencies).pose
     except LoopFailure:
         return np.full_like(reference.poses, np.nan)
 
 
-def model_on_record(
-    robot: Robot, scenario: Scenario, parameters: Array, record: xr.Dataset
-) -> Array:
+def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> Array:
     """Return the poses (N, 6) of the model on the motion of a record; NaN if it is unstable.
 
     The latencies are those that the record logs. The model runs in the servo's loop if that made
@@ -122,9 +117,10 @@ def model_on_record(
     Raises the errors of `model_run`.
     """
     if recorded_law(record) == SERVO:
-        latencies = logged_latencies(record, scenario.timing)
-        return model_run(robot, scenario, parameters, recorded_reference(record), latencies)
-    run = predicting_model(record, robot, scenario).driven_by_commands()
+        latencies = logged_latencies(record, side.timing)
+        reference = recorded_reference(record)
+        return model_run(side.robot, side.settings, parameters, reference, latencies)
+    run = predicting_model(record, side).driven_by_commands()
     try:
         return run.model_poses(parameters)
     except LoopFailure:
@@ -262,8 +258,7 @@ def _known_in_common(
 
 
 def predicted_runs(
-    robot: Robot,
-    scenario: Scenario,
+    side: ModelSide,
     records: Sequence[xr.Dataset],
     parameters: Array,
     covariance: Array,
@@ -280,18 +275,17 @@ def predicted_runs(
     Raises RecordError or EstimationError for a record that is damaged, or is of another robot,
     timing or servo. Raises dynamics.DynamicsError for parameters that no model can have.
     """
+    groups = structure(side.robot).rigid_groups
     predictions = []
     with progress.stage("predict", len(records)) as advance:
         for number, record in enumerate(records, start=1):
             rng = np.random.default_rng(stream_seed(seed, PREDICTION, number))
             try:
-                run = replace(
-                    predicting_model(record, robot, scenario), groups=structure(robot).rigid_groups
-                )
+                run = replace(predicting_model(record, side), groups=groups)
                 prediction = predict_poses(run, parameters, covariance, rng, learned)
             except (LoopFailure, TooFewFramesError):
                 shape = (record.sizes["time"], 6)
-                chart = robot.geometry.chart
+                chart = side.robot.geometry.chart
                 prediction = PosePrediction(
                     chart, np.full(shape, np.nan), np.full((*shape, 6), np.nan)
                 )
@@ -379,5 +373,6 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     plant = build_plant(scenario, robot, seed)
     times = scenario.timing.frame_times(scenario.validation.duration_s)
     references = [path.reference(times) for path in unseen_trajectories(robot, scenario, seed)]
-    model = [model_run(robot, scenario, values, reference) for reference in references]
+    settings = model_side(robot, scenario).settings
+    model = [model_run(robot, settings, values, reference) for reference in references]
     return np.array(model) - np.array([plant.run(reference).pose for reference in references])

@@ -12,7 +12,7 @@ runs at the true parameters, without noise in the servo, the worst one is known 
 whole velocity limit of 2 rad/s, it is known to 2.4 %. Faster is worth more than longer.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -25,7 +25,6 @@ from dynamics import Robot, load_robot
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.identification import identify
 from identify.estimation.result import IdentificationResult
 from identify.excitation.design import design_trajectories
 from identify.experiment.run import Experiment, taught_sensor
@@ -132,7 +131,9 @@ def check_count(runs: int) -> None:
 
 
 def identify_each(
-    records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario, progress: Progress
+    records: Sequence[xr.Dataset],
+    identify: Callable[[xr.Dataset], IdentificationResult],
+    progress: Progress,
 ) -> list[IdentificationResult]:
     """Identify from each record alone.
 
@@ -142,7 +143,7 @@ def identify_each(
     results = []
     with progress.stage("identify each run", len(records)) as advance:
         for record in records:
-            results.append(identify(record, robot, scenario))
+            results.append(identify(record))
             advance()
     return results
 

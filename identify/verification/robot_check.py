@@ -12,19 +12,20 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cmmsim.files import SensorFile
 from dynamics import Robot, closed_loop, workspace
 from dynamics.closed_loop import stability
 from dynamics.control.gains import design_servo, largest_bandwidth, servo_figures, torque_figures
 from dynamics.control.inverse_dynamics import Model
+from dynamics.control.law import Feedback
 from dynamics.errors import DynamicsError, SimulationError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
-from identify.experiment.law_in_loop import feedback
-from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distances, sensor_file
-from identify.loop_parameters import model_settings, of_actuators
+from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distances
 from identify.progress import Progress, SilentProgress
-from identify.scenario import Excitation, Scenario
+from identify.scenario import Excitation
+from identify.scenario.plant_sections import Control
 
 SAMPLES = 2000
 """Number of random joint coordinates over the travel."""
@@ -54,25 +55,47 @@ class Finding:
         return asdict(self)
 
 
-def check_robot(
-    robot: Robot, parameters: Array, scenario: Scenario, progress: Progress | None = None
-) -> list[Finding]:
-    """Return all findings about a robot with all its parameters.
+@dataclass(frozen=True)
+class Surroundings:
+    """Loop in which a robot is checked, and sensor in front of which it stands.
 
-    The robot is checked in the control loop of a scenario and in front of its sensor. The
-    scenario's `excitation` has the limits of leverage and condition.
+    Attributes
+    ----------
+    settings : LoopSettings
+        Servo, timing, friction and drives.
+    control : Control
+        Bandwidth and damping of the servo that is to be designed, if one is asked for.
+    feedback : Feedback
+        Gains that are asked of computed_torque.
+    limits : Excitation
+        Limits of leverage and condition.
+    sensor, sensor_file : str and SensorFile
+        Sensor as its user names it, and its file.
     """
+
+    settings: closed_loop.LoopSettings
+    control: Control
+    feedback: Feedback
+    limits: Excitation
+    sensor: str
+    sensor_file: SensorFile
+
+
+def check_robot(
+    robot: Robot, parameters: Array, around: Surroundings, progress: Progress | None = None
+) -> list[Finding]:
+    """Return all findings about a robot with all its parameters."""
     # Each question is a function, so that progress is shown between them.
     questions: list[Callable[[], Iterator[Finding]]] = [
         lambda: _freedoms(robot),
-        lambda: _travel(robot, scenario.excitation),
+        lambda: _travel(robot, around.limits),
         lambda: _assembly(robot),
-        lambda: _holding(robot, parameters, scenario),
+        lambda: _holding(robot, parameters, around.settings.drives.torque_limit),
         lambda: _visible(robot),
         lambda: _bodies(robot, parameters),
-        lambda: _loop(robot, parameters, model_settings(robot, scenario)),
-        lambda: _designed(robot, parameters, scenario),
-        lambda: _seen(robot, scenario),
+        lambda: _loop(robot, parameters, around.settings),
+        lambda: _designed(robot, parameters, around),
+        lambda: _seen(robot, around.sensor, around.sensor_file),
     ]
     findings = []
     with (progress or SilentProgress()).stage("check", len(questions)) as advance:
@@ -154,10 +177,9 @@ def _assembly(robot: Robot) -> Iterator[Finding]:
     yield Finding("assembly modes", len(modes) > 0, len(modes), None, "1", None, text)
 
 
-def _holding(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[Finding]:
+def _holding(robot: Robot, parameters: Array, limit: float | None) -> Iterator[Finding]:
     torque = robot.static_torque(robot.home_pose, parameters[robot.layout.dynamic])
     unit = robot.layout.unit("joint1.coulomb")
-    limit = of_actuators(robot, scenario.control, "torque_limit")
     leg = int(np.argmax(np.abs(torque)))
     most = float(np.abs(torque[leg]))
     mean = np.abs(torque).mean()
@@ -246,18 +268,18 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     )
 
 
-def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[Finding]:
+def _designed(robot: Robot, parameters: Array, around: Surroundings) -> Iterator[Finding]:
     """Judge the gains of both loops.
 
-    Gains of the servo are also designed, if the scenario asks for a bandwidth and a damping.
+    Gains of the servo are also designed, if a bandwidth and a damping are asked for.
     """
-    settings = model_settings(robot, scenario)
+    settings = around.settings
     home = robot.home_pose
-    control = scenario.control
+    control = around.control
+    asked = around.feedback
     model = Model(robot, parameters, settings.friction)
     try:
         found = servo_figures(model, settings, home)
-        asked = feedback(scenario)
         torques = torque_figures(model, settings, home, asked)
         limit = largest_bandwidth(model, settings, home, asked)
     except DynamicsError as error:
@@ -307,18 +329,15 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
     yield Finding("torque bandwidth", w <= limit, w, known, "rad/s", None, text)
 
 
-def _seen(robot: Robot, scenario: Scenario) -> Iterator[Finding]:
-    """Judge whether the platform that the scenario's sensor sees is the robot's."""
-    outside, away = platform_distances(robot, sensor_file(scenario))
+def _seen(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
+    """Judge whether the platform that a sensor sees is the robot's."""
+    outside, away = platform_distances(robot, file)
     leg = int(np.argmax(outside))
     limit = OFF_PLATFORM_M
     most = float(outside[leg])
-    text = (
-        f"leg {leg + 1} ends {most:.3g} m outside of the platform that sensor "
-        f"{scenario.sensor} sees"
-    )
+    text = f"leg {leg + 1} ends {most:.3g} m outside of the platform that sensor {sensor} sees"
     if most <= 0:
-        text = f"all legs end on the platform that sensor {scenario.sensor} sees"
+        text = f"all legs end on the platform that sensor {sensor} sees"
     yield Finding("sensor's platform", most <= limit, most, limit, "m", leg + 1, text)
     text = f"at home that platform is {away:.3g} m from the robot's"
     yield Finding("sensor's home", away <= limit, away, limit, "m", None, text)

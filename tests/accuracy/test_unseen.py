@@ -10,8 +10,12 @@ from dynamics.closed_loop import (
 )
 from dynamics.errors import DynamicsError
 from identify.excitation.design import design_trajectories
-from identify.loop_parameters import model_settings
-from tests.identify.synthetic import quick, rss6, truth
+from tests.identify.synthetic import (
+    quick,
+    rss6,
+    side_of,
+    truth,
+)
 
 SCENARIO = quick(**{"validation.duration_s": 1.0, "excitation.candidates": 1})
 
@@ -27,7 +31,7 @@ def simulated(parameters, run, seed=0):
         rss6(),
         parameters,
         path.reference(SCENARIO.timing.frame_times(1.0)),
-        model_settings(rss6(), SCENARIO),
+        side_of(SCENARIO).settings,
     ).pose
 
 

@@ -21,12 +21,15 @@ import identify
 from dynamics import DynamicsError
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.bounds import parameter_bounds
-from identify.estimation.identification import output_error_problem
 from identify.estimation.warm_start import linear_warm_start
 from identify.excitation.comparison import compare_methods
 from identify.progress import SilentProgress
 from tests.benchmarks.timing import OtherLoad, judge, plain_work
-from tests.identify.synthetic import rss6, run_plant
+from tests.identify.synthetic import (
+    problem_of,
+    rss6,
+    run_plant,
+)
 
 pytestmark = pytest.mark.thorough
 
@@ -65,7 +68,7 @@ def record(scenario):
 
 @pytest.fixture(scope="module")
 def problem(record, scenario):
-    return output_error_problem([record], rss6(), scenario)
+    return problem_of([record], scenario)
 
 
 def lower_bounds(problem):
@@ -139,7 +142,7 @@ def test_solver_is_three_times_faster_than_scipys_with_finite_differences(
     driven, settings = problem.driven_by_commands(), scenario.identification
     # A little inside the bounds, where scipy's solver can move.
     start = np.maximum(
-        linear_warm_start(problem, scenario), lower_bounds(problem) + INSIDE * problem.guess.std
+        linear_warm_start(problem), lower_bounds(problem) + INSIDE * problem.guess.std
     )
     for one in (problem, driven):
         assert np.sum(residuals(one, start) ** 2) == pytest.approx(one.cost(start), rel=1e-12)

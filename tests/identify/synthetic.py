@@ -17,6 +17,7 @@ from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.plant import build_plant
 from identify.files.run_folder import RunFolder
+from identify.model.from_record import model_side
 from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.provenance import store_robot
 from identify.record.recording import build_record, write
@@ -120,6 +121,16 @@ def quick(**overrides):
     return load_scenario("quick").with_overrides(overrides)
 
 
+def side_of(scenario, robot=None):
+    """The model's side of a scenario, of the reference robot or another."""
+    return model_side(robot or rss6(), scenario)
+
+
+def problem_of(records, scenario, robot=None):
+    """The output-error problem of records with the settings of a scenario."""
+    return output_error_problem(records, side_of(scenario, robot), scenario.identification)
+
+
 PERFECT = JointInstruments(0.0, 0.0, 0.0)
 
 
@@ -135,8 +146,8 @@ def evidence(seed, noise=1.0, instruments=None, scenario=None):
     channels = measure_joints(
         record, truth_of(run), scenario.timing, instruments or JointInstruments(), rng
     )
-    problem = output_error_problem([record], rss6(), scenario)
-    return Evidence(problem, scenario, joint_channels(channels, record), truth()[64:])
+    problem = problem_of([record], scenario)
+    return Evidence(problem, joint_channels(channels, record), truth()[64:])
 
 
 def unseen(seeds=(7, 8)):

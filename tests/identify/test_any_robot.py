@@ -23,7 +23,7 @@ from identify.estimation.base_parameters import (
     rank_by_singular_values,
     structural_regressor,
 )
-from identify.estimation.identification import identify, output_error_problem
+from identify.estimation.identification import identify
 from identify.estimation.multiple_shooting import end_state, measured_states, segments
 from identify.estimation.prior import holding_torque
 from identify.estimation.warm_start import joint_balance
@@ -33,12 +33,19 @@ from identify.excitation.information import harmonics, sensitivity_spectrum
 from identify.excitation.motion import unknowns
 from identify.experiment.plant import build_plant
 from identify.experiment.sensor_in_loop import make_sensor
-from identify.loop_parameters import model_settings
+from identify.model.from_record import identified_model
 from identify.scenario import load_scenario
 from identify.trajectory import TrajectorySet, load_trajectories, save_trajectories
 from identify.validation.unseen import unseen_errors
 from tests.dynamics.test_families import mixed_robot
-from tests.identify.synthetic import SIGMA, quick, run_plant, trajectory
+from tests.identify.synthetic import (
+    SIGMA,
+    problem_of,
+    quick,
+    run_plant,
+    side_of,
+    trajectory,
+)
 
 FORBIDDEN = {"delta3": (3, 4, 5), "rrr3": (2, 3, 4)}
 """Entries of the pose that these platforms cannot change."""
@@ -138,7 +145,7 @@ def test_the_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     parameters = truth_of(robot)
     parameters[robot.layout.coulomb] = 0.0
     reference = moved.reference(scenario.timing.frame_times(20.0))
-    run = differentiate_servo(robot, parameters, reference, model_settings(robot, scenario))
+    run = differentiate_servo(robot, parameters, reference, side_of(scenario, robot).settings)
     s, t, m = harmonics(free), run.time[6000:], len(robot.coordinate_names)
     unknown = ca.MX.sym("z", z.size)
     spectrum = sensitivity_spectrum(robot, free, scenario, parameters, unknown)
@@ -158,9 +165,10 @@ def test_the_warm_starts_equation_holds_for_the_true_parameters(robot):
     """Without dry friction the regression times the truth vanishes against the torques in it."""
     scenario, layout, parameters = quick(), robot.layout, truth_of(robot)
     parameters[layout.coulomb] = 0.0
-    _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters, robot=robot)
+    record, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters, robot=robot)
+    model = identified_model(record, side_of(scenario, robot))
     law = joint_law("pid", parameters[layout.joint_pid])
-    columns, slipping = joint_balance(robot, run.pose, run.command, scenario, law)
+    columns, slipping = joint_balance(model, run.pose, scenario.filter, law)
     columns, pid = columns[slipping], layout.joint_pid
     start = equilibrium(robot, parameters, run.pose[0], build_plant(scenario, robot).settings.servo)
     balance = columns @ np.concatenate([parameters, start.joint_integral * parameters[pid][1]])
@@ -172,7 +180,7 @@ def test_the_warm_starts_equation_holds_for_the_true_parameters(robot):
 def test_segments_from_the_true_states_make_up_the_run(robot):
     scenario, chart = quick(**{"plant.steps_per_frame": 4}), robot.geometry.chart
     record, run = run_plant(scenario, seed=1, duration_s=3.0, robot=robot)
-    problem = output_error_problem([record], robot, scenario).driven_by_commands()
+    problem = problem_of([record], scenario, robot).driven_by_commands()
     true = np.hstack(
         [chart.coordinates(run.pose), chart.coordinates(run.pose_rate), run.joint_integral]
     )
@@ -183,7 +191,8 @@ def test_segments_from_the_true_states_make_up_the_run(robot):
         assert np.allclose(one.pose, run.pose[part.first : part.last + 1], rtol=0, atol=1e-12)
         assert np.allclose(end_state(one, chart), true[part.last], rtol=0, atol=1e-9)
     error = np.abs(
-        measured_states(chain, truth_of(robot), scenario) - true[[part.first for part in chain]]
+        measured_states(chain, truth_of(robot), scenario.filter)
+        - true[[part.first for part in chain]]
     )[1:]
     assert np.all(error[:, : len(chart.freedoms)] < 5 * chart.coordinates(SIGMA))
 
@@ -194,7 +203,7 @@ def test_friction_and_gains_are_identified_with_intervals_and_unseen_motion_is_p
     """
     scenario, truth = quick(), truth_of(robot)
     record, _ = run_plant(scenario, seed=1, robot=robot)
-    run = output_error_problem([record], robot, scenario).runs[0]
+    run = problem_of([record], scenario, robot).runs[0]
     residuals, slopes = run.residuals(truth)
     forbidden = list(FORBIDDEN.get(robot.name, ()))
     unmoved = run.whiten(run.model_poses(truth) * 0 + robot.home_pose - run.measured)[:, forbidden]

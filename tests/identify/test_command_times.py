@@ -7,7 +7,7 @@ import pytest
 
 from dynamics.closed_loop.command_schedule import acting_times
 from identify.errors import EstimationError, RecordError
-from identify.estimation.identification import identify, output_error_problem
+from identify.estimation.identification import identify
 from identify.estimation.multiple_shooting import segments
 from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run
@@ -20,10 +20,12 @@ from identify.validation.unseen import model_on_record
 from tests.identify.synthetic import (
     SHORT,
     SIGMA,
+    problem_of,
     quick,
     rss6,
     run_plant,
     short_run,
+    side_of,
     trajectory,
     truth,
 )
@@ -93,11 +95,11 @@ def test_models_of_all_kinds_run_as_the_plant_did(hold):
     record, run = run_plant(
         scenario, 0, EXACT, duration_s=3.0, latency_s=latencies, command_time=acted
     )
-    found = identified_model(record, rss6(), scenario)
+    found = identified_model(record, side_of(scenario))
     for one in (found, found.driven_by_commands()):
         np.testing.assert_allclose(one.model_poses(truth()), run.pose, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(
-        model_on_record(rss6(), scenario, truth(), record), found.model_poses(truth())
+        model_on_record(side_of(scenario), truth(), record), found.model_poses(truth())
     )
     states = np.hstack([run.pose, run.pose_rate, run.joint_integral])
     for part in segments(found.driven_by_commands()):
@@ -105,7 +107,7 @@ def test_models_of_all_kinds_run_as_the_plant_did(hold):
         np.testing.assert_allclose(
             again.pose, run.pose[part.first : part.last + 1], rtol=0, atol=1e-12
         )
-    blind = identified_model(record.drop_vars("command_time"), rss6(), scenario)
+    blind = identified_model(record.drop_vars("command_time"), side_of(scenario))
     assert np.abs(blind.model_poses(truth()) - run.pose).max() > 1e-6
 
 
@@ -118,7 +120,7 @@ def test_spans_of_torques_miss_a_record_by_its_noise():
     record = excitation_run(plant, DrawnSensor(np.diag(SIGMA**2)), trajectory(0), 1).record
     assert logged_latencies(record, scenario.timing).std() > 0.2 / 60
     logged, blind = (
-        np.mean(identified_model(one, rss6(), scenario).misses(plant.parameters) ** 2)
+        np.mean(identified_model(one, side_of(scenario)).misses(plant.parameters) ** 2)
         for one in (record, record.drop_vars("command_time"))
     )
     assert 0.85 < logged < 1.05
@@ -189,4 +191,4 @@ def test_a_lost_frame_may_have_written_nothing_and_a_time_that_cannot_be_is_name
     with pytest.raises(
         EstimationError, match=r"frame 0 acted 1.5 s after it, 90.0 frames of 60 Hz; at most 60"
     ):
-        output_error_problem([ages], rss6(), SHORT)
+        problem_of([ages], SHORT)

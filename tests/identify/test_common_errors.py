@@ -17,7 +17,7 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.covariance import estimate_uncertainty
-from identify.estimation.identification import identify, output_error_problem
+from identify.estimation.identification import identify
 from identify.experiment.rig_as_known import stated_covariance
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
@@ -30,7 +30,15 @@ from identify.record.stored_common_errors import (
 )
 from identify.reporting.tables import common_error_table
 from identify.validation.unseen import model_run, predicted_runs
-from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
+from tests.identify.synthetic import (
+    SIGMA,
+    problem_of,
+    quick,
+    rss6,
+    run_plant,
+    side_of,
+    truth,
+)
 
 NAMES = ("left.fx_px", "left.cx_px", "right.cx_px", "taught.base.rz_rad", "taught.platform.tx_m")
 REFERENCE = (("position", "orientation"), ("velocity", "orientation_rate"))
@@ -129,13 +137,14 @@ def test_poses_of_unseen_motion_are_predicted_with_what_the_record_taught(method
     record, _, _ = experiment(1, scenario)
     result = identify(record, robot, scenario)
     unseen, run, _ = experiment(1, scenario, trajectory_seed=1)
-    model = robot, scenario, [unseen], result.estimate
+    side = side_of(scenario)
+    model = side, [unseen], result.estimate
     (taught,) = predicted_runs(
         *model, result.whole_covariance, 0, SilentProgress(), result.common_errors.learned
     )
     (before,) = predicted_runs(*model, result.covariance, 0, SilentProgress())
     np.testing.assert_array_equal(
-        before.poses, model_run(robot, scenario, result.estimate, recorded_reference(unseen))
+        before.poses, model_run(robot, side.settings, result.estimate, recorded_reference(unseen))
     )
     sizes = [np.sqrt(np.mean(((one.poses - run.pose) / SIGMA) ** 2)) for one in (taught, before)]
     stated = [np.sqrt(np.mean((one.std / SIGMA) ** 2)) for one in (taught, before)]
@@ -249,7 +258,7 @@ def test_eliminated_errors_are_those_that_would_be_estimated_beside_the_paramete
 def test_a_model_takes_no_latency_below_zero_and_says_how_poses_change_with_it(stated_s):
     scenario = quick(**{"timing.latency_s": stated_s, "timing.latency_std_s": 0.002})
     record, _ = run_plant(scenario, 2, duration_s=5.0)
-    run = identified_model(record, rss6(), scenario).having(np.array([-9.0]))
+    run = identified_model(record, side_of(scenario)).having(np.array([-9.0]))
     assert not run.latencies.any()
     (later,) = (
         run.having(run.errors_had + 1.0).simulate(truth()).pose - run.simulate(truth()).pose,
@@ -351,7 +360,7 @@ def test_records_that_share_a_draw_do_not_average_it():
 
 def test_a_record_without_them_is_whitened_as_ever():
     record, _ = run_plant(quick(), seed=1, duration_s=5.0)
-    problem = output_error_problem([record], rss6(), quick())
+    problem = problem_of([record], quick())
     assert problem.with_common_errors(truth()).runs[0] is problem.runs[0]
 
 

@@ -15,11 +15,19 @@ from identify.errors import EstimationError, ScenarioError
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.identification import identify, output_error_problem
 from identify.experiment.plant import build_plant
-from identify.loop_parameters import settled_drive, with_drive
+from identify.loop_parameters import settled_drive
 from identify.progress import SilentProgress
 from identify.reporting.parameter_tables import drive_sentence, unidentified
 from identify.scenario.plant_sections import DRIVE_GAINS, DriveName
-from tests.identify.synthetic import LAYOUT, NAMES, quick, rss6, run_plant
+from tests.identify.synthetic import (
+    LAYOUT,
+    NAMES,
+    problem_of,
+    quick,
+    rss6,
+    run_plant,
+    side_of,
+)
 
 GAINS = {"lp": 10.5, "li": 11.4, "ld": 0.164}
 CASCADE = {"lp": 10.5, "li": 30.0, "ld": 0.3}
@@ -70,8 +78,8 @@ def test_a_torque_limit_that_is_met_does_not_bias():
     result, true = identify(record, rss6(), scenario), build_plant(scenario, rss6()).parameters
     assert np.abs((result.estimate - true) / result.std)[FRICTION_AND_PID].max() < 3
     free = quick(**{"excitation.duration_s": 5.0})
-    unaware = output_error_problem([record], rss6(), free).driven_by_commands().cost(true)
-    aware = output_error_problem([record], rss6(), scenario).driven_by_commands().cost(true)
+    unaware = problem_of([record], free).driven_by_commands().cost(true)
+    aware = problem_of([record], scenario).driven_by_commands().cost(true)
     assert aware < 1.1 * 6 * len(run.time) < unaware
 
 
@@ -115,10 +123,12 @@ def case(number):
             break
     record, _ = run_plant(scenario, seed=number, duration_s=5.0, trajectory_seed=100 + number)
 
-    def problem_of(named):
-        return output_error_problem([record], rss6(), named)
+    side = side_of(scenario)
 
-    return law, choose_drive(problem_of, scenario, SilentProgress())
+    def under_law(named):
+        return output_error_problem([record], side.with_drive(named), scenario.identification)
+
+    return law, choose_drive(under_law, scenario.model, SilentProgress())
 
 
 @pytest.mark.slow
@@ -171,9 +181,12 @@ def test_drives_that_are_none_are_refused(changes, said):
 
 
 def test_a_law_that_was_settled_holds_for_the_stages_that_follow():
+    law = settled_drive({"drive": {"law": "pi"}})
     asked = quick(**{"model.drive": "auto"})
-    assert with_drive(asked, settled_drive({"drive": {"law": "pi"}})).model.drive == "pi"
-    assert with_drive(quick(), "pi").model.drive == "pid"
+    assert asked.with_drive(law).model.drive == "pi"
+    assert side_of(asked).with_drive(law).settings.drives.law == "pi"
+    assert quick().with_drive("pi").model.drive == "pid"
+    assert side_of(quick()).with_drive("pi") == side_of(quick())
 
 
 def test_scenarios_know_the_laws_and_gains_that_the_drives_have():
@@ -210,11 +223,11 @@ def test_the_report_says_how_the_law_is_known():
 
 
 def test_a_record_of_which_no_law_gives_a_model_is_refused_with_the_reasons():
-    def problem_of(named):
-        raise EstimationError(f"nothing under {named.model.drive}")
+    def problem_of(law):
+        raise EstimationError(f"nothing under {law}")
 
     with pytest.raises(
         EstimationError,
         match="no law of the drives gives a model that runs: pid: nothing under pid; ",
     ):
-        choose_drive(problem_of, quick(**{"model.drive": "auto"}), SilentProgress())
+        choose_drive(problem_of, quick(**{"model.drive": "auto"}).model, SilentProgress())

@@ -18,18 +18,29 @@ from identify.errors import EstimationError
 from identify.estimation.base_parameters import structure
 from identify.estimation.covariance import correlation_matrix, estimate_uncertainty
 from identify.estimation.identifiability import POOR
-from identify.estimation.identification import identify, output_error_problem
+from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import joint_balance
 from identify.experiment.plant import build_plant, drawn_load
-from identify.loop_parameters import choose_parameters, model_settings
+from identify.loop_parameters import choose_parameters
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
 from identify.record.payload import store_payload
 from identify.reporting.run_result import prediction_entry
 from identify.scenario import load_scenario
 from identify.validation.unseen import PosePrediction, predict_poses, predicted_runs
-from tests.identify.synthetic import LAYOUT, NAMES, SIGMA, quick, rss6, run_plant, truth, truth_of
+from tests.identify.synthetic import (
+    LAYOUT,
+    NAMES,
+    SIGMA,
+    problem_of,
+    quick,
+    rss6,
+    run_plant,
+    side_of,
+    truth,
+    truth_of,
+)
 from tests.identify.test_interval_coverage import check_coverage, row_of
 
 FRICTION_AND_PID = [i for i, name in enumerate(NAMES) if name.startswith("joint")]
@@ -74,7 +85,7 @@ def assert_near_the_truth(result, limit):
 def unseen_error(scenario, parameters, seed=7):
     """RMS (6,) of a model against the noise-free plant on a trajectory it has not seen."""
     record, run = run_plant(scenario, seed=0, sigma=np.zeros(6), trajectory_seed=seed)
-    problem = output_error_problem([record], rss6(), scenario)
+    problem = problem_of([record], scenario)
     return np.sqrt(np.mean((problem.runs[0].model_poses(parameters) - run.pose) ** 2, axis=0))
 
 
@@ -89,9 +100,10 @@ def test_warm_start_equation_holds_for_the_true_parameters(scenario, hold, jitte
     )
     parameters[52:58] = 0
     latencies = np.random.default_rng(1).uniform(0.0, 2.0, 600) / 60 if jitter else None
-    _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters, latency_s=latencies)
+    record, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters, latency_s=latencies)
+    model = replace(identified_model(record, side_of(scenario)), acted=latencies)
     law = joint_law("pid", parameters[64:])
-    columns, slipping = joint_balance(rss6(), run.pose, run.command, scenario, law, latencies)
+    columns, slipping = joint_balance(model, run.pose, scenario.filter, law)
     columns = columns[slipping]
     start = equilibrium(
         rss6(), parameters, run.pose[0], build_plant(scenario, rss6()).settings.servo
@@ -136,7 +148,7 @@ def test_the_error_on_unseen_motions_is_the_one_predicted(scenario, ensemble):
         record, plant = run_plant(
             scenario, seed=100 + unseen, trajectory_seed=50 + unseen, duration_s=5.0
         )
-        run = identified_model(record, rss6(), scenario)
+        run = identified_model(record, side_of(scenario))
         for found, model in (
             (ratios, (result.estimate, result.covariance)),
             (exact, (truth(), np.zeros((67, 67)))),
@@ -153,7 +165,7 @@ def test_the_error_on_unseen_motions_is_the_one_predicted(scenario, ensemble):
 def test_a_prediction_keeps_the_models_slopes_where_no_frame_was_lost(scenario):
     """Found by the parameters that stand for all, they are those by all."""
     record, _ = run_plant(scenario, seed=3, trajectory_seed=4, duration_s=3.0)
-    run, rng = identified_model(record, rss6(), scenario), np.random.default_rng(0)
+    run, rng = identified_model(record, side_of(scenario)), np.random.default_rng(0)
     whole, few = (np.arange(len(run.ok)) != lost for lost in (-1, 20))
     alone = differentiate_servo(rss6(), truth(), run.reference, run.settings)
     for groups in (None, structure(rss6()).rigid_groups):
@@ -288,10 +300,10 @@ def test_the_model_is_the_closed_loop_itself_and_the_gradient_of_the_whole_cost_
     scenario, record
 ):
     """Of poses, starting guess and anchor together, off the optimum."""
-    run = identified_model(record, rss6(), scenario)
-    loop = simulate_servo(rss6(), truth(), run.reference, model_settings(rss6(), scenario))
+    run = identified_model(record, side_of(scenario))
+    loop = simulate_servo(rss6(), truth(), run.reference, side_of(scenario).settings)
     assert np.array_equal(run.model_poses(truth()), loop.pose)
-    whole = output_error_problem([record], rss6(), scenario)
+    whole = problem_of([record], scenario)
     at = 1.01 * truth()
     for problem in (whole, whole.driven_by_commands()):
         gradient = estimate_uncertainty(problem, at, np.random.default_rng(0)).gradient
@@ -306,10 +318,10 @@ def test_a_long_loss_is_flagged(scenario):
     record, _ = run_plant(scenario, seed=1, lost=range(200, 245))
     assert (
         "45 frames in a row were lost from t = 3.33 s"
-        in identified_model(record, rss6(), scenario).warnings()[0]
+        in identified_model(record, side_of(scenario)).warnings()[0]
     )
     assert (
-        identified_model(run_plant(scenario, seed=1, lost=[7, 9])[0], rss6(), scenario).warnings()
+        identified_model(run_plant(scenario, seed=1, lost=[7, 9])[0], side_of(scenario)).warnings()
         == ()
     )
 
@@ -378,13 +390,13 @@ def test_where_nothing_can_be_predicted_nothing_is_said():
     dark, plant = run_plant(quick(), 0, duration_s=2.0, lost=range(80))
     good, plant_29hz = run_plant(slow, 0, duration_s=8.0)
     with pytest.raises(LoopFailure, match="the loop is unstable"):
-        identified_model(good, rss6(), slow).model_poses(unstable)
+        identified_model(good, side_of(slow)).model_poses(unstable)
     for scenario, record, parameters, true in (
         (quick(), dark, truth(), plant),
         (slow, good, unstable, plant_29hz),
     ):
         (prediction,) = predicted_runs(
-            rss6(), scenario, [record], parameters, known, 0, SilentProgress()
+            side_of(scenario), [record], parameters, known, 0, SilentProgress()
         )
         assert prediction.std.shape == (record.sizes["time"], 6)
         assert np.isnan(prediction.std).all()
@@ -399,7 +411,12 @@ def test_a_motion_too_short_to_identify_from_can_be_predicted_and_what_cannot_be
 
     def predicted(record, parameters, **scenario):
         return predicted_runs(
-            rss6(), quick(**scenario), [record], parameters, np.zeros((67, 67)), 0, SilentProgress()
+            side_of(quick(**scenario)),
+            [record],
+            parameters,
+            np.zeros((67, 67)),
+            0,
+            SilentProgress(),
         )
 
     (prediction,) = predicted(record, truth())

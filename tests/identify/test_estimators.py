@@ -50,10 +50,12 @@ from tests.identify.synthetic import (
     PERFECT,
     evidence,
     guess_of,
+    problem_of,
     quick,
     recorded_run_folder,
     rss6,
     run_plant,
+    side_of,
     truth,
     truth_of,
     unseen,
@@ -67,7 +69,7 @@ def seen():
 
 @pytest.fixture(scope="module")
 def asked(seen):
-    return examination(seen, truth(), unseen())
+    return examination(seen, side_of(quick()), truth(), unseen())
 
 
 def score(seen, asked, parameters):
@@ -94,7 +96,7 @@ def test_distances_are_relative_and_of_what_the_record_shows(seen, asked):
 
 def test_an_estimator_that_fails_has_its_reason_in_the_table(seen, asked):
     """No torque channel, no known gains: the other rows stand, and the figure can be drawn."""
-    poses_only = Evidence(seen.problem, seen.scenario)
+    poses_only = Evidence(seen.problem)
     chosen = find_estimators(["torque_ls", "known_pid", "warm_start"])
     rows = {row.name: row for row in compare(poses_only, asked, chosen, SilentProgress())}
     assert "needs a measured torque" in rows["torque_ls"].note
@@ -184,7 +186,7 @@ def test_what_is_missing_or_unknown_is_said_before_anything_is_written(
         find_estimators(["warm_start", "best"])
     assert list(find_estimators(["torque_ls", "closed_loop"])) == ["closed_loop", "torque_ls"]
     with pytest.raises(EstimationError, match="no unseen trajectory"):
-        examination(seen, truth(), [])
+        examination(seen, side_of(quick()), truth(), [])
     (tmp_path / "scenario.toml").write_text(quick().to_toml(), encoding="utf-8")
     (tmp_path / "experiment.nc").write_bytes((folder / "experiment.nc").read_bytes())
     for arguments, says in (
@@ -257,7 +259,7 @@ def test_the_mean_torque_of_a_frame_is_that_of_the_motion(timing):
     """
     scenario = quick(**timing)
     record, run = run_plant(scenario, 0, np.zeros(6), duration_s=5.0)
-    problem = identified_model(record, rss6(), scenario)
+    problem = problem_of([record], scenario)
     latencies = np.full(len(run.torque), scenario.timing.latency_s)
     mean = frame_mean(
         run.torque,
@@ -269,7 +271,7 @@ def test_the_mean_torque_of_a_frame_is_that_of_the_motion(timing):
     )
 
     def left(torque):
-        equations = torque_equations(problem, run.pose, torque, scenario)
+        equations = torque_equations(problem, problem.runs[0], run.pose, torque)
         return np.sqrt(
             np.mean(equations.residual(np.append(truth(), np.zeros(6)))[equations.kind < 6] ** 2)
         )
@@ -386,7 +388,7 @@ def test_total_least_squares_and_the_encoder_route_agree_with_least_squares_wher
 
 def test_encoders_give_the_true_poses_but_for_rounding_and_the_channels_are_seeded(short):
     record, run, measured = short
-    reference = identified_model(record, rss6(), quick()).reference.poses
+    reference = identified_model(record, side_of(quick())).reference.poses
     poses = rss6().forward_kinematics(measured(PERFECT)["joint_angle"].values, reference)
     assert np.abs(poses - run.pose).max() < 1e-10
     one, same, other = (measured(JointInstruments(0.05, 1e-4, 1e-3), seed) for seed in (1, 1, 2))

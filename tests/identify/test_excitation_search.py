@@ -29,12 +29,16 @@ from identify.excitation.information import (
 )
 from identify.excitation.motion import sample_times, unknowns
 from identify.excitation.search import climb
-from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
 from tests.identify.commands import command
-from tests.identify.synthetic import NAMES, index_of, rss6
+from tests.identify.synthetic import (
+    NAMES,
+    index_of,
+    rss6,
+    side_of,
+)
 
 QUICK = load_scenario("quick")
 SMALL = QUICK.with_overrides(
@@ -72,7 +76,7 @@ def a_motion(robot, seed, scenario=QUICK):
 def simulated(robot, parameters, trajectory, scenario):
     """Run of the whole scenario's duration, with sensitivities."""
     reference = trajectory.reference(scenario.timing.frame_times(scenario.excitation.duration_s))
-    return differentiate_servo(robot, parameters, reference, model_settings(rss6(), scenario))
+    return differentiate_servo(robot, parameters, reference, side_of(scenario).settings)
 
 
 @pytest.mark.parametrize("harmonics_", [2, 5])

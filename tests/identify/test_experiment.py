@@ -22,7 +22,6 @@ from identify.experiment.plant import build_plant
 from identify.experiment.run import run_plant, taught_sensor
 from identify.experiment.sensor_in_loop import make_sensor, robot_meshes, robot_transforms
 from identify.experiment.truth import check_truth, read_truth, true_poses
-from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
 from identify.record.recording import poses
 from identify.scenario import scenario_from_toml
@@ -31,7 +30,15 @@ from identify.studies.rows.row_sensor import DrawnSensor
 from identify.trajectory import random_trajectory
 from identify.validation.unseen import unseen_errors
 from tests.identify import synthetic
-from tests.identify.synthetic import PERFECT, SIGMA, quick, rss6, trajectory, truth
+from tests.identify.synthetic import (
+    PERFECT,
+    SIGMA,
+    quick,
+    rss6,
+    side_of,
+    trajectory,
+    truth,
+)
 
 SHORT = {"excitation.duration_s": 1.0, "excitation.candidates": 2}
 
@@ -173,7 +180,7 @@ def test_the_sensor_gets_the_scenarios_timing_and_latencies_jitter_as_it_says(se
     assert late(0.002).timing.drawn_latencies(400, np.random.default_rng(0)).std() == pytest.approx(
         0.002, rel=0.15
     )
-    assert model_settings(rss6(), late(0.002)).timing.latency_s == 0.01
+    assert side_of(late(0.002)).settings.timing.latency_s == 0.01
     jittered = true(0, 0.005)
     assert np.array_equal(jittered, true(0, 0.005))
     assert 1e-7 < np.abs(jittered - true(0, 0.0)).max() < 1e-3
@@ -195,7 +202,7 @@ STRIBECK = {
 
 def test_the_model_knows_of_no_switch_and_without_one_the_plant_is_the_nominal_robot_bit_by_bit():
     switched, plain = quick(**ELASTIC, **MISPLACED, **STRIBECK), quick()
-    assert model_settings(rss6(), switched) == model_settings(rss6(), quick())
+    assert side_of(switched).settings == side_of(quick()).settings
     assert build_plant(switched).settings.elasticity.stiffness == 1000.0
     text = switched.to_toml()
     assert scenario_from_toml(text) == switched

@@ -16,7 +16,7 @@ from dynamics import load_robot
 from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
 from identify.errors import RecordError, ScenarioError
-from identify.estimation.identification import identify, output_error_problem
+from identify.estimation.identification import identify
 from identify.experiment.plant import build_plant
 from identify.files.atomic import write_bytes
 from identify.files.dataset import covariance_netcdf
@@ -27,7 +27,14 @@ from identify.scenario import load_scenario
 from identify.validation.unseen import model_run
 from tests.identify.commands import command, refusal
 from tests.identify.static_poses import drawn, known_robot, poses_of
-from tests.identify.synthetic import quick, run_plant, trajectory, truth
+from tests.identify.synthetic import (
+    problem_of,
+    quick,
+    run_plant,
+    side_of,
+    trajectory,
+    truth,
+)
 
 SENSOR = np.repeat([3e-6, 11e-6], 3)
 """As ctrack780 states it at home."""
@@ -62,7 +69,7 @@ def test_modes_of_the_geometry_are_how_the_poses_of_a_model_change_with_it(metho
     known, errors = off_by("rrr3", 4e-6)
     robot, scenario = known.robot, quick(robot="rrr3", **{"identification.method": method})
     record = record_of(known, robot.moved(errors), scenario, 0, load_robot("rrr3"))
-    problem = output_error_problem([record], robot, scenario)
+    problem = problem_of([record], scenario, robot)
     run = (problem if method == "closed_loop" else problem.driven_by_commands()).runs[0]
     values = robot.parameter_sets["identified"].vector
     modes, geometry = run.pose_modes(values), run.common.geometry
@@ -78,7 +85,7 @@ def test_modes_of_the_geometry_are_how_the_poses_of_a_model_change_with_it(metho
     assert np.abs(moved).max() > 1e-7  # m or rad
     assert run.common.all_names == tuple(f"geometry.{name}" for name in robot.geometry.number_names)
     silent = quick(robot="rrr3", **{"identification.nuisances": []})
-    assert output_error_problem([record], robot, silent).runs[0].common.geometry is None
+    assert problem_of([record], silent, robot).runs[0].common.geometry is None
 
 
 @pytest.mark.slow
@@ -161,7 +168,8 @@ def unseen_errors(known, true, scenario, parameters):
     )
     for seed in (7, 8, 9):
         reference = trajectory(seed).reference(scenario.timing.frame_times(5.0))
-        errors.append(model_run(known, scenario, parameters, reference) - plant.run(reference).pose)
+        settings = side_of(scenario, known).settings
+        errors.append(model_run(known, settings, parameters, reference) - plant.run(reference).pose)
     return np.concatenate(errors)
 
 
@@ -183,7 +191,7 @@ def test_a_calibration_done_before_is_read_and_the_true_robot_is_drawn_about_it(
     known = replace(known, robot=known.robot.moved(5 * errors))
     path = written(tmp_path, known)
     scenario = load_scenario("quick").with_overrides({"robot": "rrr3", "geometry.known": str(path)})
-    read = known_geometry(scenario)
+    read = known_geometry(load_robot("rrr3"), scenario.geometry)
     off = read.robot.geometry.deviations_from(known.robot.geometry)
     np.testing.assert_allclose(off, 0.0, atol=1e-14)
     np.testing.assert_allclose(read.covariance, known.covariance, rtol=1e-12)
@@ -201,7 +209,8 @@ def test_what_is_no_calibration_of_this_robot_is_refused_in_one_line(tmp_path):
     scenario = load_scenario("quick").with_overrides({"robot": "rrr3", "geometry.known": str(path)})
 
     def said(**overrides):
-        return refusal(ScenarioError, known_geometry, scenario.with_overrides(overrides))
+        changed = scenario.with_overrides(overrides)
+        return refusal(ScenarioError, known_geometry, load_robot(changed.robot), changed.geometry)
 
     assert "is neither exact, calibrated, nor a robot.toml" in said(
         **{"geometry.known": str(tmp_path / "none.toml")}
@@ -259,7 +268,7 @@ def test_a_run_calibrates_its_robot_first_and_the_truth_stays_where_no_estimator
     for name in ("geometry.json", "geometry.md", "poses.json"):
         (folder / name).unlink()
     scenario = load_scenario(tmp_path / "run" / "scenario.toml")
-    known = known_geometry(scenario, tmp_path / "run")
+    known = known_geometry(load_robot("rrr3"), scenario.geometry, tmp_path / "run")
     plant = build_plant(scenario, seed=0, known=known)
     off = plant.robot.geometry.deviations_from(plant.nominal.geometry)
     errors = off @ np.linalg.solve(known.covariance, off) / len(off)

@@ -14,7 +14,15 @@ from identify.model.from_record import identified_model
 from identify.record.recorded_law import recorded_law, takes_torques
 from identify.studies.rows.row_sensor import DrawnSensor
 from identify.validation.unseen import model_on_record
-from tests.identify.synthetic import NAMES, SIGMA, quick, rss6, short_run, trajectory
+from tests.identify.synthetic import (
+    NAMES,
+    SIGMA,
+    quick,
+    rss6,
+    short_run,
+    side_of,
+    trajectory,
+)
 
 FRICTION = [i for i, name in enumerate(NAMES) if name.startswith("joint") and "pid" not in name]
 GAINS = [i for i, name in enumerate(NAMES) if name.startswith("joint_pid")]
@@ -47,7 +55,7 @@ def test_a_record_under_a_feedforward_is_identified_by_its_commands(observer):
     assert result.searches == ("command_driven",)
     assert np.abs((result.estimate - plant.parameters) / result.std)[FRICTION + GAINS].max() < 3.5
     assert result.identifiable[GAINS].all()
-    after = model_on_record(rss6(), scenario, result.estimate, made.record)
+    after = model_on_record(side_of(scenario), result.estimate, made.record)
     assert np.abs((after - true_poses(made.truth))[:, :3]).max() < 5e-6
 
 
@@ -75,7 +83,7 @@ def test_a_record_of_torques_shows_base_parameters_without_the_gains():
 def test_spans_of_torques_find_their_starts_from_filtered_rates_that_are_far_off():
     """By ten times what the filter makes of noise, so that joints stick and slip otherwise."""
     scenario, plant, made = excited("computed_torque", seconds=4.0)
-    run = identified_model(made.record, rss6(), scenario)
+    run = identified_model(made.record, side_of(scenario))
     off = (
         2e-3
         * np.array([1, 1, 1, 6, 6, 6])
@@ -107,7 +115,7 @@ def test_derivatives_of_fitted_spans_are_finite_differences():
     """Of the poses, by the platform's mass and the friction of a joint: each span's start
     follows."""
     scenario, plant, made = excited("computed_torque", seconds=2.0)
-    run, values = identified_model(made.record, rss6(), scenario), plant.parameters
+    run, values = identified_model(made.record, side_of(scenario)), plant.parameters
     slopes = run.simulate(values).pose_sensitivity
     for index, size in ((0, 1e-3), (FRICTION[1], 1e-5), (FRICTION[7], 1e-5)):
         ends = [

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from identify.errors import EstimationError, RecordError
 from identify.estimation.covariance import estimate_uncertainty
-from identify.estimation.identification import identify, output_error_problem
+from identify.estimation.identification import identify
 from identify.estimation.output_error_search import search
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.experiment.plant import build_plant, drawn_load
@@ -26,6 +26,7 @@ from tests.identify.synthetic import (
     NAMES,
     SIGMA,
     index_of,
+    problem_of,
     quick,
     rss6,
     run_plant,
@@ -68,7 +69,7 @@ def stating(records, *loads):
     restated = [records[1].copy() for _ in loads]
     for record, (load, std) in zip(restated, loads, strict=True):
         store_payload(record, LAYOUT, load, std)
-    return output_error_problem([records[0], *restated], rss6(), SCENARIO).driven_by_commands()
+    return problem_of([records[0], *restated], SCENARIO).driven_by_commands()
 
 
 def covariance(problem, parameters):
@@ -83,7 +84,7 @@ def test_the_intervals_allow_for_how_far_a_wrong_load_moves_the_estimate(records
         heavier,
         lighter,
     ) = (  # where the optimum lies if the load is stated a standard deviation too heavy, or too light
-        search(stating(records, (LOAD + sign * STD, None)), truth(), SCENARIO, silent).parameters
+        search(stating(records, (LOAD + sign * STD, None)), truth(), silent).parameters
         for sign in (1, -1)
     )
     at, shift = (heavier + lighter) / 2, (heavier - lighter) / 2
@@ -124,7 +125,7 @@ def test_an_exactly_known_load_leaves_every_digit_as_it_was(records):
     unsaid.attrs = {
         name: value for name, value in unsaid.attrs.items() if not name.endswith("_std")
     }
-    unsaid = output_error_problem([records[0], unsaid], rss6(), SCENARIO).driven_by_commands()
+    unsaid = problem_of([records[0], unsaid], SCENARIO).driven_by_commands()
     assert np.array_equal(covariance(unsaid, truth()), stated)
 
 

@@ -19,7 +19,13 @@ from identify.record.own_record import read_own_records
 from identify.record.payload import recorded_payload
 from identify.record.recording import VARIABLES, poses, read
 from tests.identify.commands import command, one_line
-from tests.identify.synthetic import LAYOUT, index_of, quick, rss6, short_run
+from tests.identify.synthetic import (
+    LAYOUT,
+    index_of,
+    quick,
+    short_run,
+    side_of,
+)
 from tests.identify.test_recording import with_values
 
 POSE = ("x", "y", "z", "alpha", "beta", "gamma")
@@ -311,7 +317,7 @@ def late(record):
 )
 def test_units_and_a_start_in_motion_are_told_of_any_record(record, spoil, says):
     with pytest.raises(EstimationError, match=says):
-        identified_model(spoil(record), rss6(), quick(**{"excitation.fundamental_hz": 0.4}))
+        identified_model(spoil(record), side_of(quick(**{"excitation.fundamental_hz": 0.4})))
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,7 @@ from tests.identify.synthetic import (
     rss6,
     run_plant,
     short_run,
+    side_of,
     trajectory,
 )
 
@@ -358,7 +359,7 @@ def test_what_a_record_need_not_have_and_what_rounding_leaves_of_symmetry_is_no_
         reference_velocity=record["reference_velocity"].values * [1, 0, 0],
         measured_covariance=np.broadcast_to(covariance, record["measured_covariance"].shape),
     )
-    np.testing.assert_allclose(identified_model(bare, rss6(), SHORT).covariance, covariance)
+    np.testing.assert_allclose(identified_model(bare, side_of(SHORT)).covariance, covariance)
     once = SHORT.with_overrides({"identification.method": "command_driven"})
     assert np.all(np.isfinite(identify(without(record, "seed"), rss6(), once).estimate))
 
@@ -373,9 +374,11 @@ def test_a_load_that_no_body_has_is_refused_and_its_numbers_are_shown_as_plain_o
 
 
 def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record, recorded_folder):
-    check_trajectory(record, trajectory(0), SHORT)
+    check_trajectory(record, trajectory(0), SHORT.timing, SHORT.excitation.duration_s)
     planned = load_trajectories(recorded_folder.trajectories).excitation
-    check_trajectory(read(recorded_folder.experiment), planned, SHORT)
+    check_trajectory(
+        read(recorded_folder.experiment), planned, SHORT.timing, SHORT.excitation.duration_s
+    )
     gap = np.abs(
         trajectory(0).pose(record["time"].values) - trajectory(1).pose(record["time"].values)
     )
@@ -384,11 +387,11 @@ def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record,
     with pytest.raises(
         EstimationError, match=rf"differs by {gap.max():.3g} rad at t = {frame / 60:.2f} s"
     ):
-        check_trajectory(record, trajectory(1), SHORT)
+        check_trajectory(record, trajectory(1), SHORT.timing, SHORT.excitation.duration_s)
     with pytest.raises(
         EstimationError, match=r"has 120 frames, and the scenario asks for 600 .*duration_s = 10 s"
     ):
-        check_trajectory(record, trajectory(0), quick())
+        check_trajectory(record, trajectory(0), quick().timing, quick().excitation.duration_s)
 
 
 def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geometry_by_its_name(

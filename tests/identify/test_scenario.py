@@ -22,7 +22,7 @@ from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector
 from identify.reporting.settings import changed_settings
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
-from identify.scenario.scenario import SECTIONS, estimator_settings, with_estimator_settings
+from identify.scenario.scenario import ESTIMATOR_SECTIONS
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import NAMES, SHORT, changed_robot_file, rss6
 
@@ -381,7 +381,7 @@ def test_without_settings_the_scenario_is_left_as_it_is_and_by_an_identification
     pipeline.identify(recorded_folder.path, SilentProgress())
     assert recorded_folder.scenario.read_text(encoding="utf-8") == mine
     result = load_result(recorded_folder.result)
-    assert result["settings"] == estimator_settings(SHORT)
+    assert result["settings"] == SHORT.estimator_settings()
     assert changed_settings(SHORT.to_toml(), result["settings"]) == changed_settings(
         SHORT.to_toml()
     )
@@ -394,11 +394,11 @@ def test_what_the_record_was_made_with_is_refused_in_one_line_and_every_setting_
         with pytest.raises(
             ScenarioError, match=f"'{next(iter(setting))}' cannot be set for an identification"
         ):
-            with_estimator_settings(SHORT, setting)
+            SHORT.with_estimator_settings(setting)
     with pytest.raises(
         ScenarioError, match=r"valid names in \[identification\]: method, scale_anchor"
     ):
-        with_estimator_settings(SHORT, {"identification.methode": "closed_loop"})
+        SHORT.with_estimator_settings({"identification.methode": "closed_loop"})
     assert (
         command(
             "identify", "--out", recorded_folder.path, "--set", "identification.scale_anchor=prior"
@@ -412,8 +412,8 @@ def test_what_the_record_was_made_with_is_refused_in_one_line_and_every_setting_
         in said
     )
     assert not recorded_folder.result.exists()
-    listed = {key.partition(".")[0] for key in estimator_settings(SHORT)}
-    assert listed == set(SECTIONS) < set(Scenario.model_fields)
+    listed = {key.partition(".")[0] for key in SHORT.estimator_settings()}
+    assert listed == set(ESTIMATOR_SECTIONS) < set(Scenario.model_fields)
 
 
 def test_the_report_says_what_differs_from_the_built_in_scenario_and_what_was_set_anew(run_folder):

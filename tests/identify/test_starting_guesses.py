@@ -30,7 +30,6 @@ from dynamics import DynamicsError
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.estimation.identifiability import identifiability
-from identify.estimation.identification import output_error_problem
 from identify.estimation.multiple_shooting import (
     MultipleShooting,
     end_state,
@@ -54,6 +53,7 @@ from tests.identify.synthetic import (
     SIGMA,
     Stages,
     guess_of,
+    problem_of,
     quick,
     rss6,
     run_plant,
@@ -95,7 +95,7 @@ def recorded(request):
     noise."""
     scenario = load_scenario("paper").with_overrides({"sensor": request.param})
     record, _ = run_plant(scenario, seed=1, duration_s=scenario.excitation.duration_s)
-    return scenario, output_error_problem([record], rss6(), scenario)
+    return problem_of([record], scenario)
 
 
 @pytest.mark.parametrize(
@@ -110,16 +110,15 @@ def test_the_optimum_does_not_depend_on_the_starting_guess(
     recorded, record_property, spread, starts, misses
 ):
     """24 of 25 starting guesses reach the same optimum."""
-    scenario, stated = recorded
+    stated = recorded
     excess, apart = [], []
     for seed in range(starts):
         problem = replace(stated, guess=drawn_guess(spread, seed))
-        warm = linear_warm_start(problem, scenario)
-        found = output_error_searches(problem, scenario, warm, SilentProgress())[
-            "closed_loop"
-        ].solution
+        warm = linear_warm_start(problem)
+        searches = output_error_searches(problem, warm, True, SilentProgress())
+        found = searches["closed_loop"].solution
         assert "max_iterations" not in found.stop_reason
-        from_truth = search(problem, truth(), scenario, silent)
+        from_truth = search(problem, truth(), silent)
         excess.append(found.costs[-1] - from_truth.costs[-1])
         apart.append(distance(problem, found.parameters, from_truth.parameters))
     reached = (np.array(excess) <= SAME_COST) & (
@@ -141,10 +140,10 @@ def found(plant_steps, model_steps):
     gain, signs = NAMES.index("joint_pid.lp"), np.random.default_rng(1).choice([-1, 1], len(NAMES))
     start = truth() * np.where(np.arange(len(NAMES)) == gain, 1.0, 1 + 0.15 * signs)
     store_anchor(record, ScaleAnchor("joint_gain", truth()[gain], 1e-9))
-    problem = output_error_problem([record], rss6(), scenario)
+    problem = problem_of([record], scenario)
     problem = replace(problem, guess=replace(problem.guess, values=start))
-    driven = search(problem.driven_by_commands(), start, scenario, silent)
-    solution = search(problem, driven.parameters, scenario, silent)
+    driven = search(problem.driven_by_commands(), start, silent)
+    solution = search(problem, driven.parameters, silent)
     return problem, solution, base_parameters(structural_regressor(rss6()), LAYOUT)
 
 
@@ -189,7 +188,7 @@ SMOOTHED = {
 def driven(duration_s, changes=None, **how):
     scenario = quick(**{"plant.steps_per_frame": 4} | (changes or {}))
     record, run = run_plant(scenario, seed=1, duration_s=duration_s, **how)
-    return scenario, output_error_problem([record], rss6(), scenario).driven_by_commands(), run
+    return scenario, problem_of([record], scenario).driven_by_commands(), run
 
 
 def states_of(run):
@@ -212,7 +211,7 @@ def test_segments_from_the_true_states_make_up_the_run_and_states_are_measured_t
             end_state(one, rss6().geometry.chart), true[part.last], rtol=0, atol=1e-9
         )
     error = np.abs(
-        measured_states(chain, truth(), scenario) - true[[part.first for part in chain]]
+        measured_states(chain, truth(), scenario.filter) - true[[part.first for part in chain]]
     )[1:]
     assert np.all(error[:, :6] < 5 * SIGMA)
     assert np.all(error[:, 6:12] < 0.1 * np.abs(run.pose_rate).max(axis=0))
@@ -245,7 +244,7 @@ def test_condensing_takes_the_step_of_the_whole_problem():
     problem = replace(problem, guess=guess_of(truth(), 0.02 * truth()))
     start = truth() * np.random.default_rng(0).uniform(0.95, 1.05, 67)
     chain = segments(problem.runs[0])
-    shooting = MultipleShooting(problem, [chain], [measured_states(chain, start, scenario)])
+    shooting = MultipleShooting(problem, [chain], [measured_states(chain, start, scenario.filter)])
     states, inner = shooting.states[0].copy(), slice(1, None)
     size, count = len(start), states[inner].size
 
@@ -275,16 +274,16 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     does."""
     scenario = quick()
     record, _ = run_plant(scenario, seed=1)
-    problem = output_error_problem([record], rss6(), scenario)
+    problem = problem_of([record], scenario)
     unstable = problem.guess.values.copy()
     unstable[64:] = [10.0, 24.0, 0.02]
     problem = replace(problem, guess=replace(problem.guess, values=unstable))
     commanded = problem.driven_by_commands()
     with pytest.raises(DynamicsError, match="unstable"):
-        search(commanded, unstable, scenario, silent)
+        search(commanded, unstable, silent)
     assert runnable_start(commanded, unstable) is None
     progress = Stages()
-    searches = output_error_searches(problem, scenario, unstable, progress)
+    searches = output_error_searches(problem, unstable, True, progress)
     found = {name: search.solution for name, search in searches.items()}
     assert [name for name, _, _ in progress.seen] == ["multiple shooting", "identify"]
     assert all(sum(steps) == total for _, total, steps in progress.seen)
@@ -294,14 +293,14 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     )
     assert list(found) == ["multiple_shooting", "command_driven", "closed_loop"]
     for name, judged in (("command_driven", commanded), ("closed_loop", problem)):
-        from_truth = search(judged, truth(), scenario, silent)
+        from_truth = search(judged, truth(), silent)
         assert found[name].costs[-1] < from_truth.costs[-1] + 0.1
 
 
 def test_a_model_that_no_segment_bears_is_named():
-    scenario, problem, _ = driven(2.0)
+    _, problem, _ = driven(2.0)
     wild = truth().copy()
     wild[64:] *= [1e4, 1e4, 1e-4]
     hopeless = replace(problem, guess=replace(problem.guess, values=wild))
     with pytest.raises(EstimationError, match=r"nor does multiple shooting.*frame"):
-        shoot(hopeless, scenario, wild, SilentProgress())
+        shoot(hopeless, wild, SilentProgress())

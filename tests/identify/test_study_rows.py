@@ -19,7 +19,7 @@ from dynamics.closed_loop import (
 )
 from identify.errors import EstimationError, ScenarioError
 from identify.experiment.plant import build_plant
-from identify.loop_parameters import model_settings
+from identify.model.from_record import model_side
 from identify.scenario import load_scenario
 from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.identified import prediction_figures
@@ -253,9 +253,10 @@ def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_predi
     poses[:, :3] += 0.002 * np.sin(np.arange(60)[:, None] / np.array([5.0, 7.0, 9.0]))
     reference = Reference(poses, np.gradient(poses, settings.timing.frame_period_s, axis=0))
     truth = build_plant(settings, robot).parameters
+    loop = model_side(robot, settings).settings
     error = 1e-4 * truth * np.random.default_rng(0).normal(size=len(truth))
-    model = differentiate_servo(robot, truth + error, reference, model_settings(robot, settings))
-    true = model_run(robot, settings, truth, reference)
+    model = differentiate_servo(robot, truth + error, reference, loop)
+    true = model_run(robot, loop, truth, reference)
     found = prediction_figures(
         [(model.pose, model.pose_sensitivity)], np.outer(error, error), [true]
     )

@@ -10,6 +10,7 @@ from identify.estimation.result import IdentificationResult
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment
 from identify.experiment.truth import true_poses
+from identify.model.from_record import ModelSide
 from identify.progress import SilentProgress
 from identify.studies.rows.kind import Row
 from identify.studies.rows.row_sensor import rms_um
@@ -60,14 +61,13 @@ def coverage(
 
 
 def predictions(
-    result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int
+    result: IdentificationResult, side: ModelSide, unseen: Sequence[Experiment], seed: int
 ) -> list[PosePrediction]:
     """Predict the poses of all unseen trajectories by the identified model."""
     records = [one.record for one in unseen]
     estimated = result.estimate, result.whole_covariance
     return predicted_runs(
-        plant.nominal,
-        plant.scenario,
+        side,
         records,
         *estimated,
         seed,

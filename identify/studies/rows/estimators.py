@@ -12,6 +12,7 @@ from pydantic import Field, field_validator
 
 from identify.estimators.estimator import find_estimators
 from identify.experiment.joint_instruments import instruments_of
+from identify.model.from_record import model_side
 from identify.own_parts import ESTIMATORS
 from identify.progress import SilentProgress
 from identify.scenario import Scenario
@@ -83,11 +84,19 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Estimator
     made = recorded(scenario, seed, options)
     robot = made.plant.nominal
     run = made.excitation
-    channels = instrumented(run.record, run.truth, scenario, instruments_of(robot), made.number)
+    channels = instrumented(
+        run.record, run.truth, scenario.timing, instruments_of(robot), made.number
+    )
     unseen = [(one.record, one.truth) for one in made.unseen]
     chosen = find_estimators(options.estimators or None)
     scores = compare_on_record(
-        (run.record, run.truth), channels, robot, scenario, unseen, chosen, SilentProgress()
+        (run.record, run.truth),
+        channels,
+        model_side(robot, scenario),
+        scenario.identification,
+        unseen,
+        chosen,
+        SilentProgress(),
     )
     return {
         name: value

@@ -6,7 +6,7 @@ the sensor teaches itself, seeded by the row. The exciting and the unseen trajec
 `trajectory_seed`, the same in all rows. Rows thus differ by their factors and their noise only.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
@@ -24,7 +24,7 @@ from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor
 from identify.experiment.truth import true_poses
-from identify.loop_parameters import model_settings, with_drive
+from identify.model.from_record import ModelSide, model_side
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.record.command_times import logged_latencies
@@ -233,31 +233,32 @@ def compute(
     unseen = made.unseen
     result = identify_record(made.records, plant.nominal, scenario)
     # The model is run with the law of the drives that was identified.
-    plant = replace(plant, scenario=with_drive(scenario, result.drive.law))
+    side = model_side(plant.nominal, scenario).with_drive(result.drive.law)
     row = _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
-    predicted = predictions(result, plant, unseen, made.number)
-    row |= _unseen_figures(result, plant, unseen, predicted) | coverage(
+    predicted = predictions(result, side, unseen, made.number)
+    row |= _unseen_figures(result, side, plant.parameters, unseen, predicted) | coverage(
         result, plant, unseen, predicted
     )
     if not options.unaware:
         return row
     unaware = scenario.with_overrides({"identification.nuisances": []})
     result = identify_record(made.records, plant.nominal, unaware)
-    plant = replace(plant, scenario=with_drive(unaware, result.drive.law))
-    covered = coverage(result, plant, unseen, predictions(result, plant, unseen, made.number))
+    side = model_side(plant.nominal, unaware).with_drive(result.drive.law)
+    covered = coverage(result, plant, unseen, predictions(result, side, unseen, made.number))
     return row | {f"unaware_{name}": value for name, value in covered.items()}
 
 
 def _unseen_figures(
     result: IdentificationResult,
-    plant: Plant,
+    side: ModelSide,
+    truth: Array,
     unseen: list[Experiment],
     predicted: list[PosePrediction],
 ) -> Row:
-    """Return the errors of the identified model on unseen trajectories."""
-    robot = plant.nominal
-    scenario = plant.scenario
-    settings = model_settings(robot, scenario)
+    """Return the errors of the identified model on unseen trajectories.
+
+    truth: true parameters (p,).
+    """
     models = []
     for of, one in zip(predicted, unseen, strict=True):
         # Such a prediction is the identified model's own run, which need not be done again.
@@ -265,11 +266,13 @@ def _unseen_figures(
             models.append((of.poses, of.slopes))
             continue
         reference = recorded_reference(one.record)
-        latencies = logged_latencies(one.record, scenario.timing)
-        run = differentiate_servo(robot, result.estimate, reference, settings, latencies=latencies)
+        latencies = logged_latencies(one.record, side.timing)
+        run = differentiate_servo(
+            side.robot, result.estimate, reference, side.settings, latencies=latencies
+        )
         assert run.pose_sensitivity is not None
         models.append((run.pose, run.pose_sensitivity))
-    true = [model_on_record(robot, scenario, plant.parameters, one.record) for one in unseen]
+    true = [model_on_record(side, truth, one.record) for one in unseen]
     errors = np.concatenate(
         [poses - true_poses(one.truth) for (poses, _), one in zip(models, unseen, strict=True)]
     )
