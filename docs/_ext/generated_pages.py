@@ -38,9 +38,9 @@ FOLLOWED = {"position_rms_um": "position, µm", "orientation_rms_urad": "orienta
 
 COMPARED = SHARES | {
     "true_position_ratio": "position over that with the true model",
-    "true_orientation_ratio": "orientation",
-    "starting_position_excess_um": "with the starting model more by, µm",
-    "starting_orientation_excess_urad": "µrad",
+    "true_orientation_ratio": "orientation over that with the true model",
+    "starting_position_excess_um": "initial model worse by, µm",
+    "starting_orientation_excess_urad": "initial model worse by, µrad",
 }
 """And beside it with other models."""
 
@@ -49,13 +49,13 @@ TIMING = ("timing",)
 
 def at_both_rates(name: str) -> dict[str, tuple[str, ...]]:
     """Kept answers of a study of tracking, at both timings."""
-    return {name: ("60 Hz",), f"{name}_29hz": ("29 Hz, latency of a frame",)}
+    return {name: ("60 Hz",), f"{name}_29hz": ("29 Hz, latency of one frame",)}
 
 
 COVERED = {
-    "intervals": "quantities identified",
-    "covered_percent": "of their 95 % intervals hold, %",
-    "poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
+    "intervals": "identified quantities",
+    "covered_percent": "their 95 % intervals that contain the truth, %",
+    "poses_covered_percent": "validation poses within their 95 % interval, %",
     "predicted_position_rms_um": "error of predicted positions, µm",
 }
 """Figures of stated uncertainty against the truth."""
@@ -68,7 +68,7 @@ ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
         },
         {
             "coulomb_error_percent": "error of Coulomb friction, %",
-            "coulomb_std_percent": "as stated, %",
+            "coulomb_std_percent": "its stated standard deviation, %",
             "viscous_error_percent": "error of viscous friction, %",
         },
     ),
@@ -85,10 +85,10 @@ ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "excitation_methods": (
         {"scenario.excitation.method": "method"},
         {
-            "identified_groups": "groups identified",
-            "group_std_percent": "their deviation, %",
+            "identified_groups": "identified groups",
+            "group_std_percent": "their standard deviation, %",
             "coulomb_std_percent": "Coulomb friction, %",
-            "unseen_position_rms_um": "position on unseen motion, µm",
+            "unseen_position_rms_um": "position error in validation, µm",
         },
     ),
     "interval_coverage": (
@@ -104,7 +104,7 @@ ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
         {f"unaware_{name}": said for name, said in COVERED.items()},
     ),
     "control_value": (
-        {"options.law": "law", "options.model_error": "error of the model, starting model 1"},
+        {"options.law": "law", "options.model_error": "error of the model (initial model: 1)"},
         FOLLOWED,
     ),
 }

@@ -19,10 +19,10 @@ from identify.studies.study_file import STUDIES, load_study
 LAWS = "test_rows_of_a_study_follow_its_laws"
 WORST = "unseen_position_um_"
 ESTIMATED = {
-    "groups_percent": "groups, %",
-    "gains_percent": "gains, %",
-    "position_um": "position, µm",
-    "orientation_urad": "orientation, µrad",
+    "groups_percent": "error of groups, %",
+    "gains_percent": "error of gains, %",
+    "position_um": "largest position error, µm",
+    "orientation_urad": "largest orientation error, µrad",
     "seconds": "time, s",
 }
 """What is told of an estimator."""
@@ -95,21 +95,21 @@ def sensor_speed(folder: Path) -> str:
     found = figures_of(kept(folder, "speeds"), "test_sensor_speed")
     renderers = ("analytic", "pyrender")
     titles = {
-        "frames_a_second": "stereo frames a second, drawn and measured",
-        "times_straightforward": "times as fast as the straightforward pipeline",
+        "frames_a_second": "stereo frames per second, drawn and measured",
+        "times_straightforward": "speed relative to the straightforward pipeline",
     }
     rows = [
         (title, *(f"{found[f'{renderer}_{name}']:.0f}" for renderer in renderers))
         for name, title in titles.items()
     ]
     others = {
-        "images_in_the_loop": "`pyrender`, in the loop, between other work",
+        "images_in_the_loop": "`pyrender`, in the loop of a run",
         "images_together": "`analytic`, many at once, on all cores",
         "without_images": "`statistical`, many at once, on all cores",
     }
     more = [(title, f"{found[f'{name}_frames_a_second']:,.0f}") for name, title in others.items()]
     table = _table(("renderer", "`analytic`", "`pyrender`"), rows)
-    return f"{table}\n\n{_table(('frames a second', ''), more)}" + _measured(
+    return f"{table}\n\n{_table(('renderer', 'frames per second'), more)}" + _measured(
         folder, "test_sensor_speed"
     )
 
@@ -129,7 +129,7 @@ def dynamics_speed(folder: Path) -> str:
         ("all 67 sensitivities of a run", "sensitivities_plain_runs", lambda value: f"{value:.1f} "
                                                                                     "plain runs"),
         ("a batch of runs on two cores", "two_cores_gain", lambda value: f"{value:.2f} times "
-                                                                         "faster than on one"),
+                                                                         "as fast as on one"),
         ("compiling a robot, at first use", "robot_compilation_s", lambda value: f"{value:.0f} s"),
         ("compiling the loop, once after "
          "installation", "loop_compilation_s", lambda value: f"{value:.0f} s"),
@@ -151,7 +151,7 @@ def robots(folder: Path) -> str:
         )
         for name in names
     ]
-    heads = ("robot", "unseen position, µm", "unseen orientation, µrad")
+    heads = ("robot", "position error, µm", "orientation error, µrad")
     return _table(heads, rows) + f"\n\nMeasured {date_of(thorough, 'test_families')}.\n"
 
 
@@ -172,7 +172,7 @@ def laws(folder: Path) -> str:
             statement = law.statement.replace("_", "\\_").replace("^", "\\^").replace("~", "\\~")
             rows.append((f"`{name}`", f"{statement}: {law.why.replace('^', '&#94;')}", measured))
     when = f"\n\nMeasured {date_of(thorough, LAWS)}.\n"
-    return _table(("study", "law, and why", "measured exponent, 99 % interval"), rows, "---") + when
+    return _table(("study", "law and reason", "measured exponent, 99 % interval"), rows, "---") + when
 
 
 def answer(name: str, factors: dict[str, str], shown: dict[str, str]) -> Callable[[Path], str]:
@@ -283,7 +283,7 @@ def _kept_rows(folder: Path, contents: dict[str, dict[str, Any]]) -> str:
 
 
 def _faster(value: float) -> str:
-    return f"{value:.1f} times faster"
+    return f"{value:.1f} times as fast"
 
 
 def _measured(folder: Path, part: str) -> str:
