@@ -172,7 +172,8 @@ def laws(folder: Path) -> str:
             statement = law.statement.replace("_", "\\_").replace("^", "\\^").replace("~", "\\~")
             rows.append((f"`{name}`", f"{statement}: {law.why.replace('^', '&#94;')}", measured))
     when = f"\n\nMeasured {date_of(thorough, LAWS)}.\n"
-    return _table(("study", "law and reason", "measured exponent, 99 % interval"), rows, "---") + when
+    heads = ("study", "law and reason", "measured exponent, 99 % interval")
+    return _table(heads, rows, "---") + when
 
 
 def answer(name: str, factors: dict[str, str], shown: dict[str, str]) -> Callable[[Path], str]:
