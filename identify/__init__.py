@@ -48,12 +48,12 @@ if TYPE_CHECKING:
     from identify.scenario import scenario_names as scenario_names
     from identify.setup import run_experiment as run_experiment
     from identify.setup import set_up as set_up
+    from identify.setup import unseen_errors as unseen_errors
     from identify.studies.in_python import Study as Study
-    from identify.validation.unseen import unseen_errors as unseen_errors
 
 _HOME = {
     **dict.fromkeys(("Scenario", "load_scenario", "scenario_names"), "identify.scenario"),
-    **dict.fromkeys(("run_experiment", "set_up"), "identify.setup"),
+    **dict.fromkeys(("run_experiment", "set_up", "unseen_errors"), "identify.setup"),
     "Study": "identify.studies.in_python",
     "build_record": "identify.record.recording",
     "ScaleAnchor": "identify.estimation.scale_anchor",
@@ -62,7 +62,6 @@ _HOME = {
     "store_payload": "identify.record.payload",
     "IdentificationResult": "identify.estimation.result",
     "identify": "identify.estimation.identification",
-    "unseen_errors": "identify.validation.unseen",
     "run_figures": "identify.reporting.pictures",
 }
 

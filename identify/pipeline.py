@@ -5,17 +5,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import cmmsim
-from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import excitation_run, taught_sensor
-from identify.experiment.sensor_in_loop import with_renderer
-from identify.files.run_folder import (
-    RunFolder,
-    load_result,
-    result_json,
-)
+from identify.experiment.run import excitation_run
+from identify.experiment.sensor_in_loop import teach
+from identify.files.run_folder import RunFolder, load_result, result_json
 from identify.progress import Progress
 from identify.record import recording
 from identify.scenario import Scenario
+from identify.setup import Setup, with_renderer
 from identify.stages.estimate import identify, identify_own
 from identify.stages.plan import begin, excite, is_begun, open_run, record_files
 from identify.stages.validate import validate
@@ -35,13 +31,13 @@ def run(
     run_folder = RunFolder(folder)
     scenario = with_renderer(scenario)
     seconds: dict[str, float] = {}
-    sensor = None
-    plant = None
+    setup = None
     taught = None
     if not is_begun(scenario, seed, folder):
-        sensor, plant, seconds = begin(scenario, seed, folder, progress)
-    if not all((folder / name).is_file() for name in record_files(scenario)):
-        taught = record(folder, progress, workers, sensor, plant)
+        setup, seconds = begin(Setup(scenario, seed), folder, progress)
+    names = record_files(scenario.identification)
+    if not all((folder / name).is_file() for name in names):
+        taught = record(folder, progress, workers, setup)
     if not run_folder.result.is_file():
         identify(folder, progress)
     if "validation" not in load_result(run_folder.result):
@@ -53,29 +49,34 @@ def record(
     folder: Path,
     progress: Progress,
     workers: int | None = None,
-    sensor: cmmsim.Sensor | None = None,
-    plant: Plant | None = None,
+    setup: Setup | None = None,
 ) -> cmmsim.Taught:
     """Run the plant on the exciting trajectory; writes experiment.nc, and payload.nc where the
     scale anchor is a payload. Returns what the sensor was taught.
 
-    sensor, plant: those of the scenario where they are at hand, the sensor taught.
+    setup: that of the run where it is at hand, its sensor taught.
     """
     run_folder, scenario, trajectories, known = open_run(folder)
     began = time.perf_counter()
-    sensor = sensor or taught_sensor(scenario, known.robot, trajectories.seed, progress)
-    plant = plant or build_plant(scenario, seed=trajectories.seed, known=known)
-    names = record_files(scenario)
-    frames = scenario.timing.frames(scenario.excitation.duration_s)
-    with progress.stage("record", frames * len(names)) as advance:
+    seed = trajectories.seed
+    if setup is None:
+        setup = Setup(scenario, seed, calibrated=known, progress=progress)
+        teach(setup.sensor, progress)
+    names = record_files(scenario.identification)
+    with progress.stage("record", setup.sensor_plan.frames * len(names)) as advance:
         for name in names:
-            loaded = name == run_folder.payload.name
             experiment = excitation_run(
-                plant, sensor, trajectories.excitation, trajectories.seed, advance, loaded
+                setup.plant,
+                setup.sensor,
+                trajectories.excitation,
+                scenario.excitation,
+                seed,
+                advance,
+                scenario.payload if name == run_folder.payload.name else None,
             )
             stored = experiment.record.assign_attrs(record_seconds=time.perf_counter() - began)
             recording.write(run_folder.path / name, stored, experiment.truth)
-    return sensor.taught
+    return setup.sensor.taught
 
 
 def report(

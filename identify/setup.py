@@ -8,31 +8,45 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import platformdirs
 import xarray as xr
+from numpy.typing import ArrayLike
 
 import cmmsim
-from dynamics import Robot
+from cmmsim.imaging.renderer import choose_renderer
+from dynamics import Robot, load_robot
 from identify.arrays import Array
 from identify.errors import EstimationError, ScenarioError, WriteError
 from identify.estimation.result import IdentificationResult
-from identify.excitation.design import design_trajectories
-from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import excitation_run, teach, untaught_sensor
-from identify.experiment.sensor_in_loop import with_renderer
+from identify.excitation.constraints import MotionConstraints
+from identify.excitation.criteria import criterion_of
+from identify.excitation.design import Design, design_trajectories
+from identify.experiment.plant import (
+    KnownLoop,
+    Plant,
+    RunSettings,
+    true_parameters,
+    true_robot,
+    with_springs,
+)
+from identify.experiment.run import excitation_run
+from identify.experiment.sensor_in_loop import SensorPlan, teach
 from identify.files.atomic import write_bytes
 from identify.files.dataset import POSE, netcdf
+from identify.loop_parameters import loop_settings
+from identify.model.from_record import model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import integer_seed
 from identify.record import recording
+from identify.record.known_geometry import KnownGeometry, known_geometry
 from identify.scenario import Scenario
 from identify.trajectory import TrajectorySet
-from identify.validation.unseen import unseen_errors
+from identify.validation.unseen import errors_of_model
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,26 +84,104 @@ class UnseenErrors:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Robot, plant and sensor of a scenario; `set_up` makes it.
+    """Parts of the experiment that a scenario describes; `set_up` makes it.
 
-    scenario: with the renderer chosen. seed: of all that is random. plant: the true robot in its
-    loop, which no estimator sees. sensor: the stereo sensor, taught when it is first needed.
+    The scenario is resolved here, once, and each part when it is first asked for. What runs,
+    designs, measures or tracks is given the parts that it reads, and no scenario.
+
+    scenario: with the renderer chosen. seed: of all that is random. loaded: the robot of the
+    scenario's file, if it is loaded already. calibrated: what is known of its geometry, if that is
+    not what the scenario says. progress: where a calibration of the cameras shows its progress.
     """
 
     scenario: Scenario
-    seed: int
-    plant: Plant
-    sensor: cmmsim.Sensor
+    seed: int = 0
+    loaded: Robot | None = None
+    calibrated: KnownGeometry | None = None
+    progress: Progress | None = None
+
+    @cached_property
+    def nominal(self) -> Robot:
+        """The robot as its file describes it."""
+        return self.loaded or load_robot(self.scenario.robot)
+
+    @cached_property
+    def known(self) -> KnownGeometry:
+        """The robot as servo and estimator know it, with the covariance of its geometry."""
+        return self.calibrated or known_geometry(self.nominal, self.scenario.geometry)
 
     @property
     def robot(self) -> Robot:
         """The robot as servo and estimator know it."""
-        return self.plant.nominal
+        return self.known.robot
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The true robot in its loop, which no estimator sees."""
+        scenario = self.scenario
+        switches = scenario.plant
+        timing = scenario.timing
+        control = scenario.control
+        settings = loop_settings(self.nominal, scenario.servo, timing, control, switches)
+        identification = scenario.identification
+        return Plant(
+            nominal=self.robot,
+            settings=with_springs(settings, self.nominal, switches),
+            robot=true_robot(self.nominal, switches, scenario.geometry, self.known, self.seed),
+            parameters=true_parameters(self.nominal, switches),
+            switches=switches,
+            loop=KnownLoop(
+                settings=model_side(self.nominal, scenario).settings,
+                start=scenario.model,
+                prior=identification.prior,
+                filter_time=scenario.model.derivative_filter_s or switches.derivative_filter_s,
+                control=control,
+            ),
+            runs=RunSettings(
+                timing=timing,
+                limits=scenario.excitation.singularity_limits,
+                rig=scenario.rig,
+                anchor=identification.scale_anchor,
+                anchor_std=identification.anchor_std,
+                scenario_toml=scenario.to_toml(),
+            ),
+            geometry_covariance=self.known.covariance,
+        )
+
+    @cached_property
+    def sensor_plan(self) -> SensorPlan:
+        """The sensor that is to be made."""
+        scenario = self.scenario
+        return SensorPlan(
+            name=scenario.sensor,
+            file=scenario.sensor_file(),
+            renderer=scenario.renderer,
+            method=scenario.pose_method,
+            rig=scenario.rig,
+            frames=scenario.timing.frames(scenario.excitation.duration_s),
+        )
+
+    @cached_property
+    def sensor(self) -> cmmsim.Sensor:
+        """The stereo sensor. A run teaches it, unless that has been done."""
+        return self.sensor_plan.untaught(self.robot, self.seed, self.progress)
+
+    @cached_property
+    def design(self) -> Design:
+        """The task of choosing trajectories."""
+        scenario = self.scenario
+        return Design(
+            robot=self.robot,
+            settings=scenario.excitation,
+            unseen=scenario.validation,
+            limits=MotionConstraints(self.robot, scenario.excitation, self.sensor_plan.sight),
+            criterion=partial(criterion_of, self.robot, scenario),
+        )
 
     @cached_property
     def trajectories(self) -> TrajectorySet:
         """The exciting trajectory and the unseen ones, searched when they are first asked for."""
-        return design_trajectories(self.robot, self.scenario, self.seed)
+        return design_trajectories(self.design, self.seed)
 
     def run(
         self,
@@ -130,9 +222,12 @@ class Setup:
         progress = progress or SilentProgress()
         trajectory = self.trajectories.excitation
         teach(self.sensor, progress)
-        frames = self.scenario.timing.frames(self.scenario.excitation.duration_s)
-        with progress.stage("record", frames) as advance:
-            done = excitation_run(self.plant, self.sensor, trajectory, self.seed, advance, payload)
+        settings = self.scenario.excitation
+        load = self.scenario.payload if payload else None
+        with progress.stage("record", self.sensor_plan.frames) as advance:
+            done = excitation_run(
+                self.plant, self.sensor, trajectory, settings, self.seed, advance, load
+            )
         content = netcdf(recording.record_groups(done.record, done.truth))
         if path is not None:
             write_bytes(path, content, parents=True)
@@ -161,6 +256,14 @@ class Setup:
             raise EstimationError(f"{result!r} is no result: identify.identify(record) gives one")
         scenario = self.scenario.with_drive(result.drive.law)
         return UnseenErrors(unseen_errors(result.estimate, self.robot, scenario, self.seed))
+
+
+def with_renderer(scenario: Scenario) -> Scenario:
+    """Return the scenario with the renderer of this machine in place of "auto".
+
+    Where OpenGL is missing, one line of warning says so.
+    """
+    return scenario.with_overrides({"renderer": choose_renderer(scenario.renderer).name})
 
 
 def set_up(
@@ -198,11 +301,10 @@ def set_up(
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError(f"{scenario!r} is no scenario: identify.load_scenario(name) gives one")
-    number = integer_seed(seed)
-    chosen = with_renderer(scenario)
-    plant = build_plant(chosen, seed=number)
-    sensor = untaught_sensor(chosen, plant.nominal, number, progress)
-    return Setup(chosen, number, plant, sensor)
+    setup = Setup(with_renderer(scenario), integer_seed(seed), progress=progress)
+    # A plant or a sensor that cannot be made is refused here, and not when it is first used.
+    _ = setup.plant, setup.sensor
+    return setup
 
 
 def run_experiment(
@@ -224,3 +326,17 @@ def run_experiment(
     600
     """
     return set_up(scenario, seed, progress).run(path, progress, payload)
+
+
+def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed: int = 0) -> Array:
+    """Return the pose errors (runs, N, 6) [m, rad] of a model against the plant.
+
+    Both run on the scenario's unseen trajectories for this seed, each with its own friction law and
+    steps. An ideal sensor closes both loops, so the errors come only from the parameters (p,) and
+    from what the model leaves out. They are NaN if, and only if, the model's loop is unstable.
+
+    Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
+    range. Raises TrajectoryError if no unseen trajectory keeps the robot's limits.
+    """
+    setup = Setup(scenario, seed, loaded=robot)
+    return errors_of_model(parameters, setup.plant, setup.design, seed)

@@ -161,15 +161,16 @@ def cmmsim_sensor(
 
     Its noise is drawn from the seed of the test. All tests share what it was taught.
     """
-    from identify.experiment.sensor_in_loop import make_sensor
+    from identify.setup import Setup
 
     key = cmmsim_scenario.model_dump_json(
         include={"sensor", "sensor_changes", "timing", "renderer"}
     )
+    plan = Setup(cmmsim_scenario).sensor_plan
     if key not in cmmsim_taught:
         seed = request.config.getoption("accuracy_seed")
-        cmmsim_taught[key] = make_sensor(cmmsim_scenario, cmmsim_robot, seed).teach()
-    return make_sensor(cmmsim_scenario, cmmsim_robot, cmmsim_seed, cmmsim_taught[key])
+        cmmsim_taught[key] = plan.make(cmmsim_robot, seed).teach()
+    return plan.make(cmmsim_robot, cmmsim_seed, cmmsim_taught[key])
 
 
 def _check_options(config: pytest.Config) -> None:

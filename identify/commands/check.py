@@ -66,7 +66,6 @@ def check(
     """
     from dynamics import load_robot
     from identify.experiment.law_in_loop import feedback
-    from identify.experiment.sensor_in_loop import sensor_file
     from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
     from identify.verification.robot_check import Surroundings, check_robot
 
@@ -80,10 +79,10 @@ def check(
     around = Surroundings(
         settings=loop_settings(chosen, given.servo, given.timing, given.control, given.model),
         control=given.control,
-        feedback=feedback(given),
+        feedback=feedback(given.control, given.timing),
         limits=given.excitation,
         sensor=given.sensor,
-        sensor_file=sensor_file(given),
+        sensor_file=given.sensor_file(),
     )
     findings = check_robot(chosen, values, around, terminal_progress(quiet))
     failed = [finding for finding in findings if not finding.ok]

@@ -241,8 +241,10 @@ def variation(
     from identify.record.provenance import RunFiles
     from identify.record.recording import run_groups
     from identify.reporting import variation_tables as tables
+    from identify.setup import Setup
+    from identify.stages.repeat import designed_runs
     from identify.trajectory import load_trajectories
-    from identify.validation.variation import designed_runs, identify_each
+    from identify.validation.variation import identify_each
     from identify.validation.variation import variation as variation_of
 
     folder = RunFolder(out)
@@ -254,7 +256,7 @@ def variation(
     recorded: dict[str, bytes] = {}
     if designed:
         seed = load_trajectories(folder.trajectories).seed
-        runs = designed_runs(scenario, robot, seed, designed, workers, progress)
+        runs = designed_runs(Setup(scenario, seed), designed, workers, progress)
         groups = run_groups([(run.record, run.truth) for run in runs])
         recorded = {"variation.nc": netcdf(groups)}
         records = [run.record for run in runs]
@@ -288,13 +290,15 @@ def compare_excitation(
     scenario: Scenario, seed: int, folder: Path, progress: Progress, json: Path | None, quiet: bool
 ) -> None:
     """Search with every method, and write comparison.json and comparison.png into `folder`."""
-    from dynamics import load_robot
     from identify.excitation.comparison import compare_methods, comparison_figure
+    from identify.excitation.information import knowledge
+    from identify.setup import Setup
 
-    robot = load_robot(scenario.robot)
-    found = compare_methods(robot, scenario, seed, progress)
+    setup = Setup(scenario, seed)
+    design = setup.design
+    found = compare_methods(design, knowledge(design.robot, scenario), seed, progress)
     figures = {**asdict(found), "scenario": scenario.name}
-    figure = comparison_figure(robot, scenario, found)
+    figure = comparison_figure(design.robot, design.settings, found)
     save_files(folder, {"comparison.json": figures, "comparison.png": figure})
     paper = PAPER if scenario.robot == PAPERS_ROBOT else None
     tell(figures, json, quiet, lambda: _print_methods(found, folder, paper))

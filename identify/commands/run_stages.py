@@ -107,9 +107,12 @@ def warm_up(
     """
     from dynamics import built_in_robots
     from identify.experiment.warm_up import warm_up
+    from identify.setup import Setup, with_renderer
 
-    others = tuple(built_in_robots()) if all_robots else ()
-    warm_up(chosen_scenario(scenario, settings, robot), terminal_progress(quiet), others)
+    chosen = with_renderer(chosen_scenario(scenario, settings, robot))
+    setup = Setup(chosen)
+    others = set(built_in_robots()) - {chosen.robot} if all_robots else ()
+    warm_up(setup.plant, setup.sensor_plan, terminal_progress(quiet), tuple(others))
 
 
 def excite(
@@ -150,7 +153,10 @@ def excite(
     if compare:
         compare_excitation(chosen, seed, folder.path, terminal_progress(quiet), json, quiet)
         return
-    _pipeline().excite(chosen, seed, folder.path, terminal_progress(quiet))
+    from identify.setup import Setup, with_renderer
+
+    setup = Setup(with_renderer(chosen), seed)
+    _pipeline().excite(setup, folder.path, terminal_progress(quiet))
     tell(load_result(folder.trajectories), json, quiet, lambda: None)
 
 

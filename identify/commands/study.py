@@ -168,19 +168,22 @@ def study(
     from identify.runtime import cores
     from identify.studies.memory import check_memory
     from identify.studies.runner import run_study
+    from identify.studies.study_design import prepare
     from identify.studies.table import rows_beside
 
     count = cores() if workers is None else workers
+    setup = prepare(chosen)
     # The memory of other machines is not known here.
     if scheduler is None:
-        check_memory(chosen, max(count, 1))
+        check_memory(chosen, setup, max(count, 1))
     others = rows_beside(chosen, beside or ())
     folder = out or Path("runs") / f"study-{chosen.name}"
     try:
         progress = terminal_progress(quiet, rate="rows/s")
         # Figures are drawn at the end only, because drawing takes seconds.
         so_far = partial(_summary, chosen, folder, figures=False)
-        outcome = run_study(chosen, folder, progress, _workers(scheduler, count, insecure), so_far)
+        workers_there = _workers(scheduler, count, insecure)
+        outcome = run_study(chosen, folder, progress, workers_there, so_far, setup)
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(STOPPED) from None

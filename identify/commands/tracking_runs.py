@@ -85,6 +85,7 @@ def track(
       cmmsim track --law feedforward --model true --motion poses.csv
     """
     from dynamics.errors import SimulationError
+    from identify.setup import Setup, with_renderer
     from identify.tracking.track import MODELS
     from identify.tracking.track import track as follow_all
 
@@ -98,7 +99,9 @@ def track(
     folder = context.with_resource(
         new_run_folder(out or Path("runs") / f"track-{chosen.name}-{seed}")
     ).path
-    entry = follow_all(chosen, laws, models, seed, terminal_progress(quiet), run, motion)
+    progress = terminal_progress(quiet)
+    setup = Setup(with_renderer(chosen), seed, progress=progress)
+    entry = follow_all(setup, laws, models, progress, run, motion)
     save_files(folder, {"track.json": entry, "scenario.toml": chosen.to_toml()})
     tell(entry, json, quiet, lambda: _print(entry, folder))
     first = entry["runs"][0]

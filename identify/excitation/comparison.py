@@ -1,7 +1,7 @@
 """Comparison of the excitation methods with the same criterion, seed and random candidates."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,14 +11,14 @@ from dynamics.closed_loop import prepare
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import Worst
 from identify.excitation.criteria import log_observability, observability_index
-from identify.excitation.design import motion_check, random_candidates, search_problem
-from identify.excitation.information import knowledge, log_information
+from identify.excitation.design import Design
+from identify.excitation.information import Knowledge, log_information
 from identify.excitation.motion import sample_times
 from identify.excitation.search import FEWEST_MEMBERS, SEARCHES
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import SEARCH, child
-from identify.scenario import Scenario
+from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
 
 COMPARISON_REFINEMENT = 10
@@ -75,31 +75,28 @@ class Comparison:
     entries: tuple[Entry, ...]
 
 
-def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progress) -> Comparison:
-    """Search with every method.
+def compare_methods(design: Design, known: Knowledge, seed: int, progress: Progress) -> Comparison:
+    """Search with every method, and judge what each finds by its information.
 
     Raises the errors of `design_trajectories`.
     """
-    settings = scenario.excitation
-    # The evolutionary method needs a population.
-    count = max(settings.candidates, FEWEST_MEMBERS)
+    robot = design.robot
+    # The evolutionary method needs a population, and the gradient's needs whole periods.
+    count = max(design.settings.candidates, FEWEST_MEMBERS)
+    settings = design.settings.model_copy(update={"method": "gradient", "candidates": count})
+    design = replace(design, settings=settings)
     # Compiled first, so that no method's time contains it.
     with progress.stage("compile the robot", 1) as advance:
         prepare(robot)
         advance()
     began = time.perf_counter()
-    scenario = scenario.with_overrides(
-        {"excitation.method": "gradient", "excitation.candidates": count}
-    )
-    check = motion_check(robot, scenario)
     with progress.stage("random candidates", 1) as advance:
-        candidates = random_candidates(robot, scenario, count, seed, check)
-        problem = search_problem(robot, scenario, candidates)
+        candidates = design.candidates(count, seed)
+        problem = design.search_problem(candidates)
         index = log_observability(
             robot, problem.unknowns, settings.duration_s, problem.candidates[0]
         )
         advance()
-    known = knowledge(robot, scenario)
     prepared = time.perf_counter() - began
     times = sample_times(settings.fundamental_hz, settings.harmonics, COMPARISON_REFINEMENT)
     entries = []
@@ -109,7 +106,7 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
         seconds = time.perf_counter() - began
         trajectory = found.trajectory(problem)
         try:
-            information = float(np.exp(log_information(robot, scenario, known, trajectory)))
+            information = float(np.exp(log_information(robot, known, trajectory)))
         except TrajectoryError:
             information = None
         entry = Entry(
@@ -133,9 +130,8 @@ COMPONENTS = ("x", "y", "z", "α", "β", "γ")
 POINTS = 1000
 
 
-def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) -> Figure:
+def comparison_figure(robot: Robot, settings: Excitation, comparison: Comparison) -> Figure:
     """Draw position, orientation and joints over one period, one column a method, limits dashed."""
-    settings = scenario.excitation
     figure = Figure(figsize=(5 * len(comparison.entries), 9), layout="constrained")
     panels = figure.subplots(3, len(comparison.entries), sharex=True, sharey="row", squeeze=False)
     time = np.linspace(0.0, 1.0 / settings.fundamental_hz, POINTS)

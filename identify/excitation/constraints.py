@@ -25,7 +25,7 @@ import numpy as np
 
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.measuring.observation import GRAZING
-from cmmsim.visibility import EDGE_PX, SightLines, sight_lines
+from cmmsim.visibility import EDGE_PX, SightLines
 from dynamics import DynamicsError, Robot
 from dynamics.kinematics.platform import rotation_matrix
 from dynamics.rigid_body.jacobians import joint_coordinates, pose_jacobian, singularity_measures
@@ -34,7 +34,7 @@ from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.motion import is_whole_periods
 from identify.loop_parameters import of_actuators
-from identify.scenario import Excitation, Scenario
+from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory, box_of
 
 STICKERS_A_PLANE = 4
@@ -217,14 +217,13 @@ class Worst:
 
 
 class MotionConstraints:
-    """Constraints of a scenario on the motion of a robot.
+    """Constraints on the motion of a robot.
 
     Raises TrajectoryError, with value, limit and leg, if even the home pose breaks them. Raises
     ScenarioError for settings of another kind of actuators.
     """
 
-    def __init__(self, robot: Robot, scenario: Scenario, sight: SightLines | None = None) -> None:
-        settings = scenario.excitation
+    def __init__(self, robot: Robot, settings: Excitation, sight: SightLines) -> None:
         geometry = robot.geometry
         chart = robot.geometry.chart
         margin, velocity = (
@@ -238,7 +237,6 @@ class MotionConstraints:
                 f"travel limit {robot.travel_limit:g} {unit} of {robot.name}"
             )
         _check_home(robot, settings, margin)
-        sight = sight or sight_lines(scenario.sensor, scenario.sensor_changes)
         self.box = box_of(chart, settings.position_amplitude_m, settings.orientation_amplitude_rad)
         stickers = required_stickers(sight, robot.home_pose)
         self.always_in_sight = within_sight(
@@ -344,12 +342,11 @@ def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:
         raise TrajectoryError(f"{robot.name} may not even be at home: {error}") from error
 
 
-def check_periods(scenario: Scenario) -> None:
+def check_periods(settings: Excitation) -> None:
     """Raise TrajectoryError if a run is not a whole number of periods.
 
     It could not end at home and at rest.
     """
-    settings = scenario.excitation
     if not is_whole_periods(settings.duration_s, settings.fundamental_hz):
         periods = settings.duration_s * settings.fundamental_hz
         raise TrajectoryError(

@@ -25,7 +25,7 @@ number. Any other run is sampled from start to end.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -92,10 +92,12 @@ def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: 
     return cast(Criterion, make(robot, scenario, unknowns, typical))
 
 
-def _check_made(
-    part: str, made: object, robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array
-) -> None:
-    """Raise ScenarioError if the object made by a user's own function is not a criterion of z."""
+def _check_made(part: str, made: object, *given: Any) -> None:
+    """Raise ScenarioError if the object made by a user's own function is not a criterion of z.
+
+    The function was given robot, scenario, unknowns and typical z.
+    """
+    unknowns, typical = given[2:]
     if not isinstance(made, Criterion):
         raise ScenarioError(f"{part} must return a Criterion, returned {type(made).__name__}")
     for name in ("value", "smooth"):

@@ -1,6 +1,7 @@
 """Design of a run's trajectories: the exciting one, and unseen random ones."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,13 +10,14 @@ from dynamics.kinematics.chart import Chart
 from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods
-from identify.excitation.criteria import criterion_of, log_observability, observability_index
-from identify.excitation.motion import SAMPLES_PER_HARMONIC, unknowns
+from identify.excitation.criteria import Criterion, log_observability, observability_index
+from identify.excitation.motion import SAMPLES_PER_HARMONIC, Unknowns, unknowns
 from identify.excitation.search import SEARCHES, SearchProblem
 from identify.loop_parameters import of_actuators
 from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import EXCITATION, SEARCH, UNSEEN, child
-from identify.scenario import Excitation, Scenario
+from identify.scenario import Excitation
+from identify.scenario.sections import Validation
 from identify.trajectory import FourierTrajectory, TrajectorySet, check_travel, random_trajectory
 
 ATTEMPTS = 50
@@ -83,10 +85,68 @@ They fill the box only as closely as they were sampled for it.
 """
 
 
+@dataclass(frozen=True)
+class Design:
+    """Task of choosing trajectories for a robot.
+
+    Attributes
+    ----------
+    robot : Robot
+        Robot that is to follow them.
+    settings : Excitation
+        Form of the trajectories, and how the exciting one is searched.
+    unseen : Validation
+        Number and length of the unseen trajectories.
+    limits : MotionConstraints
+        Limits of the motion.
+    criterion : callable
+        Function (unknowns, typical) that returns the criterion of the search, see
+        `identify.excitation.criteria`.
+    """
+
+    robot: Robot
+    settings: Excitation
+    unseen: Validation
+    limits: MotionConstraints
+    criterion: Callable[[Unknowns, Array], Criterion]
+
+    def check(self, trajectory: FourierTrajectory, times: Array) -> None:
+        """Raise TrajectoryError for a random trajectory that breaks a limit at times (N,) [s]."""
+        self.limits.check(trajectory, times, RANDOM_TOLERANCE)
+
+    def candidates(self, count: int, seed: int) -> list[FourierTrajectory]:
+        """Draw the random trajectories from which a search starts or chooses."""
+        settings = self.settings
+        return admissible_trajectories(
+            self.robot, settings, settings.duration_s, count, child(seed, EXCITATION), self.check
+        )
+
+    def search_problem(
+        self, candidates: list[FourierTrajectory], advance: Advance = lambda n=1: None
+    ) -> SearchProblem:
+        """Set up the search with admissible random trajectories.
+
+        Raises ScenarioError if there is no such criterion. Raises TrajectoryError if the method
+        needs a whole number of periods and the run has none.
+        """
+        if self.settings.method != "random":
+            check_periods(self.settings)
+        free = unknowns(self.robot.geometry.chart, self.settings)
+        pool = [free.of(trajectory) for trajectory in candidates]
+        criterion = self.criterion(free, agreed(pool[0]))
+        values = []
+        for z in pool:
+            values.append(-float(criterion.value(z)))
+            advance()
+        # A stable order keeps the result the same where values are equal.
+        best_first = [pool[k] for k in np.argsort(values, kind="stable")]
+        return SearchProblem(self.settings, free, self.limits, criterion, best_first)
+
+
 def design_trajectories(
-    robot: Robot, scenario: Scenario, seed: int, progress: Progress | None = None
+    design: Design, seed: int, progress: Progress | None = None
 ) -> TrajectorySet:
-    """Design the exciting trajectory and the validation trajectories of a scenario.
+    """Design the exciting trajectory and the validation trajectories.
 
     Each kind has its own stream of the seed.
 
@@ -95,85 +155,33 @@ def design_trajectories(
     has none, or if a search finds nothing.
     """
     progress = progress or SilentProgress()
-    settings = scenario.excitation
-    check = motion_check(robot, scenario)
+    settings = design.settings
     with progress.stage("excitation", settings.candidates) as advance:
-        candidates = random_candidates(robot, scenario, settings.candidates, seed, check)
-        problem = search_problem(robot, scenario, candidates, advance)
+        candidates = design.candidates(settings.candidates, seed)
+        problem = design.search_problem(candidates, advance)
     found = SEARCHES[settings.method](problem, child(seed, SEARCH), progress)
-    index = log_observability(robot, problem.unknowns, settings.duration_s, problem.candidates[0])
+    index = log_observability(
+        design.robot, problem.unknowns, settings.duration_s, problem.candidates[0]
+    )
     indices = [
         observability_index(index, problem.unknowns.of(trajectory)) for trajectory in candidates
     ]
     return TrajectorySet(
         seed=seed,
         excitation=found.trajectory(problem),
-        validation=_unseen(robot, scenario, seed, check),
+        validation=unseen_trajectories(design, seed),
         observability_index=observability_index(index, found.z),
         first_index=indices[0],
         median_index=float(np.median(indices)),
     )
 
 
-def unseen_trajectories(
-    robot: Robot, scenario: Scenario, seed: int
-) -> tuple[FourierTrajectory, ...]:
-    """Return the validation trajectories of a scenario without a search.
-
-    They are the same as those of `design_trajectories`.
-    """
-    return _unseen(robot, scenario, seed, motion_check(robot, scenario))
-
-
-def motion_check(robot: Robot, scenario: Scenario) -> Check:
-    """Return the check of all limits of the motion of a scenario."""
-    constraints = MotionConstraints(robot, scenario)
-    return lambda trajectory, times: constraints.check(trajectory, times, RANDOM_TOLERANCE)
-
-
-def random_candidates(
-    robot: Robot, scenario: Scenario, count: int, seed: int, check: Check
-) -> list[FourierTrajectory]:
-    """Draw the random trajectories from which a search starts or chooses."""
-    settings = scenario.excitation
-    return admissible_trajectories(
-        robot, settings, settings.duration_s, count, child(seed, EXCITATION), check
-    )
-
-
-def search_problem(
-    robot: Robot,
-    scenario: Scenario,
-    candidates: list[FourierTrajectory],
-    advance: Advance = lambda n=1: None,
-) -> SearchProblem:
-    """Set up the search of a scenario with admissible random trajectories.
-
-    Raises ScenarioError if there is no such criterion. Raises TrajectoryError if the method needs a
-    whole number of periods and the run has none.
-    """
-    settings = scenario.excitation
-    if settings.method != "random":
-        check_periods(scenario)
-    free = unknowns(robot.geometry.chart, settings)
-    pool = [free.of(trajectory) for trajectory in candidates]
-    criterion = criterion_of(robot, scenario, free, agreed(pool[0]))
-    values = []
-    for z in pool:
-        values.append(-float(criterion.value(z)))
-        advance()
-    # A stable order keeps the result the same where values are equal.
-    best_first = [pool[k] for k in np.argsort(values, kind="stable")]
-    return SearchProblem(settings, free, MotionConstraints(robot, scenario), criterion, best_first)
-
-
-def _unseen(
-    robot: Robot, scenario: Scenario, seed: int, check: Check
-) -> tuple[FourierTrajectory, ...]:
-    count = scenario.validation.count
-    duration_s = scenario.validation.duration_s
+def unseen_trajectories(design: Design, seed: int) -> tuple[FourierTrajectory, ...]:
+    """Return the validation trajectories, for which nothing is searched."""
+    drawn = child(seed, UNSEEN)
+    unseen = design.unseen
     return tuple(
         admissible_trajectories(
-            robot, scenario.excitation, duration_s, count, child(seed, UNSEEN), check
+            design.robot, design.settings, unseen.duration_s, unseen.count, drawn, design.check
         )
     )

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot
-from dynamics.closed_loop import LoopFailure, differentiate_servo
+from dynamics.closed_loop import LoopFailure, LoopSettings, differentiate_servo
 from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
 from identify.estimation.prior import StartingGuess, model_guess
@@ -71,10 +71,9 @@ def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: A
     """
     known = knowledge(robot, scenario)
     value, smooth = (
-        log_linear_information(robot, unknowns, scenario, known, v)
-        for v in (None, smoothing_of(robot))
+        log_linear_information(robot, unknowns, known, v) for v in (None, smoothing_of(robot))
     )
-    return Criterion(value, smooth, judge=partial(log_information, robot, scenario, known))
+    return Criterion(value, smooth, judge=partial(log_information, robot, known))
 
 
 @dataclass(frozen=True)
@@ -83,21 +82,30 @@ class Knowledge:
 
     Attributes
     ----------
+    start : str
+        Name of the parameter set that the guess is made of.
     guess : StartingGuess
         Starting guess of the parameters.
+    settings : LoopSettings
+        Loop of the model.
+    times : ndarray, shape (N,)
+        Times of the frames of the run, s.
     covariance : ndarray, shape (6, 6)
         Covariance of a measured pose, m and rad.
     scaled_prior : ndarray, shape (p, p)
         Information of the prior in units of its standard deviations.
     """
 
+    start: str
     guess: StartingGuess
+    settings: LoopSettings
+    times: Array
     covariance: Array
     scaled_prior: Array
 
 
 def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
-    """Return the scenario's starting guess with its prior, scale anchor and sensor."""
+    """Return the scenario's starting guess with its prior, scale anchor, loop and sensor."""
     settings = scenario.identification
     guess = model_guess(robot, scenario.model, settings)
     prior = np.eye(len(robot.layout.names))
@@ -110,28 +118,23 @@ def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
     covariance = expected_covariance(
         scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes
     )
-    return Knowledge(guess, covariance, prior)
+    times = scenario.timing.frame_times(scenario.excitation.duration_s)
+    start = scenario.model.start_parameters
+    return Knowledge(start, guess, model_side(robot, scenario).settings, times, covariance, prior)
 
 
-def log_information(
-    robot: Robot, scenario: Scenario, known: Knowledge, trajectory: FourierTrajectory
-) -> float:
-    """Return ln D of a trajectory run for `excitation.duration_s`.
+def log_information(robot: Robot, known: Knowledge, trajectory: FourierTrajectory) -> float:
+    """Return ln D of a trajectory.
 
     Raises TrajectoryError if the model with the starting guess is unstable on it.
     """
-    times = scenario.timing.frame_times(scenario.excitation.duration_s)
+    reference = trajectory.reference(known.times)
     try:
-        run = differentiate_servo(
-            robot,
-            known.guess.values,
-            trajectory.reference(times),
-            model_side(robot, scenario).settings,
-        )
+        run = differentiate_servo(robot, known.guess.values, reference, known.settings)
     except LoopFailure as error:
         raise TrajectoryError(
-            f"no D-criterion: the closed loop with the parameters model.start_parameters = "
-            f"{scenario.model.start_parameters!r} is unstable on this trajectory: {error}"
+            "no D-criterion: the closed loop with the parameters model.start_parameters = "
+            f"{known.start!r} is unstable on this trajectory: {error}"
         ) from error
     assert run.pose_sensitivity is not None
     whitener = np.linalg.inv(np.linalg.cholesky(known.covariance))
@@ -153,7 +156,7 @@ def pid_response(robot: Robot, parameters: Array, s: ComplexArray) -> ComplexArr
 
 
 def torque_response(
-    robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray
+    robot: Robot, parameters: Array, settings: LoopSettings, s: ComplexArray
 ) -> ComplexArray:
     """Return S (K, m, n), coordinates per torque or force, at s = i omega (K,) [1/s].
 
@@ -174,25 +177,25 @@ def torque_response(
     # The last digits of the quotient are noise, which differs between processors.
     stiffness = agreed(stiffness, RESPONSE_BITS)
     damping = parameters[robot.layout.viscous][:, None] * joint_rates
-    loop = pid_response(robot, parameters, s) * (1 + servo_response(scenario, s))
+    loop = pid_response(robot, parameters, s) * (1 + servo_response(settings, s))
     total = np.multiply.outer(s**2, inertia) + np.multiply.outer(s, damping) + stiffness
     return np.asarray(np.linalg.inv(total + np.multiply.outer(loop, joint_rates)))
 
 
 def tracking_response(
-    robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray
+    robot: Robot, parameters: Array, settings: LoopSettings, s: ComplexArray
 ) -> ComplexArray:
     """Return T (K, m, m) from desired to actual coordinates, as `torque_response`."""
-    gain = pid_response(robot, parameters, s) * servo_response(scenario, s)
+    gain = pid_response(robot, parameters, s) * servo_response(settings, s)
     drive = np.multiply.outer(gain, robot.coordinate_jacobian(robot.home_pose))
-    return np.asarray(torque_response(robot, parameters, scenario, s) @ drive)
+    return np.asarray(torque_response(robot, parameters, settings, s) @ drive)
 
 
-def servo_response(scenario: Scenario, s: ComplexArray) -> ComplexArray:
+def servo_response(settings: LoopSettings, s: ComplexArray) -> ComplexArray:
     """Return C exp(-s t_d) (K,) of the visual servo at s (K,) [1/s]."""
-    servo = scenario.servo
-    timing = scenario.timing
-    delay = np.exp(-s * (timing.latency_s + timing.frame_period_s / 2))
+    servo = settings.servo
+    timing = settings.timing
+    delay = np.exp(-s * (timing.latency_s + 1.0 / timing.frame_rate_hz / 2))
     return np.asarray((servo.kp + servo.kd * s + servo.ki / s) * delay)
 
 
@@ -201,27 +204,22 @@ HARMONICS_SEEN = 8
 
 
 def log_linear_information(
-    robot: Robot,
-    unknowns: Unknowns,
-    scenario: Scenario,
-    known: Knowledge,
-    smoothing: float | None = None,
+    robot: Robot, unknowns: Unknowns, known: Knowledge, smoothing: float | None = None
 ) -> ca.Function:
     """Return the function z -> ln D in the linearised loop.
 
     `smoothing` is as in `log_observability`.
     """
     z = ca.MX.sym("z", unknowns.size)
-    rows = sensitivity_spectrum(robot, unknowns, scenario, known.guess.values, z, smoothing)
+    rows = sensitivity_spectrum(robot, unknowns, known.settings, known.guess.values, z, smoothing)
     count = len(known.guess.std)
     free = unknowns.chart.basis
     whitener = np.linalg.inv(np.linalg.cholesky(known.covariance)) @ free
     rows = rows @ ca.DM(
         np.kron(np.eye(2 * len(harmonics(unknowns))), agreed(whitener.T, RESPONSE_BITS))
     )
-    frames = scenario.timing.frames(scenario.excitation.duration_s)
     # A harmonic of amplitude x has the mean square |x|^2 / 2 over the frames.
-    scaled = ca.diag(known.guess.std * np.sqrt(frames / 2)) @ rows
+    scaled = ca.diag(known.guess.std * np.sqrt(len(known.times) / 2)) @ rows
     determinant = log_determinant(count)(scaled @ scaled.T + ca.DM(known.scaled_prior))
     return ca.Function("log_linear_information", [z], [determinant / (2 * count)], ["z"], ["value"])
 
@@ -235,7 +233,7 @@ def harmonics(unknowns: Unknowns) -> ComplexArray:
 def sensitivity_spectrum(
     robot: Robot,
     unknowns: Unknowns,
-    scenario: Scenario,
+    settings: LoopSettings,
     parameters: Array,
     z: ca.MX,
     smoothing: float | None = None,
@@ -246,8 +244,8 @@ def sensitivity_spectrum(
     """
     times = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
     s = harmonics(unknowns)
-    response = torque_response(robot, parameters, scenario, s)
-    tracking = tracking_response(robot, parameters, scenario, s[: unknowns.harmonics])
+    response = torque_response(robot, parameters, settings, s)
+    tracking = tracking_response(robot, parameters, settings, s[: unknowns.harmonics])
     moved = tracked_motion(unknowns, z, times, tracking)
     sampled = regressor(robot, smoothing, "torque").map(len(times))(*moved)
     waves = np.exp(-np.outer(times, s)) * 2 / len(times)

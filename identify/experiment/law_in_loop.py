@@ -16,10 +16,9 @@ from identify.arrays import Array
 from identify.errors import ScenarioError, TrajectoryError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop
-from identify.model.from_record import model_side
 from identify.own_parts import LAWS, Telling, chosen, is_own
-from identify.scenario import Scenario
-from identify.scenario.plant_sections import FILTERED
+from identify.scenario import Timing
+from identify.scenario.plant_sections import FILTERED, Control
 
 FASTEST = 1.0
 """Bandwidth of computed_torque with an observer, times the time between two frames.
@@ -122,25 +121,25 @@ def prepared(
     SimulationError
         If the gains are unstable with this model, or a user's own law fails.
     """
-    scenario = plant.scenario
+    loop = plant.loop
+    timing = plant.runs.timing
     robot = plant.nominal
     chosen_law: Law = _telling(law, chosen(law, "law", LAWS))
-    times = scenario.timing.frame_times(motion.duration_s)
+    times = timing.frame_times(motion.duration_s)
     desired = motion.motion.pose(times)
     try:
-        check_motion(robot, desired, times, **scenario.excitation.singularity_limits)
+        check_motion(robot, desired, times, **plant.runs.limits)
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
-    settings = model_side(robot, scenario).settings
+    settings = loop.settings
     if known.drive is not None:
-        stated = scenario.model.derivative_filter_s or scenario.plant.derivative_filter_s
-        filter_time = stated if known.drive == FILTERED else None
+        filter_time = loop.filter_time if known.drive == FILTERED else None
         settings = replace(
             settings, drives=replace(settings.drives, law=known.drive, filter_time=filter_time)
         )
     model = Model(robot, known.parameters, settings.friction, known.doubt)
-    asked = feedback(scenario)
-    usual = np.full(len(times), scenario.timing.latency_s)
+    asked = feedback(loop.control, timing)
+    usual = np.full(len(times), timing.latency_s)
     found = chosen_law(
         Assignment(
             model=model,
@@ -156,7 +155,7 @@ def prepared(
     )
     if not isinstance(found, LawInLoop):
         raise ScenarioError(f"law {law!r} must return a LawInLoop, returned {type(found).__name__}")
-    if found.drives.torques and not scenario.control.torque_access:
+    if found.drives.torques and not loop.control.torque_access:
         raise ScenarioError(
             f"law {law} sets torques, which the drives of {robot.name} do not take: "
             "control.torque_access = false; feedforward needs joint commands only"
@@ -173,10 +172,8 @@ def _telling(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:
     return Telling(f"law {law!r}", asked, SimulationError) if is_own(law) else asked
 
 
-def feedback(scenario: Scenario) -> Feedback:
-    """Return the loop gains that a scenario asks of computed_torque."""
-    control = scenario.control
-    timing = scenario.timing
+def feedback(control: Control, timing: Timing) -> Feedback:
+    """Return the loop gains that are asked of computed_torque."""
     period = timing.frame_period_s
     # Latency, half a frame of hold, and one frame of difference quotient.
     delay = timing.latency_s + 1.5 * period

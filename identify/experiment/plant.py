@@ -3,13 +3,16 @@
 Its geometry, friction law and drives may differ from those that the estimator knows.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from dynamics import Robot, load_robot
+from dynamics import Robot
 from dynamics.closed_loop import (
     IDEAL,
     ClosedLoopRun,
@@ -28,23 +31,74 @@ from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
-from identify.loop_parameters import loop_settings, of_actuators
+from identify.loop_parameters import of_actuators
 from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
-from identify.record.known_geometry import KnownGeometry, known_geometry
+from identify.record.known_geometry import KnownGeometry
 from identify.record.payload import payload_vector
 from identify.record.pose_covariance import factor
+from identify.scenario import Model, PriorValue, Timing
 from identify.scenario import Plant as PlantSwitches
-from identify.scenario import Scenario
+from identify.scenario.plant_sections import Control
+from identify.scenario.sections import Geometry, Payload, Rig
+
+
+@dataclass(frozen=True)
+class KnownLoop:
+    """Closed loop as an experimenter knows it, who has not seen the plant.
+
+    Attributes
+    ----------
+    settings : LoopSettings
+        Loop of the model.
+    start : Model
+        Section of the scenario with the starting parameters and the law of the drives.
+    prior : mapping of str to PriorValue
+        Parameters that are known better, by name.
+    filter_time : float or None
+        Time constant of drives with a filter, s, where one is stated.
+    control : Control
+        What is asked of control laws, and what the drives take.
+    """
+
+    settings: LoopSettings
+    start: Model
+    prior: Mapping[str, PriorValue]
+    filter_time: float | None
+    control: Control
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What all runs of a plant have in common, whatever the motion.
+
+    Attributes
+    ----------
+    timing : Timing
+        Frames and latencies.
+    limits : mapping of str to float
+        Limits that keep the robot away from singularities, as `check_travel` takes them.
+    rig : Rig
+        How the cameras move, and who watches them.
+    anchor, anchor_std : str, float or None
+        Measurement that fixes the scale of the parameters, and its standard deviation.
+    scenario_toml : str
+        Text of the scenario, which records keep.
+    """
+
+    timing: Timing
+    limits: Mapping[str, float]
+    rig: Rig
+    anchor: str
+    anchor_std: float | None
+    scenario_toml: str
 
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """The true robot in its loop, made by `build_plant`.
+    """The true robot in its loop. `identify.setup` makes it of a scenario.
 
     Attributes
     ----------
-    scenario : Scenario
-        Scenario that describes the plant.
     nominal : Robot
         Robot that servo and estimator know.
     robot : Robot
@@ -53,15 +107,23 @@ class Plant:
         True parameters, SI.
     settings : LoopSettings
         True loop, whose joints may be elastic.
+    switches : PlantSwitches
+        What was asked of the plant. Its truth keeps them.
+    loop : KnownLoop
+        Loop as control laws know it.
+    runs : RunSettings
+        What all runs of the plant have in common.
     geometry_covariance : ndarray, shape (g, g), optional
         Covariance of the true geometry about the known one, where that is calibrated.
     """
 
-    scenario: Scenario
     nominal: Robot
     robot: Robot
     parameters: Array
     settings: LoopSettings
+    switches: PlantSwitches
+    loop: KnownLoop
+    runs: RunSettings
     geometry_covariance: Array | None = None
 
     def check(self) -> None:
@@ -149,6 +211,21 @@ class Plant:
             said = stability.verdict(self.nominal, parameters, settings, reference.poses[0])
             raise LoopFailure(f"{error}; {said}", error.frame, error.saturated) from None
 
+    def without_latency(self) -> Plant:
+        """Return the plant in a loop, and with a law that knows of it, that loses no time."""
+        none = ("latency_s", "latency_jitter_s", "latency_std_s", "dropout")
+        timing = self.runs.timing.model_copy(update=dict.fromkeys(none, 0.0))
+        settings, known = (
+            replace(loop, timing=replace(loop.timing, latency_s=0.0))
+            for loop in (self.settings, self.loop.settings)
+        )
+        return replace(
+            self,
+            settings=settings,
+            loop=replace(self.loop, settings=known),
+            runs=replace(self.runs, timing=timing),
+        )
+
     def truth(self, run: ClosedLoopRun) -> xr.Dataset:
         """Return the truth of a run: motion, parameters without a load, and model mismatch."""
         truth = build_truth(
@@ -165,7 +242,7 @@ class Plant:
             prismatic=self.robot.layout.prismatic,
         )
         # The drive gains are among the parameters already.
-        switches = self.scenario.plant.model_dump(exclude_none=True, exclude={"drive_gains"})
+        switches = self.switches.model_dump(exclude_none=True, exclude={"drive_gains"})
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 
     def _mismatch(self, run: ClosedLoopRun) -> dict[str, ArrayLike]:
@@ -185,54 +262,19 @@ class Plant:
         springs = self.settings.elasticity
         if springs is None:
             return settings
-        period = self.scenario.timing.frame_period_s
+        period = self.runs.timing.frame_period_s
         needed = springs.steps_needed(self.robot, parameters, pose, period, settings.friction)
         return replace(settings, steps_per_frame=max(settings.steps_per_frame, needed))
 
 
-def build_plant(
-    scenario: Scenario,
-    nominal: Robot | None = None,
-    seed: int = 0,
-    known: KnownGeometry | None = None,
-) -> Plant:
-    """Build the plant of a scenario.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Scenario that describes the plant.
-    nominal : Robot, optional
-        Robot of the scenario. The default loads it.
-    seed : int
-        Seed of the run. The true values of a calibrated geometry are drawn from it.
-    known : KnownGeometry, optional
-        Geometry that the estimator knows. The default is that of the scenario.
-
-    Raises
-    ------
-    ScenarioError
-        If there is no such parameter set (the message lists the valid names), or as for
-        `known_geometry`.
-    """
-    nominal = nominal or load_robot(scenario.robot)
-    switches = scenario.plant
-    known = known or known_geometry(nominal, scenario.geometry)
-    settings = loop_settings(nominal, scenario.servo, scenario.timing, scenario.control, switches)
+def with_springs(settings: LoopSettings, nominal: Robot, switches: PlantSwitches) -> LoopSettings:
+    """Return the settings of a loop with the elastic joints that a plant asks for, if it does."""
     stiffness = of_actuators(nominal, switches, "joint_stiffness")
-    if stiffness is not None:
-        inertia, damping = (
-            of_actuators(nominal, switches, name) for name in ("motor_inertia", "joint_damping")
-        )
-        settings = replace(settings, elasticity=JointElasticity(stiffness, inertia, damping))
-    return Plant(
-        scenario=scenario,
-        nominal=known.robot,
-        robot=true_robot(nominal, scenario, seed, known),
-        parameters=true_parameters(nominal, switches),
-        settings=settings,
-        geometry_covariance=known.covariance,
-    )
+    if stiffness is None:
+        return settings
+    inertia = of_actuators(nominal, switches, "motor_inertia")
+    damping = of_actuators(nominal, switches, "joint_damping")
+    return replace(settings, elasticity=JointElasticity(stiffness, inertia, damping))
 
 
 def true_parameters(nominal: Robot, switches: PlantSwitches) -> Array:
@@ -244,7 +286,9 @@ def true_parameters(nominal: Robot, switches: PlantSwitches) -> Array:
     return values
 
 
-def true_robot(nominal: Robot, scenario: Scenario, seed: int, known: KnownGeometry) -> Robot:
+def true_robot(
+    nominal: Robot, switches: PlantSwitches, calibration: Geometry, known: KnownGeometry, seed: int
+) -> Robot:
     """Return the robot with its true geometry.
 
     A geometry that no calibration covers has the errors that the plant states. If this run
@@ -254,28 +298,30 @@ def true_robot(nominal: Robot, scenario: Scenario, seed: int, known: KnownGeomet
     Raises ScenarioError if the plant states errors for a geometry that was calibrated before.
     """
     if known.covariance is None:
-        return misplaced(nominal, scenario.plant)
-    if scenario.geometry.known == "calibrated":
-        return nominal.moved(true_deviations(nominal, scenario, seed))
+        return misplaced(nominal, switches)
+    if calibration.known == "calibrated":
+        return nominal.moved(true_deviations(nominal, switches, calibration, seed))
     for name in ("geometry_error_m", "length_error_m", "axis_error_rad"):
-        if getattr(scenario.plant, name):
+        if getattr(switches, name):
             raise ScenarioError(
-                f"plant.{name} = {getattr(scenario.plant, name):g} with geometry.known = "
-                f"{scenario.geometry.known!r}: the true geometry is drawn from the covariance of "
+                f"plant.{name} = {getattr(switches, name):g} with geometry.known = "
+                f"{calibration.known!r}: the true geometry is drawn from the covariance of "
                 "that calibration; set one of both"
             )
     drawn = np.random.default_rng(child(seed, TRUE_GEOMETRY)).standard_normal(len(known.covariance))
     return known.robot.moved(factor(known.covariance) @ drawn)
 
 
-def true_deviations(robot: Robot, scenario: Scenario, seed: int) -> Array:
+def true_deviations(
+    robot: Robot, switches: PlantSwitches, calibration: Geometry, seed: int
+) -> Array:
     """Return the deviations (g,) of the true geometric numbers from the nominal ones, m and rad.
 
     They include the offsets of the encoders, which are drawn from the seed.
     """
     drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
-    true = misplaced(robot, scenario.plant).geometry
-    offset = of_actuators(robot, scenario.geometry, "encoder_offset")
+    true = misplaced(robot, switches).geometry
+    offset = of_actuators(robot, calibration, "encoder_offset")
     # An offset of an encoder is the opposite shift of its joint.
     return true.shifted(-offset * drawn).deviations_from(robot.geometry)
 
@@ -302,15 +348,12 @@ class PlatformLoad:
     true: Array
 
 
-def drawn_load(
-    layout: ParameterLayout, scenario: Scenario, rng: np.random.Generator
-) -> PlatformLoad:
-    """Draw the scenario's load.
+def drawn_load(layout: ParameterLayout, load: Payload, rng: np.random.Generator) -> PlatformLoad:
+    """Draw a known load.
 
     The true values scatter about the stated ones with the stated standard deviations. Draws with a
     negative value are repeated.
     """
-    load = scenario.payload
     stated = payload_vector(layout, load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
     std = payload_vector(
         layout, load.mass_std_kg, (load.Ixx_std_kg_m2, load.Iyy_std_kg_m2, load.Izz_std_kg_m2)

@@ -26,7 +26,7 @@ from dynamics.files import parse_json, read_text
 from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.progress import Progress, SilentProgress
-from identify.scenario import Scenario
+from identify.scenario.sections import Rig
 
 LARGEST_RATIO = 1.5
 """Largest ratio of focal lengths, and of baselines, of two rigs that count as alike."""
@@ -37,9 +37,9 @@ SHARE = 0.1
 
 
 def known_rig(
-    scenario: Scenario, file: SensorFile, rng: np.random.Generator, progress: Progress | None = None
+    section: Rig, file: SensorFile, rng: np.random.Generator, progress: Progress | None = None
 ) -> KnownRig | None:
-    """Return the rig of a scenario's sensor file as the estimator knows it.
+    """Return the rig of a sensor file as a scenario's section says that the estimator knows it.
 
     None stands for exact knowledge.
 
@@ -49,7 +49,6 @@ def known_rig(
     Raises ScenarioError for a file that holds no calibration, or one of another rig. Raises
     CalibrationError if the pictures do not determine the cameras.
     """
-    section = scenario.rig
     rig, _ = rig_from_file(file.rig)
     if section.exact:
         return None

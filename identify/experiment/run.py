@@ -10,32 +10,23 @@ import xarray as xr
 
 import cmmsim
 from cmmsim.uncertainty.drift_watch import DriftWatch
-from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from dynamics.closed_loop.command_schedule import acting_times
 from identify.arrays import Array
-from identify.estimation.prior import model_guess
+from identify.estimation.prior import starting_guess
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, by_images, prepared
 from identify.experiment.plant import Plant, PlatformLoad, drawn_load
-from identify.experiment.rig_as_known import known_rig
-from identify.experiment.sensor_in_loop import (
-    PoseSensor,
-    SensorInLoop,
-    make_sensor,
-    sensor_file,
-)
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop
 from identify.filtering import spline_derivatives, without_gaps
-from identify.progress import Advance, Progress
+from identify.progress import Advance
 from identify.random_streams import (
     ANCHOR,
-    CALIBRATION,
     EXPOSURES,
     LATENCY,
     LOAD,
     MEAN_LATENCY,
     NOISE,
-    TEACHING,
     stream_seed,
 )
 from identify.record import recording
@@ -45,7 +36,8 @@ from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
 from identify.record.recorded_law import SERVO, store_law
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
-from identify.scenario import Scenario
+from identify.scenario import Excitation, Timing
+from identify.scenario.sections import Payload, Rig
 from identify.trajectory import FourierTrajectory, check_travel
 
 PAYLOAD_RUN = 1_000_000
@@ -72,58 +64,28 @@ class Experiment:
     truth: xr.Dataset
 
 
-def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress) -> cmmsim.Sensor:
-    """Return the scenario's sensor with its frames taught."""
-    sensor = untaught_sensor(scenario, robot, seed, progress)
-    teach(sensor, progress)
-    return sensor
-
-
-def untaught_sensor(
-    scenario: Scenario, robot: Robot, seed: int, progress: Progress | None = None
-) -> cmmsim.Sensor:
-    """Return the scenario's sensor before teaching.
-
-    The run's seed decides its noise in teaching, and the error of the known rig.
-    """
-    rng = np.random.default_rng(stream_seed(seed, CALIBRATION))
-    known = known_rig(scenario, sensor_file(scenario), rng, progress)
-    return make_sensor(scenario, robot, stream_seed(seed, TEACHING), known=known)
-
-
-def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
-    """Teach the frames of a sensor, and report the progress in hundredths."""
-    with progress.stage("teach the sensor", 100) as advance:
-        shown = 0
-
-        def report(done: int, total: int) -> None:
-            nonlocal shown
-            advance(100 * done // total - shown)
-            shown = 100 * done // total
-
-        sensor.teach(report)
-
-
 def excitation_run(
     plant: Plant,
     sensor: PoseSensor,
     trajectory: FourierTrajectory,
+    settings: Excitation,
     seed: int,
     advance: Advance = lambda n=1: None,
-    payload: bool = False,
+    payload: Payload | None = None,
 ) -> Experiment:
-    """Run the plant along the exciting trajectory, without or with the scenario's load.
+    """Run the plant along the exciting trajectory, without or with a known load.
 
     Raises the errors of `run_plant`.
     """
-    duration_s = plant.scenario.excitation.duration_s
-    law = plant.scenario.excitation.law
-    if not payload:
-        return run_plant(plant, sensor, trajectory, duration_s, seed, 0, advance, law=law)
-    load = drawn_load(
-        plant.robot.layout, plant.scenario, np.random.default_rng(stream_seed(seed, LOAD))
+    load = None
+    number = 0
+    if payload is not None:
+        number = PAYLOAD_RUN
+        rng = np.random.default_rng(stream_seed(seed, LOAD))
+        load = drawn_load(plant.robot.layout, payload, rng)
+    return run_plant(
+        plant, sensor, trajectory, settings.duration_s, seed, number, advance, load, settings.law
     )
-    return run_plant(plant, sensor, trajectory, duration_s, seed, PAYLOAD_RUN, advance, load, law)
 
 
 def run_plant(
@@ -169,20 +131,23 @@ def run_plant(
     LoopFailure
         If the loop is unstable.
     """
-    scenario = plant.scenario
-    times = plant.scenario.timing.frame_times(duration_s)
-    check_travel(plant.nominal, trajectory, times, **scenario.excitation.singularity_limits)
+    runs = plant.runs
+    times = runs.timing.frame_times(duration_s)
+    check_travel(plant.nominal, trajectory, times, **runs.limits)
     reference = trajectory.reference(times)
-    part_exposures(sensor, scenario, seed)
-    watch = _watched(sensor, scenario, len(times))
+    part_exposures(sensor, runs.rig, seed)
+    watch = _watched(sensor, runs.rig, len(times))
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
-    latencies = drawn_latencies(scenario, len(times), seed, run)
+    latencies = drawn_latencies(runs.timing, len(times), seed, run)
     true_load = None if load is None else load.true
     in_loop = None
     if law != SERVO:
         motion = NamedMotion("the trajectory", trajectory, duration_s)
+        start = plant.loop.start
         # The law knows no more than an experimenter: starting model and stated load.
-        guess = model_guess(plant.nominal, scenario.model, scenario.identification)
+        guess = starting_guess(
+            plant.nominal, start.start_parameters, 1.0, plant.loop.prior, start.drive_law
+        )
         model = guess.values + (0.0 if load is None else load.stated)
         in_loop = prepared(plant, law, KnownModel(model), motion, by_images(eye), latencies.known)
     done = plant.run(reference, RateSensor(eye.measure), latencies.true, true_load, in_loop)
@@ -190,20 +155,18 @@ def run_plant(
     truth = plant.truth(done)
     if in_loop is not None:
         store_law(record, law, in_loop.drives)
-    settings = scenario.identification
     rng = np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
-    if not scenario.rig.exact and isinstance(sensor, cmmsim.Sensor) and done.measured_ok.any():
+    if not runs.rig.exact and isinstance(sensor, cmmsim.Sensor) and done.measured_ok.any():
         # An exposure that is late shifts a pose by its rate, so the rates are needed, too.
         poses = without_gaps(done.measured, done.measured_ok)
-        rates = spline_derivatives(poses, scenario.timing.frame_rate_hz)[0]
+        rates = spline_derivatives(poses, runs.timing.frame_rate_hz)[0]
         found = sensor.common_errors(poses, rates)
         store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
     if watch is not None and (finding := watch.finding).judged_frames:
         store_finding(record, finding.to_dict())
     store_anchor(
-        record,
-        measured_anchor(settings.scale_anchor, settings.anchor_std, layout, plant.parameters, rng),
+        record, measured_anchor(runs.anchor, runs.anchor_std, layout, plant.parameters, rng)
     )
     if load is not None:
         store_payload(record, layout, load.stated, load.std)
@@ -211,36 +174,34 @@ def run_plant(
     return Experiment(record, truth)
 
 
-def part_exposures(sensor: PoseSensor, scenario: Scenario, seed: int) -> None:
+def part_exposures(sensor: PoseSensor, rig: Rig, seed: int) -> None:
     """Delay the right camera's exposure by a random draw from its stated uncertainty.
 
     All runs of a seed have the same delay.
     """
-    rig = scenario.rig
     if isinstance(sensor, cmmsim.Sensor) and rig.right_later_s is None and rig.right_later_std_s:
         drawn = np.random.default_rng(stream_seed(seed, EXPOSURES)).standard_normal()
         sensor.move_rig(rig.errors, rig.right_later_std_s * drawn)
 
 
-def _watched(sensor: PoseSensor, scenario: Scenario, frames: int) -> DriftWatch | None:
+def _watched(sensor: PoseSensor, rig: Rig, frames: int) -> DriftWatch | None:
     """Let the cameras drift during a run of this many frames, and return their watch.
 
     It is None where nothing can be watched: for poses by planes, or a sensor without images.
     """
     if not isinstance(sensor, cmmsim.Sensor):
         return None
-    sensor.drift_rig(scenario.rig.drift, frames)
-    if scenario.rig.watch == "none" or sensor.method != "registration":
+    sensor.drift_rig(rig.drift, frames)
+    if rig.watch == "none" or sensor.method != "registration":
         return None
-    return sensor.watch_drift(base=scenario.rig.watch == "both")
+    return sensor.watch_drift(base=rig.watch == "both")
 
 
-def drawn_latencies(scenario: Scenario, frames: int, seed: int, run: int) -> Latencies:
+def drawn_latencies(timing: Timing, frames: int, seed: int, run: int) -> Latencies:
     """Draw the latencies of the frames of a run.
 
     The unknown error of their mean is the same for all runs of a seed.
     """
-    timing = scenario.timing
     known = timing.drawn_latencies(frames, np.random.default_rng(stream_seed(seed, LATENCY, run)))
     if not timing.latency_std_s:
         return Latencies(known, known)
@@ -261,7 +222,7 @@ def _record(
 ) -> xr.Dataset:
     """Record of a run with the known latencies (frames,) [s]; None stands for the scenario's."""
     if latencies is None:
-        latencies = np.full(len(run.time), plant.scenario.timing.latency_s)
+        latencies = np.full(len(run.time), plant.runs.timing.latency_s)
     record = recording.build_record(
         time=run.time,
         reference_pose=reference.poses,
@@ -271,10 +232,10 @@ def _record(
         measured_ok=run.measured_ok,
         command=run.command,
         command_time=acting_times(run.time, latencies),
-        scenario_toml=plant.scenario.to_toml(),
+        scenario_toml=plant.runs.scenario_toml,
         robot=plant.nominal.name,
         seed=seed,
-        frame_rate_hz=plant.scenario.timing.frame_rate_hz,
+        frame_rate_hz=plant.runs.timing.frame_rate_hz,
         prismatic=plant.nominal.layout.prismatic,
     )
     store_robot(record, plant.nominal)

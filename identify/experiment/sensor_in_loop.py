@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol
 
@@ -10,19 +11,21 @@ import trimesh
 from numpy.typing import NDArray
 
 import cmmsim
-from cmmsim.files import SensorFile, read_sensor_file
-from cmmsim.files.rig_and_bodies import marked_body
+from cmmsim.files import SensorFile
+from cmmsim.files.rig_and_bodies import marked_body, rig_from_file
 from cmmsim.files.schema import unit
-from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.imaging.scene_bodies import PlacedBodies, rod_transforms
 from cmmsim.uncertainty.known_rig import KnownRig
+from cmmsim.visibility import SightLines, stated_covariance
 from dynamics import Robot
 from dynamics.bodies import Part, parts_of
 from dynamics.geometry import RobotGeometry
 from identify.arrays import Array
 from identify.errors import ScenarioError
-from identify.progress import Advance
-from identify.scenario import Scenario
+from identify.experiment.rig_as_known import known_rig
+from identify.progress import Advance, Progress
+from identify.random_streams import CALIBRATION, TEACHING, stream_seed
+from identify.scenario.sections import Rig
 
 OFF_PLATFORM_M = 0.05
 """Largest distance of a leg's end from the platform that the sensor sees, and of both homes, m."""
@@ -69,44 +72,109 @@ def robot_transforms(robot: Robot, pose: Array) -> PlacedBodies:
     return PlacedBodies(names, rod_transforms(ends[:, 0], ends[:, 1]))
 
 
-def make_sensor(
-    scenario: Scenario,
-    robot: Robot,
-    seed: int,
-    taught: cmmsim.Taught | None = None,
-    known: KnownRig | None = None,
-) -> cmmsim.Sensor:
-    """Make the scenario's sensor, with its timing, its rig errors and the robot's legs in view.
+@dataclass(frozen=True)
+class SensorPlan:
+    """Sensor that an experiment is to have.
 
-    A process should make only one, because the sensor owns the renderer.
-
-    Parameters
+    Attributes
     ----------
-    scenario : Scenario
-        Scenario with the sensor's settings.
-    robot : Robot
-        Robot whose legs are in view.
-    seed : int
-        Seed of the sensor.
-    taught : cmmsim.Taught, optional
-        Frames taught before.
-    known : KnownRig, optional
-        Rig as the estimator knows it. The default is exact knowledge, or the rig of `taught`.
-
-    Raises
-    ------
-    ScenarioError
-        If the platform that the sensor sees is not the robot's.
+    name : str
+        Name in messages.
+    file : SensorFile
+        Its file, with the changes and the timing of the experiment.
+    renderer : str
+        What draws its images.
+    method : str
+        How poses are found in them.
+    rig : Rig
+        How well the cameras are known, how they move, and who watches them.
+    frames : int
+        Frames over which the cameras drift before a run says how many it has.
     """
-    file = sensor_file(scenario)
-    check_platform(robot, file, scenario.sensor)
-    sensor = cmmsim.Sensor(
-        file, seed, scenario.pose_method, taught, renderer=scenario.renderer, known=known
-    )
-    sensor.move_rig(scenario.rig.errors, scenario.rig.right_later_s or 0.0)
-    sensor.drift_rig(scenario.rig.drift, scenario.timing.frames(scenario.excitation.duration_s))
-    sensor.add_bodies(robot_meshes(robot))
-    return sensor
+
+    name: str
+    file: SensorFile
+    renderer: str
+    method: str
+    rig: Rig
+    frames: int
+
+    @property
+    def sight(self) -> SightLines:
+        """Stickers and cameras, as far as they decide which stickers can be looked for."""
+        return SightLines(
+            marked_body("platform", self.file.platform), *rig_from_file(self.file.rig)
+        )
+
+    def covariance(self, pose: Array) -> Array:
+        """Return the covariance (6, 6) [m, rad] that the sensor states of a pose (6,) at rest."""
+        sensor = cmmsim.Sensor(self.file, 0, self.method, renderer="analytic")
+        return stated_covariance(sensor, self.sight, pose)
+
+    def make(
+        self,
+        robot: Robot,
+        seed: int,
+        taught: cmmsim.Taught | None = None,
+        known: KnownRig | None = None,
+    ) -> cmmsim.Sensor:
+        """Make the sensor, with its rig errors and the legs of a robot in view.
+
+        A process should make only one, because the sensor owns the renderer.
+
+        Parameters
+        ----------
+        robot : Robot
+            Robot whose legs are in view.
+        seed : int
+            Seed of the sensor.
+        taught : cmmsim.Taught, optional
+            Frames taught before.
+        known : KnownRig, optional
+            Rig as the estimator knows it. The default is exact knowledge, or the rig of `taught`.
+
+        Raises
+        ------
+        ScenarioError
+            If the platform that the sensor sees is not the robot's.
+        """
+        check_platform(robot, self.file, self.name)
+        sensor = cmmsim.Sensor(
+            self.file, seed, self.method, taught, renderer=self.renderer, known=known
+        )
+        sensor.move_rig(self.rig.errors, self.rig.right_later_s or 0.0)
+        sensor.drift_rig(self.rig.drift, self.frames)
+        sensor.add_bodies(robot_meshes(robot))
+        return sensor
+
+    def untaught(self, robot: Robot, seed: int, progress: Progress | None = None) -> cmmsim.Sensor:
+        """Make the sensor of a run, before teaching.
+
+        The seed of the run decides its noise in teaching, and the error of the known rig. Raises
+        as `make` and `known_rig`.
+        """
+        rng = np.random.default_rng(stream_seed(seed, CALIBRATION))
+        known = known_rig(self.rig, self.file, rng, progress)
+        return self.make(robot, stream_seed(seed, TEACHING), known=known)
+
+    def taught(self, robot: Robot, seed: int, progress: Progress) -> cmmsim.Sensor:
+        """Make the sensor of a run, and teach it its frames."""
+        sensor = self.untaught(robot, seed, progress)
+        teach(sensor, progress)
+        return sensor
+
+
+def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
+    """Teach the frames of a sensor, and report the progress in hundredths."""
+    with progress.stage("teach the sensor", 100) as advance:
+        shown = 0
+
+        def report(done: int, total: int) -> None:
+            nonlocal shown
+            advance(100 * done // total - shown)
+            shown = 100 * done // total
+
+        sensor.teach(report)
 
 
 def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
@@ -141,20 +209,6 @@ def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
             f"{robot.name} is at home {away:.3g} m from where sensor {sensor} has its platform at "
             f"home, limit {OFF_PLATFORM_M:g} m: platform.home has to be that of the robot"
         )
-
-
-def sensor_file(scenario: Scenario) -> SensorFile:
-    """Return the file of the scenario's sensor, with the scenario's changes and timing."""
-    file = read_sensor_file(scenario.sensor, scenario.sensor_changes)
-    return file.model_copy(update={"timing": scenario.timing.of_sensor()})
-
-
-def with_renderer(scenario: Scenario) -> Scenario:
-    """Return the scenario with the renderer of this machine in place of "auto".
-
-    Where OpenGL is missing, one line of warning says so.
-    """
-    return scenario.with_overrides({"renderer": choose_renderer(scenario.renderer).name})
 
 
 class PoseSensor(Protocol):

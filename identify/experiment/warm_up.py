@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import wait
@@ -15,12 +16,10 @@ from dynamics import Robot, load_robot
 from dynamics.closed_loop import RateSensor, Reference, prepare
 from dynamics.compiled.object_files import CacheWarning
 from identify.errors import IdentifyError, WriteError
-from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import taught_sensor
-from identify.experiment.sensor_in_loop import SensorInLoop, with_renderer
+from identify.experiment.plant import Plant
+from identify.experiment.sensor_in_loop import SensorInLoop, SensorPlan
 from identify.progress import Progress, SilentProgress
 from identify.runtime import cores, deaf_offspring
-from identify.scenario import Scenario
 
 WARM_UP_FRAMES = 12
 """Number of frames of the motion on which everything is compiled."""
@@ -38,43 +37,39 @@ def compile_robots(robots: tuple[Robot, ...], progress: Progress) -> None:
             advance()
 
 
-def warm_up(scenario: Scenario, progress: Progress, robots: tuple[str, ...] = ()) -> None:
-    """Compile the code of a scenario's runs, and of further robots, into the caches on disk.
+def warm_up(
+    plant: Plant, sensor: SensorPlan, progress: Progress, robots: tuple[str, ...] = ()
+) -> None:
+    """Compile the code of the runs of a plant, and of further robots, into the caches on disk.
 
     Each task has a process of its own, because LLVM compiles on one core. All cores are used.
 
     Raises the errors of a run before its first frame, IdentifyError if a process dies, and
     WriteError if code cannot be kept.
     """
-    scenario = with_renderer(scenario)
-    build_plant(scenario)
-    renderers = dict.fromkeys((scenario.renderer, "analytic"))
     tasks: dict[str, Task] = {
-        "the robot": partial(_compile_plant, scenario),
-        "the sensor": partial(_compile_sensor, scenario, tuple(renderers)),
+        "the robot": partial(_compile_plant, plant),
+        "the sensor": partial(_compile_sensor, plant, sensor),
     }
-    tasks |= {name: partial(_compile_named, name) for name in robots if name != scenario.robot}
+    tasks |= {name: partial(_compile_named, name) for name in robots}
     with progress.stage("compile", len(tasks)) as advance:
         _side_by_side(tasks, advance)
 
 
-def _compile_plant(scenario: Scenario) -> None:
-    plant = build_plant(scenario)
+def _compile_plant(plant: Plant) -> None:
     compile_robots((plant.nominal, plant.robot), SilentProgress())
     plant.run(_nearby(plant), RateSensor(lambda frame, time, pose, rate: np.array(pose)))
 
 
-def _compile_sensor(scenario: Scenario, renderers: tuple[str, ...]) -> None:
-    """Teach the sensor and measure some frames with each renderer."""
-    plant = build_plant(scenario)
+def _compile_sensor(plant: Plant, planned: SensorPlan) -> None:
+    """Teach the sensor and measure some frames, with its own renderer and the analytic one."""
     motion = _nearby(plant)
-    for renderer in renderers:
-        sensor = taught_sensor(
-            scenario.with_overrides({"renderer": renderer}), plant.nominal, 0, SilentProgress()
-        )
-        eye = SensorInLoop(sensor, plant.robot, 0)
+    rate_hz = plant.runs.timing.frame_rate_hz
+    for renderer in dict.fromkeys((planned.renderer, "analytic")):
+        plan = replace(planned, renderer=renderer)
+        eye = SensorInLoop(plan.taught(plant.nominal, 0, SilentProgress()), plant.robot, 0)
         for frame, (pose, rate) in enumerate(zip(motion.poses, motion.rates, strict=True)):
-            eye.measure(frame, frame / scenario.timing.frame_rate_hz, pose, rate)
+            eye.measure(frame, frame / rate_hz, pose, rate)
 
 
 def _compile_named(name: str) -> None:
@@ -128,5 +123,5 @@ def _nearby(plant: Plant) -> Reference:
     """Return a motion of some millimetres from home."""
     chart = plant.nominal.geometry.chart
     rate = chart.basis @ chart.coordinates(np.array([0.02, 0.0, 0.0, 0.0, 0.05, 0.0]))
-    times = np.arange(WARM_UP_FRAMES)[:, None] / plant.scenario.timing.frame_rate_hz
+    times = np.arange(WARM_UP_FRAMES)[:, None] / plant.runs.timing.frame_rate_hz
     return Reference(plant.nominal.home_pose + times * rate, np.tile(rate, (WARM_UP_FRAMES, 1)))

@@ -2,12 +2,10 @@
 
 import numpy as np
 
-from cmmsim.visibility import SightLines, expected_covariance, sight_lines
-from dynamics import Robot, load_robot
+from cmmsim.visibility import SightLines
+from dynamics import Robot
 from identify.arrays import Array
 from identify.experiment.plant import true_deviations
-from identify.experiment.run import taught_sensor
-from identify.experiment.sensor_in_loop import with_renderer
 from identify.geometry.calibration import PoseModel, Tolerance, calibrate
 from identify.geometry.encoders import check_encoders
 from identify.geometry.observability import check_enough
@@ -18,14 +16,15 @@ from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import STATIC_POSES, UNSEEN_POSES, child
-from identify.record.known_geometry import KnownGeometry
-from identify.scenario import Scenario
+from identify.scenario import Excitation
+from identify.scenario.sections import Geometry
+from identify.setup import Setup
 
 
 def run_geometry(
-    scenario: Scenario, seed: int, progress: Progress, measurements: StaticPoses | None = None
+    setup: Setup, progress: Progress, measurements: StaticPoses | None = None
 ) -> GeometryOutcome:
-    """Calibrate the geometry of a scenario's robot, simulated or from a user's own measurements.
+    """Calibrate the geometry of a robot, simulated or from a user's own measurements.
 
     Raises
     ------
@@ -37,65 +36,56 @@ def run_geometry(
     UnreachablePoseError
         If a measured pose is out of reach.
     """
-    scenario = with_renderer(scenario)
-    robot = load_robot(scenario.robot)
-    settings = scenario.geometry
-    tolerance = Tolerance(settings.tolerance_m, settings.tolerance_rad)
+    robot = setup.nominal
+    seed = setup.seed
+    settings = setup.scenario.geometry
+    limits = setup.scenario.excitation
     lost = 0
     chosen = None
     true = None
     if measurements is not None:
         data = measurements
         check_encoders(robot, data)
-        designer = _designer(robot, scenario, data.frames, data.covariances.mean(axis=0), None)
+        covariance = data.covariances.mean(axis=0)
+        designer = _designer(robot, settings, limits, data.frames, covariance, None)
         rng = np.random.default_rng(child(seed, STATIC_POSES))
         among = designer.candidates(settings.candidates, rng)
     else:
-        sight = sight_lines(scenario.sensor, scenario.sensor_changes)
-        designer = _designer(robot, scenario, *_expected(robot, scenario), sight)
-        chosen, among = _choose(designer, scenario, seed, progress)
-        true = true_deviations(robot, scenario, seed)
+        plan = setup.sensor_plan
+        nothing = np.zeros((6, 6))
+        # Before teaching, its errors are not known, and the frames count as exact.
+        taught = settings.frames == "taught"
+        frames = FrameKnowledge(nothing, nothing) if taught else FrameKnowledge.none()
+        covariance = plan.covariance(robot.home_pose) / settings.frames_per_pose
+        designer = _designer(robot, settings, limits, frames, covariance, plan.sight)
+        chosen, among = _choose(designer, settings, seed, progress)
+        true = true_deviations(robot, setup.scenario.plant, settings, seed)
         # Refuses poses out of reach before the sensor is taught, which takes time.
         true_poses(robot, true, chosen.joints, chosen.poses)
-        sensor = taught_sensor(scenario, robot, seed, progress)
+        sensor = plan.taught(robot, seed, progress)
         data, lost = stand_at(
-            robot, scenario, sensor, true, chosen.joints, chosen.poses, seed, progress
+            robot, settings, sensor, plan.sight, true, chosen.joints, chosen.poses, seed, progress
         )
         check_encoders(robot, data)
     _require_enough(designer, among, data.different)
     with progress.stage("calibrate", 1) as advance:
-        found = calibrate(robot, data, tolerance)
+        found = calibrate(robot, data, Tolerance(settings.tolerance_m, settings.tolerance_rad))
         advance()
     unseen = designer.candidates(settings.unseen, np.random.default_rng(child(seed, UNSEEN_POSES)))
     return GeometryOutcome(
-        scenario, seed, designer.model, found, data, lost, true, unseen, chosen, among
+        setup.scenario, seed, designer.model, found, data, lost, true, unseen, chosen, among
     )
-
-
-def calibrated_for_a_run(
-    scenario: Scenario, seed: int, progress: Progress
-) -> tuple[GeometryOutcome, KnownGeometry]:
-    """Calibrate the geometry before a run that needs it.
-
-    Returns the outcome, and the geometry that is known after it. Raises the errors of
-    `run_geometry`.
-    """
-    outcome = run_geometry(scenario, seed, progress)
-    nominal = outcome.calibration.nominal
-    found = outcome.calibration.robot.geometry
-    robot = nominal.moved(found.deviations_from(nominal.geometry))
-    return outcome, KnownGeometry(robot, outcome.calibration.covariance)
 
 
 def _designer(
     robot: Robot,
-    scenario: Scenario,
+    settings: Geometry,
+    excitation: Excitation,
     frames: FrameKnowledge,
     covariance: Array,
     sight: SightLines | None,
 ) -> Designer:
-    settings = scenario.geometry
-    excitation = scenario.excitation
+    """Designer of pose sets within the limits of motions, for a covariance of a pose's mean."""
     model = PoseModel(
         robot, Tolerance(settings.tolerance_m, settings.tolerance_rad).of(robot), frames
     )
@@ -107,24 +97,10 @@ def _designer(
     return Designer(model, limits, covariance, std, settings.criterion)
 
 
-def _expected(robot: Robot, scenario: Scenario) -> tuple[FrameKnowledge, Array]:
-    """Knowledge of the frames before teaching, and the expected covariance (6, 6) of a pose's mean.
-
-    The covariance is that at home.
-    """
-    changes = scenario.sensor_changes
-    nothing = np.zeros((6, 6))
-    one = expected_covariance(scenario.sensor, robot.home_pose, scenario.pose_method, changes)
-    taught = scenario.geometry.frames == "taught"
-    frames = FrameKnowledge(nothing, nothing) if taught else FrameKnowledge.none()
-    return frames, one / scenario.geometry.frames_per_pose
-
-
 def _choose(
-    designer: Designer, scenario: Scenario, seed: int, progress: Progress
+    designer: Designer, settings: Geometry, seed: int, progress: Progress
 ) -> tuple[Candidates, Candidates]:
     """Poses to measure, and the candidates from which they were chosen."""
-    settings = scenario.geometry
     rng = np.random.default_rng(child(seed, STATIC_POSES))
     with progress.stage("choose poses", settings.poses + 1) as advance:
         among = designer.candidates(max(settings.candidates, settings.poses), rng)

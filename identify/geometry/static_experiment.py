@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import cmmsim
 from cmmsim.errors import LostError
-from cmmsim.visibility import SightLines, sight_lines, stated_covariance
+from cmmsim.visibility import SightLines, stated_covariance
 from dynamics import Robot
 from dynamics.closure import Closure
 from dynamics.errors import ConvergenceError
@@ -27,7 +27,6 @@ from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import ENCODERS, NOISE, STATIC_NOISE, child, stream_seed
 from identify.record.stored_common_errors import CommonErrors, kind_of
-from identify.scenario import Scenario
 from identify.scenario.sections import Geometry
 
 FIRST_POSE_RUN = 2_000_000
@@ -224,8 +223,9 @@ def camera_errors(sensor: cmmsim.Sensor, poses: Array) -> Array | None:
 
 def stand_at(
     robot: Robot,
-    scenario: Scenario,
+    settings: Geometry,
     sensor: cmmsim.Sensor,
+    sight: SightLines,
     deviations: Array,
     joints: Array,
     start: Array,
@@ -238,10 +238,12 @@ def stand_at(
     ----------
     robot : Robot
         Nominal robot.
-    scenario : Scenario
-        Scenario with the settings of the calibration.
+    settings : Geometry
+        Settings of the calibration.
     sensor : cmmsim.Sensor
         Taught sensor.
+    sight : SightLines
+        Its sight.
     deviations : ndarray, shape (g,)
         True geometric numbers less the nominal ones.
     joints, start : ndarray, shapes (N, n) and (N, 6)
@@ -261,7 +263,6 @@ def stand_at(
     EstimationError
         If the true robot cannot reach a pose. The message names it.
     """
-    settings = scenario.geometry
     taught = sensor.taught
     encoders = encoders_of(robot, settings)
     frames = settings.frames_per_pose
@@ -271,10 +272,8 @@ def stand_at(
     if settings.measurement == "images":
         found = measured(sensor, robot, true, frames, seed, progress)
     else:
-        sight = sight_lines(scenario.sensor, scenario.sensor_changes)
-        found = drawn(
-            sensor, sight, true, frames, np.random.default_rng(child(seed, STATIC_NOISE)), progress
-        )
+        noise = np.random.default_rng(child(seed, STATIC_NOISE))
+        found = drawn(sensor, sight, true, frames, noise, progress)
     read = encoders.read(stopped, frames, rng)
     known = FrameKnowledge(taught.base_covariance, taught.platform_covariance)
     std = np.full(robot.layout.joints, encoders.mean_std(frames))

@@ -26,7 +26,7 @@ from identify.reporting.paper import repeats_the_paper
 from identify.reporting.run_result import check_intervals
 from identify.reporting.verdict import cameras_acquitted
 from identify.scenario import Scenario
-from identify.scene import StereoView, Workcell, stereo_view, workcell, workcell_of_scenario
+from identify.scene import StereoView, Workcell, stereo_view, workcell
 from identify.trajectory import TrajectorySet, load_trajectories
 
 
@@ -89,11 +89,8 @@ class RunData:
         """
         try:
             robot = load_robot(self.scenario.robot)
-            return (
-                workcell(robot)
-                if self.truth is None
-                else workcell_of_scenario(self.scenario, robot)
-            )
+            sensor = None if self.truth is None else self.scenario.sensor_file()
+            return workcell(robot, sensor)
         except (CmmError, DynamicsError, IdentifyError) as error:
             return str(error)
 

@@ -6,7 +6,7 @@ the valid names.
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
@@ -29,6 +29,9 @@ from identify.scenario.sections import (
 )
 from identify.scenario.settings_file import SettingsFiles, to_toml
 from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, sensor_names
+
+if TYPE_CHECKING:
+    from cmmsim.files import SensorFile
 
 ESTIMATOR_SECTIONS = ("identification", "model", "filter")
 """Sections of a scenario that only the estimator reads.
@@ -214,6 +217,10 @@ class Scenario(Section):
     def with_drive(self, law: DriveName) -> "Scenario":
         """Return a copy with an identified law of the drives, if its model leaves that open."""
         return self.model_copy(update={"model": self.model.with_drive(law)})
+
+    def sensor_file(self) -> "SensorFile":
+        """Return the sensor's file, with the changes and the timing of this scenario."""
+        return self.timing.in_sensor_file(self.sensor, self.sensor_changes)
 
     def to_toml(self) -> str:
         """Return TOML text with every default written out with its unit.

@@ -16,6 +16,7 @@ from identify.scenario.section import Section, quantity
 from identify.scenario.settings_file import one_line
 
 if TYPE_CHECKING:
+    from cmmsim.files import SensorFile
     from cmmsim.files import Timing as SensorTiming
 
 LATENCY_STDS = 5.0
@@ -87,6 +88,13 @@ class Timing(Section):
             return SensorTiming(**{theirs: getattr(self, ours) for ours, theirs in IN_FILE.items()})
         except ValidationError as error:
             raise ValueError(f"timing: {error.errors()[0]['ctx']['error']}") from error
+
+    def in_sensor_file(self, sensor: str, changes: Mapping[str, Any]) -> "SensorFile":
+        """Return a sensor's file, by name or path, with changes by dotted key and this timing."""
+        from cmmsim.files import read_sensor_file
+
+        file = read_sensor_file(sensor, changes)
+        return file.model_copy(update={"timing": self.of_sensor()})
 
     def check(self) -> None:
         """Check that the values agree, and that the closed loop can delay commands by the latency.

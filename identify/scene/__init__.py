@@ -1,6 +1,6 @@
 """Scene of an experiment: robot, stickers, cameras, their images, and the page that replays a run.
 
-- `workcell` and `workcell_of_scenario` place robot and sensor.
+- `workcell` places robot and sensor; `scenario.sensor_file()` is the sensor of a scenario.
 - `stereo_view` draws both camera images and finds the stickers in them.
 - `scene_figure`, `stereo_figure` and `overview_figure` draw for print.
 - `read_motion` and `write_page` make a page that replays a run.
@@ -11,7 +11,7 @@ from identify.scene.drawings import overview_figure, scene_figure, stereo_figure
 from identify.scene.painter import View
 from identify.scene.replay import write_page
 from identify.scene.replayed_motion import Motion, motion_at_home, read_motion
-from identify.scene.workcell import Solid, ViewingCamera, Workcell, workcell, workcell_of_scenario
+from identify.scene.workcell import Solid, ViewingCamera, Workcell, workcell
 
 __all__ = [
     "Found",
@@ -28,6 +28,5 @@ __all__ = [
     "stereo_figure",
     "stereo_view",
     "workcell",
-    "workcell_of_scenario",
     "write_page",
 ]

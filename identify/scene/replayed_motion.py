@@ -17,7 +17,7 @@ from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RunFiles, check_robot, recorded_seed
 from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
 from identify.scenario import load_scenario
-from identify.scene.workcell import Workcell, workcell, workcell_of_scenario
+from identify.scene.workcell import Workcell, workcell
 
 # Names of the poses of a motion, as the page knows them.
 TRUE = "true"
@@ -137,7 +137,7 @@ def _cell(run: RunFolder, record: xr.Dataset, notes: list[str]) -> Workcell:
     robot = known_geometry(load_robot(scenario.robot), scenario.geometry, run.path).robot
     check_robot(record, robot)
     try:
-        return workcell_of_scenario(scenario, robot)
+        return workcell(robot, scenario.sensor_file())
     except (CmmError, ScenarioError) as error:
         notes.append(f"Cameras, stickers and images are left out: {error}.")
         return workcell(robot)

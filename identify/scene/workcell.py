@@ -19,17 +19,11 @@ from cmmsim.geometry.pose import apply, invert, pose_to_transform
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.scene_bodies import scene_body
 from cmmsim.visibility import SightLines
-from dynamics import Robot, load_robot
+from dynamics import Robot
 from dynamics.bodies import Part, parts_of
 from identify.arrays import Array
 from identify.errors import ScenarioError
-from identify.experiment.sensor_in_loop import (
-    check_platform,
-    robot_meshes,
-    robot_transforms,
-    sensor_file,
-)
-from identify.scenario import Scenario
+from identify.experiment.sensor_in_loop import check_platform, robot_meshes, robot_transforms
 
 PLATE_M = 0.012
 """Half the thickness of the plate that stands for a platform with known joints only, in m."""
@@ -222,15 +216,6 @@ def workcell(robot: Robot | None = None, sensor: SensorFile | None = None) -> Wo
     if robot is not None and sensor is not None:
         check_platform(robot, sensor, sensor.name)
     return Workcell(robot, sensor)
-
-
-def workcell_of_scenario(scenario: Scenario, robot: Robot | None = None) -> Workcell:
-    """Return the workcell of a scenario, with the changes that it makes to the sensor.
-
-    A robot that is loaded already may be given. Raises ScenarioError, cmmsim.CmmError or
-    dynamics.RobotFileError.
-    """
-    return workcell(robot or load_robot(scenario.robot), sensor_file(scenario))
 
 
 def _marked(name: str, file: SensorFile, stream: int) -> Solid:

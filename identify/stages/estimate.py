@@ -55,14 +55,14 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
         seed = trajectories.seed
     scenario = planned.with_estimator_settings(settings or {})
     files = RunFiles(run_folder)
-    names = record_files(scenario)
+    names = record_files(scenario.identification)
     run_folder.require(*names)
     records = {name: files.content(name) for name in names}
     if seed is not None:
         for name, one in records.items():
             check_planned(run_folder.path / name, one, scenario, trajectories)
     found = _identified(records, scenario, progress, folder)
-    changed = {} if scenario == planned else scenario_file(run_folder, scenario)
+    changed = {} if scenario == planned else scenario_file(run_folder, scenario.to_toml())
     write_files(changed | _identified_files(run_folder, found, scenario, seed))
 
 
@@ -84,7 +84,7 @@ def identify_own(
         if known.covariance is not None and GEOMETRY_COVARIANCE not in one:
             store_geometry_covariance(one, known.robot, known.covariance)
     found = _identified(records, scenario, progress)
-    files = scenario_file(run_folder, scenario)
+    files = scenario_file(run_folder, scenario.to_toml())
     for name, one in records.items():
         files[folder / name] = netcdf(recording.record_groups(one))
     files |= _identified_files(run_folder, found, scenario, None)

@@ -8,7 +8,6 @@ import cmmsim
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import OutputFolderError, RecordError
-from identify.experiment.run import taught_sensor
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_files
 from identify.files.dataset import netcdf
@@ -31,6 +30,7 @@ from identify.reporting.run_result import (
     sensor_entry,
     validation_entry,
 )
+from identify.setup import Setup
 from identify.stages.plan import check_planned, open_run
 from identify.validation.unseen import model_on_record, predicted_runs, run_unseen
 
@@ -66,17 +66,20 @@ def validate(
     files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
     covariance = files.covariance_of(robot)
     models = _identified_models(robot, run_folder, result)
-    side = model_side(robot, scenario).with_drive(settled_drive(result["identification"]))
-    taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
+    scenario = scenario.with_drive(settled_drive(result["identification"]))
+    side = model_side(robot, scenario)
+    seed = trajectories.seed
+    setup = Setup(scenario, seed, calibrated=known)
+    plan = setup.sensor_plan
+    taught = taught or plan.taught(robot, seed, progress).taught
+    duration_s = scenario.validation.duration_s
     runs = run_unseen(
-        scenario, trajectories.validation, trajectories.seed, taught, workers, progress, known
+        setup.plant, plan, taught, trajectories.validation, duration_s, seed, workers, progress
     )
     records = [files.experiment, *(run.record for run in runs)]
     model_poses = [[model_on_record(side, values, seen) for values in models] for seen in records]
     found = result["identification"].get("nuisance_estimates", {})
-    predictions = predicted_runs(
-        side, records[1:], models[1], covariance, trajectories.seed, progress, found
-    )
+    predictions = predicted_runs(side, records[1:], models[1], covariance, seed, progress, found)
     # The exciting run was fitted, so nothing is predicted for it.
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [

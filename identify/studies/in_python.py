@@ -18,6 +18,7 @@ from identify.scenario import Scenario, load_scenario
 from identify.studies.memory import check_memory
 from identify.studies.processes import local_processes
 from identify.studies.runner import in_this_process, run_study
+from identify.studies.study_design import prepare
 from identify.studies.study_file import Study as StudyFile
 
 BOOKKEEPING = ("row", "seed_entropy", "seed_spawn_key", "seconds", "error")
@@ -100,23 +101,18 @@ class Study:
         scenario = self.scenario
         if not isinstance(scenario, Scenario):
             scenario = load_scenario(scenario)
-        study = self._file(scenario)
+        named = StudyFile(name=scenario.name, kind=self.kind, scenario=scenario.name)
+        settings = {"seed": self.seed, "repeats": self.repeats}
+        study = named.with_settings({**self.changes, **self.vary, **settings})
+        setup = prepare(study, scenario)
         count = cores() if workers is None else workers
-        check_memory(study, max(count, 1), scenario)
+        check_memory(study, setup, max(count, 1))
         computing = partial(local_processes, count) if count else in_this_process
         with tempfile.TemporaryDirectory(prefix="cmmsim-study-") as temporary:
             place = Path(temporary) / "study" if folder is None else Path(folder)
-            outcome = run_study(
-                study, place, progress or SilentProgress(), computing, scenario=scenario
-            )
+            outcome = run_study(study, place, progress or SilentProgress(), computing, setup=setup)
         if outcome.failures:
             raise StudyError(
                 f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}"
             )
         return outcome.frame.drop(columns=[*BOOKKEEPING])
-
-    def _file(self, scenario: Scenario) -> StudyFile:
-        """Return what a study file of this study would hold."""
-        study = StudyFile(name=scenario.name, kind=self.kind, scenario=scenario.name)
-        options = {"seed": self.seed, "repeats": self.repeats}
-        return study.with_settings({**self.changes, **self.vary, **options})

@@ -3,9 +3,9 @@
 import psutil
 
 from identify.errors import StudyError
-from identify.scenario import Scenario
+from identify.setup import Setup as Experiment
 from identify.studies.rows import find_kind
-from identify.studies.study_design import Case, prepare
+from identify.studies.study_design import Case, Setup
 from identify.studies.study_file import Range, Study
 
 LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
@@ -17,20 +17,18 @@ PROCESS = 0.5e9
 GB = 1e9
 
 
-def check_memory(study: Study, workers: int, scenario: Scenario | None = None) -> None:
+def check_memory(study: Study, shared: Setup, workers: int) -> None:
     """Refuse a study whose longest rows, one a worker, need more memory than this machine has.
 
-    The study varies `scenario`, or else the one it names. Raises StudyError with both numbers, and
-    the errors of `prepare`.
+    Raises StudyError with both numbers.
     """
     kind = find_kind(study.kind)
     if kind.memory is None:
         return
-    setup = prepare(study, scenario)
     longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
     case = Case(0, 0, longest)
-    row = setup.row_scenario(case), kind.checked(setup.row_options(case))
-    needed = PROCESS + kind.memory(*row)
+    options = kind.checked(shared.row_options(case))
+    needed = PROCESS + kind.memory(Experiment(shared.row_scenario(case)), options)
     there = psutil.virtual_memory().total
     if workers * needed > there:
         fit = int(there // needed)

@@ -18,7 +18,6 @@ from cmmsim.allowed_plugins import allow_plugin
 from identify.errors import StudyInterrupted
 from identify.progress import Progress
 from identify.runtime import honoured, raise_noted
-from identify.scenario import Scenario
 from identify.studies.rows import find_kind
 from identify.studies.store import VIEW, Journal, open_folder, resolved
 from identify.studies.study_design import Case, Design, Finished, Setup, prepare
@@ -82,7 +81,7 @@ def run_study(
     progress: Progress,
     workers: Workers = in_this_process,
     so_far: SoFar = lambda frame: None,
-    scenario: Scenario | None = None,
+    setup: Setup | None = None,
 ) -> Outcome:
     """Run a study in its folder, or go on with it there.
 
@@ -101,8 +100,8 @@ def run_study(
         Starts what computes the rows.
     so_far : callable
         Gets the table of what is done now and then while the study runs.
-    scenario : Scenario, optional
-        Scenario that the study varies. The default is the one that the study names.
+    setup : Setup, optional
+        What the rows share, from `prepare`. The default prepares the study as its file has it.
 
     Returns
     -------
@@ -118,7 +117,7 @@ def run_study(
     StudyInterrupted
         Ctrl-C ended it.
     """
-    setup = prepare(study, scenario)
+    setup = setup or prepare(study)
     entry = resolved(study, setup)
     design = Design(study)
     with open_folder(folder, entry, len(design)) as journal:
@@ -247,9 +246,8 @@ def _compute(setup: Setup, case: Case) -> Finished:
     start = time.perf_counter()
     try:
         kind = find_kind(setup.kind)
-        row = kind.row(
-            setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case)
-        )
+        options = kind.checked(setup.row_options(case))
+        row = kind.compute(setup.row_scenario(case), setup.row_seed(case.number), options)
         figures = _plain(row, {*FIRST, *case.factors, *LAST})
     except KeyboardInterrupt:
         raise

@@ -23,10 +23,11 @@ from cmmsim import CmmError, Sensor
 from cmmsim.allowed_plugins import allowed_plugins
 from cmmsim.files import SensorFile
 from identify.errors import ScenarioError, StudyError
-from identify.experiment.sensor_in_loop import sensor_file, with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import numbers_by_name
+from identify.setup import Setup as Experiment
+from identify.setup import with_renderer
 from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.kind import Kind, check_read
 from identify.studies.study_file import Law, Range, Study
@@ -226,7 +227,14 @@ def prepare(study: Study, given: Scenario | None = None) -> Setup:
     if kind.reads is not None:
         check_read(study, kind.reads, row_scenario, row_options)
     if getattr(row_options, "sensor", "images") == "images":
-        _check_proved(row_scenario)
+        plan = Experiment(row_scenario).sensor_plan
+        try:
+            # The statistical renderer was proved for some sensors, and their cameras refuse it for
+            # others, when they are first asked for.
+            if plan.renderer == "statistical":
+                _ = Sensor(plan.file, renderer=plan.renderer).camera
+        except CmmError as error:
+            raise StudyError(f"the first row's sensor: {error}") from error
     for name in study.figures or [] if kind.columns else []:
         if name not in kind.columns:
             raise StudyError(
@@ -238,17 +246,6 @@ def prepare(study: Study, given: Scenario | None = None) -> Setup:
         except StudyError as error:
             raise StudyError(f"[[theory]] {place}: {error}") from error
     return setup
-
-
-def _check_proved(scenario: Scenario) -> None:
-    """Refuse a sensor for which the statistical renderer was not proved, if that is chosen."""
-    if scenario.renderer != "statistical":
-        return
-    try:
-        # A sensor builds its cameras, and refuses them, when they are first asked for.
-        _ = Sensor(sensor_file(scenario), renderer=scenario.renderer).camera
-    except CmmError as error:
-        raise StudyError(f"the first row's sensor: {error}") from error
 
 
 def _check_keys(study: Study, kind: Kind) -> None:

@@ -95,7 +95,7 @@ def follow(
     loop is lost.
     """
     in_loop = prepared(plant, law, known, motion, seen, latencies.known)
-    times = plant.scenario.timing.frame_times(motion.duration_s)
+    times = plant.runs.timing.frame_times(motion.duration_s)
     reference = Reference(motion.motion.pose(times), motion.motion.pose_rate(times))
     run = plant.run(reference, RateSensor(seen.measure), latencies.true, law=in_loop)
     expected = None

@@ -17,10 +17,9 @@ from dynamics.errors import DynamicsError
 from dynamics.kinematics.chart import POSE_NAMES, Chart
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.excitation.design import unseen_trajectories
+from identify.excitation.design import Design, unseen_trajectories
 from identify.experiment.law_in_loop import NamedMotion
 from identify.loop_parameters import of_actuators
-from identify.scenario import Scenario
 from identify.trajectory import box_of
 
 COLUMNS = ("t", *POSE_NAMES)
@@ -53,23 +52,22 @@ class AlongCoordinates:
         return self.chart.lifted(self.coordinates[2](t))
 
 
-def motions(
-    robot: Robot, scenario: Scenario, seed: int, own: Path | None = None
-) -> list[NamedMotion]:
-    """Return the scenario's unseen trajectories, a circle and a square.
+def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMotion]:
+    """Return the unseen trajectories of a design, a circle and a square.
 
     With a file ``own``, return only the motion through its poses, see `read_motion`. Raises
     TrajectoryError.
     """
+    robot = design.robot
+    limits = design.settings
     if own is not None:
-        fastest = of_actuators(robot, scenario.excitation, "max_joint_velocity")
+        fastest = of_actuators(robot, limits, "max_joint_velocity")
         return [read_motion(own, robot, fastest)]
-    duration = scenario.validation.duration_s
-    unseen = unseen_trajectories(robot, scenario, seed)
+    duration = design.unseen.duration_s
     found: list[NamedMotion] = [
-        NamedMotion(f"unseen {k}", path, duration) for k, path in enumerate(unseen, start=1)
+        NamedMotion(f"unseen {k}", path, duration)
+        for k, path in enumerate(unseen_trajectories(design, seed), start=1)
     ]
-    limits = scenario.excitation
     box = box_of(
         robot.geometry.chart, limits.position_amplitude_m, limits.orientation_amplitude_rad
     )

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 import cmmsim
 from dynamics.closed_loop import LoopFailure
@@ -20,24 +19,20 @@ from identify.errors import RecordError, ScenarioError
 from identify.estimation.explanation import MISFIT, Misfit
 from identify.estimation.identification import identify
 from identify.estimation.prior import starting_guess
+from identify.estimation.result import IdentificationResult
 from identify.excitation.design import design_trajectories
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, Seen, by_images, prepared
-from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import (
-    Latencies,
-    drawn_latencies,
-    excitation_run,
-    part_exposures,
-    taught_sensor,
-)
-from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, with_renderer
+from identify.experiment.plant import Plant
+from identify.experiment.run import Latencies, drawn_latencies, excitation_run, part_exposures
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, teach
 from identify.files.run_folder import RunFolder, load_result, rms_figures
 from identify.files.versions import versions
 from identify.loop_parameters import parameter_column, settled_drive
 from identify.progress import Advance, Progress
 from identify.random_streams import NOISE, TRACKED, child, stream_seed
 from identify.record.recorded_law import SERVO
-from identify.scenario import Scenario, load_scenario
+from identify.scenario import load_scenario
+from identify.setup import Setup
 from identify.tracking.following import Followed, by_drawing, follow
 from identify.tracking.motions import motions
 
@@ -66,10 +61,9 @@ class Tracking:
 
 
 def track(
-    scenario: Scenario,
+    setup: Setup,
     laws: Sequence[str],
     models: Sequence[str],
-    seed: int,
     progress: Progress,
     run_folder: Path | None = None,
     own: Path | None = None,
@@ -90,9 +84,10 @@ def track(
         The scenario, a motion or the run folder does not fit. Errors of an identification are
         raised as they are.
     """
-    scenario = with_renderer(scenario)
-    plant = build_plant(scenario)
-    followed = motions(plant.nominal, scenario, seed, own)
+    scenario = setup.scenario
+    seed = setup.seed
+    plant = setup.plant
+    followed = motions(setup.design, seed, own)
     if run_folder and "identified" not in models:
         raise ScenarioError(
             f"--run {run_folder} holds the identified model, and only {', '.join(models)} is "
@@ -101,22 +96,21 @@ def track(
     if set(laws) == {"pid"}:
         # This law knows no model, so that none has to be identified.
         models = ["initial"]
-    known = {
-        name: known_model(plant, name, run_folder)
-        for name in models
-        if name != "identified" or run_folder
-    }
+    known = {name: known_model(plant, name) for name in models if name != "identified"}
+    if run_folder and "identified" in models:
+        known["identified"] = model_of_run(plant, run_folder, scenario.robot)
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
     # Any model will do to find out whether a law can follow a motion.
-    true = known_model(plant, "true", None)
+    true = known_model(plant, "true")
     # A law that cannot follow a motion is refused before the sensor is taught, which takes long.
     for law in laws:
         for motion in followed:
             prepared(plant, law, true, motion, unseen)
-    sensor = taught_sensor(scenario, plant.nominal, seed, progress)
+    teach(setup.sensor, progress)
     if "identified" in models and not run_folder:
-        known["identified"] = _identified(plant, sensor, seed, progress)
-    task = Tracking(plant, sensor, followed, {name: known[name] for name in models}, laws, seed)
+        known["identified"] = _identified(setup, progress)
+    named = {name: known[name] for name in models}
+    task = Tracking(plant, setup.sensor, followed, named, laws, seed)
     return {
         "scenario": scenario.name,
         "seed": seed,
@@ -130,29 +124,31 @@ def track(
     }
 
 
-def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel:
-    """Return a model by its name in `MODELS`. The identified one is that of a run folder.
-
-    Raises RecordError if the folder holds no result with estimates, or a run of another robot.
-    """
-    robot = plant.nominal
-    scenario = plant.scenario
+def known_model(plant: Plant, model: str) -> KnownModel:
+    """Return the "initial" or the "true" model of a plant."""
     if model == "true":
-        return KnownModel(plant.parameters, scenario.plant.drive, FITTED)
-    if model == "initial":
-        law = scenario.model.drive_law
-        guess = starting_guess(robot, scenario.model.start_parameters, 1.0, drive=law)
-        return KnownModel(guess.values, law)
-    assert run_folder is not None
+        return KnownModel(plant.parameters, plant.switches.drive, FITTED)
+    start = plant.loop.start
+    law = start.drive_law
+    guess = starting_guess(plant.nominal, start.start_parameters, 1.0, drive=law)
+    return KnownModel(guess.values, law)
+
+
+def model_of_run(plant: Plant, run_folder: Path, own: str) -> KnownModel:
+    """Return the model that was identified in a run folder.
+
+    ``own`` is the robot's name or file. Raises RecordError if the folder holds no result with
+    estimates, or a run of another robot.
+    """
     path = run_folder / "result.json"
-    own = plant.scenario.robot
     RunFolder(run_folder).require("scenario.toml", "result.json")
     other = load_scenario(RunFolder(run_folder).whole_scenario).robot
     if other != own:
         raise RecordError(f"{run_folder} holds a run of {other}, not of {own}")
     try:
         identification = load_result(path).get("identification")
-        column = parameter_column(identification, "estimate", robot.layout.names)
+        names = plant.nominal.layout.names
+        column = parameter_column(identification, "estimate", names)
         told: list[Any] = [(identification or {}).get(name) for name in MISFIT]
         misfit = None if None in told else Misfit(*told)
         return KnownModel(np.array(column), settled_drive(identification), _fitted_doubt(misfit))
@@ -160,24 +156,24 @@ def known_model(plant: Plant, model: str, run_folder: Path | None) -> KnownModel
         raise RecordError(f"{path}: {error}") from None
 
 
-def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progress) -> KnownModel:
+def _identified(setup: Setup, progress: Progress) -> KnownModel:
     """Identify the model from the scenario's excitation."""
-    scenario = plant.scenario
-    if scenario.identification.scale_anchor == "payload":
+    settings = setup.scenario.excitation
+    if setup.scenario.identification.scale_anchor == "payload":
         raise ScenarioError(
             "identification.scale_anchor = payload needs two runs: identify first, and pass --run "
             "DIR"
         )
-    trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
-    frames = scenario.timing.frames(scenario.excitation.duration_s)
-    with progress.stage("record", frames) as advance:
-        record = excitation_run(plant, sensor, trajectories.excitation, seed, advance).record
-    return identified_model(plant, record, progress)
+    trajectory = design_trajectories(setup.design, setup.seed, progress).excitation
+    with progress.stage("record", setup.sensor_plan.frames) as advance:
+        record = excitation_run(
+            setup.plant, setup.sensor, trajectory, settings, setup.seed, advance
+        ).record
+    return model_of_result(identify(record, setup.robot, setup.scenario, progress))
 
 
-def identified_model(plant: Plant, record: xr.Dataset, progress: Progress) -> KnownModel:
-    """Identify the model from a record of a plant. Raises as `identify`."""
-    found = identify(record, plant.nominal, plant.scenario, progress)
+def model_of_result(found: IdentificationResult) -> KnownModel:
+    """Return the model that was identified from a record."""
     return KnownModel(found.estimate, found.drive.law, _fitted_doubt(found.misfit))
 
 
@@ -202,7 +198,7 @@ def follow_by_images(
     delay between the exposures depend on the seed alone. The second value is what the loop saw.
     Raises as `follow`.
     """
-    part_exposures(sensor, plant.scenario, seed)
+    part_exposures(sensor, plant.runs.rig, seed)
     seen = by_images(
         SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, FIRST_RUN + number), advance)
     )
@@ -211,7 +207,7 @@ def follow_by_images(
 
 
 def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
-    timing = task.plant.scenario.timing
+    timing = task.plant.runs.timing
     frames = sum(timing.frames(motion.duration_s) for motion in task.motions)
     runs = [
         (law, model) for law in task.laws for model in ([None] if law == SERVO else task.models)
@@ -312,18 +308,15 @@ def _drawn(
     """Return the mean squared errors (6,) over all motions, with one part exact."""
     plant = task.plant
     if exact == "latency":
-        still = dict.fromkeys(("latency_s", "latency_jitter_s", "latency_std_s", "dropout"), 0.0)
-        still = {f"timing.{name}": value for name, value in still.items()}
-        # A plant without latency needs another closed loop, and so is built anew.
-        plant = build_plant(plant.scenario.with_overrides(still), plant.nominal)
-    dropout = plant.scenario.timing.dropout
+        plant = plant.without_latency()
+    timing = plant.runs.timing
     squares = []
     for number, motion in enumerate(task.motions):
         # The same noise for every cause, so that the differences are those of the cause.
         rng = np.random.default_rng(child(task.seed, TRACKED, number))
-        lost = rng.random(plant.scenario.timing.frames(motion.duration_s)) < dropout
+        lost = rng.random(timing.frames(motion.duration_s)) < timing.dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")
-        known = known_model(plant, "true", None) if exact == "model" else model
+        known = known_model(plant, "true") if exact == "model" else model
         latencies = (
             Latencies() if exact == "latency" else _latencies(task.plant, motion, task.seed, number)
         )
@@ -337,7 +330,5 @@ def _drawn(
 
 
 def _latencies(plant: Plant, motion: NamedMotion, seed: int, number: int) -> Latencies:
-    scenario = plant.scenario
-    return drawn_latencies(
-        scenario, scenario.timing.frames(motion.duration_s), seed, FIRST_RUN + number
-    )
+    timing = plant.runs.timing
+    return drawn_latencies(timing, timing.frames(motion.duration_s), seed, FIRST_RUN + number)

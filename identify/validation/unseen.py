@@ -28,21 +28,19 @@ from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
 from identify.estimation.covariance import repeated_experiments
-from identify.excitation.design import unseen_trajectories
-from identify.experiment.plant import build_plant
+from identify.excitation.design import Design, unseen_trajectories
+from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, run_plant
-from identify.experiment.sensor_in_loop import make_sensor
-from identify.model.from_record import ModelSide, model_side, predicting_model
+from identify.experiment.sensor_in_loop import SensorPlan
+from identify.model.from_record import ModelSide, predicting_model
 from identify.model.loop_model import LoopModel
 from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
 from identify.record.command_times import logged_latencies
-from identify.record.known_geometry import KnownGeometry
 from identify.record.recorded_law import SERVO, recorded_law
 from identify.record.recording import recorded_reference
 from identify.runtime import cores
-from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 from identify.validation.processes import mapped
 
@@ -51,24 +49,24 @@ POLL_S = 0.2
 
 
 def run_unseen(
-    scenario: Scenario,
-    trajectories: tuple[FourierTrajectory, ...],
-    seed: int,
+    plant: Plant,
+    sensor: SensorPlan,
     taught: cmmsim.Taught,
+    trajectories: tuple[FourierTrajectory, ...],
+    duration_s: float,
+    seed: int,
     workers: int | None,
     progress: Progress,
-    known: KnownGeometry | None = None,
 ) -> list[Experiment]:
-    """Run the plant with images in the loop on every trajectory.
+    """Run a plant with images in the loop on every trajectory, each for a duration.
 
     The work is spread over `workers` processes; None means one a core. Every run has its own noise
-    stream, and all share the taught frames, so the results do not depend on the workers. ``known``
-    is the known geometry, with that of the scenario as its default.
+    stream, and all share the taught frames, so the results do not depend on the workers.
     """
-    how = (scenario, seed, taught, known)
+    how = (plant, sensor, taught, duration_s, seed)
     workers = workers or cores()
     numbers = range(1, len(trajectories) + 1)
-    frames = scenario.timing.frames(scenario.validation.duration_s) * len(trajectories)
+    frames = plant.runs.timing.frames(duration_s) * len(trajectories)
     with progress.stage("validate", frames) as advance:
         # A pool would only add the start of a process.
         if workers == 1 or len(trajectories) == 1:
@@ -298,12 +296,12 @@ class _Worker:
     """Plant and sensor of one process, which keeps the renderer."""
 
     def __init__(
-        self, scenario: Scenario, seed: int, taught: cmmsim.Taught, known: KnownGeometry | None
+        self, plant: Plant, sensor: SensorPlan, taught: cmmsim.Taught, duration_s: float, seed: int
     ) -> None:
-        self._plant = build_plant(scenario, seed=seed, known=known)
+        self._plant = plant
         self._seed = seed
-        self._duration_s = scenario.validation.duration_s
-        self._sensor = make_sensor(scenario, self._plant.nominal, seed, taught)
+        self._duration_s = duration_s
+        self._sensor = sensor.make(plant.nominal, seed, taught)
 
     def run(self, number: int, trajectory: FourierTrajectory, advance: Advance) -> Experiment:
         return run_plant(
@@ -317,14 +315,15 @@ _counter: Synchronized[int]
 
 def _start_worker(
     counter: Synchronized[int],
-    scenario: Scenario,
-    seed: int,
+    plant: Plant,
+    sensor: SensorPlan,
     taught: cmmsim.Taught,
-    known: KnownGeometry | None,
+    duration_s: float,
+    seed: int,
 ) -> None:
     # A process of a pool can only keep its state in the module.
     global _worker, _counter
-    _worker = _Worker(scenario, seed, taught, known)
+    _worker = _Worker(plant, sensor, taught, duration_s, seed)
     _counter = counter
 
 
@@ -359,20 +358,20 @@ def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
         advance(counter.value - done)
 
 
-def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed: int = 0) -> Array:
+def errors_of_model(parameters: ArrayLike, plant: Plant, design: Design, seed: int) -> Array:
     """Return the pose errors (runs, N, 6) [m, rad] of a model against the plant.
 
-    Both run on the scenario's unseen trajectories for this seed, each with its own friction law and
-    steps. An ideal sensor closes both loops, so the errors come only from the parameters (p,) and
-    from what the model leaves out. They are NaN if, and only if, the model's loop is unstable.
+    Both run on the unseen trajectories of a seed, each with its own friction law and steps. An
+    ideal sensor closes both loops, so the errors come only from the parameters (p,) and from what
+    the model leaves out. They are NaN if, and only if, the model's loop is unstable.
 
     Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
     range. Raises TrajectoryError if no unseen trajectory keeps the robot's limits.
     """
-    values = checked_loop_parameters(robot, parameters, scenario.model.drive_law)
-    plant = build_plant(scenario, robot, seed)
-    times = scenario.timing.frame_times(scenario.validation.duration_s)
-    references = [path.reference(times) for path in unseen_trajectories(robot, scenario, seed)]
-    settings = model_side(robot, scenario).settings
+    robot = plant.nominal
+    settings = plant.loop.settings
+    values = checked_loop_parameters(robot, parameters, settings.drives.law)
+    times = plant.runs.timing.frame_times(design.unseen.duration_s)
+    references = [path.reference(times) for path in unseen_trajectories(design, seed)]
     model = [model_run(robot, settings, values, reference) for reference in references]
     return np.array(model) - np.array([plant.run(reference).pose for reference in references])

@@ -14,26 +14,17 @@ whole velocity limit of 2 rad/s, it is known to 2.4 %. Faster is worth more than
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from dynamics import Robot, load_robot
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.result import IdentificationResult
-from identify.excitation.design import design_trajectories
-from identify.experiment.run import Experiment, taught_sensor
-from identify.progress import Progress, SilentProgress
-from identify.random_streams import DESIGN, stream_seed
-from identify.scenario import Scenario
-from identify.trajectory import FourierTrajectory
-from identify.validation.processes import mapped
-from identify.validation.unseen import run_unseen
+from identify.progress import Progress
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -146,36 +137,3 @@ def identify_each(
             results.append(identify(record))
             advance()
     return results
-
-
-def designed_runs(
-    scenario: Scenario, robot: Robot, seed: int, count: int, workers: int | None, progress: Progress
-) -> list[Experiment]:
-    """Run the plant with images in the loop on `count` exciting trajectories.
-
-    Each trajectory is designed from random candidates of its own by the scenario's method, and is
-    as long as the exciting run. The workers are as in `run_unseen`.
-
-    Raises the errors of the stages `excite` and `record`.
-    """
-    # Seeds of their own keep these runs apart from the experiment's.
-    own = stream_seed(seed, DESIGN)
-    seeds = [stream_seed(own, number) for number in range(count)]
-    trajectories = []
-    with (
-        progress.stage("design the runs", count) as advance,
-        mapped(workers, partial(_designed, scenario), seeds) as found,
-    ):
-        for trajectory in found:
-            trajectories.append(trajectory)
-            advance()
-    # `run_unseen` runs for the duration of the validation.
-    lasting = scenario.with_overrides({"validation.duration_s": scenario.excitation.duration_s})
-    taught = taught_sensor(lasting, robot, own, progress).taught
-    return run_unseen(lasting, tuple(trajectories), own, taught, workers, progress)
-
-
-def _designed(scenario: Scenario, seed: int) -> FourierTrajectory:
-    return design_trajectories(
-        load_robot(scenario.robot), scenario, seed, SilentProgress()
-    ).excitation

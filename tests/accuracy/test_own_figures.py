@@ -14,7 +14,7 @@ from cmmsim.detection.detector import find_detector
 from cmmsim.detector_leaderboard import compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, pose_to_transform
-from identify.experiment.sensor_in_loop import make_sensor
+from identify.setup import Setup
 from tests.dynamics.conftest import random_states
 
 pytestmark = [pytest.mark.thorough, pytest.mark.rendering]
@@ -45,7 +45,7 @@ def test_sticker_centres_without_noise(
 ):
     """What images, detection and their pixel convention leave when the camera makes no noise."""
     silent = cmmsim_scenario.with_overrides({"sensor_changes.camera.noise": False})
-    sensor = make_sensor(silent, cmmsim_robot, cmmsim_seed, cmmsim_sensor.taught)
+    sensor = Setup(silent).sensor_plan.make(cmmsim_robot, cmmsim_seed, cmmsim_sensor.taught)
     errors = []
     for pose in random_poses(sensor, 20, cmmsim_seed):
         seen, true = sensor.measure(pose), sticker_centres(sensor, pose)

@@ -9,13 +9,8 @@ from dynamics.closed_loop import (
     simulate_servo,
 )
 from dynamics.errors import DynamicsError
-from identify.excitation.design import design_trajectories
-from tests.identify.synthetic import (
-    quick,
-    rss6,
-    side_of,
-    truth,
-)
+from identify.setup import Setup
+from tests.identify.synthetic import quick, rss6, side_of, truth
 
 SCENARIO = quick(**{"validation.duration_s": 1.0, "excitation.candidates": 1})
 
@@ -26,7 +21,7 @@ def unseen_errors(parameters, seed=0):
 
 def simulated(parameters, run, seed=0):
     """Poses of the loop with these parameters on an unseen trajectory."""
-    path = design_trajectories(rss6(), SCENARIO, seed).validation[run]
+    path = Setup(SCENARIO, seed).trajectories.validation[run]
     return simulate_servo(
         rss6(),
         parameters,

@@ -33,9 +33,9 @@ from dynamics.closed_loop import (
 )
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.warm_start import SLIPPING_SHARE
-from identify.excitation.design import design_trajectories
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.scenario import load_scenario
+from identify.setup import Setup
 
 RATE_HZ, SECONDS = 1000.0, 5.0
 TIMES = np.arange(round(RATE_HZ * SECONDS) + 1) / RATE_HZ
@@ -127,9 +127,8 @@ def designed_commands():
     design = {"method": "random", "criterion": "observability", "candidates": 64}
     period = {"fundamental_hz": 2 / SECONDS, "harmonics": 5, "duration_s": SECONDS}
     asked = {f"excitation.{key}": value for key, value in (design | period).items()}
-    trajectory = design_trajectories(
-        robot(), load_scenario("paper").with_overrides(asked), seed=0
-    ).excitation
+    scenario = load_scenario("paper").with_overrides(asked)
+    trajectory = Setup(scenario, loaded=robot()).trajectories.excitation
     home = robot().inverse_kinematics(robot().home_pose)
     return home_commands() - home + robot().inverse_kinematics(trajectory.pose(TIMES))
 

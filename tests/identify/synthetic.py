@@ -15,13 +15,13 @@ from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
-from identify.experiment.plant import build_plant
 from identify.files.run_folder import RunFolder
 from identify.model.from_record import model_side
 from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.provenance import store_robot
 from identify.record.recording import build_record, write
 from identify.scenario import load_scenario
+from identify.setup import Setup
 from identify.trajectory import TrajectorySet, random_trajectory, save_trajectories
 
 SIGMA = np.repeat([5e-6, 30e-6], 3)
@@ -34,6 +34,16 @@ def rss6() -> Robot:
 
 LAYOUT = rss6().layout
 NAMES = LAYOUT.names
+
+
+def build_plant(scenario, nominal=None, seed=0, known=None):
+    """Plant of a scenario; nominal: its robot, if it is loaded; known: what is known of that."""
+    return Setup(scenario, seed, nominal, known).plant
+
+
+def design_of(scenario, robot=None):
+    """Task of choosing the trajectories of a scenario."""
+    return Setup(scenario, loaded=robot or rss6()).design
 
 
 def index_of(name):

@@ -27,19 +27,19 @@ from identify.estimation.identification import identify
 from identify.estimation.multiple_shooting import end_state, measured_states, segments
 from identify.estimation.prior import holding_torque
 from identify.estimation.warm_start import joint_balance
-from identify.excitation.constraints import MotionConstraints, condition_number
+from identify.excitation.constraints import condition_number
 from identify.excitation.criteria import log_observability
 from identify.excitation.information import harmonics, sensitivity_spectrum
 from identify.excitation.motion import unknowns
-from identify.experiment.plant import build_plant
-from identify.experiment.sensor_in_loop import make_sensor
 from identify.model.from_record import identified_model
 from identify.scenario import load_scenario
+from identify.setup import Setup, unseen_errors
 from identify.trajectory import TrajectorySet, load_trajectories, save_trajectories
-from identify.validation.unseen import unseen_errors
 from tests.dynamics.test_families import mixed_robot
 from tests.identify.synthetic import (
     SIGMA,
+    build_plant,
+    design_of,
     problem_of,
     quick,
     run_plant,
@@ -148,7 +148,9 @@ def test_the_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     run = differentiate_servo(robot, parameters, reference, side_of(scenario, robot).settings)
     s, t, m = harmonics(free), run.time[6000:], len(robot.coordinate_names)
     unknown = ca.MX.sym("z", z.size)
-    spectrum = sensitivity_spectrum(robot, free, scenario, parameters, unknown)
+    spectrum = sensitivity_spectrum(
+        robot, free, side_of(scenario, robot).settings, parameters, unknown
+    )
     parts = np.array(ca.Function("spectrum", [unknown], [spectrum])(z)).reshape(
         len(parameters), len(s), 2, m
     )
@@ -254,7 +256,7 @@ def test_limits_are_judged_at_home_first_and_in_the_norm_of_the_workspace():
         ("travel_margin_rad", 2.0, r"travel_margin_rad = 2 rad leaves nothing of the travel limit"),
     ):
         with pytest.raises(TrajectoryError, match=says):
-            MotionConstraints(robot, quick(**{f"excitation.{key}": value}))
+            design_of(quick(**{f"excitation.{key}": value}), robot)
 
 
 def test_settings_of_another_kind_of_actuators_are_refused_with_the_key_to_set():
@@ -272,7 +274,7 @@ def test_settings_of_another_kind_of_actuators_are_refused_with_the_key_to_set()
         ),
     ):
         with pytest.raises(ScenarioError, match=says):
-            MotionConstraints(robot, quick(**{f"excitation.{key}": 0.2}))
+            design_of(quick(**{f"excitation.{key}": 0.2}), robot)
     smoothed = {"plant.friction": "smoothed", "plant.smoothing_velocity_rad_s": 1e-3}
     with pytest.raises(
         ScenarioError, match=r"plant.smoothing_velocity_rad_s = 0.001 .* set smoothing_velocity_m_s"
@@ -330,10 +332,10 @@ def test_a_robot_that_is_not_the_one_whose_platform_the_sensor_sees_is_refused_w
         ScenarioError,
         match=r"platform joint \d of large is 0.2\d* m outside .* ctrack780 .*limit 0.05",
     ):
-        make_sensor(quick(), large, 0)
+        Setup(quick()).sensor_plan.make(large, 0)
     raised = quick(**{"sensor_changes.platform.home": [0, 0, 0.3, 0, 0, 0]})
     with pytest.raises(ScenarioError, match=r"rss6 is at home 0.1 m from where sensor ctrack780"):
-        make_sensor(raised, small, 0)
+        Setup(raised).sensor_plan.make(small, 0)
 
 
 def test_a_loop_that_is_lost_says_its_eigenvalue_and_the_frame_rate_that_would_hold_it():

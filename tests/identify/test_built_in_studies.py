@@ -17,6 +17,7 @@ import pytest
 
 import cmmsim
 from cmmsim.geometry.pose import apply, invert
+from identify.setup import Setup
 from identify.studies.rows.row_sensor import row_sensor
 from identify.studies.runner import compute
 from identify.studies.study_design import Design, prepare
@@ -212,7 +213,7 @@ def expected():
     setup, design, points = prepare(study), Design(study), []
     for point in range(study.points):
         scenario = setup.row_scenario(design.case(point))
-        eye, rng = row_sensor(scenario, "exact", 0), np.random.default_rng(0)
+        eye, rng = row_sensor(Setup(scenario).sensor_plan, "exact", 0), np.random.default_rng(0)
         box = np.repeat(
             (
                 scenario.excitation.position_amplitude_m,

@@ -9,7 +9,6 @@ from dynamics.closed_loop.command_schedule import acting_times
 from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
 from identify.estimation.multiple_shooting import segments
-from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.model.from_record import identified_model
@@ -20,6 +19,7 @@ from identify.validation.unseen import model_on_record
 from tests.identify.synthetic import (
     SHORT,
     SIGMA,
+    build_plant,
     problem_of,
     quick,
     rss6,
@@ -117,7 +117,9 @@ def test_spans_of_torques_miss_a_record_by_its_noise():
     """
     scenario = late(**{"excitation.law": "computed_torque", "excitation.duration_s": 2.0})
     plant = build_plant(scenario, rss6())
-    record = excitation_run(plant, DrawnSensor(np.diag(SIGMA**2)), trajectory(0), 1).record
+    record = excitation_run(
+        plant, DrawnSensor(np.diag(SIGMA**2)), trajectory(0), scenario.excitation, 1
+    ).record
     assert logged_latencies(record, scenario.timing).std() > 0.2 / 60
     logged, blind = (
         np.mean(identified_model(one, side_of(scenario)).misses(plant.parameters) ** 2)
@@ -137,11 +139,15 @@ def test_the_experiment_logs_what_a_laboratory_can_and_not_how_far_its_clock_is_
         [build_plant(one, rss6()) for one in (scenario, off)],
         DrawnSensor(np.diag(SIGMA**2)),
     )
-    exact, other = (excitation_run(plant, eye, trajectory(0), 3) for plant in plants)
+    exact, other = (
+        excitation_run(plant, eye, trajectory(0), scenario.excitation, 3) for plant in plants
+    )
     np.testing.assert_array_equal(exact.record["command_time"], other.record["command_time"])
     assert np.abs(true_poses(exact.truth) - true_poses(other.truth)).max() > 1e-6
     still = late(jitter_frames=0.0, **{"excitation.duration_s": 2.0})
-    record = excitation_run(build_plant(still, rss6()), eye, trajectory(0), 3).record
+    record = excitation_run(
+        build_plant(still, rss6()), eye, trajectory(0), still.excitation, 3
+    ).record
     np.testing.assert_allclose(record["command_time"] - record["time"], 1 / 60, atol=1e-12)
     assert logged_latencies(record, still.timing) is None
 

@@ -8,10 +8,9 @@ from cmmsim.errors import CmmError
 from cmmsim.teaching import exactly_taught
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify
-from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run
-from identify.experiment.sensor_in_loop import make_sensor, sensor_file
 from identify.record.drift import DRIFT, drift_warnings, read_finding, store_finding
+from identify.setup import Setup
 from tests.identify.synthetic import quick, rss6, run_plant, trajectory
 
 DRIFT_KEY = "rig.drift"
@@ -20,8 +19,10 @@ DRIFT_KEY = "rig.drift"
 def recorded(**changes):
     """Record and truth of 1.5 s through images, with cameras that are taught without error."""
     scenario = quick(**{"renderer": "analytic", "excitation.duration_s": 1.5} | changes)
-    sensor = make_sensor(scenario, rss6(), 0, exactly_taught(sensor_file(scenario)))
-    return excitation_run(build_plant(scenario, rss6()), sensor, trajectory(0), 0).record
+    setup = Setup(scenario, loaded=rss6())
+    plan = setup.sensor_plan
+    sensor = plan.make(rss6(), 0, exactly_taught(plan.file))
+    return excitation_run(setup.plant, sensor, trajectory(0), scenario.excitation, 0).record
 
 
 @pytest.mark.slow
@@ -54,7 +55,7 @@ def test_an_identification_begins_its_warnings_with_the_cameras():
 def test_a_drift_that_no_run_can_have_is_refused_before_anything_is_taught(drift, words):
     scenario = quick(**{"renderer": "analytic", DRIFT_KEY: drift})
     with pytest.raises(CmmError, match=words):
-        make_sensor(scenario, rss6(), 0)
+        Setup(scenario).sensor_plan.make(rss6(), 0)
     with pytest.raises(ScenarioError, match=r"rig\.watch"):
         quick(**{"rig.watch": "everything"})
     with pytest.raises(ScenarioError, match="a name with a dot stands in quotes"):

@@ -14,7 +14,6 @@ from dynamics.closed_loop.drives import DRIVES, READS, cascade_gains
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.identification import identify, output_error_problem
-from identify.experiment.plant import build_plant
 from identify.loop_parameters import settled_drive
 from identify.progress import SilentProgress
 from identify.reporting.parameter_tables import drive_sentence, unidentified
@@ -22,6 +21,7 @@ from identify.scenario.plant_sections import DRIVE_GAINS, DriveName
 from tests.identify.synthetic import (
     LAYOUT,
     NAMES,
+    build_plant,
     problem_of,
     quick,
     rss6,

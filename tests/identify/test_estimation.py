@@ -21,7 +21,7 @@ from identify.estimation.identifiability import POOR
 from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import joint_balance
-from identify.experiment.plant import build_plant, drawn_load
+from identify.experiment.plant import drawn_load
 from identify.loop_parameters import choose_parameters
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
@@ -33,6 +33,7 @@ from tests.identify.synthetic import (
     LAYOUT,
     NAMES,
     SIGMA,
+    build_plant,
     problem_of,
     quick,
     rss6,

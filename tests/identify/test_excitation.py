@@ -24,12 +24,11 @@ from identify.excitation.constraints import (
 )
 from identify.excitation.design import (
     design_trajectories,
-    motion_check,
-    random_candidates,
     unseen_trajectories,
 )
 from identify.excitation.motion import unknowns
 from identify.scenario import load_scenario, scenario_from_toml
+from identify.setup import Setup
 from identify.trajectory import (
     FourierTrajectory,
     check_travel,
@@ -38,7 +37,7 @@ from identify.trajectory import (
     save_trajectories,
 )
 from tests.identify.commands import refusal
-from tests.identify.synthetic import Stages, rss6
+from tests.identify.synthetic import Stages, design_of, rss6
 
 CHART = rss6().geometry.chart
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
@@ -135,7 +134,7 @@ def quick(**overrides):
 def designed(seed=3, **overrides):
     """What is designed for `quick` with four candidates; a smaller number draws the first of
     them."""
-    return design_trajectories(rss6(), quick(**overrides), seed)
+    return design_trajectories(design_of(quick(**overrides)), seed)
 
 
 def test_a_run_too_short_to_show_every_parameter_has_no_index():
@@ -161,7 +160,7 @@ def test_seed_decides_everything_and_unseen_trajectories_depend_on_nothing_else(
     for others in (
         b.validation,
         designed(candidates=1).validation,
-        unseen_trajectories(robot, QUICK, 3),
+        unseen_trajectories(design_of(QUICK, robot), 3),
     ):
         for one, other in zip(designed().validation, others, strict=True):
             np.testing.assert_array_equal(one.sine, other.sine)
@@ -200,7 +199,7 @@ def narrowed(factor):
 @pytest.mark.parametrize("seed", range(3))
 def test_worst_is_what_the_robot_says(robot, seed):
     trajectory, t = random_one(seed), np.arange(400) / 40
-    worst = {w.name: w for w in MotionConstraints(robot, QUICK).worst(trajectory, t)}
+    worst = {w.name: w for w in design_of(QUICK, robot).limits.worst(trajectory, t)}
     seen = measure(robot, trajectory.pose(t))
     fine = 1e-4
     rates = robot.inverse_kinematics(trajectory.pose(t + fine)) - robot.inverse_kinematics(
@@ -235,10 +234,9 @@ def test_broken_limits_no_feasible_start_and_a_run_that_cannot_end_at_rest_are_n
             r"box of [xyz] is 0\.01 m at t = \d+\.\d+ s, limit 0\.005 m",
         ),
     ):
+        limits = design_of(quick(**{key: value}), robot).limits
         with pytest.raises(TrajectoryError, match=message):
-            MotionConstraints(robot, quick(**{key: value})).check(
-                random_one(0), np.arange(400) / 40, 1e-3
-            )
+            limits.check(random_one(0), np.arange(400) / 40, 1e-3)
     for overrides, reason in (
         ({"max_joint_velocity_rad_s": 0.01}, r"only 0 of 50 .*velocity of leg \d"),
         ({"position_amplitude_m": 0.06}, r"only 0 of 50 .*±0\.06 m.*leg \d"),
@@ -248,13 +246,13 @@ def test_broken_limits_no_feasible_start_and_a_run_that_cannot_end_at_rest_are_n
             r"travel_margin_rad = 1 rad leaves nothing of the travel limit 0\.9948",
         ),
     ):
-        scenario = quick(candidates=1, **overrides)
-        assert re.search(reason, refusal(TrajectoryError, design_trajectories, robot, scenario, 0))
+        setup = Setup(quick(candidates=1, **overrides), loaded=robot)
+        assert re.search(reason, refusal(TrajectoryError, getattr, setup, "trajectories"))
     for duration_s, periods in ((5.0, 0.5), (13.0, 1.3)):
         with pytest.raises(
             TrajectoryError, match=rf"end at rest: excitation\.duration_s = .* is {periods} per"
         ):
-            check_periods(quick(duration_s=duration_s, method="gradient"))
+            check_periods(quick(duration_s=duration_s, method="gradient").excitation)
 
 
 def test_the_best_candidate_is_chosen_by_a_criterion_of_ones_own(tmp_path, monkeypatch, robot):
@@ -275,16 +273,17 @@ def test_the_best_candidate_is_chosen_by_a_criterion_of_ones_own(tmp_path, monke
     scenario = quick(criterion="own_criterion:smallness")
     free = unknowns(robot.geometry.chart, scenario.excitation)
     progress = Stages()
-    chosen = design_trajectories(robot, scenario, 3, progress).excitation
+    design = design_of(scenario, robot)
+    chosen = design_trajectories(design, 3, progress).excitation
     assert progress.seen == [("excitation", 4, [1] * 4)]
-    drawn = random_candidates(robot, scenario, 4, 3, motion_check(robot, scenario))
+    drawn = design.candidates(4, 3)
     sizes = [np.linalg.norm(free.of(trajectory)) for trajectory in drawn]
     assert np.linalg.norm(free.of(chosen)) == pytest.approx(min(sizes))
     assert scenario_from_toml(scenario.to_toml()) == scenario
     with pytest.raises(
         ScenarioError, match="criterion 'own_criterion:beauty' is no importable module:name"
     ):
-        design_trajectories(robot, quick(criterion="own_criterion:beauty"), 3)
+        design_trajectories(design_of(quick(criterion="own_criterion:beauty"), robot), 3)
     with pytest.raises(
         ScenarioError,
         match="unknown criterion 'beauty'; valid: observability, information, or module",
@@ -302,7 +301,7 @@ def test_box_that_is_said_to_be_in_sight_is_and_sight_counts_where_that_is_not_p
     # A narrow image: the shares that are within one are those of stickers that the cameras can look
     # for.
     sight = narrowed(1.5)
-    constraints = MotionConstraints(robot, quick(position_amplitude_m=0.1), sight)
+    constraints = MotionConstraints(robot, quick(position_amplitude_m=0.1).excitation, sight)
     assert not constraints.always_in_sight
     chosen = required_stickers(sight, robot.home_pose)
     function, rng, lost = constraints.shares_of(["visibility"]), np.random.default_rng(1), 0
@@ -317,4 +316,4 @@ def test_box_that_is_said_to_be_in_sight_is_and_sight_counts_where_that_is_not_p
     with pytest.raises(
         TrajectoryError, match=r"visibility: both cameras can look for \d stickers of plane [ABC]"
     ):
-        MotionConstraints(robot, QUICK, narrowed(12.0))
+        MotionConstraints(robot, QUICK.excitation, narrowed(12.0))

@@ -17,9 +17,8 @@ from dynamics.closed_loop import (
 )
 from identify.errors import TrajectoryError
 from identify.excitation.comparison import compare_methods
-from identify.excitation.constraints import MotionConstraints
 from identify.excitation.criteria import SMOOTHING_RAD_S, log_observability
-from identify.excitation.design import design_trajectories, search_problem
+from identify.excitation.design import design_trajectories
 from identify.excitation.information import (
     harmonics,
     knowledge,
@@ -33,12 +32,7 @@ from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
 from tests.identify.commands import command
-from tests.identify.synthetic import (
-    NAMES,
-    index_of,
-    rss6,
-    side_of,
-)
+from tests.identify.synthetic import NAMES, design_of, index_of, rss6, side_of
 
 QUICK = load_scenario("quick")
 SMALL = QUICK.with_overrides(
@@ -138,7 +132,7 @@ def test_gradients_are_those_of_finite_differences(robot, known, criterion):
     if criterion == "observability":
         value = log_observability(robot, free, 10.0, z, SMOOTHING_RAD_S)
     else:
-        value = log_linear_information(robot, free, QUICK, known, SMOOTHING_RAD_S)
+        value = log_linear_information(robot, free, known, SMOOTHING_RAD_S)
     unknown = ca.MX.sym("z", z.size)
     gradient = np.array(
         ca.Function("gradient", [unknown], [ca.gradient(value(unknown), unknown)])(z)
@@ -164,7 +158,8 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     run = simulated(robot, parameters, trajectory, scenario)
     s, t = harmonics(free), run.time[6000:]
     unknown = ca.MX.sym("z", z.size)
-    spectrum = sensitivity_spectrum(robot, free, scenario, parameters, unknown)
+    settings = side_of(scenario, robot).settings
+    spectrum = sensitivity_spectrum(robot, free, settings, parameters, unknown)
     parts = np.array(ca.Function("spectrum", [unknown], [spectrum])(z)).reshape(67, len(s), 2, 6)
     waves = np.exp(np.outer(s, t))
     expected = np.einsum("pkj,kt->tjp", parts[:, :, 0] + 1j * parts[:, :, 1], waves).real
@@ -196,20 +191,20 @@ def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
         name: {"value": value, "std": deviation} for name, (value, deviation) in prior.items()
     }
     scenario = QUICK.with_overrides({"identification.prior": entries})
-    found = log_information(robot, scenario, knowledge(robot, scenario), trajectory)
+    found = log_information(robot, knowledge(robot, scenario), trajectory)
     assert found == pytest.approx(expected, rel=1e-6)
 
 
 def test_longer_runs_inform_more_and_an_unstable_starting_model_is_named(robot, known):
     _, _, trajectory = a_motion(robot, 10)
     longer = QUICK.with_overrides({"excitation.duration_s": 20.0})
-    once, twice = (log_information(robot, s, known, trajectory) for s in (QUICK, longer))
+    once, twice = (log_information(robot, knowledge(robot, s), trajectory) for s in (QUICK, longer))
     assert 0.0 < twice - once < np.log(2) / 2 + 0.05
     late = QUICK.with_overrides({"timing.frame_rate_hz": 30.0, "timing.latency_s": 0.05})
     with pytest.raises(
         TrajectoryError, match=r"no D-criterion: .*model\.start_parameters = 'initial' is unstable"
     ):
-        log_information(robot, late, known, trajectory)
+        log_information(robot, knowledge(robot, late), trajectory)
 
 
 @pytest.fixture
@@ -223,7 +218,7 @@ def small(**overrides):
 
 @cache
 def designed(method, seed=0, **overrides):
-    return design_trajectories(rss6(), small(method=method, **overrides), seed)
+    return design_trajectories(design_of(small(method=method, **overrides)), seed)
 
 
 def drawn(count):
@@ -244,11 +239,9 @@ def test_limits_hold_between_the_instants_of_the_search(one_start, method):
     runs into.
     """
     scenario = small(method=method, max_joint_velocity_rad_s=0.45)
-    found = design_trajectories(rss6(), scenario, 0).excitation
-    worst = {
-        w.name: w
-        for w in MotionConstraints(rss6(), scenario).check(found, sample_times(0.1, 3, 10))
-    }
+    design = design_of(scenario)
+    found = design_trajectories(design, 0).excitation
+    worst = {w.name: w for w in design.limits.check(found, sample_times(0.1, 3, 10))}
     if method == "gradient":
         assert worst["velocity"].share > 0.99
 
@@ -276,7 +269,7 @@ def test_seed_decides_what_is_found(method):
         TrajectoryError,
         match=r"excitation\.candidates = 3: the evolutionary method needs at least 5",
     ):
-        design_trajectories(rss6(), small(method="evolutionary", candidates=3), 0)
+        design_trajectories(design_of(small(method="evolutionary", candidates=3)), 0)
 
 
 @pytest.mark.slow
@@ -313,7 +306,7 @@ def test_command_compares_and_leaves_its_files_and_none_where_it_is_interrupted(
 @pytest.mark.thorough
 def test_threads_of_linear_algebra_do_not_change_what_is_found():
     """IPOPT's own rounds otherwise with two threads, by enough to end elsewhere."""
-    problem = search_problem(rss6(), load_scenario("paper"), drawn(1))
+    problem = design_of(load_scenario("paper")).search_problem(drawn(1))
     climbed(problem)  # IPOPT's library is loaded by its first use
     found = []
     for threads in (1, 2):
@@ -332,7 +325,7 @@ def test_interrupt_stops_the_search(seconds, monkeypatch):
     """
     monkeypatch.setattr("identify.excitation.search.STARTS", 20)
     scenario = QUICK.with_overrides({"excitation.method": "gradient"})
-    problem = search_problem(rss6(), scenario, drawn(2) * 10)
+    problem = design_of(scenario).search_problem(drawn(2) * 10)
     timer = threading.Timer(seconds, lambda: os.kill(os.getpid(), signal.SIGINT))
     timer.start()
     with pytest.raises(KeyboardInterrupt):
@@ -347,7 +340,9 @@ def test_gradient_method_wins_in_value(criterion, generations):
     """The paper's settings, and for its own criterion its number of generations, in one run."""
     overrides = {"excitation.criterion": criterion, "excitation.generations": generations}
     scenario = load_scenario("paper").with_overrides(overrides)
-    random, evolutionary, gradient = compare_methods(rss6(), scenario, 0, SilentProgress()).entries
+    design = design_of(scenario)
+    known = knowledge(rss6(), scenario)
+    random, evolutionary, gradient = compare_methods(design, known, 0, SilentProgress()).entries
     assert gradient.value > 1.02 * evolutionary.value > 1.02 * random.value
     for entry in (evolutionary, gradient):
-        MotionConstraints(rss6(), scenario).check(entry.trajectory, sample_times(0.1, 5, 10))
+        design.limits.check(entry.trajectory, sample_times(0.1, 5, 10))

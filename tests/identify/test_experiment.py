@@ -18,21 +18,20 @@ from identify.errors import RecordError, TrajectoryError
 from identify.estimation.explanation import SUSPICIOUS
 from identify.estimation.identification import identify
 from identify.experiment.joint_instruments import measure_joints
-from identify.experiment.plant import build_plant
-from identify.experiment.run import run_plant, taught_sensor
-from identify.experiment.sensor_in_loop import make_sensor, robot_meshes, robot_transforms
+from identify.experiment.run import run_plant
+from identify.experiment.sensor_in_loop import robot_meshes, robot_transforms
 from identify.experiment.truth import check_truth, read_truth, true_poses
 from identify.progress import SilentProgress
 from identify.record.recording import poses
 from identify.scenario import scenario_from_toml
-from identify.setup import run_experiment
+from identify.setup import Setup, run_experiment, unseen_errors
 from identify.studies.rows.row_sensor import DrawnSensor
 from identify.trajectory import random_trajectory
-from identify.validation.unseen import unseen_errors
 from tests.identify import synthetic
 from tests.identify.synthetic import (
     PERFECT,
     SIGMA,
+    build_plant,
     quick,
     rss6,
     side_of,
@@ -66,7 +65,7 @@ class Told:
 
 @pytest.fixture(scope="module")
 def sensor():
-    return taught_sensor(quick(**SHORT), rss6(), 0, SilentProgress())
+    return Setup(quick(**SHORT)).sensor_plan.taught(rss6(), 0, SilentProgress())
 
 
 def test_rods_join_the_robots_joints():
@@ -169,7 +168,7 @@ def test_the_sensor_gets_the_scenarios_timing_and_latencies_jitter_as_it_says(se
         )
 
     scenario = late(0.0, **{"timing.exposure_s": 0.004, "timing.dropout": 0.25})
-    timing = make_sensor(scenario, rss6(), 0, sensor.taught).timing
+    timing = Setup(scenario).sensor_plan.make(rss6(), 0, sensor.taught).timing
     assert (timing.frame_rate, timing.exposure, timing.dropout, timing.latency) == (
         60.0,
         0.004,

@@ -73,14 +73,18 @@ SHORT = (
     " --set validation.count=1"
 )
 PLAN = (
-    "identify.stages.plan.untaught_sensor",
+    "identify.experiment.sensor_in_loop.SensorPlan.untaught",
     "identify.stages.plan.teach",
     "identify.stages.plan.design_trajectories",
 )
-RECORD = ("identify.pipeline.taught_sensor", "identify.pipeline.excitation_run")
+RECORD = (
+    "identify.experiment.sensor_in_loop.SensorPlan.untaught",
+    "identify.pipeline.teach",
+    "identify.pipeline.excitation_run",
+)
 IDENTIFY = ("identify.estimation.identification.identify",)
 VALIDATE = (
-    "identify.stages.validate.taught_sensor",
+    "identify.experiment.sensor_in_loop.SensorPlan.taught",
     "identify.stages.validate.run_unseen",
     "identify.stages.validate.predicted_runs",
 )
@@ -303,7 +307,7 @@ def prepared(case):
             patch.setattr(import_module(module), "figure_bytes", bytes_once)
         patch.setattr("identify.verification.against_mujoco.DURATION_S", 2.1)
         patch.setattr("identify.scene.replay.KEY_FRAMES", 2)
-        patch.setattr("identify.validation.variation.designed_runs", designed_runs)
+        patch.setattr("identify.stages.repeat.designed_runs", designed_runs)
         patch.setattr("identify.reporting.report.drawn", simple_picture)
         patch.setattr(time, "perf_counter", lambda: 0.0)
         yield

@@ -24,6 +24,7 @@ from identify.geometry.static_experiment import Encoders, measured, stand_at
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses, read_static_poses
 from identify.progress import SilentProgress
 from identify.record.geometry_errors import covariance_fault
+from identify.setup import Setup
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.static_poses import (
     TOLERANCE,
@@ -137,8 +138,9 @@ def test_cameras_that_are_not_exact_are_handed_to_the_calibration():
             exact.truth, base_covariance=frames, platform_covariance=frames, known=known
         )
         sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", taught=taught)
-        how = robot, drawing, sensor, nothing, chosen.joints, chosen.poses, 0, SilentProgress()
-        found.append(stand_at(*how)[0])
+        sight = Setup(drawing).sensor_plan.sight
+        how = robot, drawing.geometry, sensor, sight, nothing, chosen.joints, chosen.poses
+        found.append(stand_at(*how, 0, SilentProgress())[0])
     exactly, inexactly = found
     assert exactly.common is None
     expected = sensor.common_errors(inexactly.poses, np.zeros_like(inexactly.poses))

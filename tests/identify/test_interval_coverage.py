@@ -19,11 +19,11 @@ from scipy.stats import binom
 
 from dynamics import built_in_robots, load_robot
 from identify.estimation.identification import identify
-from identify.excitation.design import design_trajectories
-from identify.experiment.plant import build_plant
-from identify.experiment.run import excitation_run, taught_sensor
+from identify.experiment.run import excitation_run
+from identify.experiment.sensor_in_loop import teach
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
+from identify.setup import Setup
 from identify.studies.processes import local_processes
 from identify.studies.rows.coverage import quantities as quantities_of
 from identify.studies.runner import run_study
@@ -49,7 +49,7 @@ LOWEST, HIGHEST = 0.93, 0.97
 def experiment_rows(count: int, processes: int, robot: str = "rss6", **settings) -> list[dict]:
     """Rows of the first `count` experiments with a robot."""
     scenario = load_scenario("paper").with_overrides(CHANGES | {"robot": robot} | settings)
-    trajectory = design_trajectories(load_robot(robot), scenario, 0).excitation
+    trajectory = Setup(scenario).trajectories.excitation
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
         return [
@@ -102,13 +102,18 @@ def quantities(rows: list[dict]) -> dict[str, dict]:
 def _block(scenario, trajectory, numbers: range) -> list[dict]:
     """Rows of experiments with one teaching."""
     robot = load_robot(scenario.robot)
-    sensor = taught_sensor(scenario, robot, numbers[0] // BLOCK * BLOCK, SilentProgress())
+    setup = Setup(scenario, numbers[0] // BLOCK * BLOCK, robot)
+    teach(setup.sensor, SilentProgress())
     plant, true = (
-        build_plant(scenario, robot),
+        setup.plant,
         robot.parameter_sets[scenario.plant.parameters].vector,
     )
     records = (
-        (number, excitation_run(plant, sensor, trajectory, number).record) for number in numbers
+        (
+            number,
+            excitation_run(plant, setup.sensor, trajectory, scenario.excitation, number).record,
+        )
+        for number in numbers
     )
     return [row_of(number, identify(record, robot, scenario), true) for number, record in records]
 

@@ -17,7 +17,6 @@ from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify
-from identify.experiment.plant import build_plant
 from identify.files.atomic import write_bytes
 from identify.files.dataset import covariance_netcdf
 from identify.record.geometry_errors import read_geometry_covariance, store_geometry_covariance
@@ -28,6 +27,7 @@ from identify.validation.unseen import model_run
 from tests.identify.commands import command, refusal
 from tests.identify.static_poses import drawn, known_robot, poses_of
 from tests.identify.synthetic import (
+    build_plant,
     problem_of,
     quick,
     run_plant,
@@ -169,7 +169,8 @@ def unseen_errors(known, true, scenario, parameters):
     for seed in (7, 8, 9):
         reference = trajectory(seed).reference(scenario.timing.frame_times(5.0))
         settings = side_of(scenario, known).settings
-        errors.append(model_run(known, settings, parameters, reference) - plant.run(reference).pose)
+        model = model_run(known, settings, parameters, reference)
+        errors.append(model - plant.run(reference).pose)
     return np.concatenate(errors)
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify
-from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.model.from_record import identified_model
@@ -17,6 +16,7 @@ from identify.validation.unseen import model_on_record
 from tests.identify.synthetic import (
     NAMES,
     SIGMA,
+    build_plant,
     quick,
     rss6,
     short_run,
@@ -34,7 +34,9 @@ def excited(law, seed=1, seconds=5.0, **more):
     """
     scenario = quick(**{"excitation.law": law, "excitation.duration_s": seconds}, **more)
     plant = build_plant(scenario, rss6())
-    made = excitation_run(plant, DrawnSensor(np.diag(SIGMA**2)), trajectory(0), seed)
+    made = excitation_run(
+        plant, DrawnSensor(np.diag(SIGMA**2)), trajectory(0), scenario.excitation, seed
+    )
     return scenario, plant, made
 
 

@@ -15,7 +15,7 @@ from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify
 from identify.estimation.output_error_search import search
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.experiment.plant import build_plant, drawn_load
+from identify.experiment.plant import drawn_load
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.record.payload import store_payload
@@ -25,6 +25,7 @@ from tests.identify.synthetic import (
     LAYOUT,
     NAMES,
     SIGMA,
+    build_plant,
     index_of,
     problem_of,
     quick,
@@ -47,7 +48,7 @@ SCENARIO = quick(**{
     "identification.method": "command_driven",
     "payload.mass_std_kg": SHARE * 8.0,
 })  # fmt: skip
-DRAWN = drawn_load(LAYOUT, SCENARIO, np.random.default_rng(0))
+DRAWN = drawn_load(LAYOUT, SCENARIO.payload, np.random.default_rng(0))
 LOAD, STD = DRAWN.stated, DRAWN.std
 """What the scenario's load adds to the parameters (67,), and its standard deviations (67,)."""
 
@@ -155,11 +156,11 @@ def test_drawn_loads_spread_as_stated_and_are_never_negative():
     would make none.
     """
     rng = np.random.default_rng(0)
-    masses = np.array([drawn_load(LAYOUT, SCENARIO, rng).true[MASS] for _ in range(2000)])
+    masses = np.array([drawn_load(LAYOUT, SCENARIO.payload, rng).true[MASS] for _ in range(2000)])
     assert masses.std() == pytest.approx(0.04, rel=0.07)
     assert masses.mean() == pytest.approx(8.0, abs=4 * 0.04 / np.sqrt(2000))
     vague = quick(**{"payload.mass_std_kg": 8.0, "payload.Izz_std_kg_m2": 0.04})
-    drawn = np.array([drawn_load(LAYOUT, vague, rng).true for _ in range(200)])
+    drawn = np.array([drawn_load(LAYOUT, vague.payload, rng).true for _ in range(200)])
     assert (drawn >= 0).all()
     assert np.flatnonzero(np.ptp(drawn, axis=0)).tolist() == [MASS, index_of("platform.Izz")]
 
@@ -175,9 +176,9 @@ def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth():
     )
 
     def run(one, seed=0, payload=True):
-        return excitation_run(
-            build_plant(one, rss6()), sensor, trajectory(0), seed, payload=payload
-        )
+        load = one.payload if payload else None
+        plant = build_plant(one, rss6())
+        return excitation_run(plant, sensor, trajectory(0), one.excitation, seed, payload=load)
 
     heavy, known = run(vague), run(exact)
     assert heavy.record.attrs["payload_mass"] == known.record.attrs["payload_mass"] == 8.0
@@ -215,10 +216,12 @@ def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(count
 
     def identified(seed, **attributes):
         bare, heavy = (
-            excitation_run(plant, sensor, trajectory(0), seed, payload=payload).record
-            for payload in (False, True)
+            excitation_run(
+                plant, sensor, trajectory(0), weighed.excitation, seed, payload=payload
+            ).record
+            for payload in (None, weighed.payload)
         )
-        return identify([bare, heavy.assign_attrs(attributes)], rss6(), plant.scenario)
+        return identify([bare, heavy.assign_attrs(attributes)], rss6(), weighed)
 
     results = [identified(seed) for seed in range(count)]
     errors = np.array([result.estimate[GAIN] - truth()[GAIN] for result in results])

@@ -29,7 +29,7 @@ PROCESSORS = {
 GIVEN = """
 import hashlib, json, numpy as np, dynamics
 from identify import load_scenario
-from identify.excitation import design
+from identify.setup import Setup
 
 paper, given = load_scenario("paper"), {}
 for criterion in ("observability", "information"):
@@ -37,22 +37,21 @@ for criterion in ("observability", "information"):
     scenario = paper.model_copy(update={"excitation": excitation})
     for name in ("rss6", "delta3"):
         robot = dynamics.load_robot(name)
-        check = design.motion_check(robot, scenario)
-        candidates = design.random_candidates(robot, scenario, 4, 0, check)
-        problem = design.search_problem(robot, scenario, candidates)
+        design = Setup(scenario, loaded=robot).design
+        problem = design.search_problem(design.candidates(4, 0))
         for function in (problem.criterion.smooth, problem.constraints.shares):
             digest = hashlib.sha256(function.serialize().encode()).hexdigest()
             given[f"{name} {criterion} {function.name()}"] = digest
 print(json.dumps(given))
 """
 FOUND = """
-import json, numpy as np, dynamics
+import json, numpy as np
 from identify import load_scenario
-from identify.excitation.design import design_trajectories
+from identify.setup import Setup
 
 for name in ("paper", "quick", "geometry"):
     scenario = load_scenario(name)
-    designed = design_trajectories(dynamics.load_robot(scenario.robot), scenario, 0)
+    designed = Setup(scenario).trajectories
     for one in (designed.excitation, *designed.validation):
         print(json.dumps([*one.sine.ravel(), *one.cosine.ravel(), *one.offset]))
 """

@@ -11,7 +11,6 @@ import pytest
 from cmmsim.files import read_sensor_file
 from cmmsim.geometry.pose import invert
 from dynamics import load_robot
-from identify.experiment.plant import build_plant
 from identify.files.dataset import read_group, write_groups
 from identify.files.run_folder import RunFolder, save_result
 from identify.record.provenance import store_robot
@@ -19,7 +18,7 @@ from identify.record.recording import build_model_run, write, write_model_runs
 from identify.scene import replay, workcell
 from tests.identify.commands import command
 from tests.identify.conftest import make_result
-from tests.identify.synthetic import quick, rss6, run_plant
+from tests.identify.synthetic import build_plant, quick, rss6, run_plant
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,6 @@ from dynamics import load_robot
 from identify import pipeline
 from identify.errors import ScenarioError
 from identify.estimation.identification import identify
-from identify.experiment.sensor_in_loop import make_sensor
 from identify.files.run_folder import load_result
 from identify.progress import SilentProgress
 from identify.record.recording import read
@@ -23,6 +22,7 @@ from identify.reporting.run_result import parameter_vector
 from identify.reporting.settings import changed_settings
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 from identify.scenario.scenario import ESTIMATOR_SECTIONS
+from identify.setup import Setup
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import NAMES, SHORT, changed_robot_file, rss6
 
@@ -315,7 +315,7 @@ def test_changed_sensor_is_that_of_a_file_with_the_same_entries_in_the_loop_and_
     changed = load_scenario("paper").with_overrides(
         {f"sensor_changes.{key}": CHANGES[key] for key in CHANGES}
     )
-    sensor = make_sensor(changed, load_robot("rss6"), seed=0)
+    sensor = Setup(changed).sensor_plan.make(load_robot("rss6"), seed=0)
     assert (sensor.noise.dark_noise, sensor.optics.psf_px) == (52.0, 0.6)
     for rig in (sensor.rig, sight_lines("ctrack780", changed.sensor_changes).rig):
         assert np.linalg.norm(rig.from_camera[1][:3, 3]) == pytest.approx(0.8)

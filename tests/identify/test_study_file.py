@@ -437,8 +437,9 @@ def test_what_a_kind_does_not_read_changes_nothing_in_its_rows(kind, options):
     other, left = with_others(scenario, unread)
     shared = {"sensor.timing.latency", "sensor.timing.latency_jitter"}  # which the scenario states
     assert left <= ALONE | shared | {"sensor.renderer"}
+    chosen = find_kind(kind)
     one, two = (
-        find_kind(kind).row(settings, np.random.SeedSequence(3), options)
+        chosen.compute(settings, np.random.SeedSequence(3), chosen.checked(options))
         for settings in (scenario, other)
     )
     assert one == two
@@ -446,9 +447,8 @@ def test_what_a_kind_does_not_read_changes_nothing_in_its_rows(kind, options):
 
 def test_what_a_held_pose_reads_acts_on_its_rows():
     def row(options, **changes):
-        return kind.row(
-            scenario.with_overrides(overrides(changes)), np.random.SeedSequence(3), options
-        )
+        settings = scenario.with_overrides(overrides(changes))
+        return kind.compute(settings, np.random.SeedSequence(3), kind.checked(options))
 
     kind, scenario = (
         find_kind("static_pose"),

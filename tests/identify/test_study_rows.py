@@ -18,9 +18,9 @@ from dynamics.closed_loop import (
     differentiate_servo,
 )
 from identify.errors import EstimationError, ScenarioError
-from identify.experiment.plant import build_plant
 from identify.model.from_record import model_side
 from identify.scenario import load_scenario
+from identify.setup import Setup
 from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.identified import prediction_figures
 from identify.studies.rows.row_sensor import SENSORS_KEPT, DrawnSensor, exact_sensor
@@ -43,7 +43,8 @@ def seed(number=0):
 
 
 def row(kind, number=0, settings=None, **options):
-    return find_kind(kind).row(settings or scenario(), seed(number), options)
+    chosen = find_kind(kind)
+    return chosen.compute(settings or scenario(), seed(number), chosen.checked(options))
 
 
 static = partial(row, "static_pose")
@@ -53,7 +54,8 @@ def test_a_row_is_that_of_its_seed_whatever_the_process_has_kept():
     exact_sensor.cache_clear()
     assert exact_sensor.cache_info().maxsize == SENSORS_KEPT
     given = seed()
-    alone, again = (find_kind("static_pose").row(scenario(), given, {}) for _ in range(2))
+    kind = find_kind("static_pose")
+    alone, again = (kind.compute(scenario(), given, kind.checked({})) for _ in range(2))
     assert alone == again
     assert given.n_children_spawned == 0, "the seed is used up"
     assert alone["position_rms_um"] != static(1)["position_rms_um"]
@@ -252,7 +254,7 @@ def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_predi
     poses = np.tile(robot.home_pose, (60, 1))
     poses[:, :3] += 0.002 * np.sin(np.arange(60)[:, None] / np.array([5.0, 7.0, 9.0]))
     reference = Reference(poses, np.gradient(poses, settings.timing.frame_period_s, axis=0))
-    truth = build_plant(settings, robot).parameters
+    truth = Setup(settings, loaded=robot).plant.parameters
     loop = model_side(robot, settings).settings
     error = 1e-4 * truth * np.random.default_rng(0).normal(size=len(truth))
     model = differentiate_servo(robot, truth + error, reference, loop)

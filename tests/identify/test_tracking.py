@@ -11,8 +11,8 @@ from dynamics.control.law import LawInLoop
 from dynamics.errors import SimulationError
 from identify.errors import RecordError, ScenarioError, TrajectoryError
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, prepared
-from identify.experiment.plant import build_plant
 from identify.experiment.run import drawn_latencies
+from identify.experiment.sensor_in_loop import SensorPlan
 from identify.files.run_folder import RunFolder, save_result
 from identify.scenario import load_scenario
 from identify.studies.rows.row_sensor import DrawnSensor
@@ -20,7 +20,7 @@ from identify.tracking import track as tracking
 from identify.tracking.following import by_drawing, follow
 from identify.tracking.motions import circle, read_motion, square
 from tests.identify.commands import command, one_line, refusal
-from tests.identify.synthetic import SIGMA, rss6, trajectory
+from tests.identify.synthetic import SIGMA, build_plant, rss6, trajectory
 
 NOISE = np.diag(SIGMA**2)
 UNSTABLE = {"control.bandwidth_rad_s": 240.0, "control.damping": 0.1}
@@ -44,7 +44,11 @@ class Sensor(DrawnSensor):
 
 
 def plant(**changes):
-    return build_plant(load_scenario("quick").with_overrides(SHORT | changes))
+    return build_plant(settings(**changes))
+
+
+def settings(**changes):
+    return load_scenario("quick").with_overrides(SHORT | changes)
 
 
 def swing(seconds=2.0, size=1.0):
@@ -263,9 +267,9 @@ def noting(assignment):
 def test_what_is_not_known_of_the_mean_latency_is_drawn_for_a_seed_and_no_law_knows_it():
     """The run is that with the drawn latency; the same for all motions of a seed."""
     stated = {"timing.latency_s": 0.006, "timing.latency_std_s": 0.002}
-    vague, model = plant(**stated), tracking.known_model(plant(), "true", None)
+    vague, model = plant(**stated), tracking.known_model(plant(), "true")
     drawn = [
-        drawn_latencies(vague.scenario, 120, seed, run) for seed, run in ((3, 0), (3, 7), (4, 0))
+        drawn_latencies(vague.runs.timing, 120, seed, run) for seed, run in ((3, 0), (3, 7), (4, 0))
     ]
     first, other, another = (float(one.true[0]) for one in drawn)
     assert first == other != another
@@ -293,7 +297,8 @@ def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
     """By drawn poses; `pid`, which knows no model, is there once. A model that is better leaves
     less error.
     """
-    monkeypatch.setattr(tracking, "taught_sensor", lambda *given: Sensor(NOISE))
+    monkeypatch.setattr(SensorPlan, "untaught", lambda *given: Sensor(NOISE))
+    monkeypatch.setattr(tracking, "teach", lambda *given: None)
     out = tmp_path / "track"
     settings = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
     settings += ["--set", "renderer=analytic", "--set", "control.observer=false"]
@@ -332,7 +337,8 @@ def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
 
 def test_a_robot_that_no_law_keeps_on_its_motion_is_no_success(tmp_path, monkeypatch, capsys):
     """Nor is it identified for `pid`, which knows no model."""
-    monkeypatch.setattr(tracking, "taught_sensor", lambda *given: Sensor(NOISE))
+    monkeypatch.setattr(SensorPlan, "untaught", lambda *given: Sensor(NOISE))
+    monkeypatch.setattr(tracking, "teach", lambda *given: None)
     monkeypatch.setattr(tracking, "excitation_run", None)
     out, settings = tmp_path / "track", ["--set", "servo.kp=40", "--set", "renderer=analytic"]
     settings += ["--set", "control.torque_limit_N_m=3.1"]
@@ -377,12 +383,12 @@ def test_a_feedforward_that_is_lost_by_the_servos_gains_says_its_eigenvalue():
 def test_the_identified_model_is_that_of_a_run(tmp_path):
     """Of the same robot."""
     chosen, run = plant(), RunFolder(tmp_path)
-    run.scenario.write_text(chosen.scenario.to_toml())
+    run.scenario.write_text(settings().to_toml())
     estimates = {name: {"estimate": float(k)} for k, name in enumerate(rss6().layout.names)}
     save_result(run.result, {"identification": {"parameters": estimates}})
-    known = tracking.known_model(chosen, "identified", tmp_path).parameters
+    known = tracking.model_of_run(chosen, tmp_path, "rss6").parameters
     assert np.array_equal(known, np.arange(len(estimates)))
-    said = refusal(RecordError, tracking.known_model, plant(robot="rus6"), "identified", tmp_path)
+    said = refusal(RecordError, tracking.model_of_run, plant(robot="rus6"), tmp_path, "rus6")
     assert "holds a run of rss6, not of rus6" in said
 
 

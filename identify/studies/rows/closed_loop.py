@@ -9,28 +9,26 @@ import numpy as np
 from pydantic import Field
 
 from cmmsim.teaching import exactly_taught
-from dynamics import load_robot
 from identify.errors import EstimationError
-from identify.excitation.design import admissible_trajectories, motion_check
-from identify.experiment.plant import build_plant
+from identify.excitation.design import admissible_trajectories
 from identify.experiment.run import run_plant
-from identify.experiment.sensor_in_loop import make_sensor, sensor_file
 from identify.experiment.truth import true_poses
 from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.scenario import Scenario
 from identify.scenario.section import Section
+from identify.setup import Setup
 from identify.studies.rows.kind import (
     LIMITS,
     NOISE_OFF,
     PATH,
     PICTURES,
     PLANT,
+    UNWATCHED,
     Column,
     Kind,
     Reads,
     Row,
-    unwatched,
 )
 from identify.studies.rows.row_sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 
@@ -89,17 +87,19 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
 
     Raises EstimationError if no frame was measured, LoopFailure, and the errors of the sensor.
     """
-    scenario = unwatched(scenario)
-    robot = load_robot(scenario.robot)
+    setup = Setup(scenario.with_overrides(UNWATCHED))
+    plan = setup.sensor_plan
     number = stream_seed(seed, EXPERIMENT)
     # A sensor that is given no teaching teaches itself.
-    taught = exactly_taught(sensor_file(scenario)) if options.teaching == "exact" else None
-    sensor = make_sensor(scenario, robot, number, taught)
-    duration = scenario.validation.duration_s
+    taught = exactly_taught(plan.file) if options.teaching == "exact" else None
+    sensor = plan.make(setup.robot, number, taught)
+    design = setup.design
+    duration = design.unseen.duration_s
     drawn = np.random.SeedSequence(stream_seed(seed, TRAJECTORY))
-    check = motion_check(robot, scenario)
-    trajectory = admissible_trajectories(robot, scenario.excitation, duration, 1, drawn, check)[0]
-    run = run_plant(build_plant(scenario, robot), sensor, trajectory, duration, number, 1)
+    trajectory = admissible_trajectories(
+        design.robot, design.settings, duration, 1, drawn, design.check
+    )[0]
+    run = run_plant(setup.plant, sensor, trajectory, duration, number, 1)
     ok = run.record["measured_ok"].values.astype(bool)
     if not ok.any():
         raise EstimationError(

@@ -10,11 +10,9 @@ from identify.estimation.result import IdentificationResult
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment
 from identify.experiment.truth import true_poses
-from identify.model.from_record import ModelSide
-from identify.progress import SilentProgress
 from identify.studies.rows.kind import Row
 from identify.studies.rows.row_sensor import rms_um
-from identify.validation.unseen import PosePrediction, predicted_runs
+from identify.validation.unseen import PosePrediction
 
 
 def coverage(
@@ -58,22 +56,6 @@ def coverage(
         "predicted_position_rms_um": rms_um(errors[:, :3]),
     }
     return row | ({"covered_percent": 100.0 * float(np.mean(held))} if held else {})
-
-
-def predictions(
-    result: IdentificationResult, side: ModelSide, unseen: Sequence[Experiment], seed: int
-) -> list[PosePrediction]:
-    """Predict the poses of all unseen trajectories by the identified model."""
-    records = [one.record for one in unseen]
-    estimated = result.estimate, result.whole_covariance
-    return predicted_runs(
-        side,
-        records,
-        *estimated,
-        seed,
-        SilentProgress(),
-        result.common_errors.learned,
-    )
 
 
 def quantities(

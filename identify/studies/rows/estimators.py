@@ -15,8 +15,16 @@ from identify.experiment.joint_instruments import instruments_of
 from identify.model.from_record import model_side
 from identify.own_parts import ESTIMATORS
 from identify.progress import SilentProgress
+from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.identified import READS, RecordOptions, memory, recorded
+from identify.studies.rows.identified import (
+    EXPERIMENT,
+    READS,
+    RecordOptions,
+    memory,
+    recorded,
+    row_setup,
+)
 from identify.studies.rows.kind import Column, Kind, Row
 from identify.validation.estimator_comparison import START, Score, compare_on_record, instrumented
 
@@ -81,7 +89,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Estimator
 
     Raises EstimationError, and the errors of experiment and sensor.
     """
-    made = recorded(scenario, seed, options)
+    made = recorded(row_setup(scenario, stream_seed(seed, EXPERIMENT)), options)
     robot = made.plant.nominal
     run = made.excitation
     channels = instrumented(

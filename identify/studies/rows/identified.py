@@ -14,15 +14,14 @@ import numpy as np
 import xarray as xr
 from pydantic import Field
 
-from cmmsim.visibility import expected_covariance
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import differentiate_servo
 from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
-from identify.excitation.design import design_trajectories
-from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor
+from identify.experiment.plant import Plant
+from identify.experiment.run import Experiment, excitation_run, run_plant
+from identify.experiment.sensor_in_loop import PoseSensor, teach
 from identify.experiment.truth import true_poses
 from identify.model.from_record import ModelSide, model_side
 from identify.progress import SilentProgress
@@ -32,23 +31,24 @@ from identify.record.recording import recorded_reference
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario, scenario_from_toml
 from identify.scenario.section import Section
-from identify.scenario.sections import Rig
-from identify.studies.rows.coverage import coverage, predictions
+from identify.scenario.sections import Geometry, Rig
+from identify.setup import Setup
+from identify.studies.rows.coverage import coverage
 from identify.studies.rows.kind import (
     NOISE_OFF,
     PLANT,
     SENSOR,
+    UNWATCHED,
     Column,
     Idle,
     Kind,
     Reads,
     Row,
     timing,
-    unwatched,
 )
 from identify.studies.rows.row_sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
-from identify.validation.unseen import PosePrediction, model_on_record
+from identify.validation.unseen import PosePrediction, model_on_record, predicted_runs
 
 EXPERIMENT = 0
 CHOSEN = {
@@ -199,26 +199,32 @@ class Recorded:
     number: int
 
 
-def recorded(scenario: Scenario, seed: np.random.SeedSequence, options: RecordOptions) -> Recorded:
+def row_setup(settings: Scenario, number: int) -> Setup:
+    """Return the setup of a row with a seed, which shares its robot with other rows."""
+    return Setup(settings.with_overrides(UNWATCHED), number, robot_named(settings.robot))
+
+
+def recorded(setup: Setup, options: RecordOptions) -> Recorded:
     """Run the plant of a row with its sensor. Raises the errors of experiment and sensor."""
-    number = stream_seed(seed, EXPERIMENT)
-    scenario = unwatched(scenario)
-    plant = build_plant(scenario, robot_named(scenario.robot), number)
-    trajectories = designed_trajectories(scenario, options.trajectory_seed)
-    drawn = options.sensor == "drawn"
-    sensor = (
-        _drawn(scenario)
-        if drawn
-        else taught_sensor(scenario, plant.nominal, number, SilentProgress())
-    )
-    experiment = excitation_run(plant, sensor, trajectories.excitation, number)
+    number = setup.seed
+    settings = setup.scenario.excitation
+    plant = setup.plant
+    trajectories = designed_trajectories(setup, options.trajectory_seed)
+    sensor: PoseSensor
+    if options.sensor == "drawn":
+        covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
+        sensor = DrawnSensor(covariance, plant.runs.timing.dropout)
+    else:
+        sensor = setup.sensor
+        teach(sensor, SilentProgress())
+    how = (plant, sensor, trajectories.excitation, settings, number)
+    experiment = excitation_run(*how)
     records = [experiment.record]
-    if scenario.identification.scale_anchor == "payload":
-        records.append(
-            excitation_run(plant, sensor, trajectories.excitation, number, payload=True).record
-        )
+    if plant.runs.anchor == "payload":
+        records.append(excitation_run(*how, payload=setup.scenario.payload).record)
+    duration_s = setup.scenario.validation.duration_s
     unseen = [
-        run_plant(plant, sensor, trajectory, scenario.validation.duration_s, number, run)
+        run_plant(plant, sensor, trajectory, duration_s, number, run)
         for run, trajectory in enumerate(trajectories.validation, start=1)
     ]
     return Recorded(plant, experiment, records, unseen, number)
@@ -228,24 +234,33 @@ def compute(
     scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions
 ) -> Row:
     """Compute one row. Raises EstimationError, and the errors of experiment and sensor."""
-    made = recorded(scenario, seed, options)
+    made = recorded(row_setup(scenario, stream_seed(seed, EXPERIMENT)), options)
     plant = made.plant
-    unseen = made.unseen
-    result = identify_record(made.records, plant.nominal, scenario)
-    # The model is run with the law of the drives that was identified.
-    side = model_side(plant.nominal, scenario).with_drive(result.drive.law)
-    row = _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
-    predicted = predictions(result, side, unseen, made.number)
-    row |= _unseen_figures(result, side, plant.parameters, unseen, predicted) | coverage(
-        result, plant, unseen, predicted
-    )
-    if not options.unaware:
-        return row
-    unaware = scenario.with_overrides({"identification.nuisances": []})
-    result = identify_record(made.records, plant.nominal, unaware)
-    side = model_side(plant.nominal, unaware).with_drive(result.drive.law)
-    covered = coverage(result, plant, unseen, predictions(result, side, unseen, made.number))
-    return row | {f"unaware_{name}": value for name, value in covered.items()}
+    robot = plant.nominal
+    records = [one.record for one in made.unseen]
+    asked = {"": scenario}
+    if options.unaware:
+        asked["unaware_"] = scenario.with_overrides({"identification.nuisances": []})
+    row: Row = {}
+    for prefix, settings in asked.items():
+        result = identify_record(made.records, robot, settings)
+        # The model is run with the law of the drives that was identified.
+        side = model_side(robot, settings).with_drive(result.drive.law)
+        predicted = predicted_runs(
+            side,
+            records,
+            result.estimate,
+            result.whole_covariance,
+            made.number,
+            SilentProgress(),
+            result.common_errors.learned,
+        )
+        if not prefix:
+            row |= _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
+            row |= _unseen_figures(result, side, plant.parameters, made.unseen, predicted)
+        covered = coverage(result, plant, made.unseen, predicted)
+        row |= {f"{prefix}{name}": value for name, value in covered.items()}
+    return row
 
 
 def _unseen_figures(
@@ -340,47 +355,38 @@ def prediction_figures(
     }
 
 
-def _drawn(scenario: Scenario) -> DrawnSensor:
-    home = robot_named(scenario.robot).home_pose
-    covariance = expected_covariance(
-        scenario.sensor, home, scenario.pose_method, changes=scenario.sensor_changes
-    )
-    return DrawnSensor(covariance, scenario.timing.dropout)
-
-
 @lru_cache(maxsize=4)
 def robot_named(name: str) -> Robot:
     """Load a robot, once a process."""
     return load_robot(name)
 
 
-def designed_trajectories(scenario: Scenario, seed: int) -> TrajectorySet:
-    """Design the trajectories of a scenario, or return those designed before.
+def designed_trajectories(setup: Setup, seed: int) -> TrajectorySet:
+    """Design the trajectories of a setup, or return those designed before.
 
-    The design knows neither the plant nor what is known of the rig. Rows that differ only in these
-    share their trajectories.
+    The design knows neither the plant nor what is known of rig and geometry. Rows that differ only
+    in these share their trajectories.
     """
-    design = {"rig": Rig(), "plant": PlantSwitches(), "renderer": "auto"}
-    return _designed(scenario.model_copy(update=design).to_toml(), seed)
+    design = {"rig": Rig(), "plant": PlantSwitches(), "geometry": Geometry(), "renderer": "auto"}
+    return _designed(setup.scenario.model_copy(update=design).to_toml(), seed)
 
 
 @lru_cache(maxsize=64)
 def _designed(scenario_toml: str, seed: int) -> TrajectorySet:
-    scenario = scenario_from_toml(scenario_toml)
-    return design_trajectories(robot_named(scenario.robot), scenario, seed)
+    settings = scenario_from_toml(scenario_toml)
+    return Setup(settings, seed, robot_named(settings.robot)).trajectories
 
 
 HELD = 5
 """Number of arrays that a row holds at once, each the size of all poses' sensitivities."""
 
 
-def memory(scenario: Scenario, options: object) -> float:
-    """Return the memory needed to identify from the records of a scenario, bytes.
+def memory(setup: Setup, options: object) -> float:
+    """Return the memory needed to identify from the records of a setup, bytes.
 
     It was measured with up to 24,000 frames.
     """
-    parameters = len(robot_named(scenario.robot).layout.names)
-    return HELD * 8.0 * 6 * parameters * scenario.timing.frames(scenario.excitation.duration_s)
+    return HELD * 8.0 * 6 * len(setup.nominal.layout.names) * setup.sensor_plan.frames
 
 
 IDENTIFICATION = Kind(

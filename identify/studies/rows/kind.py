@@ -14,6 +14,7 @@ from identify.scenario import Scenario
 from identify.scenario.section import Section
 from identify.scenario.settings_file import one_line
 from identify.scenario.timing import IN_FILE
+from identify.setup import Setup
 from identify.studies.study_file import Range, Study
 
 
@@ -235,9 +236,8 @@ Row = dict[str, float]
 """Figures of a row by name."""
 
 
-def unwatched(scenario: Scenario) -> Scenario:
-    """Return the scenario without a watch on its cameras. No figure of a row depends on a watch."""
-    return scenario.with_overrides({"rig.watch": "none"})
+UNWATCHED = {"rig.watch": "none"}
+"""Setting that rows run with. No figure of a row depends on a watch of the cameras."""
 
 
 @dataclass(frozen=True)
@@ -284,7 +284,7 @@ class Kind:
     takes_options : bool
         Whether there may be options.
     memory : callable or None
-        Function (scenario, options) that returns the bytes a row holds at once. None if few.
+        Function (setup, options) that returns the bytes a row holds at once. None if few.
     """
 
     name: str
@@ -294,7 +294,7 @@ class Kind:
     options: type[Section] | None = None
     reads: Reads | None = None
     takes_options: bool = True
-    memory: Callable[[Scenario, Any], float] | None = None
+    memory: Callable[[Setup, Any], float] | None = None
 
     def checked(self, options: Mapping[str, Any]) -> Any:
         """Return the options as `compute` takes them, with their defaults.
@@ -312,9 +312,3 @@ class Kind:
             return self.options.model_validate(dict(options))
         except ValidationError as error:
             raise StudyError(f"options of {self.name}: {one_line(error, self.options)}") from error
-
-    def row(
-        self, scenario: Scenario, seed: np.random.SeedSequence, options: Mapping[str, Any]
-    ) -> Mapping[str, float]:
-        """Compute one row. Raises StudyError for wrong options, and the errors of the row."""
-        return self.compute(scenario, seed, self.checked(options))

@@ -18,6 +18,7 @@ from identify.excitation.design import drawn_trajectory
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
+from identify.setup import Setup
 from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, timing
 from identify.studies.rows.row_sensor import (
     POSE_COLUMNS,
@@ -77,7 +78,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
 
     Raises EstimationError if fewer than two poses were measured, and the errors of the sensor.
     """
-    eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
+    eye = row_sensor(Setup(scenario).sensor_plan, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
     path = drawn_trajectory(rng, Chart("free", tuple(eye.sensor.home)), scenario.excitation)
     # The path repeats itself after one period of the fundamental frequency.
@@ -123,9 +124,9 @@ FRAME = 4.3e3
 """Bytes held for each frame, as measured with up to 1,800,000 frames."""
 
 
-def memory(scenario: Scenario, options: PathPoseOptions) -> float:
+def memory(setup: Setup, options: PathPoseOptions) -> float:
     """Return the memory needed to follow a stretch of a path, bytes."""
-    return FRAME * scenario.timing.frames(options.stretch_s)
+    return FRAME * setup.scenario.timing.frames(options.stretch_s)
 
 
 PATH_POSE = Kind(

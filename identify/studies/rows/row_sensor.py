@@ -19,8 +19,7 @@ from cmmsim.files import SensorFile
 from cmmsim.measuring.measurement import lost_measurement, measurement_without_stickers
 from cmmsim.teaching import exactly_taught
 from identify.arrays import Array
-from identify.experiment.sensor_in_loop import sensor_file
-from identify.scenario import Scenario
+from identify.experiment.sensor_in_loop import SensorPlan
 from identify.studies.rows.kind import Column, Row
 
 SENSORS_KEPT = 16
@@ -56,16 +55,15 @@ class RowSensor:
     rim: float
 
 
-def row_sensor(scenario: Scenario, teaching: Teaching, seed: int) -> RowSensor:
-    """Return the sensor of a scenario at the beginning of a run of its own.
+def row_sensor(plan: SensorPlan, teaching: Teaching, seed: int) -> RowSensor:
+    """Return a sensor at the beginning of a run of its own.
 
     The robot's links are not in its view.
     """
-    file = sensor_file(scenario)
     if teaching == "exact":
-        built = exact_sensor(file.model_dump_json(), scenario.pose_method, scenario.renderer)
+        built = exact_sensor(plan.file.model_dump_json(), plan.method, plan.renderer)
     else:
-        built = _built(file, scenario.pose_method, scenario.renderer, None, seed)
+        built = _built(plan.file, plan.method, plan.renderer, None, seed)
     built.sensor.start_run(seed)
     return built
 

@@ -21,6 +21,7 @@ from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
+from identify.setup import Setup
 from identify.studies.rows.kind import (
     BOX,
     NOISE_OFF,
@@ -150,7 +151,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
 
     Raises EstimationError, with a reason, if every picture was lost, and the errors of the sensor.
     """
-    eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
+    eye = row_sensor(Setup(scenario).sensor_plan, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, POSES))
     dropout = np.random.default_rng(stream_seed(seed, DROPOUT))
     box = np.repeat(

@@ -12,15 +12,16 @@ import numpy as np
 from pydantic import Field
 
 from dynamics.control.inverse_dynamics import VAGUE
+from identify.estimation.identification import identify
 from identify.experiment.law_in_loop import KnownModel
-from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import excitation_run, taught_sensor
-from identify.experiment.sensor_in_loop import PoseSensor
+from identify.experiment.run import excitation_run
+from identify.experiment.sensor_in_loop import teach
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
-from identify.studies.rows.identified import designed_trajectories, robot_named
+from identify.setup import Setup
+from identify.studies.rows.identified import designed_trajectories, row_setup
 from identify.studies.rows.kind import (
     NOISE_OFF,
     PICTURES,
@@ -29,12 +30,11 @@ from identify.studies.rows.kind import (
     Kind,
     Reads,
     Row,
-    unwatched,
 )
 from identify.studies.rows.row_sensor import rms_um
 from identify.tracking.following import Followed
 from identify.tracking.motions import motions
-from identify.tracking.track import follow_by_images, identified_model, known_model
+from identify.tracking.track import follow_by_images, known_model, model_of_result
 
 EXPERIMENT = 0
 SIGNS = 1
@@ -130,20 +130,20 @@ READS = Reads(
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingOptions) -> Row:
     """Compute one row. Raises the errors of sensor, identification and laws (LoopFailure)."""
     number = stream_seed(seed, EXPERIMENT)
-    robot = robot_named(scenario.robot)
-    scenario = unwatched(scenario)
-    plant = build_plant(scenario, robot, number)
-    sensor = taught_sensor(scenario, robot, number, SilentProgress())
+    setup = row_setup(scenario, number)
+    plant = setup.plant
+    sensor = setup.sensor
+    teach(sensor, SilentProgress())
     signs = np.random.default_rng(stream_seed(seed, SIGNS)).choice(
         [-1.0, 1.0], len(plant.parameters)
     )
-    model = _model(plant, sensor, number, options)
+    model = _model(setup, options)
     if options.off:
         model = replace(
             model, parameters=model.parameters * (1.0 + options.off * signs), doubt=VAGUE
         )
     # A circle and a square follow the unseen trajectories, and do not count here.
-    unseen = motions(robot, scenario, number)[: scenario.validation.count]
+    unseen = motions(setup.design, number)[: setup.design.unseen.count]
 
     def followed(law: str, known: KnownModel) -> list[Followed]:
         return [
@@ -153,28 +153,30 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
 
     done = followed(options.law, model)
     beside = followed("pid", model)
-    normalised = [one.normalised_squared_error(robot) for one in done]
+    normalised = [one.normalised_squared_error(setup.nominal) for one in done]
     known = [value for value in normalised if value is not None]
     row = _figures(done, beside)
     if options.compared:
         start, truth = (
-            followed(options.law, known_model(plant, name, None)) for name in ("initial", "true")
+            followed(options.law, known_model(plant, name)) for name in ("initial", "true")
         )
         row |= _against(done, start, truth)
     return row | ({"observer_normalised_error": float(np.mean(known))} if known else {})
 
 
-def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptions) -> KnownModel:
+def _model(setup: Setup, options: TrackingOptions) -> KnownModel:
     """Return the model that the law knows."""
+    plant = setup.plant
     if options.model_error is not None:
-        start, truth = (known_model(plant, name, None) for name in ("initial", "true"))
+        start, truth = (known_model(plant, name) for name in ("initial", "true"))
         between = truth.parameters + options.model_error * (start.parameters - truth.parameters)
         return replace(start if options.model_error else truth, parameters=between)
     if options.model != "identified":
-        return known_model(plant, options.model, None)
-    trajectory = designed_trajectories(plant.scenario, options.trajectory_seed).excitation
-    record = excitation_run(plant, sensor, trajectory, number).record
-    return identified_model(plant, record, SilentProgress())
+        return known_model(plant, options.model)
+    settings = setup.scenario.excitation
+    trajectory = designed_trajectories(setup, options.trajectory_seed).excitation
+    record = excitation_run(plant, setup.sensor, trajectory, settings, setup.seed).record
+    return model_of_result(identify(record, setup.robot, setup.scenario))
 
 
 def _rms(runs: list[Followed], axes: slice) -> float:

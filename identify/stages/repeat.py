@@ -1,0 +1,48 @@
+"""Runs of a plant on exciting trajectories of their own, which show how estimates vary."""
+
+from dataclasses import replace
+from functools import partial
+
+from identify.excitation.design import design_trajectories
+from identify.experiment.run import Experiment
+from identify.progress import Progress, SilentProgress
+from identify.random_streams import DESIGN, stream_seed
+from identify.setup import Setup
+from identify.trajectory import FourierTrajectory
+from identify.validation.processes import mapped
+from identify.validation.unseen import run_unseen
+
+
+def designed_runs(
+    setup: Setup, count: int, workers: int | None, progress: Progress
+) -> list[Experiment]:
+    """Run the plant with images in the loop on `count` exciting trajectories.
+
+    Each trajectory is designed from random candidates of its own by the scenario's method, and is
+    as long as the exciting run. The workers are as in `run_unseen`.
+
+    Raises the errors of the stages `excite` and `record`.
+    """
+    # Seeds of their own keep these runs apart from the experiment's.
+    own = stream_seed(setup.seed, DESIGN)
+    seeds = [stream_seed(own, number) for number in range(count)]
+    trajectories = []
+    with (
+        progress.stage("design the runs", count) as advance,
+        mapped(workers, partial(_designed, setup), seeds) as found,
+    ):
+        for trajectory in found:
+            trajectories.append(trajectory)
+            advance()
+    duration_s = setup.scenario.excitation.duration_s
+    # The records say how long these runs are, which stand for those of the validation.
+    lasting = setup.scenario.with_overrides({"validation.duration_s": duration_s})
+    setup = replace(setup, scenario=lasting, seed=own)
+    plan = setup.sensor_plan
+    taught = plan.taught(setup.robot, own, progress).taught
+    paths = tuple(trajectories)
+    return run_unseen(setup.plant, plan, taught, paths, duration_s, own, workers, progress)
+
+
+def _designed(setup: Setup, seed: int) -> FourierTrajectory:
+    return design_trajectories(setup.design, seed, SilentProgress()).excitation
