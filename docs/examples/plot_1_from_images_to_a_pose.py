@@ -2,9 +2,10 @@
 From two images to a pose
 =========================
 
-The sensor of this testbed is a pair of cameras. It looks at a platform and at a fixed base, both
-with round stickers, and tells the pose of the platform in the frame of the base. Nothing of the
-truth is handed over: the images are drawn, noise is added, and what follows knows the images only.
+This page measures the pose of a platform from two images, and checks the covariance of the result.
+The sensor is a pair of cameras. It looks at a platform and at a fixed base, both with round
+stickers, and measures the pose of the platform in the frame of the base. The measurement uses only
+the images, which are drawn with noise.
 """
 
 import matplotlib.pyplot as plt
@@ -15,8 +16,8 @@ import cmmsim
 # %%
 # Both images
 # -----------
-# ``ctrack780`` is the built-in sensor, in the size of a C-Track 780. The platform stands 4 mm beside its home, and is
-# turned by a few hundredths of a radian. A pose is ``[x, y, z, alpha, beta, gamma]`` in m and rad.
+# ``ctrack780`` is the built-in sensor, which has the size of a C-Track 780. The platform is some millimetres from its
+# home, and is turned by one to two hundredths of a radian. A pose is ``[x, y, z, alpha, beta, gamma]`` in m and rad.
 
 sensor = cmmsim.load_sensor("ctrack780", seed=0, renderer="analytic")
 pose = sensor.home + [0.004, -0.003, 0.002, 0.01, -0.02, 0.015]
@@ -41,12 +42,12 @@ plt.show()
 
 # %%
 # The bright discs are stickers. Those with a circle belong to the platform and were used for its
-# pose; the others stand on the base.
+# pose. The others are on the base.
 #
 # One sticker
 # -----------
-# A sticker has a radius of some four pixels. Its edge is blurred by the pixels, and all grey values carry noise. The
-# centre of the ellipse is found to about a hundredth of a pixel all the same, for dozens of pixels tell of it.
+# A sticker has a radius of about four pixels. The pixels blur its edge, and all grey values have noise. The centre of
+# the ellipse is nevertheless found to about a hundredth of a pixel, because it depends on dozens of pixels.
 
 x, y = measured.left_pixels[0]
 column, row = round(x), round(y)
@@ -64,9 +65,10 @@ figure.colorbar(shown, label="grey value")
 plt.show()
 
 # %%
-# The pose and what it claims
+# The pose and its covariance
 # ---------------------------
-# A measurement brings its own covariance: the noise of the grey values, carried through ellipse, triangulation and fit.
+# A measurement states a covariance. It is the noise of the grey values, propagated through the fit of the ellipses,
+# triangulation and the fit of the pose.
 
 error = measured.pose - pose
 claimed = np.sqrt(np.diag(measured.covariance))
@@ -80,9 +82,9 @@ for name, unit, e, s in zip(
     print(f"{name:6s} error {e:7.2f} {unit:5s} claimed standard deviation {s:6.2f} {unit}")
 
 # %%
-# One error proves nothing. A claim about noise is checked by repeating: here the same pose is
-# measured 300 times, and the spread of the results is set beside the claim. Bars of one height are
-# what an honest sensor shows.
+# A single error proves nothing. Repeated measurements check the stated noise: here the same pose is
+# measured 300 times, and the standard deviation of the results is compared with the claimed one.
+# Both bars have the same height if the claim is right.
 
 poses = np.array([sensor.measure(pose).pose for _ in range(300)])
 spread = poses.std(axis=0, ddof=1)
@@ -109,9 +111,10 @@ plt.show()
 # %%
 # What does not average out
 # -------------------------
-# Before its first measurement the sensor *teaches* itself the frames of base and platform and the places of the
-# stickers, from pictures of the platform at home. Teaching has an error, too. It is the same in every later frame, so no
-# repetition shows it, and the covariance above does not hold it. It is the second part that a measurement states:
+# Before its first measurement the sensor determines the frames of base and platform and the positions of the stickers,
+# from pictures of the platform at home. This is called *teaching*. The error of teaching is the same in every later
+# frame, so that repeated measurements do not show it, and the covariance above does not contain it. A measurement states
+# it separately:
 
 taught = np.sqrt(np.diag(measured.common_covariance))
 offset = poses.mean(axis=0) - pose

@@ -2,9 +2,10 @@
 From a motion to parameters with intervals
 ==========================================
 
-One experiment: a robot moves along a trajectory that shows its dynamics, the stereo sensor measures
-its platform, a visual servo closes the loop around these measurements, and what was logged is
-turned into masses, inertias, friction and gains, each with an interval.
+This page does one experiment and identifies the robot from it. A robot moves along a trajectory that
+shows its dynamics, the stereo sensor measures its platform, and a visual servo closes the loop
+around these measurements. From the record, masses, inertias, friction and gains are identified,
+each with an interval.
 """
 
 import matplotlib.pyplot as plt
@@ -19,9 +20,9 @@ POSE = ("x", "y", "z", "alpha", "beta", "gamma")
 # %%
 # The experiment
 # --------------
-# A *scenario* holds all that decides an experiment. ``quick`` is the short one that comes with the package: the paper's
-# six-legged robot ``rss6``, ten seconds of motion, 60 frames a second. Here the images are drawn by the renderer that
-# needs no OpenGL.
+# A *scenario* holds everything that decides an experiment. ``quick`` is a short built-in one: the paper's six-legged
+# robot ``rss6``, ten seconds of motion, and 60 frames per second. Here the images are drawn by the renderer that needs
+# no OpenGL.
 
 scenario = identify.load_scenario("quick").with_overrides({"renderer": "analytic"})
 robot = dynamics.load_robot(scenario.robot)
@@ -36,9 +37,9 @@ print(
 )
 
 # %%
-# What was logged: where the platform should be, where the sensor saw it, and the commands to the
-# joints. The servo lags behind the reference. That is as it should be: the parameters are estimated
-# through the closed loop.
+# The record holds the desired poses, the measured poses and the commands to the joints. The servo
+# lags behind the reference. This does no harm, because the parameters are estimated through the
+# closed loop.
 
 time = record["time"]
 figure, panels = plt.subplots(1, 3, figsize=(10, 3.1), layout="constrained")
@@ -64,9 +65,9 @@ plt.show()
 # %%
 # The estimate
 # ------------
-# The estimator gets the record, the geometry of the robot, and a starting guess: the manufacturer's figures, which know
-# nothing of friction. It never sees the truth. A linear fit brings the guess near, then the model's closed loop is
-# fitted to the measured poses.
+# The estimator gets the record, the geometry of the robot and an initial guess, the manufacturer's figures, which have
+# no friction. It never sees the truth. A linear fit improves the guess. Then the closed loop of the model is fitted to
+# the measured poses.
 
 result = identify.identify(record, robot, scenario)
 print(result)
@@ -74,9 +75,9 @@ table = result.to_dataframe()
 table.loc[table["identifiable"], ["unit", "initial", "estimate", "low", "high"]].round(4)
 
 # %%
-# The table shows the parameters that this record identifies. Of the others it says nothing, and
-# they are not reported as numbers: the poses cannot tell them apart. What the poses do show of them
-# are *groups*, weighted sums of parameters, which are estimated as well as if they were parameters:
+# The table shows the parameters that this record identifies. The poses do not determine the others
+# one by one, so that they are not reported as numbers. The poses determine *groups*, weighted sums
+# of parameters, which have estimates and intervals of their own:
 
 groups = result.groups
 sums = [k for k in range(len(groups.names)) if np.count_nonzero(groups.combinations[k]) > 1]
@@ -86,10 +87,10 @@ for k in sums[:6]:
     )
 
 # %%
-# Beside the truth
-# ----------------
-# In a simulation the truth is known. It stands in a group of its own in the record's file, which the estimator never
-# opens. How many of the 95 % intervals hold it?
+# Comparison with the truth
+# -------------------------
+# In a simulation the truth is known. It is in a separate group of the record's file, which the estimator never opens.
+# How many of the 95 % intervals contain it?
 
 truth = robot.parameter_sets[scenario.plant.parameters].vector
 shown = np.flatnonzero(result.identifiable)
@@ -108,30 +109,31 @@ for axes, chosen in zip(panels, (links, ~links), strict=True):
     axes.axhline(0, color="black", lw=1)
     names = [result.names[k] for k in shown[chosen]]
     axes.set_xticks(places, names, rotation=60, ha="right", fontsize="small")
-panels[0].set_ylabel("estimate less truth, 95 % interval [%]")
+panels[0].set_ylabel("estimate minus truth, 95 % interval [%]")
 plt.show()
 
 inside = (low <= truth[shown]) & (truth[shown] <= high)
-print(f"{inside.sum()} of {len(shown)} intervals hold the truth")
+print(f"{inside.sum()} of {len(shown)} intervals contain the truth")
 
 # %%
 # Is the model right?
 # -------------------
-# The residuals say it without knowing the truth: where the model is right, nothing but the sensor's noise is left of
-# them. The first number is what was left, the second what noise alone would leave.
+# The *residuals*, the differences between the measured poses and those of the model, show this without the truth. If
+# the model is right, they contain only the sensor's noise. The first number is the variance of the residuals, and the
+# second is what noise alone would give.
 
 print(f"{result.noise_ratio:.3f} times the stated variance is left; noise alone leaves "
       f"{result.expected_noise_ratio:.3f} ± {result.noise_ratio_std:.3f}")  # fmt: skip
 print("warnings:", *(result.warnings or ["none"]))
 
 # %%
-# On a motion that it never saw
-# -----------------------------
-# The last judge is a motion that played no part in the estimate. ``unseen_errors`` lets the true robot and a model run
-# the same unseen trajectories, and gives the difference of their true poses.
+# Validation
+# ----------
+# Motions that were not used for the estimate validate the model. ``unseen_errors`` runs the true robot and a model on
+# the same validation trajectories, and returns the difference of their true poses.
 
 for who, parameters in (
-    ("starting guess", result.initial),
+    ("initial guess", result.initial),
     ("identified", result.estimate),
 ):
     errors = identify.unseen_errors(parameters, robot, scenario, seed=0)
@@ -143,7 +145,7 @@ for who, parameters in (
     )
 
 # %%
-# The same from the command line, with a report to open in a browser: ``cmmsim run quick``.
+# ``cmmsim run quick`` does the same on the command line, and writes a report to open in a browser.
 
 with xr.open_dataset(record.attrs["path"], group="truth") as true:
     difference = 1e6 * (true["position"] - record["measured_position"])

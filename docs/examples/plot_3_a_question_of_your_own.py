@@ -2,9 +2,9 @@
 A question of your own: does a faster camera know friction better?
 ==================================================================
 
-One experiment answers nothing of the kind: its noise is one draw. A *study* repeats an experiment
-over the values of a factor, each time with noise of its own, and tells the error against the truth
-with its spread.
+This page answers one question by a study. One experiment cannot answer it, because its noise is a
+single draw. A *study* repeats an experiment over the values of a factor, each time with other
+noise. It compares the results with the truth, and shows the errors with their spread.
 
 A study is one TOML file. This one asks how the error of the identified friction depends on the
 frame rate:
@@ -27,8 +27,8 @@ folder = Path(tempfile.mkdtemp()) / "study"
 cmmsim = Path(sys.executable).with_name("cmmsim")
 
 # %%
-# The command runs it on all cores. Each law that the file states is checked, with an interval; a
-# law that too few rows cannot decide is called *undecided*, not proved.
+# The command runs it on all cores. It checks each law that the file states, with an interval. If the
+# rows are too few to decide, the law is called *undecided*.
 
 ran = subprocess.run(
     [cmmsim, "study", "friction_against_frame_rate.toml", "--out", folder],
@@ -39,9 +39,9 @@ ran = subprocess.run(
 print(ran.stdout.replace(str(folder), "FOLDER"))
 
 # %%
-# All rows are in one table, with the unit of a figure at the end of its name. Here is a figure
-# for a paper: the error against the truth of every single experiment, their root mean square, and
-# what the estimator stated of itself, which it can state without knowing the truth.
+# All rows are in one table. The name of each column ends with its unit. The following figure shows
+# the error of every single experiment, the root mean square, and the standard deviation that the
+# estimator states without knowing the truth.
 
 rows = pd.read_parquet(folder / "study.parquet")
 rate = "scenario.timing.frame_rate_hz"
@@ -77,8 +77,8 @@ panels[0].legend(fontsize="small")
 plt.show()
 
 # %%
-# The errors of the six joints' friction err together in one experiment, so single experiments
-# scatter widely; more of them (``--repeats 50``) narrow that down. ``cmmsim study`` has also
+# In one experiment the friction errors of the six joints are correlated, so that single experiments
+# scatter widely. More of them (``--repeats 50``) give a more accurate mean. ``cmmsim study`` has also
 # written ``summary.md`` and ``figures/``.
 
 print(sorted(path.name for path in folder.rglob("*") if path.is_file()))

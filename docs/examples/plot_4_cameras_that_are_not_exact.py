@@ -2,9 +2,10 @@
 Cameras that are not exact
 ==========================
 
-In the pages before, the estimator knew the cameras exactly. No calibration does. Here the true
-cameras are moved by what a calibration may leave unknown, and the estimator is not told. What
-becomes of the poses, and does the covariance know?
+This page shows what the error of a camera calibration does to poses. In the pages before, the
+estimator knew the cameras exactly, which no calibration achieves. Here the true cameras are moved by
+what a calibration may leave unknown, and the estimator is not told. Are the poses still right, and
+does their covariance contain the error?
 """
 
 import matplotlib.pyplot as plt
@@ -16,16 +17,16 @@ import cmmsim
 # %%
 # How well a camera is known
 # --------------------------
-# ``cmmsim calibrate`` states a standard deviation for each camera parameter. Where the axis of a lens meets the image,
-# the principal point, is the one that is found worst. From a dozen sharp rendered pictures it comes out to some 0.03 px.
-# Three cases: exact, as well as that, and three times worse.
+# ``cmmsim calibrate`` states a standard deviation for each camera parameter. The principal point, where the axis of a
+# lens meets the image, is known least well. From a dozen sharp rendered pictures its standard deviation is about 0.03 px.
+# The three cases here are exact, this value, and about three times this value.
 
 known_to = [0.0, 0.03, 0.1]  # px, standard deviation of each principal point
 
 # %%
 # ``move_rig`` moves the true cameras, here their principal points. It is called before the first
-# measurement, so the sensor also teaches itself with the wrong cameras, as a real one would: what
-# is wrong in base and platform alike cancels. The platform then moves along a small closed path.
+# measurement, so that teaching also uses the wrong cameras, as with a real sensor. An error that is
+# the same for base and platform then cancels. The platform moves along a small closed path.
 
 turn = np.linspace(0, 2 * np.pi, 25)
 path = np.stack(
@@ -35,7 +36,7 @@ tilt = 0.03 * np.stack([np.sin(turn), np.sin(2 * turn), np.cos(turn)], axis=1)
 
 
 def run(std_px: float, draw: int) -> dict[str, float]:
-    """Root mean square of the position errors, what was claimed, and the frames lost."""
+    """Root mean square of the errors, claimed standard deviation, and lost frames."""
     sensor = cmmsim.load_sensor("ctrack780", seed=draw, renderer="analytic")
     rng = np.random.default_rng(draw)
     names = ("left.cx_px", "left.cy_px", "right.cx_px", "right.cy_px")
@@ -60,11 +61,11 @@ table = pd.DataFrame([run(std, draw) for std in known_to for draw in range(3)])
 table.set_index(["known to [px]", "rig"]).round(2)
 
 # %%
-# Two things happen, and which of them depends on the rig that is drawn:
+# One of two things happens, depending on the cameras that are drawn:
 #
-# - Where the error lets the rays of both cameras miss each other, the sensor finds its stickers inconsistent, and *loses*
-#   frames, or all of them. A wrong camera is then seen, not believed.
-# - Where it does not, poses are wrong by more than they claim, and nothing says so.
+# - If the rays of both cameras miss each other, the sensor finds its stickers inconsistent and loses some or all frames.
+#   It then reports no wrong pose.
+# - Otherwise the poses are wrong by more than they claim, and nothing says so.
 
 seen = table[table["error [µm]"].notna()]
 figure, axes = plt.subplots(figsize=(6, 3.4), layout="constrained")
@@ -90,7 +91,7 @@ axes.legend()
 plt.show()
 
 # %%
-# So the covariance of a measurement knows the noise of the pixels, and not the cameras. A
-# scenario can tell the estimator how well it knows them: ``rig.known`` takes the covariance of a
-# calibration, and its error, the same in all poses of a run, is then estimated beside the robot's
-# parameters. The tutorial of the same name shows how.
+# The covariance of a measurement contains the noise of the pixels, and not the error of the cameras.
+# A scenario can tell the estimator how well it knows the cameras: ``rig.known`` takes the covariance
+# of a calibration. The camera error, which is the same in all poses of a run, is then estimated
+# beside the robot's parameters. The tutorial of the same name shows how.
