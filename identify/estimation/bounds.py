@@ -33,7 +33,6 @@ from scipy.stats import norm
 from dynamics.inertia import MOMENTS, SMALLEST, physical_inertias
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
-from identify.estimation.bounded_least_squares import Problem
 from identify.estimation.prior import StartingGuess
 
 
@@ -103,23 +102,6 @@ class ParameterBounds:
         """
         multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
         return np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
-
-
-@dataclass(frozen=True)
-class InCoordinates:
-    """Least-squares problem in the coordinates, see `bounded_least_squares.Problem`."""
-
-    problem: Problem
-    bounds: ParameterBounds
-
-    def cost(self, parameters: Array) -> float:
-        """Return the cost at coordinates (p,)."""
-        return self.problem.cost(self.bounds.parameters(parameters))
-
-    def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
-        """Return cost and linearisation at coordinates (p,)."""
-        cost, factor, residual = self.problem.linearise(self.bounds.parameters(parameters))
-        return cost, factor @ self.bounds.matrix, residual
 
 
 def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:

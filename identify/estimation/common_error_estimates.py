@@ -8,7 +8,7 @@ At its optimum z = -(1 + M^T M)^-1 M^T r.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,7 +49,7 @@ def most_likely(run: LoopModel, parameters: Array) -> Array:
     They are in standard deviations beforehand.
     """
     assert run.marginal is not None
-    missed = run.without_common_errors().misses(parameters).ravel() - run.marginal.had
+    missed = replace(run, marginal=None).misses(parameters).ravel() - run.marginal.had
     return most_likely_of(run.marginal.modes, missed)
 
 

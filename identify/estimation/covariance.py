@@ -133,6 +133,7 @@ def estimate_uncertainty(
     shown = [replace(one, rows=one.rows @ units) for one in linear]
     scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
     if misfit.significant:
+        # an error of the model lasts for many frames, whose residuals then are not independent
         model = sum(
             coloured_score_covariance(one.left, one.rows, run.ok)
             for run, one in zip(runs, shown, strict=True)

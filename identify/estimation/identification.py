@@ -11,6 +11,7 @@ from dataclasses import replace
 import xarray as xr
 
 from dynamics import DynamicsError, Robot, load_robot
+from dynamics.closed_loop.drives import DriveName
 from dynamics.closed_loop.start_state import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.base_parameters import structure
@@ -100,16 +101,17 @@ def identify(
     by_servo = all(recorded_law(record) == SERVO for record in records)
     closed_loop = by_servo and settings.method == "closed_loop"
     side = model_side(robot, scenario)
+
+    def problem_under(law: DriveName) -> OutputErrorProblem:
+        return output_error_problem(records, side.with_drive(law), settings)
+
     problem = output_error_problem(records, side, settings)
+    # drives that took torques had no law
     in_loop = not any(run.settings.drives.torques for run in problem.runs)
-    drive = choose_drive(
-        lambda law: output_error_problem(records, side.with_drive(law), settings),
-        side.model,
-        progress,
-        in_loop,
-    )
+    drive = choose_drive(problem_under, side.model, progress, in_loop)
     if drive.asked:
-        problem = output_error_problem(records, side.with_drive(drive.law), settings)
+        problem = problem_under(drive.law)
+    # with the record's seed, so that the same record has the same intervals every time
     rng = mixed_generator(UNCERTAINTY, recorded_seed(records[0]))
     chosen = time.perf_counter()
     warm = linear_warm_start(problem)
@@ -122,6 +124,7 @@ def identify(
     judged = last.linearised()
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
+    # only under the logged commands are the residuals of a right model white
     driven = by_commands.linearised() if closed_loop else judged
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, settings.qr_threshold, solution, uncertainty, explained)
@@ -180,6 +183,7 @@ def output_error_problem(
     """
     robot = side.robot
     groups = structure(robot).rigid_groups
+    # the motion depends on the groups alone, so that no other sensitivity need be integrated
     runs = tuple(replace(identified_model(record, side), groups=groups) for record in records)
     anchor = read_anchor(records[0], robot.layout)
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:

@@ -90,6 +90,7 @@ class Segment:
         pose = chart.pose(coordinates)
         at_rest = np.zeros(count)
         start = None
+        # the run begins in equilibrium, and no other segment does
         if self.first:
             before, latencies = run.commands_before(self.first)
             start = StartState(
@@ -199,6 +200,7 @@ class MultipleShooting:
 
         Raises LoopFailure where a segment does not run.
         """
+        # the states go along with the step that was taken, as the linearisation before has it
         self.states = self._moved(parameters)
         self._at = parameters.copy()
         self._eliminated = []

@@ -6,7 +6,7 @@ loses the frames that the real one lost. Driven by commands, the model's joints 
 commands, so that it feels what the sensor's noise did to the plant.
 
 The residuals are the pose differences of all records, whitened by the sensor's covariance, and one
-row for each thing known beside the poses (`prior`).
+row for each thing known beside the poses: the starting guess and the scale anchor.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from dynamics import DynamicsError
 from identify.arrays import Array, triangular_factor
 from identify.estimation.bounded_least_squares import StopCriteria
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
-from identify.estimation.prior import StartingGuess, prior_residuals
+from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.model.loop_model import LoopModel
 from identify.scenario import Filter
@@ -97,6 +97,7 @@ class OutputErrorProblem:
             for run in self.runs:
                 total += float(np.sum(run.misses(parameters, ahead) ** 2))
         except DynamicsError:
+            # a search steps back from there
             return np.inf
         return total
 
@@ -108,6 +109,7 @@ class OutputErrorProblem:
         known, known_jacobian = self.known(parameters)
         size = len(parameters)
         cost = float(known @ known)
+        # of each record only the triangle is kept, however long it is
         triangle = np.column_stack([known_jacobian, known])
         for run in self.runs:
             residual, shown = run.shown_residuals(parameters)
@@ -124,5 +126,12 @@ class OutputErrorProblem:
         return np.asarray(rows.T @ rows, dtype=float)
 
     def known(self, parameters: Array) -> tuple[Array, Array]:
-        """Return residuals (k,) of what is known beside the poses, and their rows (k, p)."""
-        return prior_residuals(parameters, self.guess, self.anchor)
+        """Return residuals (k,) of what is known beside the poses, and their rows (k, p).
+
+        They are in standard deviations.
+        """
+        guess = self.guess
+        place, measured = self.anchor.row(guess.layout)
+        rows = np.vstack([guess.rows, place])
+        values = np.concatenate([guess.values / guess.std, measured])
+        return rows @ parameters - values, rows

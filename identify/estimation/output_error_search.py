@@ -14,8 +14,8 @@ import numpy as np
 from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.bounded_least_squares import Problem, Solution, StopCriteria, minimise
-from identify.estimation.bounds import InCoordinates
+from identify.estimation.bounded_least_squares import Problem, Solution, minimise
+from identify.estimation.bounds import ParameterBounds
 from identify.estimation.common_error_estimates import most_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
@@ -106,9 +106,46 @@ def search_with_common_errors(
     return Search(problem, solution)
 
 
-def search(problem: OutputErrorProblem, start: Array, advance: Advance) -> Solution:
-    """Minimise one output-error problem from parameters (p,), within its bounds."""
-    return _within_bounds(problem, problem, start, problem.stop, advance)
+@dataclass(frozen=True)
+class InCoordinates:
+    """Least-squares problem in coordinates of bounds, see `bounded_least_squares.Problem`."""
+
+    problem: Problem
+    bounds: ParameterBounds
+
+    def cost(self, parameters: Array) -> float:
+        """Return the cost at coordinates (p,)."""
+        return self.problem.cost(self.bounds.parameters(parameters))
+
+    def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
+        """Return cost and linearisation at coordinates (p,)."""
+        cost, factor, residual = self.problem.linearise(self.bounds.parameters(parameters))
+        return cost, factor @ self.bounds.matrix, residual
+
+
+def search(
+    problem: OutputErrorProblem,
+    start: Array,
+    advance: Advance,
+    shooting: MultipleShooting | None = None,
+) -> Solution:
+    """Minimise one output-error problem from parameters (p,), within its bounds.
+
+    shooting: form of the problem that is minimised in its place. In the end `advance` has counted
+    all iterations that the problem allows.
+    """
+    bounds = problem.bounds
+    found = minimise(
+        InCoordinates(shooting or problem, bounds),
+        bounds.coordinates(start),
+        bounds.lower,
+        np.abs(np.linalg.inv(bounds.matrix)) @ problem.guess.std,
+        problem.stop,
+        lambda i, cost: advance(),
+        ahead=shooting is None,  # the states of shooting follow the steps that are taken
+    )
+    advance(problem.stop.max_iterations - found.iterations)
+    return replace(found, parameters=bounds.parameters(found.parameters))
 
 
 def shoot(problem: OutputErrorProblem, warm: Array, progress: Progress) -> Solution:
@@ -117,15 +154,15 @@ def shoot(problem: OutputErrorProblem, warm: Array, progress: Progress) -> Solut
     It starts from warm start or starting guess. Raises EstimationError if no model runs segment by
     segment, or none that does so runs over the whole records.
     """
-    criteria = replace(problem.stop, cost_tolerance=CLOSE_ENOUGH)
+    loose = replace(problem, stop=replace(problem.stop, cost_tolerance=CLOSE_ENOUGH))
     chains = [segments(run) for run in problem.runs]
     for start in _candidates(problem, warm):
         states = [measured_states(chain, start, problem.low_pass) for chain in chains]
         shooting = MultipleShooting(problem, chains, states)
         if not np.isfinite(shooting.cost(start)):
             continue
-        with progress.stage("multiple shooting", criteria.max_iterations) as advance:
-            solution = _within_bounds(shooting, problem, start, criteria, advance)
+        with progress.stage("multiple shooting", loose.stop.max_iterations) as advance:
+            solution = search(loose, start, advance, shooting)
         if np.isfinite(problem.cost(solution.parameters)):
             return solution
     raise EstimationError(
@@ -140,18 +177,12 @@ def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
     It is None if the model runs with neither.
     """
     first, second = _candidates(problem, warm)
-    ahead = _begins_there(problem)
+    # A search linearises this very problem at just these parameters, unless it is whitened for
+    # common errors first, or has other coordinates.
+    ahead = not problem.physical and not any(run.common.all_names for run in problem.runs)
     costs = [(problem.cost(first, ahead=ahead), first), (problem.cost(second), second)]
     cost, start = min(costs, key=lambda entry: entry[0])
     return start if np.isfinite(cost) else None
-
-
-def _begins_there(problem: OutputErrorProblem) -> bool:
-    """Tell whether a search linearises this very problem at just the parameters that it is given.
-
-    It does not if the problem is whitened for common errors first, or has other coordinates.
-    """
-    return not problem.physical and not any(run.common.all_names for run in problem.runs)
 
 
 def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
@@ -185,31 +216,6 @@ def _with_common_errors(
 
 def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:
     return [problem.bounds.nearest(start) for start in (warm, problem.guess.values)]
-
-
-def _within_bounds(
-    least_squares: Problem,
-    problem: OutputErrorProblem,
-    start: Array,
-    criteria: StopCriteria,
-    advance: Advance,
-) -> Solution:
-    """Search in the coordinates of the bounds, and return the solution in the parameters.
-
-    In the end `advance` has counted all iterations that the criteria allow.
-    """
-    bounds = problem.bounds
-    found = minimise(
-        InCoordinates(least_squares, bounds),
-        bounds.coordinates(start),
-        bounds.lower,
-        np.abs(np.linalg.inv(bounds.matrix)) @ problem.guess.std,
-        criteria,
-        lambda i, cost: advance(),
-        ahead=least_squares is problem,
-    )
-    advance(criteria.max_iterations - found.iterations)
-    return replace(found, parameters=bounds.parameters(found.parameters))
 
 
 def _why(problem: OutputErrorProblem, parameters: Array) -> str:

@@ -1,7 +1,6 @@
-"""Prior: what is known beside the poses, as residuals that join theirs.
+"""Starting guess: each parameter with its standard deviation before the experiment.
 
-It is the scale anchor and the starting guess, each parameter with its standard deviation. That is
-wide, but for parameters of which a scenario's `[identification.prior]` knows more.
+That is wide, but for parameters of which a scenario's `[identification.prior]` knows more.
 """
 
 from collections.abc import Mapping
@@ -15,7 +14,6 @@ from dynamics import Robot
 from dynamics.closed_loop.drives import ABOVE_ZERO, READS, DriveName
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
-from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import check_parameter_set
 from identify.scenario import Model, PriorValue
 from identify.scenario.sections import Identification
@@ -135,16 +133,3 @@ def typical_sizes(layout: ParameterLayout, values: Array, torque: float) -> Arra
 def friction(layout: ParameterLayout) -> NDArray[np.bool_]:
     """Return which parameters (p,) are those of friction."""
     return np.isin(layout.names, layout.coulomb_names + layout.viscous_names)
-
-
-def prior_residuals(
-    parameters: Array, guess: StartingGuess, anchor: ScaleAnchor
-) -> tuple[Array, Array]:
-    """Return residuals (k,) of what is known beside the poses, and their rows (k, p).
-
-    They are in standard deviations.
-    """
-    place, measured = anchor.row(guess.layout)
-    rows = np.vstack([guess.rows, place])
-    values = np.concatenate([guess.values / guess.std, measured])
-    return rows @ parameters - values, rows

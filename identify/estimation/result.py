@@ -217,6 +217,7 @@ class IdentificationResult:
         common = self.common_errors
         anchor = self.scale_anchor
         whiteness = self.whiteness
+        # correlations of the others tell of the starting guess rather than of the record
         identified = np.flatnonzero(self.identifiable)
         correlations = correlation_matrix(self.covariance[np.ix_(identified, identified)])
         pairs = strongest_pairs(correlations, [self.names[k] for k in identified], STRONGEST)

@@ -71,6 +71,7 @@ def measured_anchor(
     the robot.
     """
     if name not in MEASURED_PARAMETER:
+        # nothing is measured here: a load stands with the run that was made under it
         return ScaleAnchor(name)
     spread = default_std(name, layout) if std is None else std
     measured = true[layout.names.index(MEASURED_PARAMETER[name])]

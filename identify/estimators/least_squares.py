@@ -104,6 +104,7 @@ def torque_equations(
     others = slice(layout.dynamic.stop, None)
     matrix = np.zeros((2 * len(columns), columns.shape[1]))
     matrix[: len(columns), dynamic] = columns[:, dynamic]
+    # the balance holds the controller's torque with the opposite sign
     matrix[len(columns) :, others] = -columns[:, others]
     joint = np.nonzero(rows)[1]
     # the torque of a known payload stands on the right side
@@ -215,6 +216,7 @@ def fit_equations(
     The standard deviations, N m or N, come from the residuals of each joint, if weighted, or else
     of all joints. They account for the correlation by the filter.
     """
+    # without weights joints count alike, but dynamics and controller have residuals of their own
     groups = equations.kind if weighted else equations.kind // equations.layout.joints
     # N m or N: a first value, which weighs the starting guess only
     noise = np.full(len(equations.right), 0.1)

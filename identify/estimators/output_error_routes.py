@@ -72,6 +72,7 @@ def warm_start_alone(evidence: Evidence) -> Estimate:
 def _searched(problem: OutputErrorProblem, closed_loop: bool) -> Estimate:
     began = time.perf_counter()
     warm = linear_warm_start(problem)
+    # the last search is the estimator's own, and those before it lead there
     found = list(output_error_searches(problem, warm, closed_loop, SilentProgress()).values())
     seconds = time.perf_counter() - began
     last = found[-1].solution

@@ -98,6 +98,7 @@ def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
         show, does not begin at rest, or is in other units or frames than the robot's.
     """
     check_origin(record, side.robot, side.timing, side.settings.servo)
+    # before the model is made, as nothing can be filtered in a record that is too short
     check_length(record.sizes["time"], side.fewest_frames, side.timing.frame_rate_hz)
     run = _model(record, side)
     check_reference(run.reference, side.timing.frame_rate_hz)
@@ -143,6 +144,7 @@ def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
         payload_std=load_std,
         acted=logged_latencies(record, side.timing),
     )
+    # what poses notice of these errors depends on the noise of the run, which is known by now
     run = replace(run, common=_common_errors(record, side, run))
     return torque_model(run, side.low_pass) if takes_torques(record) else run
 

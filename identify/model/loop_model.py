@@ -112,10 +112,6 @@ class LoopModel:
         had = modes[:, inside] @ self.errors_had[inside]
         return replace(self, marginal=Marginal.of(modes, had))
 
-    def without_common_errors(self) -> "LoopModel":
-        """Return the same run with residuals whitened by the sensor's noise alone."""
-        return replace(self, marginal=None)
-
     def modes(self, parameters: Array) -> Array:
         """Return the shift (N, 6, k) of the measured poses against the model by the common errors.
 
@@ -233,6 +229,7 @@ class LoopModel:
             return simulate_commands(*given, self.logged, sensor, latencies=late)
         if sensitivities:
             return differentiate_servo(*given, sensor, latencies=late, groups=self.groups)
+        # another robot moves, but the servo goes by the one that it knows
         return simulate_servo(*given, sensor, servo_robot=self.robot, latencies=late)
 
     def simulate_repeats(
@@ -281,8 +278,8 @@ class LoopModel:
     def misses(self, parameters: Array, ahead: bool = False) -> Array:
         """Return the whitened residuals model - measurement (n, 6) of the good frames.
 
-        With `ahead` they come from a run with the sensitivities that `residuals` will need. Raises
-        LoopFailure if the model is unstable.
+        With `ahead` they come from a run with the sensitivities that `shown_residuals` will need.
+        Raises LoopFailure if the model is unstable.
         """
         return self.without_common(self._missed(self._latest_run(parameters, sensitivities=ahead)))
 
@@ -309,11 +306,6 @@ class LoopModel:
         """
         return self.misses(parameters)
 
-    def residuals(self, parameters: Array) -> tuple[Array, Array]:
-        """Return `misses` (n, 6), and their Jacobian (n, 6, p)."""
-        missed, shown = self.shown_residuals(parameters)
-        return missed, self.of_all(shown)
-
     def shown_residuals(self, parameters: Array) -> tuple[Array, Array]:
         """Return `misses` (n, 6), and their derivatives (n, 6, k) before `of_all`."""
         missed, shown = self._shown_in_noise(parameters)
@@ -330,7 +322,7 @@ class LoopModel:
         return self.groups.of_all(shown)
 
     def residuals_in_noise(self, parameters: Array) -> tuple[Array, Array]:
-        """Return what `residuals` returns, but whitened by the noise alone."""
+        """Return residuals (n, 6) and their Jacobian (n, 6, p), whitened by the noise alone."""
         missed, shown = self._shown_in_noise(parameters)
         return missed, self.of_all(shown)
 

@@ -103,6 +103,7 @@ class TorqueModel(LoopModel):
                 for fit, (first, last) in zip(fits, self._spans, strict=True)
             ]
         )
+        # no servo is in the loop that would follow the noise
         measured = pose if noise is None else pose + noise
         return replace(fits[0].run, pose=pose, measured=measured, pose_sensitivity=slopes)
 
@@ -159,6 +160,7 @@ class TorqueModel(LoopModel):
         spans = zip(self._spans, self.starts, before, strict=True)
         fits = [self._fitted(values, moved, span, start, near) for span, start, near in spans]
         if robot is None:
+            # one set of fits only: each holds the sensitivities of all its frames
             self._latest.clear()
             self._latest[key] = fits
         return fits

@@ -50,6 +50,7 @@ def check_command_times(record: xr.Dataset, source: str) -> None:
     time = record["time"].values
     unsaid = np.flatnonzero(~(np.isfinite(acted) | np.isnan(acted) & lost))
     early = np.flatnonzero(acted < time - CLOCK_S)
+    # lost frames have written nothing, and stand between those that have
     written = np.flatnonzero(~np.isnan(acted))
     back = written[1:][np.diff(acted[written]) < -CLOCK_S]
     overtaken = (

@@ -138,6 +138,7 @@ def read_table(path: Path, robot: Robot) -> Table:
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield number and cells of each line that is neither empty nor a comment."""
     content = read_bytes(path, f"record {path}", RecordError, LARGEST)
+    # spreadsheets write a mark in front, which utf-8-sig takes away
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

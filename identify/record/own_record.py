@@ -138,6 +138,7 @@ def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
         measured = Measured.model_validate(own)
     except ValidationError as error:
         raise RecordError(f"{path}: [{DESCRIPTION}] {one_line(error, Measured)}") from error
+    # a scenario has a name, which this file need not state
     name = path.stem if is_name(path.stem) else DESCRIPTION
     return SCENARIOS.from_dict({"name": name} | content, str(path), path.parent), measured
 
@@ -208,6 +209,7 @@ def _state_anchor(
 ) -> None:
     """Store with a record what fixes the scale of its parameters."""
     record.attrs["scale_anchor"] = settings.scale_anchor
+    # these two measure no parameter
     if settings.scale_anchor in ("payload", "prior"):
         return
     if measured.anchor_value is None or settings.anchor_std is None:

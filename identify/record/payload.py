@@ -63,6 +63,7 @@ def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array
     load = np.zeros(len(layout.names))
     std = np.zeros(len(layout.names))
     stated = record.attrs
+    # a record that states one figure must state all
     if not any(name in stated or f"{name}_std" in stated for name in ADDED):
         return load, std
     try:

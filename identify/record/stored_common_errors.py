@@ -194,6 +194,7 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
     given = [name for name in (CHANGES, COVARIANCE) if name in record]
     if not given:
         return NONE
+    # one without the other says nothing of the errors
     if len(given) == 1:
         raise RecordError(
             f"the record holds {given[0]} and not {({CHANGES, COVARIANCE} - {*given}).pop()}"

@@ -2,16 +2,13 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
 from dynamics import load_robot
-from identify.arrays import Array
 from identify.estimation import identification
-from identify.estimation.result import IdentificationResult
 from identify.files.atomic import write_files
 from identify.files.dataset import covariance_netcdf, netcdf, parameter_units
 from identify.files.run_folder import (
@@ -61,9 +58,9 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     if seed is not None:
         for name, one in records.items():
             check_planned(run_folder.path / name, one, scenario, trajectories)
-    found = _identified(records, scenario, progress, folder)
+    found = _identified_files(run_folder, records, scenario, seed, progress)
     changed = {} if scenario == planned else scenario_file(run_folder, scenario.to_toml())
-    write_files(changed | _identified_files(run_folder, found, scenario, seed))
+    write_files(changed | found)
 
 
 def identify_own(
@@ -83,66 +80,41 @@ def identify_own(
     for one in contents:
         if known.covariance is not None and GEOMETRY_COVARIANCE not in one:
             store_geometry_covariance(one, known.robot, known.covariance)
-    found = _identified(records, scenario, progress)
+    found = _identified_files(run_folder, records, scenario, None, progress)
     files = scenario_file(run_folder, scenario.to_toml())
     for name, one in records.items():
         files[folder / name] = netcdf(recording.record_groups(one))
-    files |= _identified_files(run_folder, found, scenario, None)
-    write_files(files, parents=True)
-
-
-@dataclass(frozen=True)
-class _Identified:
-    """Records by file, with their identification.
-
-    ``models`` are the poses (N, 6) on the first record of the model before and after, and
-    ``seconds`` is the time that it took.
-    """
-
-    records: Mapping[str, xr.Dataset]
-    result: IdentificationResult
-    models: tuple[Array, Array]
-    seconds: float
-
-    @property
-    def record(self) -> xr.Dataset:
-        """The first record."""
-        return next(iter(self.records.values()))
-
-
-def _identified(
-    records: Mapping[str, xr.Dataset],
-    scenario: Scenario,
-    progress: Progress,
-    folder: Path | None = None,
-) -> _Identified:
-    began = time.perf_counter()
-    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, folder).robot
-    result = identification.identify(list(records.values()), robot, scenario, progress)
-    first = next(iter(records.values()))
-    # The models run with the drive law that was identified.
-    side = model_side(robot, scenario).with_drive(result.drive.law)
-    before, after = (
-        model_on_record(side, values, first) for values in (result.initial, result.estimate)
-    )
-    return _Identified(records, result, (before, after), time.perf_counter() - began)
+    write_files(files | found, parents=True)
 
 
 def _identified_files(
-    run_folder: RunFolder, found: _Identified, scenario: Scenario, seed: int | None
+    run_folder: RunFolder,
+    records: Mapping[str, xr.Dataset],
+    scenario: Scenario,
+    seed: int | None,
+    progress: Progress,
 ) -> dict[Path, bytes]:
-    """Return covariance.nc and result.json, and model.nc for a user's own record.
+    """Identify from records by file; return covariance.nc and result.json.
 
-    Such a record has no seed. `validate`, which otherwise writes model.nc, cannot judge it.
+    A user's own record has no seed, and `validate`, which otherwise writes model.nc, cannot judge
+    it. So model.nc is returned as well.
     """
-    seen = found.record
-    result = found.result
+    began = time.perf_counter()
+    nominal = load_robot(scenario.robot)
+    robot = known_geometry(nominal, scenario.geometry, run_folder.path).robot
+    result = identification.identify(list(records.values()), robot, scenario, progress)
+    seen = next(iter(records.values()))
+    # The models run with the drive law that was identified.
+    side = model_side(robot, scenario).with_drive(result.drive.law)
+    before, after = (
+        model_on_record(side, values, seen) for values in (result.initial, result.estimate)
+    )
+    ended = time.perf_counter()
     measured = recording.poses(seen, "measured")
     ok = seen["measured_ok"].values.astype(bool)
-    before, after = found.models
     covariance = result.whole_covariance
     # By these digests later stages see whether the result belongs to its files.
-    made_of = {name: digest(one) for name, one in found.records.items()} | {
+    made_of = {name: digest(one) for name, one in records.items()} | {
         "covariance.nc": digest(covariance)
     }
     files = {}
@@ -163,7 +135,7 @@ def _identified_files(
             ENTRY: made_of,
             "seconds": {
                 "record": seen.attrs.get("record_seconds"),
-                "identify": found.seconds,
+                "identify": ended - began,
                 **seconds,
             },
             DRIFT: read_finding(seen),

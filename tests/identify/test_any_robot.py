@@ -206,7 +206,7 @@ def test_friction_and_gains_are_identified_with_intervals_and_unseen_motion_is_p
     scenario, truth = quick(), truth_of(robot)
     record, _ = run_plant(scenario, seed=1, robot=robot)
     run = problem_of([record], scenario, robot).runs[0]
-    residuals, slopes = run.residuals(truth)
+    residuals, slopes = run.residuals_in_noise(truth)
     forbidden = list(FORBIDDEN.get(robot.name, ()))
     unmoved = run.whiten(run.model_poses(truth) * 0 + robot.home_pose - run.measured)[:, forbidden]
     np.testing.assert_allclose(residuals[:, forbidden], unmoved, atol=1e-9)

@@ -14,12 +14,12 @@ from dynamics.inertia import UnphysicalInertiaError, physical_inertias
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.bounds import (
     BoundedEstimate,
-    InCoordinates,
     ParameterBounds,
     bounded_estimate,
     parameter_bounds,
 )
 from identify.estimation.identification import identify
+from identify.estimation.output_error_search import InCoordinates
 from identify.scenario import load_scenario
 from tests.identify.synthetic import (
     LAYOUT,
