@@ -3,6 +3,7 @@
 import os
 import stat
 import tempfile
+import time
 import warnings
 from contextlib import suppress
 from functools import cache
@@ -13,6 +14,13 @@ import platformdirs
 
 # bytes at the beginning of a file: the digest of its key and of what follows
 DIGEST = sha256().digest_size
+
+DAY = 24 * 3600.0  # s
+UNUSED = 60 * DAY
+"""Age in seconds since its last use from which on a file is removed."""
+
+KINDS = (".kernel", ".robot", ".half")
+"""Endings of the files that this cache makes; one written by halves ends in the last."""
 
 AT_ONCE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags with which files are opened. A pipe would otherwise wait for somebody to write into it."""
@@ -38,6 +46,7 @@ def load_object(name: str) -> bytes | None:
         with os.fdopen(os.open(path, AT_ONCE), "rb") as file:
             if not _ours_alone(os.fstat(file.fileno())):
                 return None
+            _note_use(path, os.fstat(file.fileno()).st_mtime)
             digest = file.read(DIGEST)
             content = file.read()
     except OSError:
@@ -58,10 +67,11 @@ def save_object(name: str, content: bytes) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         # readable and writable by its owner alone
-        descriptor, beside = tempfile.mkstemp(dir=path.parent)
+        descriptor, beside = tempfile.mkstemp(dir=path.parent, suffix=".half")
         with os.fdopen(descriptor, "wb") as file:
             file.write(sha256(name.encode() + content).digest() + content)
         Path(beside).replace(path)
+        _remove_unused(path.parent)
     except OSError as error:
         if beside is not None:
             Path(beside).unlink(missing_ok=True)
@@ -73,6 +83,29 @@ def save_object(name: str, content: bytes) -> None:
             "process compiles anew"
         )
         _warn_once(f"{text}; name another folder with CMMSIM_CACHE")
+
+
+def _note_use(path: Path, changed: float) -> None:
+    """Note once a day, in a file's time of change, that the file is used.
+
+    Many disks keep no time of access.
+    """
+    if time.time() - changed > DAY:
+        with suppress(OSError):  # a cache that cannot be written to serves as well
+            os.utime(path)
+
+
+@cache
+def _remove_unused(folder: Path) -> None:
+    """Remove what no process used for two months: code of sources that have changed since.
+
+    Done once by a process.
+    """
+    oldest = time.time() - UNUSED
+    with suppress(OSError):  # what is left is removed by the next process
+        for path in folder.iterdir():
+            if path.suffix in KINDS and path.lstat().st_mtime < oldest:
+                path.unlink(missing_ok=True)
 
 
 @cache

@@ -5,6 +5,7 @@ only.
 import os
 import subprocess
 import sys
+import time
 import warnings
 from fractions import Fraction
 from inspect import getsource
@@ -15,10 +16,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from dynamics.compiled import object_files
 from dynamics.compiled.kernel import call_columns, entry, kernel, plain
 from dynamics.compiled.lanes import NAMES, ColumnFunction, PartedFunction, graph_of, lane_groups
 from dynamics.compiled.machine_code import compiled_functions
-from dynamics.compiled.object_files import CacheWarning, load_object
+from dynamics.compiled.object_files import CacheWarning, load_object, save_object
 from dynamics.compiled.operations import CALLED, MEANING
 from dynamics.compiled.quick_arithmetic import quickened
 from dynamics.errors import DynamicsError
@@ -355,6 +357,26 @@ def test_no_bit_of_a_file_may_change_nor_its_owner(own_cache, monkeypatch):
     assert load_object(file.name)
     monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
     assert load_object(file.name) is None
+
+
+def test_code_that_was_not_used_for_two_months_is_removed_and_other_files_stay(
+    own_cache, monkeypatch
+):
+    monkeypatch.setattr(object_files, "_remove_unused", object_files._remove_unused.__wrapped__)
+    save_object("used.robot", b"used")
+    for name in ("unused.robot", "broken_off.half", "new.kernel", "notes.txt"):
+        (own_cache / name).write_bytes(b"")
+    long_ago = time.time() - 61 * 24 * 3600
+    for name in ("used.robot", "unused.robot", "broken_off.half", "notes.txt"):
+        os.utime(own_cache / name, (long_ago, long_ago))
+    assert load_object("used.robot") == b"used"
+    save_object("next.robot", b"next")
+    assert {path.name for path in own_cache.iterdir()} == {
+        "used.robot",
+        "new.kernel",
+        "notes.txt",
+        "next.robot",
+    }
 
 
 def _twice(x):
