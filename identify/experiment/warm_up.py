@@ -19,7 +19,7 @@ from identify.errors import IdentifyError, WriteError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop, SensorPlan
 from identify.progress import Progress, SilentProgress
-from identify.runtime import cores, deaf_offspring
+from identify.runtime import cores, deaf_offspring, end_with_parent
 
 WARM_UP_FRAMES = 12
 """Number of frames of the motion on which everything is compiled."""
@@ -110,6 +110,7 @@ def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
 
 def _do(task: Task, unkept: "SimpleQueue[str]") -> None:
     """Do a task, and put what it warns of code that cannot be kept into a queue."""
+    end_with_parent()
     with warnings.catch_warnings(record=True) as given:
         task()
     for one in given:
