@@ -1,40 +1,38 @@
-"""Synthetic stereo optical CMM: renders a posed platform with stickers, and measures its pose from
-the images.
+"""Synthetic stereo optical CMM: it renders a posed platform with stickers and measures its pose.
 
 Sensor
-    load_sensor(name_or_path, seed) -> Sensor   built in (`built_in_names() -> list[str]`), or a
-    TOML file Sensor.measure(pose) -> Measurement         pose (6,) m, rad and its covariance (6,6);
-    teaches itself on first use Sensor.measure_many(poses) -> MeasuredPoses many poses at once, with
-    images or, "statistical", without Sensor.capture(pose) -> StereoFrame         both whole images
-    Sensor.teach() -> Taught                    what other sensors with the same cameras and bodies
-    may take over require_opengl()                            raises OpenGLMissingError where
-    pyrender cannot draw
+    load_sensor(name_or_path, seed)    -> Sensor, built in (`built_in_names()`) or of a TOML file
+    Sensor.measure(pose)               -> Measurement: pose (6,) m, rad and its covariance (6, 6)
+    Sensor.measure_many(poses)         -> MeasuredPoses of many frames at once
+    Sensor.capture(pose)               -> StereoFrame: both whole images
+    Sensor.teach()                     -> Taught, for sensors with the same cameras and bodies
+    require_opengl()                   raises OpenGLMissingError where pyrender cannot draw
 
 Images from elsewhere
-    measure_frame(StereoFrame(left, right), sensor.estimator) -> Measurement    of a PoseEstimator
-    Tracker(sensor.estimator).measure(images) -> Measurement                    frame after frame
+    measure_frame(StereoFrame(left, right), sensor.estimator)  -> Measurement
+    Tracker(sensor.estimator).measure(images)                  -> Measurement, frame after frame
 
 Cameras that drift
-    Sensor.drift_rig({"right.cx_px": 0.1}, frames)      the true rig moves in each run, and the
-    estimator is not told Sensor.watch_drift() -> DriftWatch                  its `finding` says
-    when the rig ceased to fit, and how it moved
+    Sensor.drift_rig({"right.cx_px": 0.1}, frames)  moves the true rig; the estimator is not told
+    Sensor.watch_drift()                            -> DriftWatch, whose `finding` names a change
 
 Geometry
-    pose_to_transform(pose), transform_to_pose(transform)       poses (6,) and transforms (4,4)
-    PinholeCamera, StereoRig                                    cameras with lenses, as in
-    `sensor.rig` rod(length, radius), rod_transform(start, end)              a body that may hide
-    stickers, and its place
+    pose_to_transform(pose), transform_to_pose(transform)  poses (6,) and transforms (4, 4)
+    PinholeCamera, StereoRig                               cameras with lenses, as in `sensor.rig`
+    rod(length, radius), rod_transform(start, end)         a body that may hide stickers
 
 Faults of images
-    FaultGenerator(sensor.estimator).draw(kind, pose, rng) -> Fault
-    FaultyImages(images, fault, noise, rng)                     images with a fault laid over them
-    fault_bodies()                                              the boxes that stand in the way
+    FaultGenerator(sensor.estimator).draw(kind, pose, rng)  -> Fault
+    FaultyImages(images, fault, noise, rng)                 images with a fault laid over them
+    fault_bodies()                                          the boxes that stand in the way
 
-Every error that a user can cause is a CmmError, but for OpenGLMissingError. Rooms of their own:
-`cmmsim.calibration` and `cmmsim.acceptance`; `cmmsim.allowed_plugins` for detectors and renderers
-of a user's own, which files may name once `allow_plugin(module)` allows it. Everything else is
-private. Names are imported on first use: the command `cmmsim`
-begins in this package and must not wait for OpenCV and OpenGL.
+Every error that a user can cause is a CmmError, except OpenGLMissingError. The packages
+`cmmsim.calibration` and `cmmsim.acceptance` are public as well. `cmmsim.allowed_plugins` finds
+detectors and renderers of a user's own, once `allow_plugin(module)` allows them. Everything else is
+private.
+
+Names are imported on first use: the command `cmmsim` begins in this package and must not wait for
+OpenCV and OpenGL.
 """
 
 from importlib import import_module
@@ -111,7 +109,8 @@ __all__ = [
     *_HOME,
 ]
 
-if not TYPE_CHECKING:  # a type checker would take every name for one that this knows
+# A type checker would take every name for one that this module knows.
+if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
         if name not in _HOME:

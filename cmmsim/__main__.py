@@ -1,8 +1,7 @@
-"""The command `cmmsim` from its first line on, and a warning where another `identify` stands in the
-place of ours.
+"""The command `cmmsim`, and a warning where another package `identify` stands in the place of ours.
 
-A package on PyPI has the same name. Nothing of ours in `identify` can be found then, so that the
-command begins here, the one place of this package that knows of what stands on it.
+A package on PyPI has the same name. Where it is installed, nothing of our `identify` can be found.
+The command therefore begins here, in the only module of this package that knows `identify`.
 """
 
 import sys
@@ -12,12 +11,12 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+# Text that our `identify/__init__.py` contains, and no other.
 OURS = "IdentifyError"
-"""What our `identify/__init__.py` names, and no other."""
 
 
 def foreign_identify() -> str:
-    """One line that names another package `identify` and says what to do; empty where ours is
+    """Return one line that names another package `identify` and says what to do; empty if ours is
     found.
     """
     spec = find_spec("identify")
@@ -30,27 +29,26 @@ def foreign_identify() -> str:
         else "no `identify`"
     )
     return (
-        f"{where}; install cmmsim alone into a virtual environment of its own (a PyPI package "
-        "has the same name)"
+        f"{where}; install cmmsim alone into a virtual environment of its own (a PyPI package has "
+        "the same name)"
     )
 
 
 @cache
 def warn_of_foreign_identify() -> None:
-    """Say so once, when the first name of this package is imported."""
+    """Warn of a foreign `identify`, once, when the first name of this package is imported."""
     said = foreign_identify()
     if said:
         warnings.warn(said, stacklevel=4)
 
 
 def main() -> None:
-    """Run the command; one line and exit status 1 where its package is another one."""
+    """Run the command, or exit with status 1 and one line where `identify` is another package."""
     said = foreign_identify()
     if said:
         sys.exit(f"error: {said}")
-    import_module(
-        "identify.__main__"
-    ).main()  # by name: nothing else in this package may lean on identify
+    # By name: nothing else in this package may depend on identify.
+    import_module("identify.__main__").main()
 
 
 if __name__ == "__main__":

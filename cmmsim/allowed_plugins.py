@@ -1,13 +1,12 @@
-"""Parts by name: built-in detectors and renderers, and parts of a user's own as ``module:name``.
+"""Detectors and renderers by name: built-in ones, and a user's own as ``module:name``.
 
 A built-in part is a file of its own and one line here. Its module is imported when its name is
 first used.
 
-A part of a user's own is named by its module and its name in there wherever a built-in name would
-do. The module's folder must be on PYTHONPATH, so that other processes find it. Scenarios, sensor
-files and studies are passed around, so a name in them runs code only where its module is allowed:
-by ``--plugin my_module`` on the command line, in the environment variable ``CMMSIM_PLUGINS``, or by
-`allow_plugin`.
+``module:name`` may stand wherever a built-in name may. The module's folder must be on PYTHONPATH,
+so that other processes find it. Scenarios, sensor files and studies are passed around, so a name in
+them runs code only where its module is allowed: by ``--plugin my_module`` on the command line, in
+the environment variable ``CMMSIM_PLUGINS``, or by `allow_plugin`.
 """
 
 import importlib
@@ -79,14 +78,15 @@ def is_own(name: str) -> bool:
 
 
 def own_part(option: str, name: str) -> Any:
-    """Part of a user's own, which ``module:name`` names; option: what it is to be, in messages.
+    """Import the part of a user's own that ``module:name`` names.
 
-    Raises CmmError: the module is not allowed to run (with what to type), it cannot be imported,
-    or it has no such part.
+    ``option`` is what the part is to be, for messages. Raises CmmError if the module is not allowed
+    to run, cannot be imported, or has no such part.
     """
     module, _, attribute = name.partition(":")
     if not (_is_module(module) and attribute.isidentifier()):
         raise CmmError(f"{option} {name!r} is no module:name, such as my_module:my_part")
+    # The dots keep "my_module" from allowing "my_module_2".
     if not any(f"{module}.".startswith(f"{allowed}.") for allowed in allowed_plugins()):
         raise CmmError(
             f"{option} {name!r} is code of the module {module}, which is not allowed to run; where "
@@ -104,11 +104,11 @@ def own_part(option: str, name: str) -> Any:
 
 @dataclass(frozen=True)
 class Telling:
-    """Function of a user's own that tells in one line what it raises, and where in its file.
+    """A function of a user's own whose errors are told in one line, with their place in its file.
 
-    part: how it is called in messages; refusal: what is raised then; known: errors that pass as
-    they are; check: is given part, what the function returned and what the function was given, and
-    raises what is known where it is not what was to be returned.
+    ``part`` is its name in messages. ``refusal`` is the class of the error that is raised, and
+    ``known`` are classes that pass unchanged. ``check`` is called with the part's name, the result
+    and the arguments; it raises a known error where the result is not what it should be.
     """
 
     part: str
@@ -118,7 +118,7 @@ class Telling:
     check: Callable[..., None] | None = None
 
     def __call__(self, *given: Any) -> Any:
-        """Return what the function returns. Raises `refusal`, or what is known."""
+        """Return what the function returns. Raises `refusal`, or a known error."""
         try:
             found = self.function(*given)
             if self.check is not None:
@@ -127,6 +127,8 @@ class Telling:
         except self.known:
             raise
         except Exception as error:
+            # The first entry is the call above; the second, where there is one, is in the user's
+            # file.
             at = traceback.extract_tb(error.__traceback__)[:2][-1]
             place = f"{Path(at.filename).name}, line {at.lineno}"
             said = f"{self.part} raised {type(error).__name__}: {error} ({place})"
@@ -134,12 +136,14 @@ class Telling:
 
 
 def require_detector(name: str) -> str:
-    """Name of a built-in detector, or ``module:name``. Raises UnknownOptionError."""
+    """Return the name of a built-in detector or ``module:name``. Raises UnknownOptionError."""
     return _required("detector", name, DETECTORS)
 
 
 def require_renderer(name: str) -> str:
-    """Name of a built-in renderer, "auto", or ``module:name``. Raises UnknownOptionError."""
+    """Return the name of a built-in renderer, "auto" or ``module:name``. Raises
+    UnknownOptionError.
+    """
     return _required("renderer", name, {AUTO: "", **RENDERERS})
 
 
@@ -150,14 +154,15 @@ def find(
     kind: type[K],
     check: Callable[..., None],
 ) -> K:
-    """Detector or Renderer, as ``kind`` says, of a built-in name or of ``module:name``.
+    """Return the Detector or Renderer, as ``kind`` says, of a built-in name or of ``module:name``.
 
-    A part of a user's own is a ready one of the kind; a function; or a class that is made without
-    arguments and called like the function. A function becomes one of the kind, with those of the
-    kind's figures that it carries itself. check: of what it returns, see `Telling`.
+    A user's own part may be an instance of the kind, a function, or a class that is made without
+    arguments and called like the function. A function becomes an instance of the kind, with those
+    of the kind's figures that it carries as attributes. ``check`` judges its results, see
+    `Telling`.
 
-    Raises UnknownOptionError with the valid names, and CmmError where there is nothing to be
-    called, or a module that is not allowed to run.
+    Raises UnknownOptionError with the valid names. Raises CmmError for a part that cannot be
+    called, and for a module that is not allowed to run.
     """
     name = _required(option, name, built_in)
     if name in built_in:
@@ -166,6 +171,7 @@ def find(
     part = own_part(option, name)
     said = f"{option} {name!r}"
     found = Telling(said, part, CmmError)() if isinstance(part, type) else part
+    # The kind's fields are its name, what it does, and figures with defaults.
     _, does, *figures = fields(kind)
     function = getattr(found, does.name) if isinstance(found, kind) else found
     if not callable(function):
@@ -176,7 +182,7 @@ def find(
 
 
 def _figure(part: str, owner: Any, field: Any) -> Any:
-    """Figure that a function of a user's own carries, such as its ``bias_px``."""
+    """Return a figure that a user's own function carries, such as its ``bias_px``."""
     value = getattr(owner, field.name)
     kind = type(field.default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1000:

@@ -1,6 +1,6 @@
 """Checks of arguments and of entries in TOML files.
 
-They are taken as meant, or refused with what was got and wanted.
+A value is taken as it was meant, or refused by a message that says what was got and what is wanted.
 """
 
 import operator
@@ -17,13 +17,18 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cmmsim.errors import CmmError, ShapeError
 
-SHOWN_CHARACTERS = 120  # of what is refused
-LARGEST = 500_000  # bytes of a file; far beyond what a person writes, and read within seconds
-DEEPEST = 16  # tables and lists in each other, and parts of a dotted key
+# Characters of a refused value that a message shows.
+SHOWN_CHARACTERS = 120
+# Bytes of a file: far more than a person writes, and still read within seconds.
+LARGEST = 500_000
+# Nesting of tables and lists, and parts of a dotted key.
+DEEPEST = 16
 TOO_DEEP = f"keys, tables or lists more than {DEEPEST} deep"
-NAME = r"^\w[\w .+-]*$"  # names of sensors, which become names of files
-LONGEST_NAME = 60  # so that its file has at most 255 bytes in any script
-MOST_COMPLAINTS = 8  # of one file
+# Names of sensors become names of files. A file's name has at most 255 bytes, in any script.
+NAME = r"^\w[\w .+-]*$"
+LONGEST_NAME = 60
+# Complaints about one file that a message lists.
+MOST_COMPLAINTS = 8
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 _TEXTS = re.compile(
     r"""
@@ -39,8 +44,10 @@ _TEXTS = re.compile(
 
 
 def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDArray[np.float64]:
-    """Values as an array of that shape. Raises ShapeError, which says what is ``wanted``, for
-    anything else than finite real numbers."""
+    """Return values as an array of that shape.
+
+    Raises ShapeError, which says what is ``wanted``, for anything but finite real numbers.
+    """
     try:
         found = np.asarray(values)
         numbers = found.astype(float) if found.dtype.kind in "fiubO" else None
@@ -58,14 +65,14 @@ def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDAr
 
 
 def require_kind(value: object, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raise CmmError, which says what is ``wanted``, unless the value is an instance of a class."""
+    """Raise CmmError, which says what is ``wanted``, unless a value is an instance of ``kind``."""
     if not isinstance(value, kind):
         raise CmmError(f"{wanted}, got {_shown(value)} of type {type(value).__name__}")
 
 
 class Section(BaseModel):
-    """A section of a TOML file: no other keys than its fields, finite numbers, not changed once it
-    is made.
+    """Section of a TOML file: unknown keys and infinite numbers are refused, and entries are
+    frozen.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -75,7 +82,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def check_name(name: str) -> str:
-    """The name. Raises ValueError for one that could not be that of a file."""
+    """Return the name. Raises ValueError if it cannot be that of a file."""
     if re.fullmatch(NAME, name) and len(name) <= LONGEST_NAME:
         return name
     raise ValueError(
@@ -85,9 +92,10 @@ def check_name(name: str) -> str:
 
 
 def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
-    """Text of a file; source: how messages call it, as "board file x".
+    """Return the text of a file.
 
-    Raises ``refusal`` where it cannot be read, or has more than `LARGEST` bytes.
+    ``source`` is how messages call it, such as "board file x". Raises ``refusal`` if the file
+    cannot be read, or has more than `LARGEST` bytes.
     """
     try:
         place = Path(path)
@@ -105,10 +113,10 @@ def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
 
 
 def parsed(text: str, source: str, refusal: type[CmmError]) -> dict[str, Any]:
-    """Content of a text, the caller's to change.
+    """Return the content of a TOML text, which the caller may change.
 
-    Raises ``refusal``: the text is no TOML, or has tables and lists deeper than `DEEPEST`, integers
-    beyond 64 bits, or control characters in names and strings.
+    Raises ``refusal`` if the text is not TOML, nests tables deeper than `DEEPEST`, or holds
+    integers beyond 64 bits or control characters.
     """
     try:
         return deepcopy(_parsed(text))
@@ -121,8 +129,9 @@ def parsed(text: str, source: str, refusal: type[CmmError]) -> dict[str, Any]:
 
 
 def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[CmmError]) -> M:
-    """Content as a model. Raises ``refusal`` with all that is wrong, and with the valid names of an
-    unknown key.
+    """Return a content as a model.
+
+    Raises ``refusal``, which lists what is wrong, with the valid names beside an unknown key.
     """
     try:
         return model.model_validate(content)
@@ -136,10 +145,14 @@ def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[
 
 @lru_cache(maxsize=8)
 def _parsed(text: str) -> dict[str, Any]:
-    """Kept, for a study reads the same sensor for every row, and parsing it is an eighth of the
-    row's time. Raises ValueError, which says what the text has."""
+    """Parse a TOML text. Raises ValueError, which says what the text has.
+
+    The result is cached: a study reads the same sensor for every row, and parsing it takes an
+    eighth of the row's time.
+    """
     bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
-    if any(key.count(".") >= DEEPEST for key in bare):  # tomllib takes their square in time
+    # tomllib takes time with the square of a dotted key's parts, so they are counted beforehand.
+    if any(key.count(".") >= DEEPEST for key in bare):
         raise ValueError(TOO_DEEP)
     try:
         content = tomllib.loads(text)
@@ -153,7 +166,7 @@ def _parsed(text: str) -> dict[str, Any]:
 
 
 def _fault(content: dict[str, Any]) -> str:
-    """First thing in a content that is beyond the limits, in words; empty where there is none."""
+    """Describe the first value that is beyond the limits; empty where there is none."""
     left: list[tuple[Any, int]] = [(content, 0)]
     while left:
         value, depth = left.pop()
@@ -174,7 +187,7 @@ def _fault(content: dict[str, Any]) -> str:
 
 
 def _explain(error: Any, model: type[BaseModel]) -> str:
-    """One problem in words."""
+    """Describe one problem that pydantic found."""
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
         return (
@@ -197,13 +210,13 @@ def _valid_keys(section: tuple[Any, ...], model: Any) -> list[str]:
 
 
 def _shown(values: object) -> str:
-    """Values on one line, cut where they are many."""
+    """Show values on one line, shortened to `SHOWN_CHARACTERS`."""
     text = " ".join(str(values).split())
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
 
 
 def checked_seed(seed: int) -> int:
-    """The seed. Raises CmmError unless it is a whole number from 0 on."""
+    """Return the seed. Raises CmmError unless it is a whole number from 0 on."""
     try:
         number = operator.index(seed)
     except TypeError:

@@ -1,7 +1,7 @@
 """Compilation of kernels by numba, once, into a cache on disk.
 
-Modules called ``*kernels`` hold functions of numbers and arrays only. They are imported where they
-are first needed, because importing numba takes time.
+Modules called ``*kernels`` hold functions of numbers and arrays only. Importing numba takes time,
+so they are imported where they are first needed.
 """
 
 from __future__ import annotations
@@ -21,21 +21,24 @@ from numba import njit
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher
 
-Array = np.ndarray  # of any type and shape, which each docstring states
+# An array of any type and shape: the docstrings state them.
+Array = np.ndarray
 F = TypeVar("F", bound=Callable)
 
 
+# Write permission for anybody but the owner.
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
-"""Rights of others than the owner to write."""
 
 
 class CompilationWarning(UserWarning):
-    """Kernels are compiled in every process, which takes time."""
+    """Kernels are compiled anew in every process, which takes time."""
 
 
 def compiled(function: F) -> Dispatcher[F]:
-    """Compile a kernel on its first call, or load it from the cache: beside the source, else in the
-    user's cache. Code that somebody else may have put there is not loaded.
+    """Compile a kernel on its first call, or load it from the cache.
+
+    The cache lies beside the source, or else in the user's cache folder. Code that somebody else
+    may have put there is not loaded.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     try:
@@ -56,9 +59,9 @@ def compiled(function: F) -> Dispatcher[F]:
 
 
 def _save_closed(save: Callable[..., None], folder: str, *what: object) -> None:
-    """Have numba write files that others cannot write to, whatever the user's umask.
+    """Let numba write files that only the owner may change, whatever the umask is.
 
-    Where they cannot be written, a warning says so.
+    A warning says so where they cannot be written.
     """
     umask = os.umask(OTHERS)
     os.umask(umask | OTHERS)
@@ -77,17 +80,18 @@ def _save_closed(save: Callable[..., None], folder: str, *what: object) -> None:
 
 @lru_cache
 def _ours_alone(folder: Path, source: Path) -> bool:
-    """Tell whether nobody can have written what is in a folder of compiled code but the user, root,
-    and who may change the source as well; one warning where somebody can.
+    """Tell whether only trusted users can have written into a folder of compiled code.
 
-    What is the user's own is closed to others first: folders stay, and files that were open go.
-    Windows keeps others out by itself.
+    Trusted are the user, root, and whoever may change the source as well. The user's own folders
+    are first closed to others; the user's own files that were open are removed. One warning says so
+    where somebody else remains. Windows keeps others out by itself.
     """
     if not hasattr(os, "geteuid"):
         return True
     trusted = {0, os.geteuid()}
     if folder.parent == source:
-        if source.stat().st_mode & OTHERS:  # who writes there can change the source itself
+        # Whoever may write there can change the source itself.
+        if source.stat().st_mode & OTHERS:
             return True
         trusted.add(source.stat().st_uid)
     for place in (folder.parent, folder):
@@ -112,12 +116,12 @@ def _ours_alone(folder: Path, source: Path) -> bool:
 
 
 def _is_open(path: Path) -> bool:
-    """Tell whether others than its owner may write to a file or into a folder."""
+    """Tell whether anybody but its owner may write to a file or into a folder."""
     return bool(path.stat(follow_symlinks=path.is_dir()).st_mode & OTHERS)
 
 
 @lru_cache(maxsize=1)
 def _stamp() -> str:
-    """Changes when any kernel changes."""
+    """Return a digest of all kernels, which changes when any of them changes."""
     files = sorted(Path(__file__).parent.rglob("*kernels.py"))
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()

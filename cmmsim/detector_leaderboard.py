@@ -1,9 +1,8 @@
-"""Leaderboard of the detectors: their errors on drawn images of tilted discs, beside the Cramer-Rao
-bound.
+"""Leaderboard of the detectors: their errors on images of tilted discs, and the Cramer-Rao bound.
 
-The discs are drawn exactly, their centres lie anywhere within a pixel and are known, and the camera
-adds its noise. Error means distance from the ellipse's centre; eccentricity is another matter. Two
-ways that OpenCV offers run along.
+The discs are drawn exactly. Their centres are known and lie anywhere within a pixel, and the camera
+adds its noise. An error is the distance from the ellipse's centre; eccentricity is another matter.
+Two ways that OpenCV offers are compared as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,11 +30,13 @@ from cmmsim.geometry.pose import Array, apply, pose_to_transform
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.sensor import Sensor
 
-TOGETHER = 100  # discs drawn at once
+# Discs that are drawn at once.
+TOGETHER = 100
 SMALLEST_RADIUS_PX = 1.0
 LARGEST_RADIUS_PX = 50.0
 LARGEST_TILT_DEG = 80.0
-FREE_PX = 3  # px between a disc's rim and the side of the part that is looked at
+# Pixels between a disc's rim and the side of the part that is looked at.
+FREE_PX = 3
 RESAMPLES = 1000
 CONFIDENCE = 0.95
 # The leaderboard is about accuracy. Where the noise is below half a grey value, the rounding of
@@ -48,9 +49,9 @@ LIMITS = FitLimits(largest_misfit=np.inf)
 class Condition:
     """Conditions under which a disc is seen.
 
-    radius_px: long half axis of the disc's image; tilt rad between its normal and the view; noise:
-    standard deviation of a grey value half-way up the edge, as a share of the contrast; psf_px:
-    sigma of the Gaussian point spread.
+    ``radius_px`` is the long half axis of the disc's image. ``tilt`` is the angle between its
+    normal and the view, rad. ``noise`` is the standard deviation of a grey value half-way up the
+    edge, as a share of the contrast. ``psf_px`` is the sigma of the Gaussian point spread.
     """
 
     radius_px: float
@@ -65,9 +66,9 @@ class Condition:
             and 0.0 <= self.tilt <= np.radians(LARGEST_TILT_DEG)
         ):
             raise CmmError(
-                f"a disc of {self} cannot be drawn: radius must be at least "
-                f"{SMALLEST_RADIUS_PX:g} px, tilt "
-                f"0 to {LARGEST_TILT_DEG:g} degrees, noise above 0 and below 100 % of the contrast"
+                f"a disc of {self} cannot be drawn: radius must be at least {SMALLEST_RADIUS_PX:g} "
+                f"px, tilt 0 to {LARGEST_TILT_DEG:g} degrees, noise above 0 and below 100 % of the "
+                "contrast"
             )
         if not (self.psf_px == 0.0 or NARROWEST_PSF <= self.psf_px < np.inf):
             raise CmmError(
@@ -76,22 +77,21 @@ class Condition:
         if self.radius_px > LARGEST_RADIUS_PX:
             raise CmmError(
                 f"radius {self.radius_px:g} px is more than {LARGEST_RADIUS_PX:g} px: time and "
-                "memory grow "
-                "with its square, and errors only fall with its root"
+                "memory grow with its square, and errors only fall with its root"
             )
 
     def __str__(self) -> str:
         return (
             f"radius {self.radius_px:g} px, tilt {np.degrees(self.tilt):g} degrees, noise "
-            f"{100.0 * self.noise:g} % "
-            f"of the contrast and psf {self.psf_px:g} px"
+            f"{100.0 * self.noise:g} % of the contrast and psf {self.psf_px:g} px"
         )
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Properties that all conditions share: the camera's noise, levels 0 to 1 of disc and ground,
-    and the focal length, px.
+    """Properties that all conditions share.
+
+    They are the camera's noise, the levels 0 to 1 of disc and ground, and the focal length in px.
     """
 
     noise: CameraNoise
@@ -106,7 +106,7 @@ class Scene:
 
     @property
     def contrast(self) -> float:
-        """Grey values from the ground to the disc."""
+        """Step in grey values from the ground to the disc."""
         return float(self.noise.mean_grey(np.array(self.bright))) - self.ground
 
     @property
@@ -118,8 +118,7 @@ class Scene:
         )
 
     def with_noise(self, share: float) -> "Scene":
-        """The same camera with more or less light and less or more gain, so that ``edge_noise`` is
-        ``share``.
+        """Return the scene with as much light and gain that ``edge_noise`` becomes ``share``.
 
         Raises CmmError where rounding alone makes more noise.
         """
@@ -146,9 +145,9 @@ class Scene:
 
 
 def scene_of(file: SensorFile) -> Scene:
-    """The scene of a sensor file's stickers and left camera."""
+    """Return the scene of a sensor file's stickers and left camera."""
     rig = rig_from_file(file.rig)[0]
-    # a pattern is no noise: it stays from image to image
+    # A fixed pattern stays from image to image: it is no noise.
     noise = replace(Sensor(file).noise, prnu=0.0, dsnu=0.0)
     return Scene(
         noise,
@@ -159,9 +158,10 @@ def scene_of(file: SensorFile) -> Scene:
 
 
 def working_point(file: SensorFile) -> Condition:
-    """Condition of the platform's stickers at home, in the left camera of a sensor file.
+    """Return the condition of the platform's stickers at home, in the left camera of a sensor file.
 
-    It has the median radius and tilt of those that face the camera, and the camera's own noise.
+    Radius and tilt are the medians of the stickers that face the camera; the noise is the camera's
+    own.
     """
     rig, camera_from_base = rig_from_file(file.rig)
     body = marked_body("platform", file.platform)
@@ -184,8 +184,11 @@ def working_point(file: SensorFile) -> Condition:
 def random_ellipses(
     condition: Condition, focal_px: float, size: int, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Images of discs tilted towards random sides, centres (count,2) anywhere in a window's middle
-    pixel, shapes (count,2,2), px."""
+    """Return ellipses of discs that are tilted towards random sides.
+
+    Their centres (count, 2) lie anywhere in the middle pixel of a window; shapes are (count, 2, 2)
+    px.
+    """
     middle = 0.5 * (size - 1)
     camera = PinholeCamera(focal_px, middle, middle, size, size)
     away = rng.uniform(-0.5, 0.5, (count, 2))
@@ -193,20 +196,21 @@ def random_ellipses(
     sine = np.sin(condition.tilt)
     cosine = np.cos(condition.tilt)
     normals = np.column_stack([sine * np.cos(side), sine * np.sin(side), np.full(count, -cosine)])
-    places = np.column_stack([away / focal_px, np.ones(count)])  # at depth 1: only ratios matter
+    # The discs lie at depth 1: only ratios of lengths matter.
+    places = np.column_stack([away / focal_px, np.ones(count)])
     return project_discs(camera, places, normals, np.full(count, condition.radius_px / focal_px))
 
 
 def draw_discs(
     scene: Scene, centres: Array, shapes: Array, size: int, psf_px: float
 ) -> NDArray[np.float32]:
-    """Radiance (n, size, size) of bright discs on dark ground."""
+    """Draw the radiance (n, size, size) of bright discs on dark ground."""
     shares = [coverage(*part, size, psf_px)[0] for part in _parts(centres, shapes)]
     return (scene.dark + (scene.bright - scene.dark) * np.concatenate(shares)).astype(np.float32)
 
 
 def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
-    """Centres and shapes of discs that are drawn at once."""
+    """Split discs into those that are drawn at once."""
     return [
         (centres[k : k + TOGETHER], shapes[k : k + TOGETHER])
         for k in range(0, len(centres), TOGETHER)
@@ -215,9 +219,12 @@ def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
 
 @dataclass(frozen=True)
 class Score:
-    """One detector under one condition, px and per axis: Cramer-Rao bound; rms error of the windows
-    it did not lose, its ratio to the bound with a 95 % interval; bias: rms error without noise;
-    lost: share of windows."""
+    """Score of one detector under one condition, in px and per axis.
+
+    ``rms_px`` is the error of the windows that it did not lose. ``ratio`` is that error over the
+    Cramer-Rao bound ``bound_px``, with a 95 % interval. ``bias_px`` is the rms error without noise,
+    and ``lost`` the share of lost windows.
+    """
 
     detector: str
     condition: Condition
@@ -238,16 +245,15 @@ def compete(
     detectors: Sequence[Detector] | None = None,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Score]:
-    """Scores of all detectors (built-in ones and OpenCV's by default) under all conditions, with
-    ``draws`` discs each.
+    """Return the scores of all detectors under all conditions, with ``draws`` discs each.
 
-    ``report(done, total)`` is called after each condition. Raises CmmError.
+    The detectors are the built-in ones and OpenCV's unless others are given. ``report(done,
+    total)`` is called after each condition. Raises CmmError for impossible conditions, before any
+    work is done.
     """
     if draws < 2:
         raise CmmError(f"a leaderboard needs at least 2 draws, got {draws}")
-    scenes = [
-        scene.with_noise(condition.noise) for condition in conditions
-    ]  # refused before any work is done
+    scenes = [scene.with_noise(condition.noise) for condition in conditions]
     scores: list[Score] = []
     chosen = detectors or [*map(find_detector, DETECTORS), *PEERS]
     for k, (lit, condition) in enumerate(zip(scenes, conditions, strict=True)):
@@ -302,7 +308,7 @@ def _round(
 
 
 def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: int) -> Array:
-    """Smallest mean squared error (n,) of each centre per axis, px²."""
+    """Return the smallest mean squared error (n,) of each centre per axis, px²."""
     parts = [
         cramer_rao_bound(*part, size, scene.contrast, scene.ground, scene.noise, psf_px)
         for part in _parts(centres, shapes)
@@ -313,7 +319,7 @@ def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: in
 def _ratio_interval(
     squared: Array, bounds: Array, rng: np.random.Generator
 ) -> tuple[float, float, float]:
-    """Root of mean squared error over mean bound, and the limits of its 95 % bootstrap interval."""
+    """Return the root of mean squared error over mean bound, and its 95 % bootstrap interval."""
     if len(squared) == 0:
         return np.inf, np.inf, np.inf
     drawn = rng.integers(len(squared), size=(RESAMPLES, len(squared)))
@@ -323,15 +329,16 @@ def _ratio_interval(
 
 
 def _root_mean(squared: Array) -> float:
-    """Root of the mean; infinite for a detector that found nothing."""
+    """Return the root of the mean; infinite for a detector that found nothing."""
     return float(np.sqrt(squared.mean())) if squared.size else np.inf
 
 
 def _by_window(
     find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], given: SpotWindows
 ) -> DetectedCentres:
-    """Centres that a function finds in each window alone, in 8 bit; OpenCV states no covariance, so
-    it is zero.
+    """Return the centres that a function finds in each 8-bit window alone.
+
+    OpenCV states no covariance, so it is zero.
     """
     grey = np.rint(given.windows * (255.0 / given.noise.white_level)).astype(np.uint8)
     found = [find(window) for window in grey]
@@ -341,8 +348,9 @@ def _by_window(
 
 
 def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
-    """``cv2.SimpleBlobDetector`` with its filters of shape switched off: the largest bright
-    blob."""
+    """Return the largest bright blob of ``cv2.SimpleBlobDetector``, with its filters of shape
+    off.
+    """
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
     settings.blobColor = 255
@@ -358,7 +366,7 @@ def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
 
 
 def detect_by_contour(given: SpotWindows) -> DetectedCentres:
-    """``cv2.fitEllipse`` on the longest contour of the window thresholded after Otsu."""
+    """Return ``cv2.fitEllipse`` of the longest contour, after Otsu's threshold."""
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:
         mask = cv2.threshold(window, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[1]

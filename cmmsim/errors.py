@@ -1,24 +1,37 @@
-"""Errors of the sensor package. Each message carries the evidence: the value, the limit, the valid
-names.
+"""Errors of the sensor package.
+
+Each message carries the evidence: the value, the limit, the valid names.
 """
 
 from collections.abc import Iterable
 
+# Characters of a message.
 LONGEST = 4000
-"""Characters of a message."""
 
 
 class CmmError(ValueError):
-    """Base class of everything this package refuses. The message is one line."""
+    """Base class of everything that this package refuses.
+
+    The message is one line.
+
+    Examples
+    --------
+    >>> import cmmsim
+    >>> try:
+    ...     cmmsim.load_sensor("ctrack")
+    ... except cmmsim.CmmError as error:
+    ...     print(type(error).__name__)
+    UnknownSensorError
+    """
 
     def __str__(self) -> str:
-        """Message on one line of at most `LONGEST` characters, whatever a file had in it."""
+        """Return the message on one line of at most `LONGEST` characters, whatever a file held."""
         text = " ".join(super().__str__().splitlines())
         return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 class UnknownSensorError(CmmError):
-    """A sensor name is neither built in nor a file."""
+    """A sensor's name is neither built in nor a file."""
 
     def __init__(self, name: str, valid_names: Iterable[str]) -> None:
         super().__init__(
@@ -32,8 +45,9 @@ class SensorFileError(CmmError):
 
 
 class UnknownOptionError(CmmError):
-    """An option has a value that is not on its list; ``own``: where ``module:name`` of a user's own
-    would do, too.
+    """An option has a value that is not on its list.
+
+    ``own`` says that ``module:name`` of a user's own is valid as well.
     """
 
     def __init__(
@@ -44,7 +58,7 @@ class UnknownOptionError(CmmError):
 
 
 class UnknownBodyError(CmmError):
-    """An obstacle was posed that has never been registered."""
+    """An obstacle was posed that was never registered."""
 
     def __init__(self, name: str, valid_names: Iterable[str]) -> None:
         names = ", ".join(sorted(valid_names)) or "none registered: call add_bodies first"
@@ -56,13 +70,14 @@ class ShapeError(CmmError):
 
 
 class LostError(CmmError):
-    """The stickers in the images do not determine a pose; the message becomes the measurement's
-    reason.
+    """The stickers in the images do not determine a pose.
+
+    The message becomes the measurement's reason.
     """
 
 
 class TeachingError(CmmError):
-    """The stickers could not be taught; the message says at which step."""
+    """The stickers could not be taught; the message names the step."""
 
 
 class OpenGLMissingError(RuntimeError):
@@ -77,11 +92,8 @@ class OpenGLMissingError(RuntimeError):
 
 
 class CalibrationError(CmmError):
-    """Images, board or poses from which no calibration can be made; the message says which and how
-    to go on.
-    """
+    """Images, board or poses allow no calibration; the message says which, and how to go on."""
 
 
 class AcceptanceError(CmmError):
-    """A volume that is not seen, lines that break a rule, or an artefact that cannot be
-    measured."""
+    """A volume is not seen, lines break a rule, or an artefact cannot be measured."""

@@ -2,7 +2,7 @@
 
 Marks are opaque discs and plates, added light, and whole images of one level. They are laid over
 grey values that already hold noise. A pixel of which a mark hides the share s keeps (1 - s) of what
-it showed, gets s of the mark's light, and as much noise as makes its variance that of its new mean.
+it showed and gets s of the mark's light. Noise is added until its variance is that of its new mean.
 """
 
 from __future__ import annotations
@@ -20,27 +20,30 @@ from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, Windows, readable
 
-FAINTEST = 1e-4  # radiance below which added light is not drawn
+# Radiance below which added light is not drawn.
+FAINTEST = 1e-4
 
 
 class Mark(Protocol):
-    """Something in one image: ``side`` 0 left, 1 right."""
+    """Mark in one image."""
 
     @property
     def side(self) -> int:
-        """0 left, 1 right."""
+        """Image of the mark: 0 left, 1 right."""
 
     def box(self) -> tuple[float, float, float, float]:
-        """First x, y and last x, y that the mark reaches, px of the image."""
+        """Return the first x, y and the last x, y that the mark reaches, px of the image."""
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
-        """Share hidden (h, w), 0 to 1, and light added (h, w), as radiance, of the part that begins
-        at pixel ``corner`` (x, y)."""
+        """Return the share hidden (h, w), 0 to 1, and the radiance added (h, w).
+
+        They are those of the part of the image that begins at pixel ``corner`` (x, y).
+        """
 
 
 @dataclass(frozen=True)
 class DiscMark:
-    """An opaque ellipse: centre (2,) px, shape A (2,2) px, symmetric, radiance 0 to 1."""
+    """Opaque ellipse with a centre (2,) px, a symmetric shape A (2, 2) px and a radiance 0 to 1."""
 
     side: int
     centre: Array
@@ -61,8 +64,9 @@ class DiscMark:
 
 @dataclass(frozen=True)
 class PlateMark:
-    """An opaque rectangle with softly sampled edges: centre (2,) px, half sides (2,) px, angle rad,
-    radiance 0 to 1.
+    """Opaque rectangle with softly sampled edges.
+
+    It has a centre (2,) px, half sides (2,) px, an angle in rad and a radiance 0 to 1.
     """
 
     side: int
@@ -92,9 +96,12 @@ class PlateMark:
 
 @dataclass(frozen=True)
 class GlintMark:
-    """Added light: a Gaussian core of ``peak`` radiance (above 1 saturates) and ``core`` px, and a
-    straight tail of ``tail_peak`` that decays over ``tail`` px in direction ``angle``, rad, and is
-    as wide as the core."""
+    """Added light: a Gaussian core and a straight tail.
+
+    ``peak`` is the core's radiance, which saturates above 1, and ``core`` its width in px. The tail
+    begins with ``tail_peak``, decays over ``tail`` px in the direction ``angle``, rad, and is as
+    wide as the core.
+    """
 
     side: int
     centre: Array
@@ -125,8 +132,9 @@ class GlintMark:
 
 @dataclass(frozen=True)
 class FillMark:
-    """The whole image shows one radiance: 0 a dropped frame or a covered lens, above 1 a saturated
-    one.
+    """Whole image of one radiance.
+
+    A dropped frame or a covered lens shows 0, a saturated frame more than 1.
     """
 
     side: int
@@ -144,8 +152,9 @@ class FillMark:
 def paint(
     grey: Array, corner: NDArray[np.int_], mark: Mark, noise: CameraNoise, rng: np.random.Generator
 ) -> None:
-    """Lay a mark over the grey values (h, w), float, of the part of an image that begins at pixel
-    ``corner`` (x, y).
+    """Lay a mark over the grey values (h, w), float, of a part of an image.
+
+    The part begins at pixel ``corner`` (x, y).
     """
     first_x, first_y, last_x, last_y = mark.box()
     height, width = grey.shape
@@ -166,14 +175,14 @@ def paint(
 
 
 def _box(centre: Array, reach: Array | float) -> tuple[float, float, float, float]:
-    """First x, y and last x, y, ``reach`` px around a centre (2,)."""
+    """Return the first x, y and the last x, y within ``reach`` px around a centre (2,)."""
     return (*(centre - reach), *(centre + reach))
 
 
 def _offsets(
     centre: Array, corner: NDArray[np.int_], shape: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """Distances along x (1, w) and y (h, 1) of a part's pixels from a centre."""
+    """Return the distances along x (1, w) and y (h, 1) of a part's pixels from a centre."""
     x = corner[0] + np.arange(shape[1]) - centre[0]
     y = corner[1] + np.arange(shape[0]) - centre[1]
     return x[None, :], y[:, None]
@@ -181,8 +190,17 @@ def _offsets(
 
 @dataclass(frozen=True)
 class Fault:
-    """kind: its name; marks: laid over the images; swapped: left image for right; obstacles: bodies
-    of ``fault_bodies`` that stand before the platform, name -> base_from_body (4,4)."""
+    """Fault of a stereo frame.
+
+    ``marks`` are laid over the images, and ``swapped`` takes the left image for the right one.
+    ``obstacles`` are bodies of ``fault_bodies`` that stand before the platform, base_from_body (4,
+    4) by name.
+
+    Examples
+    --------
+    >>> Fault("one_camera_dark", marks=(FillMark(0, 0.0),))
+    Fault('one_camera_dark', 1 marks, 0 obstacles)
+    """
 
     kind: str
     marks: tuple[Mark, ...] = ()
@@ -194,10 +212,34 @@ class Fault:
 
 
 class FaultyImages:
-    """Images with a fault laid over them, a StereoFrame's or such as ``sensor.look`` returns; reads
-    like those.
+    """Images with a fault laid over them, which are read like the images themselves.
 
-    Raises CmmError for arguments of another kind.
+    Parameters
+    ----------
+    images : StereoFrame or images of ``sensor.look``
+        Images without the fault.
+    fault : Fault
+        Fault that is laid over them.
+    noise : CameraNoise
+        Noise of the camera, such as ``sensor.noise``.
+    rng : numpy.random.Generator
+        Source of the marks' noise.
+
+    Raises
+    ------
+    CmmError
+        If an argument is of another kind.
+
+    Examples
+    --------
+    >>> from cmmsim.radiometry.noise import CameraNoise
+    >>> grey = np.full((60, 80), 90, dtype=np.uint8)
+    >>> covered = Fault("one_camera_dark", marks=(FillMark(0, 0.0),))
+    >>> noise = CameraNoise(2e4, 0.01, 10.0, 3e4, 0.0)
+    >>> images = FaultyImages(StereoFrame(grey, grey), covered, noise, np.random.default_rng(0))
+    >>> seen = images.full()
+    >>> bool(seen.left.max() < 20), int(seen.right.max())
+    (True, 90)
     """
 
     def __init__(
@@ -219,7 +261,7 @@ class FaultyImages:
         self._rng = rng
 
     def full(self) -> StereoFrame:
-        """Both whole images."""
+        """Return both whole images."""
         frame = self._images.full()
         sides = (frame.right, frame.left) if self._fault.swapped else (frame.left, frame.right)
         origin = np.zeros((1, 2), dtype=int)
@@ -228,17 +270,16 @@ class FaultyImages:
         )
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x,
-        y).
+        """Return the grey values (2, n, size, size) of windows.
+
+        Their first pixels are ``corners`` (2, n, 2) as (x, y).
         """
         order = slice(None, None, -1) if self._fault.swapped else slice(None)
         windows = self._images.windows(corners[order], size)[order]
         return np.stack([self._spoilt(side, windows[side], corners[side]) for side in range(2)])
 
     def _spoilt(self, side: int, images: NDArray, corners: NDArray[np.int_]) -> NDArray:
-        """Images (n, h, w) of one camera, with first pixels (n, 2), after its marks were laid over
-        them.
-        """
+        """Return images (n, h, w) of one camera, with first pixels (n, 2), under its marks."""
         marks = [m for m in self._fault.marks if m.side == side]
         if not marks:
             return images

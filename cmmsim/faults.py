@@ -1,13 +1,15 @@
-"""Faults of stereo images, drawn at random: what a measurement has to survive or to refuse.
+"""Faults of stereo images, drawn at random: a measurement has to survive or to refuse them.
 
-    faults = cmmsim.FaultGenerator(sensor.estimator) fault = faults.draw("false_discs", pose,
-    np.random.default_rng(1)) tracker = cmmsim.Tracker(sensor.estimator)
-    tracker.measure(cmmsim.FaultyImages(sensor.look(pose), fault, sensor.noise,
-    np.random.default_rng(2)))
+    faults = cmmsim.FaultGenerator(sensor.estimator)
+    fault = faults.draw("false_discs", pose, np.random.default_rng(1))
+    rng = np.random.default_rng(2)
+    images = cmmsim.FaultyImages(sensor.look(pose), fault, sensor.noise, rng)
+    cmmsim.Tracker(sensor.estimator).measure(images)
 
 Faults are laid over grey values, so they can be laid over pictures from anywhere. Only bodies that
-hide stickers from both cameras consistently have to be drawn with the scene:
-``sensor.add_bodies(fault_bodies())`` once, then ``sensor.look(pose, obstacles=fault.obstacles)``.
+hide stickers from both cameras consistently have to be drawn with the scene: register them by
+``sensor.add_bodies(fault_bodies())`` once, then call ``sensor.look(pose,
+obstacles=fault.obstacles)``.
 """
 
 from __future__ import annotations
@@ -25,9 +27,11 @@ from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, checked_pose, invert, pose_to_transform
 from cmmsim.measuring.pose_estimator import PoseEstimator
 
-BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
+# Sides of the boxes that hide stickers, m.
+BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)
 FEW = 4
-KINDS = (  # each is drawn by the method of its name, as marks or as a whole
+# Each kind is drawn by the method of its name, as marks or as a whole fault.
+KINDS = (
     *(
         "hidden",
         "half_hidden",
@@ -64,7 +68,24 @@ def fault_bodies() -> dict[str, trimesh.Trimesh]:
 
 
 class FaultGenerator:
-    """Draws faults where an estimator's stickers are; ``kinds`` are the names."""
+    """Generator of faults where an estimator's stickers are.
+
+    Parameters
+    ----------
+    estimator : PoseEstimator
+        Estimator of the images, such as ``sensor.estimator``.
+
+    Raises
+    ------
+    CmmError
+        If the estimator is of another kind.
+
+    Examples
+    --------
+    >>> faults = FaultGenerator(sensor.estimator)
+    >>> faults.draw("one_camera_dark", sensor.home, np.random.default_rng(1))
+    Fault('one_camera_dark', 1 marks, 0 obstacles)
+    """
 
     def __init__(self, estimator: PoseEstimator) -> None:
         require_kind(
@@ -79,19 +100,45 @@ class FaultGenerator:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """hidden: stickers covered in one or both images; half_hidden: cut by a straight edge;
-        obstacles: bodies stand before the platform; one_camera_dark, one_camera_covered;
-        false_discs: discs like stickers in single images; false_points: discs in both images where
-        one point in space would show; glint: saturated light with a tail on or beside stickers;
-        merging: discs that touch stickers; swapped: left for right; black, saturated: whole frames;
-        several: two or three of those at once that leave something to measure."""
+        """Names of the kinds of faults.
+
+        ======================  ========================================================== hidden
+        stickers covered in one or both images half_hidden             stickers cut by a straight
+        edge obstacles               bodies before the platform one_camera_dark         a black
+        image one_camera_covered      an image of one level false_discs             discs like
+        stickers in single images false_points            discs in both images, where one point in
+        space would show glint                   saturated light with a tail, on or beside stickers
+        merging                 discs that touch stickers swapped                 the left image
+        taken for the right one black, saturated        whole frames several                 two or
+        three faults at once that leave something to measure ======================
+        ==========================================================
+        """
         return KINDS
 
     def draw(self, kind: str, pose: ArrayLike, rng: np.random.Generator) -> Fault:
-        """A fault of that kind for the platform at a pose (6,).
+        """Draw a fault of a kind for the platform at a pose.
 
-        Raises UnknownOptionError with the valid kinds, ShapeError for what is no pose, CmmError for
-        no generator.
+        Parameters
+        ----------
+        kind : str
+            One of ``kinds``.
+        pose : array_like, shape (6,)
+            Pose of the platform, m and rad.
+        rng : numpy.random.Generator
+            Source of chance.
+
+        Returns
+        -------
+        Fault
+
+        Raises
+        ------
+        UnknownOptionError
+            If there is no such kind.
+        ShapeError
+            If the pose is not six finite numbers.
+        CmmError
+            If ``rng`` is no generator.
         """
         if kind not in KINDS:
             raise UnknownOptionError("fault", kind, KINDS)
@@ -104,8 +151,9 @@ class FaultGenerator:
     def _outlines(
         self, pose: Array, stickers: slice = slice(None), off: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Ellipses of n stickers moved by ``off`` (3,) m: centres (2, n, 2) and shapes (2, n, 2,
-        2), px.
+        """Return the ellipses of n stickers that are moved by ``off`` (3,) m.
+
+        Centres are (2, n, 2) and shapes (2, n, 2, 2), px.
         """
         camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
         places = self._taught.platform_places[stickers] + off
@@ -113,8 +161,9 @@ class FaultGenerator:
         return sticker_outlines(self._rig, camera_from_platform, places, normals, self._radius)
 
     def _some(self, rng: np.random.Generator, most: int | None = None) -> NDArray[np.int_]:
-        """Random stickers: as often as not up to FEW of them, else up to all; never more than
-        ``most``.
+        """Choose random stickers, at most ``most``.
+
+        As often as not they are up to FEW, otherwise up to all.
         """
         count = len(self._taught.platform_places)
         largest = min(most or count, FEW if rng.random() < 0.5 else count, count)
@@ -125,15 +174,15 @@ class FaultGenerator:
         sides = _one_or_both(rng)
         for k in self._some(rng):
             for side in sides:
-                # holds the ellipse at any angle
+                # The larger singular value of the shape: the plate holds the ellipse at any angle.
                 half = np.linalg.norm(shapes[side, k], 2) + rng.uniform(1.0, 12.0, 2)
                 yield PlateMark(
                     side, centres[side, k], half, rng.uniform(0.0, np.pi), DARK_RADIANCE
                 )
 
     def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """The edge stands anywhere between a sticker's nearest and farthest rim, often close to the
-        nearest one.
+        """Hide stickers behind an edge between their nearest and farthest rim, often close to the
+        nearest.
         """
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
@@ -163,7 +212,7 @@ class FaultGenerator:
         return Fault("obstacles", obstacles=places)
 
     def _right_eye(self) -> Array:
-        """Place (3,) of the right camera in the base frame."""
+        """Return the place (3,) of the right camera in the base frame."""
         return apply(self._taught.base_from_camera, invert(self._rig.right_from_left)[:3, 3])
 
     def _one_camera_dark(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
@@ -173,7 +222,7 @@ class FaultGenerator:
         yield FillMark(int(rng.integers(2)), rng.uniform(0.0, 1.0))
 
     def _false_discs(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Among the stickers, on them or near them."""
+        """Lay discs among the stickers, on them or near them."""
         centres, shapes = self._outlines(pose)
         for _ in range(rng.integers(1, 31)):
             side = int(rng.integers(2))
@@ -183,9 +232,7 @@ class FaultGenerator:
             yield DiscMark(side, centre, rng.uniform(0.7, 1.4) * shape, _radiance(rng))
 
     def _false_points(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Discs in space, on the platform's planes or somewhere around; they hide what is behind
-        them.
-        """
+        """Lay discs in space, on the platform's planes or around; they hide what is behind them."""
         for _ in range(rng.integers(1, 21)):
             k = rng.integers(len(self._taught.platform_places))
             off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)
@@ -195,7 +242,7 @@ class FaultGenerator:
                 yield DiscMark(side, centres[side, 0], shapes[side, 0], radiance)
 
     def _glint(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Glint of one surface.
+        """Add the glint of one surface.
 
         Both cameras see it near the same sticker, in unlike directions and strengths.
         """
@@ -212,7 +259,7 @@ class FaultGenerator:
                 yield GlintMark(side, centre, peak, core, tail_peak, tail, rng.uniform(0.0, np.pi))
 
     def _merging(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """The discs' rims overlap, touch, or leave a small gap."""
+        """Lay discs whose rims overlap the stickers' rims, touch them, or leave a small gap."""
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
         for k in self._some(rng):
@@ -253,12 +300,12 @@ class FaultGenerator:
 
 
 def _one_or_both(rng: np.random.Generator) -> tuple[int, ...]:
-    """The left image, the right one, or, as often as not, both."""
+    """Choose the left image, the right one, or, as often as not, both."""
     return ((0,), (1,), (0, 1), (0, 1))[rng.integers(4)]
 
 
 def _radiance(rng: np.random.Generator) -> float:
-    """Radiance of a sticker, or another bright one."""
+    """Choose the radiance of a sticker, or another bright one."""
     return STICKER_RADIANCE if rng.random() < 0.5 else float(rng.uniform(0.3, 1.3))
 
 

@@ -1,4 +1,4 @@
-"""Sensors by the name or the path of a sensor file."""
+"""Loading of sensors by the name or the path of a sensor file."""
 
 from __future__ import annotations
 

@@ -1,10 +1,15 @@
-"""Many frames at once: drawn, read and measured in blocks, on all cores."""
+"""Many frames at once: drawn, read and measured in blocks, on all cores.
+
+Windows are read, ellipses fitted and stickers triangulated as those of one exposure with all the
+stickers; each exposure is then solved for itself.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -16,76 +21,128 @@ from cmmsim.geometry.pose import Array, invert, transforms_of
 from cmmsim.imaging.analytic import ANALYTIC
 from cmmsim.imaging.renderer import Renderer
 from cmmsim.imaging.stereo_camera import VirtualStereoCamera
-from cmmsim.measuring.measured_poses import ManySeen, measure_exposures
-from cmmsim.measuring.measurement import Measurement, lost_measurement
+from cmmsim.measuring.frame_solver import SolvedFrames, solve_frames
+from cmmsim.measuring.measurement import MeasuredPoses, Measurement, lost_measurement
+from cmmsim.measuring.observation import ManyExposures
 from cmmsim.measuring.pose_estimator import PoseEstimator
 from cmmsim.without_images.drawn_stickers import StatisticalStereoCamera
 
 T = TypeVar("T")
 R = TypeVar("R")
-BLOCK = 32  # frames that are drawn and measured together
-
-Frames = tuple[
-    PoseEstimator, Array, Array, Array, Sequence[np.random.Generator], Mapping[str, Array]
-]
-"""What ``measure_frames`` takes beside the camera."""
+# Frames that are drawn and measured together.
+BLOCK = 32
 
 
-def measure_frames(
-    camera: VirtualStereoCamera,
-    estimator: PoseEstimator,
-    poses: Array,
-    rates: Array,
-    near: Array,
-    rngs: Sequence[np.random.Generator],
-    obstacles: Mapping[str, Array],
-) -> Iterator[ManySeen]:
-    """Exposures of the platform at poses (N,6) in motion at rates (N,6), each with the noise of its
-    own stream, measured by stickers that are looked for near poses (N,6), by a movement that is
-    known: block after block of frames.
+@dataclass(frozen=True)
+class Frames:
+    """Frames of a platform at poses (N, 6) in motion at rates (N, 6), each with its own noise.
 
-    How many threads share the blocks changes nothing in the result.
+    Stickers are looked for ``near`` poses (N, 6). Obstacles stand still at base_from_body (4, 4).
     """
-    expected = expected_at(estimator, near)
+
+    estimator: PoseEstimator
+    poses: Array
+    rates: Array
+    near: Array
+    rngs: Sequence[np.random.Generator]
+    obstacles: Mapping[str, Array]
+
+    @property
+    def expected(self) -> Array:
+        """Expected camera_from_platform (N, 4, 4)."""
+        camera_from_base = invert(self.estimator.taught.base_from_camera)
+        return np.asarray(camera_from_base @ transforms_of(self.near))
+
+
+def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[ManySeen]:
+    """Measure frames block by block; their movement is taken for known.
+
+    The number of threads that share the blocks changes nothing in the result.
+    """
+    estimator = frames.estimator
+    poses = frames.poses
+    rates = frames.rates
+    rngs = frames.rngs
+    expected = frames.expected
     half = 0.5 * camera.exposure * rates
+    # The true movement is laid onto the expected pose.
     back = expected @ invert(transforms_of(poses))
     first = back @ transforms_of(poses - half)
     last = back @ transforms_of(poses + half)
     parts = [slice(start, start + BLOCK) for start in range(0, len(poses), BLOCK)]
 
     def block(part: slice) -> ManySeen:
-        images = camera.look_many(poses[part], rngs[part], obstacles, rates[part])
+        images = camera.look_many(poses[part], rngs[part], frames.obstacles, rates[part])
         return measure_exposures(estimator, images, expected[part], (first[part], last[part]))
 
     return on_all_cores(block, parts, camera.formation.renderer)
 
 
-def measure_without_images(
-    camera: StatisticalStereoCamera,
-    estimator: PoseEstimator,
-    poses: Array,
-    rates: Array,
-    near: Array,
-    rngs: Sequence[np.random.Generator],
-    obstacles: Mapping[str, Array],
-) -> list[Measurement]:
-    """As ``measure_frames`` of cameras that draw nothing, one by one."""
+def measure_without_images(camera: StatisticalStereoCamera, frames: Frames) -> list[Measurement]:
+    """Measure as ``measure_frames`` with cameras that draw nothing, one by one."""
     found = []
-    for pose, rate, expected, rng in zip(
-        poses, rates, expected_at(estimator, near), rngs, strict=True
-    ):
+    rows = zip(frames.poses, frames.rates, frames.expected, frames.rngs, strict=True)
+    for pose, rate, expected, rng in rows:
         try:
-            found.append(
-                estimator.measure(camera.look(pose, rng, obstacles, pose_rate=rate), expected)[0]
-            )
+            seen = camera.look(pose, rng, frames.obstacles, pose_rate=rate)
+            found.append(frames.estimator.measure(seen, expected)[0])
         except LostError as error:
             found.append(lost_measurement(str(error)))
     return found
 
 
+@dataclass(frozen=True)
+class ManySeen:
+    """N exposures, measured together: their poses, and the measurement of each.
+
+    ``solved`` holds the stickers of all of them. ``others`` are the measurements, by number, of
+    exposures that are lost, or whose poses are made by another method than registration.
+    """
+
+    estimator: PoseEstimator
+    found: MeasuredPoses
+    solved: SolvedFrames
+    others: dict[int, Measurement]
+
+    def measurements(self) -> list[Measurement]:
+        """Return the measurement of each exposure."""
+        return [self.others.get(k) or self._one(k) for k in range(len(self.found.poses))]
+
+    def _one(self, k: int) -> Measurement:
+        pose = self.found.poses[k]
+        return self.estimator.measurement(pose, self.found.covariances[k], self.solved.of(k))
+
+
+def measure_exposures(
+    estimator: PoseEstimator, images: ManyExposures, expected: Array, swept: tuple[Array, Array]
+) -> ManySeen:
+    """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4).
+
+    ``swept`` (N,4,4) are the expected ones at the beginning and at the end of the exposures. Each
+    is measured as ``PoseEstimator.measure`` does.
+    """
+    places = estimator.taught.platform_places
+    normals = estimator.platform.sticker_normals
+    seen = estimator.read(images, expected, places, normals).observed(swept)
+    solved = solve_frames(seen, expected, estimator, estimator.platform, places)
+    poses, covariances = estimator.in_base(solved.moves, solved.covariances)
+    of = seen.index // len(places)
+    used = np.bincount(of[solved.used], minlength=len(expected))
+    others = {}
+    for k in np.flatnonzero(solved.lost | (estimator.method != "registration")):
+        one = estimator.measurement_of(solved, int(k))
+        others[int(k)] = one
+        poses[k] = one.pose
+        covariances[k] = one.covariance
+        used[k] = len(one.target_ids)
+    return ManySeen(estimator, MeasuredPoses(poses, covariances, used), solved, others)
+
+
 def on_all_cores(work: Callable[[T], R], parts: Sequence[T], renderer: Renderer) -> Iterator[R]:
-    """Results of work on parts that know nothing of each other, in their order; in one thread with
-    a renderer that may need it, as OpenGL does."""
+    """Yield the results of work on independent parts, in their order.
+
+    OpenGL may be called from one thread only, so there is one unless the renderer is analytic.
+    """
     threads = threads_at_most() if renderer is ANALYTIC else 1
     if threads == 1 or len(parts) < 2:
         yield from map(work, parts)
@@ -94,21 +151,15 @@ def on_all_cores(work: Callable[[T], R], parts: Sequence[T], renderer: Renderer)
         yield from pool.map(work, parts)
 
 
-def expected_at(estimator: PoseEstimator, poses: Array) -> Array:
-    """Expected camera_from_platform (N,4,4) at poses (N,6)."""
-    camera_from_base = invert(estimator.taught.base_from_camera)
-    return np.asarray(camera_from_base @ transforms_of(poses))
-
-
 def threads_at_most() -> int:
-    """One a core, or as many as NUMBA_NUM_THREADS says."""
+    """Return the number of threads: one for each core, or NUMBA_NUM_THREADS."""
     from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
 
     return min(int(NUMBA_NUM_THREADS), os.cpu_count() or 1)
 
 
 def pose_rows(poses: ArrayLike) -> Array:
-    """Poses (N,6), checked; an empty list holds none."""
+    """Return poses (N, 6), checked; an empty list holds none."""
     if isinstance(poses, list) and not poses:
         return np.zeros((0, 6))
     try:

@@ -1,40 +1,24 @@
-"""The synthetic sensor: true scene and cameras on one side, estimator and tracker on the other."""
+"""The synthetic sensor: an instrument that looks at a posed platform, run after run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike
 
-from cmmsim.allowed_plugins import is_own, require_renderer
-from cmmsim.checks import checked_seed, finite_array, require_kind
-from cmmsim.detection.detector import find_detector
-from cmmsim.errors import CmmError, UnknownOptionError
-from cmmsim.files.rig_and_bodies import marked_body, require_corner
-from cmmsim.files.schema import SensorFile, Timing
-from cmmsim.geometry.camera import Optics
+from cmmsim.checks import checked_seed, finite_array
+from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.pose import Array, checked_pose
-from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
-from cmmsim.imaging.renderer import choose_renderer
-from cmmsim.imaging.stereo_camera import Quality, VirtualStereoCamera
+from cmmsim.imaging.stereo_camera import VirtualStereoCamera
+from cmmsim.instrument import Instrument
 from cmmsim.many_frames import Frames, measure_frames, measure_without_images, pose_rows
-from cmmsim.measuring.measured_poses import MeasuredPoses
-from cmmsim.measuring.measurement import Measurement, lost_measurement
-from cmmsim.measuring.observation import DetectionSettings, Observer
-from cmmsim.measuring.pose_estimator import METHODS, PoseEstimator
-from cmmsim.measuring.taught import Taught, require_taught_for, setup_of
-from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.measuring.measurement import MeasuredPoses, Measurement, lost_measurement
+from cmmsim.measuring.taught import Taught
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages
-from cmmsim.sticker_view import StickerView
-from cmmsim.teaching import Progress, Teacher, exactly_taught
+from cmmsim.teaching import Progress
 from cmmsim.tracker import Tracker
-from cmmsim.true_cameras import TrueCameras
-from cmmsim.uncertainty.common_errors import CommonErrors, MeasuringGeometry
 from cmmsim.uncertainty.drift_watch import CHANCE, DriftWatch
 from cmmsim.uncertainty.known_rig import KnownRig
 from cmmsim.without_images.drawn_stickers import STATISTICAL, DrawnStickers, StatisticalStereoCamera
@@ -42,19 +26,39 @@ from cmmsim.without_images.drawn_stickers import STATISTICAL, DrawnStickers, Sta
 if TYPE_CHECKING:
     from cmmsim.without_images.statistical_tracker import StatisticalTracker
 
-TEACHING_STREAM = 0
 RUN_STREAM = 1
 DROPOUT_STREAM = 2
 
 
-class Sensor:
-    """A stereo optical CMM that looks at a posed platform.
+class Sensor(Instrument):
+    """Stereo optical CMM that looks at a posed platform.
 
-    The cameras that draw are the file's; those that measure are the file's, too, or as they are
-    ``known``, or were when the sensor was ``taught``.
+    It teaches itself on first use. Use `load_sensor` to make one by name.
 
-    It teaches itself on first use, or takes what a sensor with the same cameras, planes and
-    stickers was taught; raises TeachingError, naming what differs, for what another one was taught.
+    Parameters
+    ----------
+    file : SensorFile
+        Content of a sensor file. Its cameras are those that draw.
+    seed, method, taught, progress, renderer
+        As of `load_sensor`.
+    known : KnownRig, optional
+        Cameras that measure, where they are known otherwise than as those that draw. A taught
+        sensor measures with the cameras that were known at teaching.
+
+    Raises
+    ------
+    CmmError
+        If an argument is of another kind.
+    UnknownOptionError
+        If there is no such method, renderer or detector.
+    TeachingError
+        If ``taught`` belongs to another sensor.
+
+    Examples
+    --------
+    >>> from cmmsim import load_sensor
+    >>> load_sensor("ctrack780", renderer="statistical")
+    Sensor('ctrack780', method 'registration', renderer 'statistical', not yet taught)
     """
 
     def __init__(
@@ -67,142 +71,34 @@ class Sensor:
         renderer: str | None = None,
         known: KnownRig | None = None,
     ) -> None:
-        require_kind(
-            file, SensorFile, "a sensor is made of a SensorFile; load_sensor takes a name or a path"
-        )
-        if method not in METHODS:
-            raise UnknownOptionError("method", method, METHODS)
-        find_detector(file.detection.detector)
-        self._asked_renderer = require_renderer(file.renderer if renderer is None else renderer)
-        if is_own(self._asked_renderer):
-            choose_renderer(self._asked_renderer)
-        if progress is not None and not callable(progress):
-            raise CmmError(
-                f"progress must be a function of the steps done and their number, got {progress!r}"
-            )
-        self._file = file
-        self._seed = checked_seed(seed)
-        self._progress = progress
-        self.method = method
-        self._known = taught.known if isinstance(taught, Taught) else known
-        figures = file.camera.model_dump(exclude={"pattern_seed"})
-        self.noise = CameraNoise(
-            **{("enabled" if k == "noise" else k): v for k, v in figures.items()}
-        )
-        self.optics = Optics(**file.lens.model_dump())
-        self.platform = marked_body("platform", file.platform)
-        self.base = marked_body("base", file.base)
-        if taught is not None:
-            require_kind(taught, Taught, "taught must be what another sensor's teach() returned")
-            require_taught_for(taught, file, len(self.platform.nominal))
-        bodies = self.platform, self.base
-        self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
-        self.rig = self.true_cameras.rig if self._known is None else self._known.rig
-        self._taught = taught
+        super().__init__(file, seed, method, taught, progress, renderer, known)
         self._tracker: Tracker | StatisticalTracker | None = None
         self._watch: DriftWatch | None = None
         self.start_run(seed)
-
-    def __repr__(self) -> str:
-        state = "not yet taught" if self._taught is None else "taught"
-        how = f"method {self.method!r}, renderer {self._asked_renderer!r}"
-        return f"Sensor({self.name!r}, {how}, {state})"
-
-    @property
-    def name(self) -> str:
-        """Name of the sensor file."""
-        return self._file.name
-
-    @property
-    def renderer(self) -> str:
-        """Name of the renderer that draws; "auto" is decided on first use."""
-        return self.true_cameras.renderer.name
-
-    @cached_property
-    def _view(self) -> StickerView:
-        """The stickers as the known rig should see them."""
-        place = self.true_cameras.camera_from_base
-        return StickerView(
-            self._file, self.platform, self.base, self.rig, self._known, place, self.optics
-        )
-
-    @cached_property
-    def settings(self) -> DetectionSettings:
-        """Settings of the search for stickers in windows."""
-        return self._view.settings(self.noise, self.camera.centre_error_px(Quality()))
-
-    @property
-    def timing(self) -> Timing:
-        """Frame rate, exposure, latency with its jitter, and dropout, as the file states them."""
-        return self._file.timing
-
-    @property
-    def note(self) -> str:
-        """Warning about the file's figures, as that they are assumed; else empty."""
-        return self._file.note
-
-    @property
-    def home(self) -> Array:
-        """Pose (6,) of the platform at teaching."""
-        return np.array(self._file.platform.home)
-
-    @property
-    def taught(self) -> Taught:
-        """Result of teaching; teaches on first use."""
-        return self.teach()
-
-    @property
-    def truth(self) -> Taught:
-        """True places of rig and stickers, for studies of the observation noise alone.
-
-        No part of the chain knows of them.
-        """
-        return exactly_taught(self._file)
-
-    @property
-    def estimator(self) -> PoseEstimator:
-        """The part that turns images into poses, also those from elsewhere."""
-        common = None
-        if self._known is not None:
-            known = self._known.covariance
-            common = partial(
-                self._geometry.pose_covariance, rig_covariance=known, method=self.method
-            )
-        return PoseEstimator(
-            self.rig, self.noise, self.settings, self.platform, self.taught, self.method, common
-        )
-
-    @cached_property
-    def _geometry(self) -> MeasuringGeometry:
-        """The set-up as it is known once it is taught."""
-        return MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
-
-    @property
-    def observer(self) -> Observer:
-        """The part that finds stickers in images, which needs no teaching."""
-        return Observer(self.rig, self.noise, self.settings)
-
-    def teach(self, progress: Progress | None = None) -> Taught:
-        """Teach the frames of base and platform, unless that has been done.
-
-        ``progress(done, total)`` is called.
-        """
-        if self._taught is None:
-            for body in (self.platform, self.base):
-                require_corner(body)
-            teacher = Teacher(
-                self.camera, self.observer, self.platform, self.base, self._view.sizes.plan()
-            )
-            rng = np.random.default_rng([self._seed, TEACHING_STREAM])
-            found = teacher.teach(self.name, self.home, rng, progress or self._progress)
-            self._taught = replace(found, setup=setup_of(self._file), known=self._known)
-        return self._taught
 
     def start_run(self, seed: int) -> None:
         """Begin a new run: new noise, and the next measurement searches the whole images.
 
         Every frame has a noise stream of its own, so that a dropped one changes nothing in the
-        others. Raises CmmError for a seed that is no whole number from 0 on.
+        others.
+
+        Parameters
+        ----------
+        seed : int
+            Seed of the run's noise.
+
+        Raises
+        ------
+        CmmError
+            If the seed is not a whole number from 0 on.
+
+        Examples
+        --------
+        >>> sensor.start_run(3)
+        >>> first = sensor.measure(sensor.home).pose
+        >>> sensor.start_run(3)
+        >>> bool(np.all(sensor.measure(sensor.home).pose == first))
+        True
         """
         self._run_seed = checked_seed(seed)
         self._frame = 0
@@ -212,57 +108,41 @@ class Sensor:
         if self._watch is not None:
             self._watch.restart()
 
-    def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
-        """Register further rigid bodies, meshes in m, that may hide stickers.
-
-        They are drawn where ``obstacles`` says. Raises CmmError for anything but meshes by name.
-        """
-        self.true_cameras.add_bodies(meshes)
-
-    def move_rig(self, changes: Mapping[str, float], right_later: float = 0.0) -> None:
-        """Change the true rig by named amounts, as ``{"right.cx_px": 0.1}``, and have the right
-        camera expose later, s; the estimator is not told.
-
-        Raises CmmError for a name that a rig has not (``stereo_rig.PARAMETER_NAMES``), ShapeError
-        for a number that is not finite.
-        """
-        self.true_cameras.move(changes, right_later)
-
-    def drift_rig(self, changes: Mapping[str, float], frames: int) -> None:
-        """Have the true rig change by named amounts, as ``{"right.cx_px": 0.1}``, evenly from the
-        first to the last of so many frames of each run from now on; the estimator is not told. No
-        changes: no drift.
-
-        Raises CmmError for a name that a rig has not, fewer than two frames, or where the stickers
-        leave an image; ShapeError for a number that is not finite.
-        """
-        self.true_cameras.drift(changes, frames)
-
-    def common_errors(self, poses: ArrayLike, rates: ArrayLike) -> CommonErrors:
-        """Errors of rig and taught frames, and how they move poses (N, 6) at rates (N, 6).
-
-        Raises CmmError for the method "planes", ShapeError for anything but rows of six finite
-        numbers.
-        """
-        self._require_registration("common errors are known of")
-        known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
-        at = np.asarray(poses, dtype=float)
-        along = np.asarray(rates, dtype=float)
-        return self._geometry.common_errors(at, along, known.covariance, known.exposure_std)
-
     def look(
         self,
         pose: ArrayLike,
         obstacles: Mapping[str, Array] | None = None,
         pose_rate: ArrayLike | None = None,
     ) -> StereoImages | DrawnStickers:
-        """One exposure, drawn as far as it is read.
+        """Take one exposure, which is drawn as far as it is read.
 
-        Parameters: pose (6,) of the platform in the middle of the exposure; obstacles: name ->
-        base_from_body (4,4), they stand still; pose_rate (6,), m/s and rad/s: the time derivative
-        of the pose, which blurs the image when the sensor's exposure is not zero. Raises
-        ShapeError, UnknownBodyError, and CmmError for too long a blur or for obstacles that are no
-        transforms by name.
+        Parameters
+        ----------
+        pose : array_like, shape (6,)
+            Pose of the platform in the middle of the exposure, m and rad.
+        obstacles : mapping of str to ndarray, shape (4, 4), optional
+            Places base_from_body of bodies of `add_bodies`. They stand still.
+        pose_rate : array_like, shape (6,), optional
+            Time derivative of the pose, m/s and rad/s. It blurs the image where the sensor's
+            exposure takes time.
+
+        Returns
+        -------
+        StereoImages or DrawnStickers
+            Images, or what would be found in them.
+
+        Raises
+        ------
+        ShapeError
+            If pose or rate are not six finite numbers.
+        UnknownBodyError
+            If an obstacle was never added.
+        CmmError
+            If the blur is too long, or obstacles are not transforms by name.
+
+        Examples
+        --------
+        >>> images = sensor.look(sensor.home)
         """
         checked = checked_pose(pose)
         placed = self.true_cameras.placed(obstacles)
@@ -280,7 +160,29 @@ class Sensor:
         obstacles: Mapping[str, Array] | None = None,
         pose_rate: ArrayLike | None = None,
     ) -> StereoFrame:
-        """Both whole images; parameters as in ``look``."""
+        """Take both whole images.
+
+        Parameters
+        ----------
+        pose, obstacles, pose_rate
+            As of `look`, which also says what is raised.
+
+        Returns
+        -------
+        StereoFrame
+
+        Raises
+        ------
+        CmmError
+            If the sensor draws no images.
+
+        Examples
+        --------
+        >>> from cmmsim import load_sensor
+        >>> drawing = load_sensor("ctrack780", renderer="analytic")
+        >>> drawing.capture(drawing.home).left.shape
+        (1536, 2048)
+        """
         return self.look(pose, obstacles, pose_rate).full()
 
     def measure(
@@ -289,14 +191,35 @@ class Sensor:
         obstacles: Mapping[str, Array] | None = None,
         pose_rate: ArrayLike | None = None,
     ) -> Measurement:
-        """Measure the platform; parameters as in ``look``, they go to the renderer only.
+        """Measure the platform in one frame.
 
         The measured pose is that in the middle of the exposure. A frame that drops out is lost
         without being looked at.
+
+        Parameters
+        ----------
+        pose, obstacles, pose_rate
+            As of `look`, which also says what is raised. Only the renderer is told them.
+
+        Returns
+        -------
+        Measurement
+
+        Raises
+        ------
+        TeachingError
+            If the sensor teaches itself and cannot.
+
+        Examples
+        --------
+        >>> measured = sensor.measure(sensor.home)
+        >>> measured.ok, measured.covariance.shape
+        (True, (6, 6))
         """
         images = self.look(pose, obstacles, pose_rate)
         if self._tracker is None:
             self._tracker = self._new_tracker()
+        # One number for every frame, so that runs over other poses lose the same frames.
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
             share = f"a share of {self.timing.dropout:.3g} drops out"
@@ -310,19 +233,33 @@ class Sensor:
     def watch_drift(self, base: bool = False, chance: float = CHANCE) -> DriftWatch:
         """Watch from now on whether the rig still is as it was taught, in each run for itself.
 
-        base: look at the base's stickers as well, which takes twice the time and sees smaller
-        movements, and those of the whole rig; chance of a false alarm in a run. Raises CmmError for
-        the method "planes", and for a chance that is none.
+        Parameters
+        ----------
+        base : bool
+            Look at the base's stickers as well. That takes twice the time, and shows smaller
+            movements, and those of the whole rig.
+        chance : float
+            Probability of a false alarm in a run.
+
+        Returns
+        -------
+        DriftWatch
+
+        Raises
+        ------
+        CmmError
+            If the method is "planes", or ``chance`` is no probability.
+
+        Examples
+        --------
+        >>> watch = sensor.watch_drift()
         """
         self._require_registration("drift is told from")
+        # Errors of a centre that are not noise stay while it stands still.
         offset = float(np.hypot(self.settings.centre_error_px, self.observer.detector.bias_px))
         period = 1.0 / self.timing.frame_rate
         self._watch = DriftWatch(self._geometry, self._known, period, chance, offset, base)
         return self._watch
-
-    def _require_registration(self, what: str) -> None:
-        if self.method != "registration":
-            raise CmmError(f"{what} poses by registration only, not by {self.method}")
 
     def measure_many(
         self,
@@ -331,12 +268,35 @@ class Sensor:
         obstacles: Mapping[str, Array] | None = None,
         near: ArrayLike | None = None,
     ) -> MeasuredPoses:
-        """Measure the platform at poses (N,6) in motion at pose_rates (N,6), one frame each.
+        """Measure the platform in many frames at once, on all cores.
 
-        Obstacles stand still. Each frame has noise and dropout of its own, and the rig does not
-        drift. The noise is as large as that of ``measure``, its numbers are others. Stickers are
-        looked for near poses (N,6), or where they are. Frames are drawn and measured on all cores.
-        Raises ShapeError for anything but such rows.
+        Each frame has noise and dropout of its own. The noise is as large as that of `measure`,
+        but its numbers are others. The rig does not drift.
+
+        Parameters
+        ----------
+        poses : array_like, shape (N, 6)
+            Poses, one frame each, m and rad.
+        pose_rates : array_like, shape (N, 6), optional
+            Time derivatives of the poses.
+        obstacles : mapping of str to ndarray, shape (4, 4), optional
+            Places of bodies that stand still, as of `look`.
+        near : array_like, shape (N, 6), optional
+            Poses near which stickers are looked for, instead of the true ones.
+
+        Returns
+        -------
+        MeasuredPoses
+
+        Raises
+        ------
+        ShapeError
+            If poses, rates or ``near`` are not such rows.
+
+        Examples
+        --------
+        >>> sensor.measure_many([sensor.home] * 3).poses.shape
+        (3, 6)
         """
         at = pose_rows(poses)
         wanted = "there is a pose rate to each pose, six finite numbers, m/s and rad/s"
@@ -347,11 +307,11 @@ class Sensor:
         camera = self.camera
         placed = self.true_cameras.placed(obstacles)
         if isinstance(camera, VirtualStereoCamera):
-            blocks = measure_frames(camera, *self._frames(at, rates, around, placed))
+            blocks = measure_frames(camera, self._frames(at, rates, around, placed))
             found = MeasuredPoses.of([each.found for each in blocks])
         elif isinstance(tracker := self._new_tracker(), Tracker):
             found = MeasuredPoses.of_each(
-                measure_without_images(camera, *self._frames(at, rates, around, placed))
+                measure_without_images(camera, self._frames(at, rates, around, placed))
             )
         else:
             rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
@@ -362,38 +322,55 @@ class Sensor:
         return found.without(self._dropout_rng.random(len(at)) < self.timing.dropout)
 
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
-        """Measure a platform at rest at poses (N,6), near others; no frame drops out.
+        """Measure a platform at rest in many frames, of which none drops out.
 
-        Without images, stickers are looked for in windows near poses (N,6), too.
+        Without images, stickers are looked for in windows as well.
+
+        Parameters
+        ----------
+        poses, near : array_like, shape (N, 6)
+            Poses, and poses near which stickers are looked for, m and rad.
+
+        Returns
+        -------
+        list of Measurement
+
+        Raises
+        ------
+        ShapeError
+            If poses or ``near`` are not such rows.
+
+        Examples
+        --------
+        >>> [one.ok for one in sensor.measure_each([sensor.home], [sensor.home])]
+        [True]
         """
         at = pose_rows(poses)
         camera = self.camera
         around = finite_array(near, at.shape, "there is a pose near each pose, finite")
         frames = self._frames(at, 0.0 * at, around, {})
         if isinstance(camera, StatisticalStereoCamera):
-            return measure_without_images(camera, *frames)
-        return [one for each in measure_frames(camera, *frames) for one in each.measurements()]
+            return measure_without_images(camera, frames)
+        return [one for each in measure_frames(camera, frames) for one in each.measurements()]
 
     def _frames(
         self, at: Array, rates: Array, around: Array, placed: Mapping[str, Array]
     ) -> Frames:
-        """The next frames, at poses ``at`` and rates, looked for ``around``, all (N,6)."""
+        """Return the next frames.
+
+        They are at poses ``at`` with rates, and stickers are looked for ``around``, all (N, 6).
+        """
         first = self._frame
         self._frame += len(at)
         streams = range(first, first + len(at))
         rngs = [np.random.default_rng([self._run_seed, RUN_STREAM, k]) for k in streams]
-        return self.estimator, at, rates, around, rngs, placed
+        return Frames(self.estimator, at, rates, around, rngs, placed)
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
-        """A tracker, which measures frame after frame."""
+        """Return a tracker, which measures frame after frame."""
         if self.renderer != STATISTICAL.name or self.method != "registration":
             return Tracker(self.estimator)
         # Late, as numba takes time to import.
         from cmmsim.without_images.statistical_tracker import StatisticalTracker
 
         return StatisticalTracker(self.estimator)
-
-    @property
-    def camera(self) -> VirtualStereoCamera | StatisticalStereoCamera:
-        """The two cameras before the true scene, as they are at teaching."""
-        return self.true_cameras.at_rest

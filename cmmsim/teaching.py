@@ -1,19 +1,16 @@
-"""Teaching (paper section 4.2): the frames of base and platform from their sticker planes, once,
-before measuring.
+"""Teaching (paper section 4.2): the frames of base and platform from their sticker planes.
 
-The base stands still: its stickers are averaged over many exposures. The platform goes through a
-smooth path; in each pose its stickers are observed, all observations are laid onto each other by
+The base stands still, and its stickers are averaged over many exposures. The platform follows a
+smooth path. Its stickers are observed at each pose, all observations are laid onto each other by
 registration, and the planes are put through the mean constellation. Different poses put the
-stickers on different parts of a pixel, so that what is left of the image formation's own error
-averages out as well.
+stickers on different parts of a pixel, which averages out the image formation's own error as well.
 
-Whatever detector the sensor measures with, the centres are those of the maximum-likelihood fit,
-which is the one without a bias: the base is seen in one pose only, so that another detector's bias
-would stay in every pose.
+The centres are always those of the maximum-likelihood fit, whatever detector the sensor measures
+with. The base is seen at one pose only, so that a detector's bias would stay in every pose.
 
-The windows in which stickers are looked for are large enough for the largest image of a sticker:
-that of one in the nearest place of work, which is taken for a fifth nearer than the rig's target,
-or of one that both cameras see on base and platform at teaching.
+The windows in which stickers are looked for hold the largest image of a sticker. That is either the
+image at the nearest place of work, which is taken for a fifth nearer than the rig's target, or the
+largest that both cameras see at teaching.
 """
 
 from collections.abc import Callable
@@ -34,12 +31,7 @@ from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.scene_bodies import placed_stickers
 from cmmsim.imaging.stereo_camera import Quality
 from cmmsim.measuring.layout_search import bright_ellipses, candidate_points, find_layout
-from cmmsim.measuring.observation import (
-    Observer,
-    StickerExposure,
-    StickerObservation,
-    faces_camera,
-)
+from cmmsim.measuring.observation import Observer, StickerExposure, StickerObservation, faces_camera
 from cmmsim.measuring.pose_estimator import (
     FEWEST_NOMINAL,
     NOMINAL_TOLERANCE,
@@ -50,25 +42,31 @@ from cmmsim.measuring.taught import Taught, setup_of
 from cmmsim.radiometry.stereo_images import StereoImages
 
 Progress = Callable[[int, int], None]
+# Reach of the teaching path about home, m and rad.
 SHIFT = 0.008
-TURN = 0.03  # m, rad: reach of the teaching path about home
+TURN = 0.03
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
-LARGEST_GAP = 1e-4  # m: in averaged exposures a whole sticker is within a few microns of its place
+# m: in averaged exposures, a whole sticker is within a few microns of its place.
+LARGEST_GAP = 1e-4
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
-ROOM = 1.35  # half the side of what is fitted over a sticker's radius at the rig's target
-SMALLEST_ROOM_PX = (
-    0.7  # on each side of the largest sticker at teaching: half a pixel goes into rounding
-)
+# Half the side of the fitted part over a sticker's radius at the rig's target.
+ROOM = 1.35
+# px on each side of the largest sticker at teaching: half a pixel is lost to rounding.
+SMALLEST_ROOM_PX = 0.7
 SMALLEST_FIT = 12
-SMALLEST_BLURRED_FIT = 14  # px
-BLUR_ROOM = 1.0  # px on each side, at least, for what point spread and exposure blur
-WINDOW_SHARE = 7 / 6  # side of a window over that of the part that is fitted
+SMALLEST_BLURRED_FIT = 14
+# px on each side, at least, for the blur of point spread and exposure.
+BLUR_ROOM = 1.0
+# Side of a window over that of the part that is fitted.
+WINDOW_SHARE = 7 / 6
 
 
 @dataclass(frozen=True)
 class TeachingPlan:
-    """Plan of teaching: quality of the views of the base, number and quality of those of the
-    platform, and window sizes, px.
+    """Plan of teaching.
+
+    It has the quality of the views of the base, the quality and number of those of the platform,
+    and the sizes of windows in px.
     """
 
     base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))
@@ -85,15 +83,15 @@ class Camera(Protocol):
     def look(
         self, pose: Array, rng: np.random.Generator, *, quality: Quality | None = None
     ) -> StereoImages | StickerExposure:
-        """One exposure of the platform at a pose (6,)."""
+        """Take one exposure of the platform at a pose (6,)."""
 
     def centre_error_px(self, quality: Quality) -> float:
-        """Error of a sticker's centre that drawing leaves, px rms."""
+        """Return the error of a sticker's centre that drawing leaves, px rms."""
 
 
 @dataclass(frozen=True)
 class Teacher:
-    """The instruments of teaching."""
+    """Instruments and plan of teaching."""
 
     camera: Camera
     observer: Observer
@@ -159,8 +157,12 @@ class Teacher:
         quality: Quality,
         window_size: int,
     ) -> StickerObservation:
-        """All stickers of a body from averaged exposures. Raises LostError when one is missing."""
+        """Observe all stickers of a body in averaged exposures. Raises LostError when one is
+        missing.
+        """
         usual = self.observer.settings
+        # Averaged exposures have so little noise that the model's own error shows: no misfit is too
+        # large.
         settings = replace(
             usual,
             window_size=window_size,
@@ -194,12 +196,15 @@ class Teacher:
     def _platform_views(
         self, rough: Array, path: Array, rng: np.random.Generator, report: Callable[[int], None]
     ) -> list[StickerObservation]:
-        """Observations along the teaching path, each expected where the ones before lead to."""
+        """Observe the platform along the teaching path, each time where the views before lead
+        to.
+        """
         places = self.platform.nominal
         last = rough
         step = np.eye(4)
         seen = []
         for k, pose in enumerate(path):
+            # Two views must be seen before the movement can be predicted: wider windows until then.
             size = self.plan.first_window if k < 2 else self.plan.platform_window
             seen.append(
                 self._look_at(
@@ -221,7 +226,9 @@ class Teacher:
     def _require_rigid(
         self, places: Array, camera_from_body: Array, seen: StickerObservation
     ) -> None:
-        """Raise LostError when a sticker has moved against the others: it is partly hidden."""
+        """Raise LostError when a sticker has moved against the others, because it is partly
+        hidden.
+        """
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         depth = np.linalg.norm(seen.points, axis=1).max()
         focal = self.observer.rig.left.focal_px
@@ -230,16 +237,18 @@ class Teacher:
             worst = self.platform.sticker_ids[gaps.argmax()]
             raise LostError(
                 f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its "
-                "place, "
-                f"at most {limit * 1e6:.0f} um; it may be partly hidden"
+                f"place, at most {limit * 1e6:.0f} um; it may be partly hidden"
             )
 
 
 def platform_frame(
     platform: MarkedBody, seen: list[StickerObservation]
 ) -> tuple[Array, Array, Array]:
-    """Sticker places (n,3) on the platform, their covariances (n,3,3) and the covariance (6,6) of
-    the platform frame, from observations of all its stickers."""
+    """Return sticker places (n, 3) on the platform with their covariances (n, 3, 3).
+
+    The third result is the covariance (6, 6) of the platform frame. Each view observes all
+    stickers.
+    """
     views = np.stack([one.points for one in seen]), np.stack([one.covariances for one in seen])
     mean, covariances = mean_constellation(*views)
     towards = _towards(platform, register(platform.nominal, mean, covariances).transform)
@@ -255,34 +264,41 @@ def platform_frame(
 
 
 def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> Array:
-    """Sticker places (c,n,3) as of ``platform_frame`` that each of c teachings finds, in whose
-    views the stickers are at points (c,v,n,3) with covariances (c,v,n,3,3)."""
+    """Return the sticker places (c, n, 3) that each of c teachings finds, as ``platform_frame``.
+
+    The stickers are seen at points (c, v, n, 3) with covariances (c, v, n, 3, 3) in v views each.
+    """
     mean, covariances = mean_constellation(points, covariances)
     towards = _towards(platform, register_sets(platform.nominal, mean, covariances).transform)
     return apply_each(invert(frames_by_planes(platform, mean, covariances, towards)), mean)
 
 
 def teaching_path(home: Array, count: int) -> Array:
-    """Smooth closed path of poses (count, 6) that starts near ``home`` and visits many sub-pixel
-    positions.
+    """Return a smooth closed path of poses (count, 6) that starts near ``home``.
+
+    It visits many sub-pixel positions.
     """
     angle = 2.0 * np.pi * np.arange(count)[:, None] / count * CYCLES + PHASES
     return home + np.array([SHIFT] * 3 + [TURN] * 3) * np.sin(angle)
 
 
 def _towards(body: MarkedBody, camera_from_body: Array) -> Array:
-    """Normals (..., 3, 3) of the planes in the camera frame, where camera_from_body is (...,
-    4, 4)."""
+    """Return normals (..., 3, 3) of the planes in the camera frame, for camera_from_body (..., 4,
+    4).
+    """
     return np.asarray(body.normals @ camera_from_body[..., :3, :3].swapaxes(-1, -2))
 
 
 def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Weighted mean (..., n, 3) of views (..., v, n, 3) of the same stickers laid onto each other,
-    near the first of them, and its covariances (..., n, 3, 3), from those of the points (..., v, n,
-    3, 3)."""
+    """Return the weighted mean (..., n, 3) of views of the same stickers, laid onto each other.
+
+    The mean lies near the first view. The second result is its covariances (..., n, 3, 3). Views
+    are (..., v, n, 3) with covariances (..., v, n, 3, 3).
+    """
     weights = np.linalg.inv(covariances)
     mean = points[..., 0, :, :]
     spread = covariances[..., 0, :, :, :]
+    # The weights turn with the views, so mean and transforms are found in turns; three settle them.
     for _ in range(3):
         sets = np.broadcast_to(mean[..., None, :, :], points.shape).reshape(-1, *points.shape[-2:])
         found = register_sets(
@@ -299,15 +315,17 @@ def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]
 
 @dataclass(frozen=True)
 class WindowSizes:
-    """Sides in px of windows and of the part around the bright spot that is fitted; growth: of what
-    is fitted, over what the smallest stickers get."""
+    """Sides in px of windows, and of the part around the bright spot that is fitted.
+
+    ``growth`` is the fitted part's side over that for the smallest stickers.
+    """
 
     window: int
     fit: int
     growth: float
 
     def plan(self) -> TeachingPlan:
-        """Teaching with windows that have grown alike."""
+        """Return a teaching plan whose windows have grown alike."""
         plan = TeachingPlan()
         names = ("base_window", "first_window", "platform_window")
         return replace(
@@ -316,10 +334,10 @@ class WindowSizes:
 
 
 def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bool) -> WindowSizes:
-    """Sizes for stickers whose radius looks ``target_px`` large at the rig's target and
-    ``largest_px`` at teaching.
+    """Return sizes for stickers whose radius is ``target_px`` at the rig's target.
 
-    Parameters: psf_px: sigma of the point spread; blurred: by it or by a moving platform.
+    At teaching it is up to ``largest_px``. The point spread has the sigma ``psf_px``; ``blurred``
+    says that it or a moving platform blurs the stickers.
     """
     smallest, blur = (
         (SMALLEST_BLURRED_FIT, max(BLUR_ROOM, psf_px)) if blurred else (SMALLEST_FIT, 0.0)
@@ -330,8 +348,9 @@ def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bo
 
 
 def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: float) -> float:
-    """Radius in px of a sticker of ``radius`` m that faces the nearer camera at ``target`` (3,) m,
-    base axes.
+    """Return the radius in px of a sticker of ``radius`` m at ``target`` (3,) m in base axes.
+
+    The sticker faces the nearer camera.
     """
     distances = [
         float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera
@@ -345,8 +364,8 @@ def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: fl
 def largest_radius(
     rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float
 ) -> float:
-    """Longest half axis in px of the stickers of a body that both cameras see; 0 where there is
-    none.
+    """Return the longest half axis in px of the stickers of a body that both cameras see; 0 without
+    any.
     """
     normals = body.sticker_normals
     seen = np.all(rig.project(apply(camera_from_body, body.nominal))[1], axis=0)
@@ -358,9 +377,10 @@ def largest_radius(
 
 
 def exactly_taught(file: SensorFile) -> Taught:
-    """Teach without any error: take the true frames and sticker places of a sensor file's scene.
+    """Return what teaching without any error would find: the true frames and places of a sensor
+    file.
 
-    For studies of the observation noise alone: all covariances are zero. Raises SensorFileError.
+    All covariances are zero, for studies of the observation noise alone. Raises SensorFileError.
     """
     _, camera_from_base = rig_from_file(file.rig)
     platform, base = (

@@ -1,5 +1,6 @@
-"""Frame after frame: where to look next comes from what was measured last, never from the true
-pose.
+"""Measurement frame after frame.
+
+The place to look next comes from the last measurements, never from the true pose.
 """
 
 from __future__ import annotations
@@ -17,12 +18,28 @@ EXPECTED_SHARE = 0.7
 
 
 class Tracker:
-    """Remembers the last two measured poses.
+    """Tracker that measures frame after frame, and remembers the last two poses.
 
-    A frame in which the prediction fails is searched as a whole at once; where that finds fewer
-    stickers, what the prediction found stands. What moves is fitted as the exposure smears it, as
-    fast as it moved since the last frame; in the first frame of a run, and in the first after a
-    loss, the smear itself tells how far.
+    Where the prediction fails, the whole frame is searched at once. Where that finds fewer
+    stickers, the prediction's finds stand. Moving stickers are fitted as the exposure smears them,
+    at the speed since the last frame. In the first frame of a run, and in the first after a loss,
+    the smear itself tells the speed.
+
+    Parameters
+    ----------
+    estimator : PoseEstimator
+        Estimator of single frames, such as ``sensor.estimator``.
+
+    Raises
+    ------
+    CmmError
+        If the estimator is of another kind.
+
+    Examples
+    --------
+    >>> tracker = Tracker(sensor.estimator)
+    >>> tracker.measure(sensor.look(sensor.home)).ok
+    True
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
@@ -35,17 +52,30 @@ class Tracker:
         self.forget()
 
     def forget(self) -> None:
-        """The next frame is searched as a whole."""
+        """Search the next frame as a whole."""
         self._last: Array | None = None
         self._step_before: Array | None = None
         self._seen = 0
 
     def measure(self, images: StereoImages | StereoFrame) -> Measurement:
-        """Measure one frame, such as ``sensor.look`` returns or a StereoFrame; never raises for
-        what is in the images.
+        """Measure one frame; whatever is in the images, it raises nothing.
 
-        Raises ShapeError for a StereoFrame of another size or bit depth, CmmError for what is no
-        image.
+        Parameters
+        ----------
+        images : StereoFrame or images of ``sensor.look``
+            Images of the rig that the estimator knows.
+
+        Returns
+        -------
+        Measurement
+            Pose with its covariance, or the reason why the frame is lost.
+
+        Raises
+        ------
+        ShapeError
+            If a StereoFrame has another size or bit depth.
+        CmmError
+            If ``images`` are no images.
         """
         if isinstance(images, StereoFrame):
             require_fitting(images, self._estimator)
@@ -71,13 +101,14 @@ class Tracker:
         return measurement
 
     def miss(self) -> None:
-        """A frame passed that nobody saw: the movement is taken to go on."""
+        """Pass a frame that nobody saw: the movement is assumed to go on."""
         if self._last is not None:
             self._last = self._predicted()
 
     def _tracked(self, images: StereoImages) -> tuple[Measurement, Array] | None:
-        """The measurement in the predicted windows; None without a prediction or where it did not
-        hold.
+        """Return the measurement in the predicted windows.
+
+        It is None without a prediction, or where the prediction did not hold.
         """
         if self._last is None:
             return None
@@ -92,18 +123,18 @@ class Tracker:
             return None
 
     def _found(self, images: StereoImages) -> tuple[Measurement, Array]:
-        """The measurement after a search of the whole images, with no prior for where the platform
-        is.
-        """
+        """Return the measurement after a search of the whole images, without any prior pose."""
         found = self._estimator.locate(images)
         if self._last is None:
             return self._estimator.measure_anew(images, found)
         return self._estimator.measure(images, found, self._swept(found))
 
     def _swept(self, middle: Array) -> tuple[Array, Array] | None:
-        """camera_from_platform (4,4) at the beginning and the end of an exposure about ``middle``.
+        """Return camera_from_platform (4, 4) at the beginning and at the end of an exposure about
+        ``middle``.
 
-        As fast as since the last frame; None where there was none or the exposure takes no time.
+        The speed is that since the last frame. The result is None where there was none, or where
+        the exposure takes no time.
         """
         share = self._estimator.settings.exposed_share
         if self._last is None or share == 0.0:
@@ -112,11 +143,11 @@ class Tracker:
         return middle @ part_of_step(step, -0.5 * share), middle @ part_of_step(step, 0.5 * share)
 
     def _predicted(self) -> Array:
-        """camera_from_platform (4,4) if the last movement goes on."""
+        """Return camera_from_platform (4, 4) if the last movement goes on."""
         assert self._last is not None
         return self._last if self._step_before is None else self._last @ self._step_before
 
 
 def part_of_step(step: Array, share: float) -> Array:
-    """A ``share`` of a small movement (4,4), to first order."""
+    """Return a ``share`` of a small movement (4, 4), to first order."""
     return rigid(rotation_exp(share * rotation_log(step[:3, :3])), share * step[:3, 3])

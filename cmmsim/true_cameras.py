@@ -1,5 +1,4 @@
-"""The true side of a sensor: its cameras as they are, what stands before them, and how a camera
-moves during a run.
+"""The true side of a sensor: its cameras, the scene before them, and how the cameras move in a run.
 
 The estimator knows nothing of it.
 """
@@ -25,29 +24,37 @@ from cmmsim.imaging.scene_bodies import Mesh, PlacedBodies, scene_body, solid_me
 from cmmsim.imaging.stereo_camera import VirtualStereoCamera
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.uncertainty.known_rig import rig_changes
-from cmmsim.without_images.conditions import Light, require_proved
-from cmmsim.without_images.drawn_stickers import STATISTICAL, StatisticalStereoCamera
+from cmmsim.without_images.drawn_stickers import (
+    STATISTICAL,
+    Light,
+    StatisticalStereoCamera,
+    require_proved,
+)
 from cmmsim.without_images.sticker_scene import StickerScene
 
 
 @dataclass(frozen=True)
 class Drift:
-    """changes (24,) of the rig's parameters, which come evenly from the first to the last of so
-    many frames.
+    """Changes (24,) of the rig's parameters that come evenly from the first to the last of some
+    frames.
     """
 
     changes: Array
     frames: int
 
     def after(self, frame: int) -> Array:
-        """Changes (24,) at a frame, counted from 0; the cameras stay where the last one leaves
-        them.
+        """Return the changes (24,) at a frame, counted from 0.
+
+        The cameras stay where the last one leaves them.
         """
         return min(frame / (self.frames - 1), 1.0) * self.changes
 
 
 class TrueCameras:
-    """Both cameras, and platform and base with their stickers at their true places."""
+    """Both cameras, and platform and base with their stickers at their true places.
+
+    The methods are those of `Sensor`, which says what they take and raise.
+    """
 
     def __init__(
         self,
@@ -74,7 +81,7 @@ class TrueCameras:
         self._drift: Drift | None = None
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
-        """As ``Sensor.add_bodies``."""
+        """Register further bodies, as `Sensor.add_bodies`."""
         require_kind(meshes, Mapping, "bodies must be meshes by name, as {'link': rod(0.3, 0.01)}")
         for name, mesh in meshes.items():
             require_kind(name, str, "the name of a body must be text")
@@ -84,8 +91,8 @@ class TrueCameras:
         self._draw_anew()
 
     def placed(self, obstacles: Mapping[str, Array] | None) -> Mapping[str, Array]:
-        """Obstacles at base_from_body (4,4) each, checked. Raises as ``Sensor.look``."""
-        # a robot's legs, every frame
+        """Return obstacles at base_from_body (4, 4) each, checked. Raises as `Sensor.look`."""
+        # The legs of a robot come in every frame, and are checked together.
         if isinstance(obstacles, PlacedBodies) and self._are_placed(obstacles):
             return obstacles
         obstacles = {} if obstacles is None else obstacles
@@ -112,7 +119,7 @@ class TrueCameras:
         }
 
     def _are_placed(self, bodies: PlacedBodies) -> bool:
-        """Tell whether they are all obstacles, in their order, and stand where bodies can."""
+        """Tell whether bodies are all obstacles, in their order, and stand where bodies can."""
         shape = len(self.obstacles), 4, 4
         if (
             bodies.names != tuple(self.obstacles)
@@ -123,13 +130,13 @@ class TrueCameras:
         return all_rigid(bodies.together)
 
     def move(self, changes: Mapping[str, float], right_later: float) -> None:
-        """As ``Sensor.move_rig``."""
+        """Change the true rig, as `Sensor.move_rig`."""
         self.rig = self.rig.moved(rig_changes(changes))
         self.right_later = right_later
         self._draw_anew()
 
     def drift(self, changes: Mapping[str, float], frames: int) -> None:
-        """As ``Sensor.drift_rig``."""
+        """Change the true rig in each run, as `Sensor.drift_rig`."""
         drift = Drift(rig_changes(changes), frames)
         if not drift.changes.any():
             self._drift = None
@@ -144,7 +151,7 @@ class TrueCameras:
         self._drift = drift
 
     def at(self, frame: int) -> VirtualStereoCamera | StatisticalStereoCamera:
-        """Both cameras before the scene, as they are at a frame of a run, counted from 0."""
+        """Return both cameras before the scene, as they are at a frame of a run, counted from 0."""
         return self.at_rest if self._drift is None else self.at_rest.moved(self._drift.after(frame))
 
     @cached_property
@@ -154,13 +161,14 @@ class TrueCameras:
 
     @cached_property
     def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
-        """Both cameras before the scene, without drift. Raises CmmError for a renderer that is not
-        proved for them.
+        """Both cameras before the scene, without drift.
+
+        Raises CmmError for a renderer that is not proved for them.
         """
         return self._without_images() if self.renderer is STATISTICAL else self._drawing()
 
     def _without_images(self) -> StatisticalStereoCamera:
-        """Cameras that say what would be found in their images."""
+        """Return cameras that say what would be found in their images."""
         stickers = self._file.stickers
         light = Light(stickers.sticker_level / 255.0, stickers.ring_level / 255.0, self._optics)
         require_proved(self._file, self._noise, light)
@@ -175,7 +183,10 @@ class TrueCameras:
         )
 
     def _drawing(self) -> VirtualStereoCamera:
-        """Cameras that draw. Stickers are drawn first: what they hide need not be drawn."""
+        """Return cameras that draw.
+
+        Stickers are drawn first, because what they hide need not be drawn.
+        """
         file = self._file
         patches = [p for body in self.scene for p in body.stickers] + [
             body.solid for body in self.scene
@@ -198,11 +209,11 @@ class TrueCameras:
         )
 
     def _draw_anew(self) -> None:
-        """Build the cameras before the next picture."""
+        """Have the cameras built anew before the next picture."""
         self.__dict__.pop("at_rest", None)
 
     def _require_in_sight(self, changes: Array, what: str) -> None:
-        """Raise CmmError where changes (24,) of the rig take stickers out of an image that shows
+        """Raise CmmError where changes (24,) of the rig move stickers out of an image that shows
         them at home.
         """
         moved = self.rig.moved(changes)
@@ -217,7 +228,6 @@ class TrueCameras:
                 x, y = there[side, sticker]
                 raise CmmError(
                     f"a drift of {what} takes sticker {body.sticker_ids[sticker]} of the "
-                    f"{body.name} out of the "
-                    f"{('left', 'right')[side]} image, to ({x:.0f}, {y:.0f}) of {camera.width} x "
-                    f"{camera.height} px"
+                    f"{body.name} out of the {('left', 'right')[side]} image, to ({x:.0f}, "
+                    f"{y:.0f}) of {camera.width} x {camera.height} px"
                 )

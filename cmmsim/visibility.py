@@ -1,8 +1,7 @@
-"""Stickers of the platform that both cameras can look for at a pose, and the worth of a measurement
-there.
+"""Stickers of the platform that both cameras can look for at a pose, and the stated accuracy there.
 
 A sticker can be looked for when it lies in both images, a detection window away from their edges,
-and neither camera sees it at grazing incidence. What stands between it and a camera is not asked.
+and neither camera sees it at grazing incidence. Obstacles are not considered.
 """
 
 from collections.abc import Mapping
@@ -35,8 +34,9 @@ EDGE_PX = DetectionSettings().window_size
 
 @dataclass(frozen=True)
 class SightLines:
-    """The geometry of sight: platform with nominal sticker places, rig, and camera_from_base
-    (4,4)."""
+    """Geometry of sight: a platform with nominal sticker places, a rig, and camera_from_base (4,
+    4).
+    """
 
     platform: MarkedBody
     rig: StereoRig
@@ -48,8 +48,8 @@ class SightLines:
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     def visible(self, pose: ArrayLike) -> NDArray[np.bool_]:
-        """Tell whether both cameras can look for each sticker (n,) with the platform at a pose (6,)
-        in the base frame.
+        """Tell for each sticker (n,) whether both cameras can look for it, with the platform at a
+        pose (6,).
         """
         base_from_platform = pose_to_transform(pose)
         seen = np.ones(len(self.platform.sticker_ids), dtype=bool)
@@ -63,8 +63,8 @@ class SightLines:
 
 
 def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> SightLines:
-    """Geometry of sight of a built-in sensor or a sensor file, with changes to its entries as in
-    `load_sensor`.
+    """Return the geometry of sight of a built-in sensor or a sensor file, with changes to its
+    entries.
 
     Raises UnknownSensorError, SensorFileError.
     """
@@ -79,20 +79,22 @@ def expected_covariance(
     method: str = "registration",
     changes: Mapping[str, Any] | None = None,
 ) -> Array:
-    """Covariance (6,6) that a sensor would state for a pose (6,), m and rad, from one exposure
-    drawn without OpenGL.
+    """Return the covariance (6, 6) that a sensor would state for a pose (6,), m and rad.
 
-    Taken as taught without error. Raises LostError where the stickers do not suffice, and what
-    `load_sensor` raises.
+    One exposure is drawn without OpenGL, and the sensor is taken as taught without error. Raises
+    LostError where the stickers do not suffice, and all that `load_sensor` raises.
     """
     sensor = load_sensor(name, 0, method, renderer="analytic", changes=changes)
     return stated_covariance(sensor, sight_lines(name, changes), pose)
 
 
 def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Array:
-    """Covariance (6,6) that a sensor states for a pose (6,), m and rad, from one exposure whose
-    stickers are where the pose says: nothing is searched, and nothing taught. Raises as
-    `expected_covariance`."""
+    """Return the covariance (6, 6) that a sensor states for a pose (6,), m and rad, from one
+    exposure.
+
+    Nothing is taught or searched: the stickers are where the pose says. Raises as
+    `expected_covariance`.
+    """
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform
     seen = sensor.observer.observe(

@@ -17,10 +17,11 @@ from dynamics.robot_platform import CHART_TOLERANCE
 class Part(NamedTuple):
     """Body of a leg, or one of the equal bars that it consists of.
 
-    name: such as link1 or link1a. leg: its number, from 0. body: its row in the layout of the
-    robot. offset (3,): of its joint from the joint of the body, in the axes of the body before, m.
-    share: share of the parameters of the body. before: number of the part that it hangs on, or -1
-    for the base. last: True where it ends at the platform.
+    The name is such as link1 or link1a. `leg` is the leg's number, from 0, and `body` the row in
+    the layout of the robot. `offset` (3,) leads from the joint of the body to the joint of the
+    part, in the axes of the body before, m. `share` is the part's share of the parameters of the
+    body. `before` is the number of the part that it hangs on, or -1 for the base. `last` is True
+    where it ends at the platform.
     """
 
     name: str
@@ -41,8 +42,9 @@ BASE = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
 class Frames:
     """Frames of the parts, in the axes of the base.
 
-    origin (parts, 3): joint to the part before, m. axes (parts, 3, 3): as columns. spin (parts, 3):
-    angular velocity, rad/s. A last row is the base itself, so that its number is -1.
+    `origin` (parts, 3) is the joint to the part before, m. `axes` (parts, 3, 3) are columns. `spin`
+    (parts, 3) is the angular velocity, rad/s. A last row is the base itself, so that its number is
+    -1.
     """
 
     origin: np.ndarray
@@ -53,9 +55,9 @@ class Frames:
 class Drawn(NamedTuple):
     """Numbers from which the drawn parts are placed.
 
-    body, before (parts,): rows of each part and of the part before in the placements, -1 for the
-    base. offset (parts, 3): in the axes of the part before, m. centre (parts, 3) and ends (parts,
-    2, 3): in the axes of the part, m.
+    `body` and `before` (parts,) are rows of each part and of the part before in the placements, -1
+    for the base. `offset` (parts, 3) is in the axes of the part before, m. `centre` (parts, 3) and
+    `ends` (parts, 2, 3) are in the axes of the part, m.
     """
 
     body: np.ndarray
@@ -68,8 +70,9 @@ class Drawn(NamedTuple):
 class Room(NamedTuple):
     """Memory for the inputs and outputs of a robot's functions.
 
-    at (6 + g,) and moving (12 + g,): a pose, then a twist, then the constants of the functions.
-    reach (2, n): joint coordinates and reach margins. placements (bodies, 15).
+    `at` (6 + g,) and `moving` (12 + g,) hold a pose, then a twist, then the constants of the
+    functions. `reach` (2, n) holds joint coordinates and reach margins, and `placements` is
+    (bodies, 15).
     """
 
     at: np.ndarray

@@ -10,8 +10,7 @@ import numpy as np
 
 from dynamics.checks import real
 from dynamics.errors import RobotFileError
-from dynamics.kinematics.chart import FREEDOMS, Chart
-from dynamics.kinematics.platform import base_from_platform
+from dynamics.kinematics.platform import FREEDOMS, Chart, base_from_platform
 from dynamics.legs.geometric_numbers import POINTS, deviations, moved, unit_of, values
 from dynamics.legs.leg import Leg
 
@@ -23,11 +22,11 @@ SAME_PLACE = 1e-6
 class RobotGeometry:
     """Legs and chart of a robot. Two geometries are equal when all their numbers are.
 
-    travel_limit: largest magnitude of a joint coordinate, rad or m. gravity (3,): m/s^2. Lengths
-    are in m, and vectors in the axes of the base unless named otherwise. Legs are assembled: each
-    knows which solution of its inverse kinematics is the one at home. Raises RobotFileError, with
-    leg and numbers, for a machine with more or fewer freedoms than actuators, for two legs in one
-    place, and where a leg cannot reach the home pose.
+    `travel_limit` is the largest magnitude of a joint coordinate, rad or m, and `gravity` (3,) is
+    in m/s^2. Lengths are in m, and vectors in the axes of the base unless named otherwise. Legs are
+    assembled: each knows which solution of its inverse kinematics is the one at home. Raises
+    RobotFileError, with leg and numbers, for a machine with more or fewer freedoms than actuators,
+    for two legs in one place, and where a leg cannot reach the home pose.
     """
 
     legs: tuple[Leg, ...]
@@ -163,10 +162,10 @@ class RobotGeometry:
     ) -> "RobotGeometry":
         """Geometry of a robot that is not built as drawn, with drawn normal errors.
 
-        std, m: of every coordinate of the joints B and A. length_std, m: of the lengths. turn_std,
-        rad: of the axes. Joint coordinates are set to zero at home as those of a real robot are.
-        Errors of zero give the geometry itself. Raises RobotFileError for a negative error, and
-        where a leg does not reach the home pose any more.
+        Standard deviations are `std`, m, of every coordinate of the joints B and A, `length_std`,
+        m, of the lengths, and `turn_std`, rad, of the axes. Joint coordinates are set to zero at
+        home as those of a real robot are. Errors of zero give the geometry itself. Raises
+        RobotFileError for a negative error, and where a leg does not reach the home pose any more.
         """
         real("geometry error", std, RobotFileError, least=0, unit=" m")
         real("error of lengths", length_std, RobotFileError, least=0, unit=" m")
@@ -213,8 +212,8 @@ class RobotGeometry:
         if len(self.legs) != freedoms:
             kind = "under-actuated" if len(self.legs) < freedoms else "over-constrained"
             raise RobotFileError(
-                f"the machine is {kind}: {len(self.legs)} actuated legs for {freedoms} freedoms "
-                f"of the platform ({', '.join(self.chart.coordinate_names)})"
+                f"the machine is {kind}: {len(self.legs)} actuated legs for {freedoms} freedoms of "
+                f"the platform ({', '.join(self.chart.coordinate_names)})"
             )
         if self.chart.name == "planar" and np.any(self.home_pose[3:5]):
             raise RobotFileError(

@@ -44,7 +44,7 @@ class UnphysicalInertiaError(ParameterError):
 class BodyInertias:
     """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body (bodies, 4).
 
-    changes: text by body of what was changed, empty where nothing was.
+    `changes` says by body what was changed, and is empty where nothing was.
     """
 
     values: np.ndarray
@@ -68,8 +68,8 @@ def physical_inertias(
     if broken and not allow_changes:
         raise UnphysicalInertiaError(
             f"no rigid body has these inertias [kg, kg m^2]: {'; '.join(grouped(broken))}; pass "
-            "allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to take "
-            "the nearest ones that engines accept"
+            "allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to take the "
+            "nearest ones that engines accept"
         )
     values = given.copy()
     changes = dict[str, str]()
@@ -83,8 +83,8 @@ def physical_inertias(
 def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
     """Text for a principal moment that exceeds the sum of the other two.
 
-    rounding: share by which it may exceed the sum. The text is empty where a rigid body can have
-    the moments.
+    It may exceed the sum by the share `rounding`. The text is empty where a rigid body can have the
+    moments.
     """
     largest = max(moments, key=moments.__getitem__)
     others = [name for name in moments if name != largest]
@@ -173,7 +173,7 @@ def acceleration_changes(
 ) -> dict[str, float]:
     """Largest |change| / |acceleration| of forward dynamics for each changed body, by body.
 
-    inertias (bodies, 4): masses and moments in the order of the layout. Bodies that have them
+    `inertias` (bodies, 4) are masses and moments in the order of the layout. Bodies that have them
     already in the parameters (p,) are left out. Linear and angular acceleration count separately,
     over the states of `travel_states`. Raises ParameterError for parameters outside their range.
     """

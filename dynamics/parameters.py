@@ -34,8 +34,8 @@ def room_for_derivatives(parameters: int, start: int) -> int:
 class RigidGroups:
     """Combinations (k, r) of the r inertial parameters of a robot on which its motion depends.
 
-    pivots (k,): one parameter of each combination, ascending. It has the coefficient 1 there, and
-    is in no other combination.
+    `pivots` (k,) are one parameter of each combination, ascending. It has the coefficient 1 there,
+    and is in no other combination.
     """
 
     pivots: np.ndarray
@@ -44,8 +44,8 @@ class RigidGroups:
     def of_all(self, by_pivots: np.ndarray) -> np.ndarray:
         """Derivatives (..., p) with respect to all parameters.
 
-        by_pivots: derivatives with respect to the pivots and to the parameters after the inertial
-        ones.
+        `by_pivots` are derivatives with respect to the pivots and to the parameters after the
+        inertial ones.
         """
         count = len(self.pivots)
         return np.concatenate(
@@ -57,8 +57,8 @@ class RigidGroups:
 class ParameterLayout:
     """Parameters of a robot: of its bodies, of joint friction, and of the joint PID.
 
-    bodies: all bodies, the platform first, with the kind of each. of_leg: places of the bodies of
-    each leg among them. prismatic: True where actuators slide.
+    `bodies` are all bodies, the platform first, with the kind of each. `of_leg` are the places of
+    the bodies of each leg among them. `prismatic` is True where actuators slide.
     """
 
     bodies: tuple[str, ...]

@@ -260,6 +260,7 @@ class RobotDynamics(RobotKinematics):
         (6,)
         """
         poses = rows("pose", pose, 6)
+        # Friction is zero at rest, with the exact sign function.
         rest = np.zeros_like(poses)
         return self.inverse_dynamics(poses, rest, rest, parameters)
 
@@ -271,8 +272,8 @@ class RobotDynamics(RobotKinematics):
         if not (condition < CONDITION_LIMIT).all():
             index = int(np.argmax(~(condition < CONDITION_LIMIT)))
             raise SingularPoseError(
-                f"the robot is singular at pose {row_text(np.atleast_2d(poses)[index])}: "
-                f"condition of J_ad {condition[index]:.3g}, limit {CONDITION_LIMIT:.0e}"
+                f"the robot is singular at pose {row_text(np.atleast_2d(poses)[index])}: condition "
+                f"of J_ad {condition[index]:.3g}, limit {CONDITION_LIMIT:.0e}"
             )
         return poses
 

@@ -9,15 +9,14 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from dynamics.checks import shown
+from dynamics.checks import Acceleration, Damping, Force, Gain, Inertia, Mass, Place, Travel, shown
 from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.files import Name, check_name, is_file, parse_toml, read_text
 from dynamics.geometry import RobotGeometry
-from dynamics.kinematics.chart import FREEDOMS, Chart
+from dynamics.kinematics.platform import FREEDOMS, Chart
 from dynamics.legs import KINDS, AnyLeg
 from dynamics.legs.leg import INERTIAL
 from dynamics.parameters import JOINT_PID, ParameterLayout, parameter_layout
-from dynamics.quantities import Acceleration, Damping, Force, Gain, Inertia, Mass, Place, Travel
 
 MOST_COMPLAINTS = 24
 """Largest number of faults that a message lists: four for each of six legs."""
@@ -218,7 +217,7 @@ def _plural(name: str) -> str:
 class ParameterSet:
     """Named parameter set.
 
-    dynamic (p,): in the order of `Robot.parameter_names`. joint_pid (3,): lp, li, ld.
+    `dynamic` (p,) are in the order of `Robot.parameter_names`, and `joint_pid` (3,) are lp, li, ld.
     """
 
     dynamic: np.ndarray
@@ -282,7 +281,7 @@ def read_robot_file(name_or_path: str | Path) -> RobotDescription:
 
 
 def parsed_robot(text: str, source: str) -> RobotDescription:
-    """Robot of the text of a file; source: how messages call it. Raises as `read_robot_file`."""
+    """Robot of the text of a file, which messages call `source`. Raises as `read_robot_file`."""
     try:
         content = RobotFile.model_validate(parse_toml(text, source, RobotFileError))
     except ValidationError as error:

@@ -15,7 +15,7 @@ from dynamics.errors import (
     UnreachablePoseError,
 )
 from dynamics.geometry import RobotGeometry
-from dynamics.kinematics.chart import POSE_NAMES
+from dynamics.kinematics.platform import POSE_NAMES
 from dynamics.parameters import parameter_layout
 from dynamics.robot_file import ParameterSet, RobotDescription
 from dynamics.robot_functions import nearby_functions, own_functions

@@ -16,9 +16,10 @@ def place_rods(
 ) -> bool:
     """Fill the ends (parts, 2, 3) of the drawn parts at a pose (6,), in the axes of the base, m.
 
-    kinematics, placements: addresses of functions of the robot. drawn, room: `Drawn` and `Room`.
-    held (6,): entries that the chart holds, to within the slack, and NaN for the others. Returns
-    False where a leg does not reach the pose, or where the platform cannot have it.
+    `kinematics` and `placements` are addresses of functions of the robot, and `drawn` and `room`
+    are `Drawn` and `Room`. `held` (6,) are entries that the chart holds, to within the slack, and
+    NaN for the others. Returns False where a leg does not reach the pose, or where the platform
+    cannot have it.
     """
     for i in range(6):
         # a comparison with NaN is never true

@@ -53,8 +53,8 @@ rss6 is below 5 (J_a2) and 10 (J_ad) within its travel.
 class WorkspaceMeasures:
     """Measures of N poses. All but the reach margins are NaN where a leg cannot reach.
 
-    theta (N, n): rad or m. reach_margin (N, n): negative out of reach. leverage (N, n): of J_a1.
-    platform_rows (N, n, n): J_a2 without unit. travel_limit: rad or m.
+    `theta` (N, n) is in rad or m. `reach_margin` (N, n) is negative out of reach. `leverage` (N, n)
+    is that of J_a1. `platform_rows` (N, n, n) are J_a2 without unit. `travel_limit` is in rad or m.
     """
 
     theta: np.ndarray
@@ -76,6 +76,7 @@ class WorkspaceMeasures:
     def _condition(self, matrices: np.ndarray) -> np.ndarray:
         """Condition numbers of matrices, NaN out of reach."""
         result = np.full(len(matrices), np.nan)
+        # NumPy refuses matrices with NaN.
         result[self.reachable] = np.linalg.cond(matrices[self.reachable])
         return result
 
@@ -94,8 +95,8 @@ class WorkspaceMeasures:
 class Extreme:
     """Point of a motion that is nearest to a limit.
 
-    value, limit, row. time: s, NaN where no times are given. leg: 1 to n, None where all are
-    concerned.
+    It has a value, its limit, and a row. `time` is in s, and NaN where no times are given. `leg` is
+    1 to n, and None where all are concerned.
     """
 
     value: float
@@ -143,6 +144,7 @@ def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
     The result is always the same for a robot.
     """
     limit = robot.travel_limit
+    # The seed is fixed: a report of a robot must not change from run to run.
     joints = np.random.default_rng(0).uniform(-limit, limit, (samples, robot.layout.joints))
     start = np.tile(robot.home_pose, (samples, 1))
     found = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from dynamics import Robot
 from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION, check_motion
 from identify.arrays import Array
 from identify.errors import TrajectoryError

@@ -1,8 +1,8 @@
-"""Artefacts of the tests, long boards with a ridge and stickers on their three upper sides, and the
-sensor before them.
+"""Artefacts of the tests, and the sensor before them.
 
-An artefact's frame has x along it, z out of its front side A and the origin in the middle of that
-side. Sides B and C slope away from A by SLOPE, so that all stickers are seen from the front.
+An artefact is a long board with a ridge and stickers on its three upper sides. Its frame has x
+along it, z out of its front side A, and its origin in the middle of that side. Sides B and C slope
+away from A by SLOPE, so that all stickers are seen from the front.
 """
 
 from dataclasses import dataclass, replace
@@ -24,24 +24,33 @@ from cmmsim.sensor import Sensor
 
 H = TypeVar("H", bound=HalfSpace)
 SLOPE = np.deg2rad(15.0)
-HALF_RIDGE = 0.020  # m: half the width of side A
-SIDE = 0.060  # m: width of sides B and C
-END = 0.020  # m: the board goes on beyond the outermost stickers
-OUT_OF_SIGHT = 100.0  # m behind the cameras
-LENGTH = 0.300  # m between the origins of the rigid bar's ends, which lie on its x axis
+# m: half the width of side A.
+HALF_RIDGE = 0.020
+# m: width of sides B and C.
+SIDE = 0.060
+# m: length of the board beyond its outermost stickers.
+END = 0.020
+# m behind the cameras.
+OUT_OF_SIGHT = 100.0
+# m between the origins of the rigid bar's ends, which lie on its x axis.
+LENGTH = 0.300
 HALF_LENGTH = 0.5 * LENGTH + 0.065
 HALF_WIDTH = HALF_RIDGE + SIDE
-# first_from_second, what is true of the ends
+# True first_from_second of the ends.
 END_FROM_END = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
 
 StickerRow = tuple[ArrayLike, ArrayLike]
-"""Stickers of one side: along (n,) m from the middle of the artefact, and across (n,) m from the
-middle line of side A, or on sides B and C away from the edge of A."""
+"""Stickers of one side, along (n,) and across (n,), m.
+
+Along is counted from the middle of the artefact, across from the middle line of side A, or on sides
+B and C from the edge of A.
+"""
 
 
 def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
-    """Section of a sensor file: an artefact with rows of stickers on its sides A, B (towards +y)
-    and C (towards -y).
+    """Return the sensor-file section of an artefact with rows of stickers on its sides.
+
+    They are A, B (towards +y) and C (towards -y).
     """
     reach = max(float(np.abs(along).max()) for along, _ in (a, b, c)) + END
     sine = float(np.sin(SLOPE))
@@ -66,9 +75,9 @@ def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
 
 
 def artefact_file(file: SensorFile, artefact: Platform) -> SensorFile:
-    """The sensor file with an artefact in place of the platform and nothing else in sight.
+    """Return the sensor file with an artefact in place of the platform, and nothing else in sight.
 
-    The artefact's stickers sit exactly at their places: they are what its certificate states.
+    The artefact's stickers sit exactly at the places that its certificate states.
     """
     stickers = file.stickers.model_copy(update={"placement": (0.0, 0.0)})
     return file.model_copy(
@@ -82,17 +91,19 @@ def _side(
     row: StickerRow,
     sign: float,
 ) -> StickerPlane:
-    """u runs along the artefact; v = n x u points to +y on all sides, so that C counts
-    backwards."""
+    """Return one side with its stickers.
+
+    u runs along the artefact, and v = n x u points to +y on all sides, so that C counts backwards.
+    """
     stickers = [(float(u), sign * float(v)) for u, v in np.column_stack(row)]
     return StickerPlane(normal=normal, point=point, across=(1.0, 0.0, 0.0), stickers=stickers)
 
 
 def rigid_bar() -> Platform:
-    """The sensor-file section of the bar: at each end a cluster of six stickers, a rigid body of
-    its own to the sensor.
+    """Return the sensor-file section of the bar, with a cluster of six stickers at each end.
 
-    The clusters differ, so that one cannot be taken for the other.
+    To the sensor each cluster is a rigid body of its own. The clusters differ, so that one cannot
+    be taken for the other.
     """
     return board(
         ((-0.190, -0.115, 0.110, 0.186), (0.006, -0.010, 0.010, -0.004)),
@@ -102,14 +113,15 @@ def rigid_bar() -> Platform:
 
 
 def bar_ends(bar: MarkedBody) -> tuple[MarkedBody, MarkedBody]:
-    """The clusters at -x and at +x, with their origins on the bar's axis, ``LENGTH`` apart, and
-    axes like the bar's.
+    """Return the clusters at -x and at +x as bodies with axes like the bar's.
+
+    Their origins lie on the bar's axis, ``LENGTH`` apart.
     """
     return _end(bar, "first end of the bar", -1.0), _end(bar, "second end of the bar", 1.0)
 
 
 def _end(bar: MarkedBody, name: str, side: float) -> MarkedBody:
-    """The stickers on one side of the bar, as a body whose axes begin half a length from the
+    """Return the stickers on one side of the bar, as a body whose origin is half a length from the
     middle.
     """
     keep = np.flatnonzero(side * bar.nominal[:, 0] > 0.0)
@@ -126,7 +138,7 @@ def _end(bar: MarkedBody, name: str, side: float) -> MarkedBody:
 
 
 def _behind(body: Body, rig: Rig) -> Body:
-    """The body moved far behind both cameras."""
+    """Return the body moved far behind both cameras."""
     view = np.array(rig.target) - np.array(rig.position)
     shift = -OUT_OF_SIGHT * view / np.linalg.norm(view)
     planes = Planes(
@@ -146,25 +158,25 @@ def _moved(half_space: H, shift: Array) -> H:
 
 @dataclass(frozen=True)
 class SensorUnderTest:
-    """file: the sensor file; seed of all its noise; renderer: one of the sensor's, None for what
-    the file says.
-    """
+    """Sensor file under test, the seed of all its noise, and a renderer, or None for the file's."""
 
     file: SensorFile
     seed: int = 0
     renderer: str | None = None
 
     def facing(self, artefact: Platform, stream: int) -> Sensor:
-        """The sensor before an artefact instead of its platform; ``stream`` keeps the noise of the
-        tests apart.
+        """Return the sensor before an artefact in place of its platform.
+
+        ``stream`` keeps the noise of the tests apart.
         """
         sensor = Sensor(artefact_file(self.file, artefact), self.seed, renderer=self.renderer)
         sensor.start_run(self.seed + 1000 * stream)
         return sensor
 
     def renderer_name(self) -> str:
-        """The renderer that will draw. Raises UnknownOptionError, or OpenGLMissingError where it
-        cannot.
+        """Return the name of the renderer that will draw.
+
+        Raises UnknownOptionError, or OpenGLMissingError where it cannot draw.
         """
         name = choose_renderer(self.renderer or self.file.renderer).name
         if name == "pyrender":
@@ -180,7 +192,7 @@ class SensorUnderTest:
 def estimator_of(
     sensor: Sensor, body: MarkedBody, base_from_camera: Array | None = None
 ) -> PoseEstimator:
-    """The sensor's pose estimator for a body whose certificate states its sticker places.
+    """Return the sensor's pose estimator for a body whose certificate states its sticker places.
 
     Poses are in the camera frame unless the place of the base is given.
     """
@@ -190,8 +202,9 @@ def estimator_of(
 
 
 def locate(estimator: PoseEstimator, images: StereoImages) -> Array:
-    """Rough camera_from_body (4,4) from whole images. Raises AcceptanceError that names the
-    body."""
+    """Find a rough camera_from_body (4, 4) in whole images. Raises AcceptanceError that names the
+    body.
+    """
     try:
         return estimator.locate(images)
     except LostError as error:

@@ -1,9 +1,9 @@
-"""Latency in the style of ASTM E3124: how long after a motion its pose is reported.
+"""Latency in the style of ASTM E3124: the time from a motion to the report of its pose.
 
-A body goes round and round; a reference with an exact clock knows where it truly is. Each reported
+A body moves on a circle, and a reference with an exact clock knows its true place. Each reported
 pose is compared with the true motion at the time of its report: the motion must be set back by the
-latency to fit the reports. Frames are tracked one after the other, not measured many at once: the
-tracker is part of the instrument under test.
+latency to fit the reports. Frames are tracked one after the other and not measured many at once,
+because the tracker is part of the instrument under test.
 """
 
 from __future__ import annotations
@@ -28,10 +28,12 @@ from cmmsim.geometry.pose import Array, apply
 from cmmsim.tracker import Tracker
 
 STREAM = 201
+# Circle in m and s: the speed is 0.31 m/s.
 RADIUS = 0.05
-PERIOD = 1.0  # m and s of the circle: 0.31 m/s
+PERIOD = 1.0
 FRAMES = 180
-STEP = 1e-5  # s, of the difference quotient of a motion
+# s: step of the difference quotient of a motion.
+STEP = 1e-5
 ITERATIONS = 8
 Motion = Callable[[Array], Array]
 """True positions (n,3) m at times (n,) s."""
@@ -39,9 +41,11 @@ Motion = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Latency:
-    """delays (n,): of each report, s; mean, std and maximum of them, s; interval: 95 % interval of
-    the mean, s; resolution: standard deviation that the noise of the positions alone gives a single
-    delay, s."""
+    """Delays (n,) of the reports, s, with their mean, standard deviation and maximum.
+
+    ``interval`` is the 95 % interval of the mean. ``resolution`` is the standard deviation of a
+    single delay that the noise of the positions alone causes.
+    """
 
     delays: Array
     mean: float
@@ -53,8 +57,8 @@ class Latency:
 
 @dataclass(frozen=True)
 class LatencyTest:
-    """latency; reported (n,) times s of the reports; stated: the latency in the sensor's file, s;
-    frame_period s.
+    """Latency found, the times (n,) of the reports, and the latency that the sensor's file states,
+    s.
     """
 
     latency: Latency
@@ -71,13 +75,12 @@ def estimate_latency(
     largest: float,
     covariances: Array | None = None,
 ) -> Latency:
-    """Delay of each report by least squares: positions(k) = motion(reported(k) - delay(k)) +
-    offset.
+    """Estimate the delay of each report by least squares.
 
-    Parameters: reported (n,) s; positions (n,3) m; motion; largest: latencies from 0 to this are
-    searched, s, at most half the period of the motion; covariances (n,3,3) of the positions. The
-    offset (3,) is constant and not a result. Raises ShapeError for less than four reports or a
-    motion that stands still.
+    The model is positions(k) = motion(reported(k) - delay(k)) + offset, with a constant offset (3,)
+    that is not a result. Reports are at times (n,) s with positions (n, 3) m and covariances (n, 3,
+    3). Latencies from 0 to ``largest`` s are searched, at most half the period of the motion.
+    Raises ShapeError for less than four reports, and for a motion that stands still.
     """
     if len(reported) < 4 or positions.shape != (len(reported), 3):
         raise ShapeError(
@@ -96,9 +99,8 @@ def estimate_latency(
                 f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed"
             )
         residuals = positions - motion(times) - offset
-        if (
-            iteration < ITERATIONS // 2
-        ):  # one common delay and the offset first, then each delay for itself
+        # One common delay and the offset first, then each delay for itself.
+        if iteration < ITERATIONS // 2:
             common, shift = _common_step(residuals, velocity)
             delays = delays + common
             offset = offset + shift
@@ -120,8 +122,7 @@ def require_room(volume: MeasuringVolume) -> None:
     if np.any(needed > volume.size):
         raise AcceptanceError(
             f"latency: the body on its circle needs {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} "
-            "mm "
-            f"across the line of sight, the volume has {volume}"
+            f"mm across the line of sight, the volume has {volume}"
         )
 
 
@@ -131,8 +132,10 @@ def latency_test(
     frames: int = FRAMES,
     advance: Callable[[], None] = lambda: None,
 ) -> LatencyTest:
-    """Move a body on a circle in the middle of the volume and report its measured positions;
-    ``advance`` is called after each frame. Raises AcceptanceError when it is not measured."""
+    """Move a body on a circle in the middle of the volume, and report its measured positions.
+
+    ``advance`` is called after each frame. Raises AcceptanceError when the body is not measured.
+    """
     require_room(volume)
     sensor = under_test.facing(rigid_bar(), STREAM)
     estimator = estimator_of(sensor, sensor.platform, under_test.base_from_camera)
@@ -171,20 +174,23 @@ def latency_test(
 
 
 def _circle(times: Array) -> Array:
-    """Positions (n,3) in volume axes on a circle across the line of sight."""
+    """Return positions (n, 3) in volume axes on a circle across the line of sight."""
     angle = 2.0 * np.pi * times / PERIOD
     return RADIUS * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(times))])
 
 
 def _coarse_delay(reported: Array, positions: Array, motion: Motion, largest: float) -> float:
-    """The best of a grid of common delays."""
+    """Return the best of a grid of common delays.
+
+    The variance of the residuals is what is left after the best constant offset.
+    """
     grid = np.linspace(0.0, largest, 101)
     misfit = [np.var(positions - motion(reported - delay), axis=0).sum() for delay in grid]
     return float(grid[int(np.argmin(misfit))])
 
 
 def _common_step(residuals: Array, velocity: Array) -> tuple[float, Array]:
-    """Least-squares change of a common delay and of the offset (3,)."""
+    """Return the least-squares change of a common delay and of the offset (3,)."""
     columns = np.zeros((residuals.size, 4))
     columns[:, 0] = -velocity.ravel()
     columns[:, 1:] = np.tile(np.eye(3), (len(residuals), 1))
@@ -193,8 +199,9 @@ def _common_step(residuals: Array, velocity: Array) -> tuple[float, Array]:
 
 
 def _resolution(velocity: Array, covariances: Array | None) -> float:
-    """Standard deviation of a delay from the positions' noise, rms over the reports; 0 without
-    covariances.
+    """Return the standard deviation of a delay from the positions' noise, rms over the reports.
+
+    It is 0 without covariances.
     """
     if covariances is None:
         return 0.0

@@ -1,8 +1,8 @@
 """Length measurement error in the style of VDI/VDE 2634-1.
 
-On each measuring line stands an artefact with a row of six stickers; the distances of five of them
+An artefact with a row of six stickers stands on each measuring line. The distances of five of them
 from the first are the test lengths. A length is the mean of a few exposures of the standing
-artefact; its error is the measured length less the certified one, and its magnitude must stay
+artefact. Its error is the measured length less the certified one, and its magnitude must stay
 within a limit. Sphere form and spacing are not tested: the targets are flat stickers.
 """
 
@@ -21,9 +21,10 @@ from cmmsim.many_frames import on_all_cores
 from cmmsim.sensor import Sensor
 
 STREAM = 1
-EXPOSURES = 5  # of the standing artefact, whose lengths are averaged
-# irregular stickers by which the artefact is recognised, in shares of the longest length from its
-# middle
+# Exposures of the standing artefact, whose lengths are averaged.
+EXPOSURES = 5
+# Irregular stickers by which the artefact is recognised, from its middle, as shares of the longest
+# length.
 RECOGNITION_B = (-0.37, -0.08, 0.31)
 RECOGNITION_C = (-0.29, 0.13, 0.4)
 RECOGNITION_ACROSS = (0.044, 0.025, 0.040)
@@ -31,8 +32,11 @@ RECOGNITION_ACROSS = (0.044, 0.025, 0.040)
 
 @dataclass(frozen=True)
 class MeasuredLength:
-    """line: its name; true: certified length, m; measured (k,): the length in each of k exposures,
-    m; std: stated standard deviation of one exposure's length, m."""
+    """Length on a line, with its certified value ``true``, m.
+
+    ``measured`` (k,) is the length in each of k exposures, m, and ``std`` the stated standard
+    deviation of one of them.
+    """
 
     line: str
     true: float
@@ -47,7 +51,7 @@ class MeasuredLength:
 
 @dataclass(frozen=True)
 class LengthTest:
-    """volume, the seven lines, and all measured lengths."""
+    """Measuring volume, its seven lines, and all measured lengths."""
 
     volume: MeasuringVolume
     lines: tuple[MeasuringLine, ...]
@@ -70,8 +74,8 @@ class LengthTest:
 
     @property
     def variance_ratio(self) -> float:
-        """Mean square of single exposures' errors in units of their stated variance; 1 when that
-        one is true.
+        """Mean square of single exposures' errors in units of their stated variance, which is right
+        at 1.
         """
         stds = np.array([length.std for length in self.lengths])
         return float(np.mean((self.single_errors / stds[:, None]) ** 2))
@@ -98,9 +102,9 @@ def length_test(
     exposures: int = EXPOSURES,
     advance: Callable[[], None] = lambda: None,
 ) -> LengthTest:
-    """Measure five lengths on each of the seven lines of a volume, which share all cores and have
-    noise of their own; ``advance`` is called after each line.
+    """Measure five lengths on each of the seven lines of a volume.
 
+    The lines share all cores, and each has noise of its own. ``advance`` is called after each line.
     Raises AcceptanceError when a line breaks a rule or a sticker is not measured.
     """
     lines = seven_lines(volume)
@@ -121,7 +125,9 @@ def length_test(
 def measure_line(
     sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, exposures: int
 ) -> list[MeasuredLength]:
-    """The lengths of one line, whose artefact the sensor faces, from ``exposures`` pictures."""
+    """Measure the lengths of one line, whose artefact the sensor faces, in ``exposures``
+    pictures.
+    """
     pose = volume.pose(line.direction, 0.5 * (line.start + line.end))
     body = sensor.platform
     estimator = estimator_of(sensor, body)
@@ -145,8 +151,10 @@ def measure_line(
 
 
 def lengths_from_first(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Distances (n-1,) m of points (n,3) from the first, and their standard deviations from
-    covariances (n,3,3).
+    """Return the distances (n - 1,) m of points (n, 3) from the first, and their standard
+    deviations.
+
+    The points have covariances (n, 3, 3).
     """
     steps = points[1:] - points[0]
     lengths = np.linalg.norm(steps, axis=1)

@@ -1,14 +1,14 @@
 """Relative pose error of a moving rigid bar in the style of ASTM E3064-16.
 
 The bar moves along two rasters in three orientations, after standing still where each begins. One
-raster goes to and fro along the volume's x axis while it advances along y, the other the other way
-round. The bar is not held along the line of sight, where flat stickers cannot be seen, but turned
-by ``TOWARDS_DEPTH`` from the image plane. On top of that it turns smoothly about all its axes.
+raster goes to and fro along the volume's x axis while it advances along y; the other exchanges
+these axes. Flat stickers cannot be seen along the line of sight, so the bar is turned by
+``TOWARDS_DEPTH`` from the image plane instead. In addition it turns smoothly about all its axes.
 
-The sensor measures the poses of the clusters at both ends in the same exposure. What the second is
-to the first is certified; the difference to what was measured is the error, of a bar that stands
-and of one that moves. Frames are tracked one after the other, not measured many at once: the
-tracker is part of the instrument under test.
+The sensor measures the poses of the clusters at both ends in the same exposure. Their certified
+relative pose is compared with the measured one, for the standing and for the moving bar. Frames are
+tracked one after the other and not measured many at once, because the tracker is part of the
+instrument under test.
 """
 
 from collections.abc import Callable
@@ -43,17 +43,21 @@ from cmmsim.measuring.measurement import Measurement
 from cmmsim.sensor import Sensor
 from cmmsim.tracker import Tracker
 
-SECONDS = 3.0  # of motion a run
-CYCLES = 1.5  # to and fro in this time
-TURN = np.deg2rad(8.0)  # reach of the turning about each axis
+# Seconds of motion in a run, and movements to and fro in this time.
+SECONDS = 3.0
+CYCLES = 1.5
+# Reach of the turning about each axis.
+TURN = np.deg2rad(8.0)
 TURN_CYCLES = np.array([1.0, 1.5, 0.5])
 TOWARDS_DEPTH = np.deg2rad(35.0)
-STEP = 1e-4  # s, of the difference quotient of a path
+# s: step of the difference quotient of a path.
+STEP = 1e-4
 SPEED_SAMPLES = 100
 STREAM = 101
-STANDING = 15  # exposures of the standing bar before each run
-# frames lost in a row end a run: each costs a search of whole images, and the rest would be lost as
-# well
+# Exposures of the standing bar before each run.
+STANDING = 15
+# Frames lost in a row that end a run: each costs a search of whole images, and the rest would be
+# lost as well.
 GIVEN_UP = 5
 RASTERS = {"x": 0, "y": 1}
 ORIENTATIONS = {
@@ -65,7 +69,11 @@ ORIENTATIONS = {
 
 @dataclass(frozen=True)
 class BarPath:
-    """name; fast: index of the raster's axis; along (3,): direction of the bar, volume axes."""
+    """Path of the bar in a volume.
+
+    ``fast`` is the index of the raster's fast axis, and ``along`` (3,) the direction of the bar in
+    volume axes.
+    """
 
     name: str
     fast: int
@@ -73,8 +81,9 @@ class BarPath:
     volume: MeasuringVolume
 
     def pose(self, time: float) -> Array:
-        """Pose (6,) of the bar in the base frame, ``time`` s after it starts to move, at rest
-        there.
+        """Return the pose (6,) of the bar in the base frame, ``time`` s after it starts to move.
+
+        It starts from rest.
         """
         phase = 2.0 * np.pi * time / SECONDS
         slow = -np.cos(0.5 * phase) * self.reach
@@ -94,20 +103,22 @@ class BarPath:
 
     @property
     def reach(self) -> Array:
-        """Largest distance (3,) of the bar's middle from that of the volume, so that the bar stays
-        inside, m.
+        """Largest distance (3,) of the bar's middle from the volume's, m, at which the bar stays
+        inside.
         """
         return 0.5 * self.volume.size - room_of_bar(self.along)
 
 
 def room_of_bar(along: Array) -> Array:
-    """Half sides (3,) of the cuboid in which a bar that turns by up to TURN stays, m."""
+    """Return half the sides (3,) of the cuboid in which a bar stays that turns by up to TURN, m."""
     across = HALF_WIDTH + HALF_LENGTH * np.sqrt(3.0) * np.sin(TURN)
     return np.asarray(HALF_LENGTH * np.abs(along) + across * np.sqrt(1.0 - along**2))
 
 
 def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
-    """The six paths of a volume. Raises AcceptanceError when the bar does not find room in it."""
+    """Return the six paths of a volume. Raises AcceptanceError when the bar does not find room in
+    it.
+    """
     paths = tuple(
         BarPath(f"raster {raster}, bar {name}", axis, along, volume)
         for raster, axis in RASTERS.items()
@@ -124,13 +135,14 @@ def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
 
 @dataclass(frozen=True)
 class BarRun:
-    """One run of the bar. Before it moves, time is negative.
+    """One run of the bar, which begins to move at time 0.
 
-    time (n,) s of the measured frames; errors (n,6) of the relative pose, [shift, turn] in axes of
-    the first end, m and rad; distance_errors (n,) of the ends' distance, m; variance_ratios (n,):
-    squared error in units of the stated covariance, over its six dimensions; lost: frames in which
-    an end was not measured; given_up: why the run was ended after GIVEN_UP of them in a row, its
-    other frames being counted as lost too.
+    ``time`` (n,) s are the measured frames. ``errors`` (n, 6) are those of the relative pose,
+    [shift, turn] in axes of the first end, m and rad. ``distance_errors`` (n,) are those of the
+    ends' distance, m. ``variance_ratios`` (n,) are squared errors in units of the stated
+    covariance, over six dimensions. ``lost`` counts frames in which an end was not measured.
+    ``given_up`` says why the run ended after GIVEN_UP of them in a row; its other frames count as
+    lost.
     """
 
     name: str
@@ -149,7 +161,7 @@ class BarRun:
 
 @dataclass(frozen=True)
 class BarTest:
-    """volume and the runs in it; exposure s; largest_speed of the bar's middle, m/s."""
+    """Measuring volume, the runs in it, the exposure in s, and the bar's largest speed in m/s."""
 
     volume: MeasuringVolume
     runs: tuple[BarRun, ...]
@@ -167,17 +179,18 @@ class BarTest:
         return sum(run.lost for run in self.runs)
 
     def errors(self, moving: bool) -> Array:
-        """Errors (n,6) [m, rad] of the moving or of the standing bar in all runs."""
+        """Return the errors (n, 6), m and rad, of the moving or of the standing bar in all runs."""
         return np.concatenate([run.errors[run.moving == moving] for run in self.runs])
 
     def distance_errors(self, moving: bool) -> Array:
-        """Errors (n,) [m] of the ends' distance of the moving or of the standing bar in all
-        runs."""
+        """Return the errors (n,) of the ends' distance, m, of the moving or of the standing bar in
+        all runs.
+        """
         return np.concatenate([run.distance_errors[run.moving == moving] for run in self.runs])
 
     @property
     def variance_ratio(self) -> float:
-        """Mean squared error in units of the stated covariance; 1 when that one is true."""
+        """Mean squared error in units of the stated covariance, which is right at 1."""
         return float(np.concatenate([run.variance_ratios for run in self.runs]).mean())
 
 
@@ -190,8 +203,8 @@ def bar_test(
 ) -> BarTest:
     """Move the bar along the six paths of a volume; ``advance`` is called after each.
 
-    seconds: of motion that are measured, from the start of each path. Raises AcceptanceError when
-    the bar does not find room or is not found in the first images.
+    ``seconds`` of motion are measured from the start of each path. Raises AcceptanceError when the
+    bar does not find room or is not found in the first images.
     """
     sensor = under_test.facing(rigid_bar(), STREAM)
     rate = sensor.timing.frame_rate
@@ -243,8 +256,11 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
 
 
 def relative_error(first: Measurement, second: Measurement) -> tuple[Array, float, float]:
-    """Error (6,) of the second end's pose relative to the first one's, in axes of the first; error
-    of their distance; squared error in units of the stated covariance, over six."""
+    """Return the error (6,) of the second end's pose relative to the first, in axes of the first.
+
+    The other results are the error of the ends' distance, and the squared error in units of the
+    stated covariance, over six.
+    """
     measured = invert(pose_to_transform(first.pose)) @ pose_to_transform(second.pose)
     turn = rotation_log(measured[:3, :3] @ END_FROM_END[:3, :3].T)
     error = np.concatenate([measured[:3, 3] - END_FROM_END[:3, 3], turn])
@@ -254,17 +270,21 @@ def relative_error(first: Measurement, second: Measurement) -> tuple[Array, floa
 
 
 def relative_covariance(first: Measurement, second: Measurement) -> Array:
-    """Covariance (6,6) of the small error [shift, turn] of the relative pose, in axes of the first
-    end.
+    """Return the covariance (6, 6) of the relative pose's small error [shift, turn].
+
+    It is in axes of the first end.
     """
     by_first = -np.eye(6)
+    # A turn of the first end moves the second one by the lever between them.
     by_first[:3, 3:] = skew(second.pose[:3] - first.pose[:3])
     total = by_first @ _small_covariance(first) @ by_first.T + _small_covariance(second)
     return compose_covariance(invert(pose_to_transform(first.pose)), total)
 
 
 def _small_covariance(measurement: Measurement) -> Array:
-    """Covariance (6,6) of the small error [shift, turn] of a pose, instead of its Euler angles."""
+    """Return the covariance (6, 6) of a pose's small error [shift, turn] instead of its Euler
+    angles.
+    """
     turn = np.eye(6)
     turn[3:, 3:] = euler_rates_matrix(measurement.pose)
     return np.asarray(turn @ measurement.covariance @ turn.T)

@@ -22,8 +22,11 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Statistics:
-    """count of values; mean, rms, 95th percentile and maximum, in the unit of the values; interval:
-    95 % interval of mean, rms and p95 by resampling blocks (a maximum has none)."""
+    """Statistics of values, in their unit.
+
+    ``interval`` holds the 95 % intervals of mean, rms and p95, which come from resampling blocks; a
+    maximum has none.
+    """
 
     count: int
     mean: float
@@ -34,14 +37,14 @@ class Statistics:
 
 
 def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statistics:
-    """Statistics of magnitudes (n,) of errors.
+    """Return the statistics of magnitudes (n,) of errors.
 
-    block: neighbours that are drawn together, because they are not independent
-    (scipy.stats.bootstrap draws single values only). Raises ShapeError for no values or values that
-    are not finite.
+    Neighbours are not independent, so ``block`` of them are drawn together; scipy.stats.bootstrap
+    draws single values only. Raises ShapeError for no values and for values that are not finite.
     """
     _require_finite(values)
     starts = rng.integers(0, len(values), (RESAMPLES, -(-len(values) // block)))
+    # Blocks go on at the beginning, so that all values are drawn equally often.
     drawn = ((starts[:, :, None] + np.arange(block)) % len(values)).reshape(RESAMPLES, -1)[
         :, : len(values)
     ]
@@ -68,7 +71,9 @@ def _figures(values: Array) -> dict[str, Array]:
 
 
 def interval_of_mean(values: Array) -> Interval:
-    """95 % interval of the mean of independent normal values (n,), n >= 2, by Student's t."""
+    """Return the 95 % interval of the mean of independent normal values (n,), n >= 2, by Student's
+    t.
+    """
     _require_finite(values)
     if len(values) < 2:
         raise ShapeError("the interval of a mean needs at least two values, got 1")
@@ -87,7 +92,10 @@ def _require_finite(values: Array) -> None:
 
 @dataclass(frozen=True)
 class PublishedFigure:
-    """instrument; quantity; value with its unit as published; note: what kind of figure it is."""
+    """Figure that was published for an instrument.
+
+    ``value`` has the published unit, and ``note`` says what kind of figure it is.
+    """
 
     instrument: str
     quantity: str
@@ -125,7 +133,7 @@ PUBLISHED = (
 
 
 def published(quantity: str) -> tuple[PublishedFigure, ...]:
-    """Published figures of one quantity, such as "position, static"; none for a quantity that
-    nobody published.
+    """Return the published figures of one quantity, such as "position, static"; there may be
+    none.
     """
     return tuple(figure for figure in PUBLISHED if figure.quantity == quantity)

@@ -1,10 +1,10 @@
-"""The measuring volume, a cuboid wholly seen by both cameras, and seven lines in it by the rules of
-VDI/VDE 2634-1.
+"""The measuring volume, a cuboid that both cameras see whole, and the seven lines of VDI/VDE
+2634-1.
 
 Volume axes are x to the right and y downwards as the rig sees them, and z away from it along the
-line from the middle of the baseline to the target; the origin is the target. Of the lines the four
-space diagonals have an end in every corner of the volume; one diagonal of each of three faces that
-meet in a corner leads along the outside.
+line from the middle of the baseline to the target; the origin is the target. Four lines are the
+space diagonals, with ends in all corners of the volume. The others are one diagonal of each of
+three faces that meet in a corner.
 """
 
 from __future__ import annotations
@@ -21,20 +21,23 @@ from cmmsim.files.schema import Rig
 from cmmsim.geometry.pose import Array, apply, frozen, invert, rigid, transform_to_pose
 from cmmsim.geometry.stereo_rig import StereoRig
 
-MARGIN_PX = 40.0  # the corners stay this far inside the images: room for the width of the artefacts
-LARGEST_SHARE = (
-    0.8  # the front face stays beyond a fifth of the way from the baseline to the target
-)
-SMALLEST_SIZE = 0.1  # m; below, the stickers of an artefact do not find room
+# The corners stay this far inside the images: room for the width of the artefacts.
+MARGIN_PX = 40.0
+# the front face stays beyond a fifth of the way from the baseline to the target
+LARGEST_SHARE = 0.8
+# m: in a smaller volume, the stickers of an artefact do not find room.
+SMALLEST_SIZE = 0.1
 CORNERS = frozen(list(product((-0.5, 0.5), repeat=3)))
 FEWEST_LINES = 7
 FEWEST_LENGTHS = 5
-LONGEST_SHARE = 2.0 / 3.0  # of the volume's space diagonal
-USED_SHARE = (
-    0.9  # of a line between the sides of the volume; the rest is room for the ends of the artefact
-)
-LENGTH_SHARES = frozen([0.19, 0.41, 0.6, 0.82, 1.0])  # test lengths of a line, of its longest
-LINES = {  # their ends in half sides of the volume
+# Least share of the volume's space diagonal that the longest test length must have.
+LONGEST_SHARE = 2.0 / 3.0
+# of a line between the sides of the volume; the rest is room for the ends of the artefact
+USED_SHARE = 0.9
+# Test lengths of a line, as shares of its longest.
+LENGTH_SHARES = frozen([0.19, 0.41, 0.6, 0.82, 1.0])
+# Ends of the lines, in half sides of the volume.
+LINES = {
     "space 1": ((-1, -1, -1), (1, 1, 1)),
     "space 2": ((1, -1, -1), (-1, 1, 1)),
     "space 3": ((-1, 1, -1), (1, -1, 1)),
@@ -47,8 +50,11 @@ LINES = {  # their ends in half sides of the volume
 
 @dataclass(frozen=True)
 class MeasuringVolume:
-    """base_from_volume (4,4) with the origin in the middle; size (3,) m along x, y, z; distance of
-    the middle from the middle of the baseline, m."""
+    """Cuboid with sides ``size`` (3,) along x, y and z, m.
+
+    ``base_from_volume`` (4, 4) has its origin in the middle. ``distance`` is that of the middle
+    from the middle of the baseline, m.
+    """
 
     base_from_volume: Array
     size: Array
@@ -71,9 +77,12 @@ class MeasuringVolume:
         return " x ".join(f"{1e3 * side:.0f}" for side in np.ravel(self.size)) + " mm"
 
     def pose(self, along: Array, position: Array, turn: Array | None = None) -> Array:
-        """Pose (6,) in the base frame of an artefact at ``position`` (3,) m in volume axes, its x
-        axis along ``along`` (3,), of any length, and its side A towards the rig; then turned by
-        ``turn`` (3,3) in its own axes."""
+        """Return the pose (6,) of an artefact in the base frame.
+
+        It stands at ``position`` (3,) m in volume axes. Its x axis points along ``along`` (3,), of
+        any length, and its side A towards the rig. Then it is turned by ``turn`` (3, 3) in its own
+        axes.
+        """
         x = along / np.linalg.norm(along)
         towards = np.array([0.0, 0.0, -1.0])
         z = towards - (towards @ x) * x
@@ -95,12 +104,15 @@ class MeasuringVolume:
 
 
 def common_volume(place: Rig) -> MeasuringVolume:
-    """The largest cube around the target of a sensor file's rig that both its cameras see whole,
-    MARGIN_PX from the edges of their images. Raises AcceptanceError when nothing is seen."""
+    """Return the largest cube around the target of a sensor file's rig that both cameras see whole.
+
+    It keeps MARGIN_PX from the edges of the images. Raises AcceptanceError when nothing is seen.
+    """
     rig, camera_from_base = rig_from_file(place)
     frame, distance = _volume_frame(rig, camera_from_base, place)
     low = 0.0
     high = 2.0 * LARGEST_SHARE * distance
+    # Bisection: after 40 halvings the side is known to rounding.
     for _ in range(40):
         middle = 0.5 * (low + high)
         if _unseen(rig, camera_from_base @ frame, np.full(3, middle), distance) is None:
@@ -109,14 +121,14 @@ def common_volume(place: Rig) -> MeasuringVolume:
             high = middle
     if low < SMALLEST_SIZE:
         raise AcceptanceError(
-            f"nothing is visible to both cameras around their target: the largest common cube has "
+            "nothing is visible to both cameras around their target: the largest common cube has "
             f"sides of {1e3 * low:.1f} mm, at least {1e3 * SMALLEST_SIZE:.0f} mm are needed"
         )
     return MeasuringVolume(frame, np.full(3, np.floor(1e3 * low) / 1e3), distance)
 
 
 def volume_of_size(place: Rig, size: Array) -> MeasuringVolume:
-    """The cuboid of ``size`` (3,) m around the target of a sensor file's rig.
+    """Return the cuboid of ``size`` (3,) m around the target of a sensor file's rig.
 
     Raises AcceptanceError naming a corner that is not seen, and the largest cube that is.
     """
@@ -128,15 +140,14 @@ def volume_of_size(place: Rig, size: Array) -> MeasuringVolume:
         largest = 1e3 * common_volume(place).size[0]
         raise AcceptanceError(
             f"measuring volume {volume} is not wholly visible to both cameras: {hidden}; the "
-            "largest "
-            f"cube that is has sides of {largest:.0f} mm"
+            f"largest cube that is has sides of {largest:.0f} mm"
         )
     return volume
 
 
 def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[Array, float]:
-    """base_from_volume (4,4), x along the baseline, and the distance of the target from the middle
-    of it, m.
+    """Return base_from_volume (4, 4), x along the baseline, and the target's distance from its
+    middle, m.
     """
     centres = [invert(move @ camera_from_base)[:3, 3] for move in rig.from_camera]
     view = np.array(place.target) - 0.5 * (centres[0] + centres[1])
@@ -166,16 +177,17 @@ def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: fl
             x, y = spots[k]
             return (
                 f"the corner ({corner}) mm is at pixel ({x:.0f}, {y:.0f}) of the {name} camera, "
-                "whose image has "
-                f"{camera.width} x {camera.height} px and {MARGIN_PX:.0f} px of margin"
+                f"whose image has {camera.width} x {camera.height} px and {MARGIN_PX:.0f} px of "
+                "margin"
             )
     return None
 
 
 @dataclass(frozen=True)
 class MeasuringLine:
-    """name; start and end (3,) of the longest test length in volume axes, m; lengths (k,) m from
-    the start.
+    """Measuring line from ``start`` to ``end`` (3,) of its longest test length, m in volume axes.
+
+    ``lengths`` (k,) are the test lengths from the start, m.
     """
 
     name: str
@@ -194,8 +206,9 @@ class MeasuringLine:
 
 
 def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
-    """The seven lines of a volume, five test lengths each. Raises AcceptanceError when a rule is
-    broken.
+    """Return the seven lines of a volume, with five test lengths each.
+
+    Raises AcceptanceError when a rule is broken.
     """
     lines = []
     for name, corners in LINES.items():
@@ -208,8 +221,8 @@ def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
 
 
 def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> None:
-    """Raise AcceptanceError naming the rule that measuring lines break, the line, the value and the
-    limit.
+    """Raise AcceptanceError, which names rule, line, value and limit, where measuring lines break a
+    rule.
     """
     if len(lines) < FEWEST_LINES:
         raise AcceptanceError(f"{len(lines)} measuring lines, at least {FEWEST_LINES} are needed")
@@ -224,9 +237,9 @@ def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> No
         limit = LONGEST_SHARE * volume.diagonal
         if longest < limit:
             raise AcceptanceError(
-                f"line {line.name}: its longest test length of {1e3 * longest:.0f} mm is less "
-                "than two thirds of the "
-                f"volume's space diagonal, {1e3 * limit:.0f} mm; choose a volume nearer to a cube"
+                f"line {line.name}: its longest test length of {1e3 * longest:.0f} mm is less than "
+                f"two thirds of the volume's space diagonal, {1e3 * limit:.0f} mm; choose a volume "
+                "nearer to a cube"
             )
         for point in (line.start, line.end):
             if np.any(np.abs(point) > 0.5 * volume.size + 1e-9):

@@ -1,7 +1,7 @@
-"""Calibration of the stereo rig from pictures of a board: rendered ones, or real photographs.
+"""Calibration of the stereo rig from pictures of a board, rendered or photographed.
 
-The way: a board description, pairs of image files, the board in each image, OpenCV's calibration as
-a start, one joint adjustment of both cameras with its covariance.
+The steps are a board description, pairs of image files, the board in each image, OpenCV's
+calibration as a start, and one joint adjustment of both cameras with its covariance.
 """
 
 from cmmsim.calibration.board import Board, read_board

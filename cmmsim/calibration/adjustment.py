@@ -1,15 +1,14 @@
-"""One least-squares adjustment of both cameras, their relative pose and all board poses to all
-measured pixels.
+"""One least-squares adjustment of both cameras, their relative pose and all board poses.
 
-Nine intrinsics describe a camera: focal lengths fx, fy and principal point cx, cy in px, then k1,
-k2, p1, p2, k3 of Brown and Conrady as OpenCV orders them. Those that a calibration does not set
-free stay where the adjustment starts.
+The observations are all measured pixels. Nine intrinsics describe a camera: focal lengths fx, fy
+and principal point cx, cy in px, then k1, k2, p1, p2, k3 of Brown and Conrady as OpenCV orders
+them. Intrinsics that are not free keep their start values.
 
-Levenberg and Marquardt's method on the normal equations. A board pose is seen by its own view only,
-so that the poses are eliminated view by view (Schur complement) and what remains is the reduced
-normal matrix N of the free intrinsics and of right_from_left. All pixels count alike; their
-variance sigma² is estimated from the residuals, and sigma² N^-1 is the covariance of independent
-errors, enlarged where the points of a view share theirs.
+Levenberg and Marquardt's method solves the normal equations. A board pose is seen by its own view
+only, so the poses are eliminated view by view (Schur complement), which leaves the reduced normal
+matrix N of the free intrinsics and of right_from_left. All pixels count alike, and their variance
+sigma² is estimated from the residuals. The covariance of independent errors is sigma² N^-1; it is
+enlarged where the points of a view share their errors.
 """
 
 from collections.abc import Callable
@@ -29,31 +28,27 @@ from cmmsim.geometry.pose import Array, apply, rotation_exp, skew
 DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}
 DEFAULT_DISTORTION = "brown5"
 MOST_STEPS = 60
-SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration
-SINGULAR = (
-    1e-14  # smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
-)
+# Relative decrease of the sum of squares that ends the iteration.
+SMALLEST_GAIN = 1e-11
+# smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
+SINGULAR = 1e-14
+# Unknowns of a pose, then the places of the unknowns of all views and of one view's board.
 POSE = 6
 COMMON = slice(None, -POSE)
-BOARD = slice(-POSE, None)  # unknowns of all views, and of one
+BOARD = slice(-POSE, None)
 
 
 def free_directions(distortion: str, fix_aspect: bool) -> Array:
-    """Matrix (9, k) from the k free numbers of a camera to all nine.
+    """Return the matrix (9, k) from the k free numbers of a camera to all nine.
 
-    distortion: which terms are free, a key of DISTORTIONS; fix_aspect: fx = fy. Raises
+    ``distortion`` names the free terms, a key of DISTORTIONS. ``fix_aspect`` sets fx = fy. Raises
     UnknownOptionError.
     """
     if distortion not in DISTORTIONS:
         raise UnknownOptionError("distortion", distortion, DISTORTIONS)
-    free = np.eye(len(INTRINSIC_NAMES))[
-        :,
-        [
-            k
-            for k, name in enumerate(INTRINSIC_NAMES)
-            if name.endswith("_px") or name in DISTORTIONS[distortion]
-        ],
-    ]
+    terms = DISTORTIONS[distortion]
+    chosen = [name.endswith("_px") or name in terms for name in INTRINSIC_NAMES]
+    free = np.eye(len(INTRINSIC_NAMES))[:, chosen]
     if fix_aspect:
         free[:, 0] += free[:, 1]
         free = np.delete(free, 1, axis=1)
@@ -61,25 +56,29 @@ def free_directions(distortion: str, fix_aspect: bool) -> Array:
 
 
 def camera_matrix(values: Array) -> Array:
-    """OpenCV's matrix (3,3) of a camera's intrinsics (9,)."""
+    """Return OpenCV's matrix (3, 3) of a camera's intrinsics (9,)."""
     return np.array([[values[0], 0.0, values[2]], [0.0, values[1], values[3]], [0.0, 0.0, 1.0]])
 
 
 def project(values: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Pixels (n, 2) of points (n, 3) in camera axes, and their derivatives by the intrinsics (n, 2,
-    9) and by the points (n, 2, 3), px/m. The points must lie before the camera."""
+    """Return the pixels (n, 2) of points (n, 3) in camera axes, and their derivatives.
+
+    The derivatives are by the intrinsics (n, 2, 9) and by the points (n, 2, 3), px/m. The points
+    must lie before the camera.
+    """
     pixels, jacobian = cv2.projectPoints(
         points, np.zeros(3), np.zeros(3), camera_matrix(values), values[4:]
     )
-    # turn 3, shift 3, f 2, c 2, distortion 5
+    # OpenCV's columns are 3 of the turn, 3 of the shift, 2 of f, 2 of c, and 5 of the distortion.
     by_all = np.asarray(jacobian, dtype=float).reshape(len(points), 2, -1)
     return np.asarray(pixels, dtype=float).reshape(-1, 2), by_all[:, :, 6:15], by_all[:, :, 3:6]
 
 
 @dataclass(frozen=True)
 class RigState:
-    """intrinsics (2,9) of the left and right camera, right_from_left (4,4), left_from_boards
-    (v,4,4) of the views.
+    """State of the rig and of the boards of v views.
+
+    It has intrinsics (2, 9), right_from_left (4, 4), and left_from_boards (v, 4, 4).
     """
 
     intrinsics: Array
@@ -93,8 +92,11 @@ class RigState:
         return float(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
 
     def moved(self, intrinsics: Array, right: Array, boards: Array) -> "RigState":
-        """The state after changes of the intrinsics (2,9), and small errors [dt, dphi] of
-        right_from_left (6,) and of the boards (v,6)."""
+        """Return the state after changes of all its parts.
+
+        They are changes of the intrinsics (2, 9), and small errors [dt, dphi] of right_from_left
+        (6,) and of the boards (v, 6).
+        """
         return RigState(
             self.intrinsics + intrinsics,
             _moved(self.right_from_left, right),
@@ -113,11 +115,15 @@ def _moved(transform: Array, change: Array) -> Array:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """state; residuals (m,2) px of each camera, measured minus computed; sigma_px: estimated
-    standard deviation of a pixel coordinate; covariance (24,24) of the left and right intrinsics (9
-    each) and of the small error [dt, dphi] of right_from_left, and independent_covariance that it
-    would be if no points of a view erred alike; condition of N scaled to a unit diagonal; steps;
-    freedom: observations minus unknowns; shared: errors that points of a view share."""
+    """Result of an adjustment.
+
+    ``residuals`` (m, 2) of each camera are measured minus computed pixels, and ``sigma_px`` is the
+    estimated standard deviation of a pixel coordinate. ``covariance`` (24, 24) belongs to the left
+    and right intrinsics (9 each) and to the small error [dt, dphi] of right_from_left;
+    ``independent_covariance`` would hold if no points of a view erred alike. ``condition`` is that
+    of N scaled to a unit diagonal. ``freedom`` is the number of observations minus unknowns, and
+    ``shared`` describes errors that points of a view share.
+    """
 
     state: RigState
     residuals: tuple[Array, Array]
@@ -132,9 +138,12 @@ class Adjustment:
 
 @dataclass(frozen=True)
 class _Normal:
-    """Normal equations by view: upper blocks of the matrix (v,s,s) and right-hand side (v,s) of the
-    c common unknowns and, last, of the pose of the view's board, s = c + 6; residuals of both
-    cameras; cost: sum of squares, px²."""
+    """Normal equations by view.
+
+    ``matrix`` (v, s, s) and ``side`` (v, s) belong to the c common unknowns and, last, to the pose
+    of the view's board; s = c + 6. ``cost`` is the sum of the squared residuals of both cameras,
+    px².
+    """
 
     matrix: Array
     side: Array
@@ -142,15 +151,18 @@ class _Normal:
     cost: float
 
     def blocks(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
-        """Blocks of the common unknowns (v,c,c), mixed (v,c,6) and of the boards (v,6,6), their
-        diagonal enlarged.
+        """Return the blocks of the common unknowns (v, c, c), mixed (v, c, 6) and of the boards (v,
+        6, 6).
+
+        The damping enlarges their diagonals.
         """
         damped = self.matrix + damping * self.matrix * np.eye(self.matrix.shape[1])
         return damped[:, COMMON, COMMON], damped[:, COMMON, BOARD], damped[:, BOARD, BOARD]
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array]:
-        """Each view's share of the reduced normal matrix (v,c,c) and of its right-hand side
-        (v,c)."""
+        """Return each view's share of the reduced normal matrix (v, c, c) and of its right-hand
+        side (v, c).
+        """
         common, mixed, boards = self.blocks(damping)
         eliminated = np.linalg.solve(boards, mixed.swapaxes(1, 2)).swapaxes(1, 2)
         matrix = np.asarray(common - eliminated @ mixed.swapaxes(1, 2), dtype=np.float64)
@@ -159,8 +171,10 @@ class _Normal:
         )
 
     def step(self, damping: float) -> tuple[Array, Array]:
-        """Damped changes of the common unknowns (c,) and of the boards (v,6)."""
+        """Return the damped changes of the common unknowns (c,) and of the boards (v, 6)."""
         matrix, side = (part.sum(axis=0) for part in self.reduced(damping))
+        # Focal lengths and distortion terms differ by ten orders of magnitude: a unit diagonal
+        # keeps digits.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         common = (
             scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
@@ -173,11 +187,10 @@ class _Normal:
 def adjust(
     points: Array, sightings: tuple[Sightings, Sightings], start: RigState, free: Array
 ) -> Adjustment:
-    """Adjust the rig and the board poses.
+    """Adjust the rig and the board poses to sightings of points (n, 3) m of the board.
 
-    Parameters: points (n,3) m of the board; sightings of the left and right camera, each view seen
-    by at least one; start; free (9,k) from ``free_directions``. Raises CalibrationError where the
-    views do not determine the cameras.
+    Each view is seen by at least one camera. ``free`` (9, k) is that of ``free_directions``. Raises
+    CalibrationError where the views do not determine the cameras.
     """
 
     def build(state: RigState) -> _Normal:
@@ -199,8 +212,8 @@ def adjust(
     if not eigenvalues[0] > SINGULAR:
         raise CalibrationError(
             "these views do not determine the cameras (smallest eigenvalue of the scaled normal "
-            f"matrix {eigenvalues[0]:.1e}): show the board tilted to several sides, all over "
-            "the image"
+            f"matrix {eigenvalues[0]:.1e}): show the board tilted to several sides, all over the "
+            "image"
         )
     sigma2 = normal.cost / freedom
     shared = shared_errors(scores, information, sigma2)
@@ -221,7 +234,7 @@ def adjust(
 def _minimise(
     build: Callable[[RigState], _Normal], state: RigState, free: Array
 ) -> tuple[RigState, int]:
-    """Levenberg-Marquardt: the state of least cost and the steps taken."""
+    """Minimise by Levenberg and Marquardt; return the state of least cost and the steps taken."""
     damping = 1e-4
     normal = build(state)
     k = free.shape[1]
@@ -239,17 +252,15 @@ def _minimise(
         elif (
             damping > 1e6 or abs(common @ normal.side[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost
         ):
-            return (
-                state,
-                step,
-            )  # what does not help is rounding: it would lower the cost by next to nothing
+            # A step that does not help is rounding: it would lower the cost by next to nothing.
+            return state, step
         else:
             damping *= 10.0
     rms = np.sqrt(normal.cost / sum(len(r) for r in normal.residuals))
     raise CalibrationError(
-        f"the adjustment has not converged in {MOST_STEPS} steps (rms {rms:.3g} px, board "
-        f"normals differ by at most {np.degrees(state.largest_tilt):.1f} degrees): show the board "
-        "tilted to several sides, by 30 degrees and more, or free fewer terms of distortion"
+        f"the adjustment has not converged in {MOST_STEPS} steps (rms {rms:.3g} px, board normals "
+        f"differ by at most {np.degrees(state.largest_tilt):.1f} degrees): show the board tilted "
+        "to several sides, by 30 degrees and more, or free fewer terms of distortion"
     )
 
 
@@ -284,8 +295,9 @@ def _normal_equations(
 def _predict(
     points: Array, seen: Sightings, state: RigState, side: int, free: Array
 ) -> tuple[Array, Array, Array]:
-    """Pixels (m,2) of one camera, and their derivatives by the common unknowns (m,2,c) and the
-    view's board (m,2,6).
+    """Predict the pixels (m, 2) of one camera, and their derivatives.
+
+    They are by the common unknowns (m, 2, c) and by the view's board (m, 2, 6).
     """
     k = free.shape[1]
     moves = state.left_from_boards[seen.view]
@@ -303,7 +315,8 @@ def _predict(
     pixels, by_intrinsics, by_place = project(
         state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0])
     )
-    pixels[~ahead] = np.inf  # a step that puts a board behind a camera is no improvement
+    # A step that puts a board behind a camera must not count as an improvement.
+    pixels[~ahead] = np.inf
     by_common = np.zeros((len(places), 2, 2 * k + POSE))
     by_common[:, :, side * k : (side + 1) * k] = by_intrinsics @ free
     if side == 1:

@@ -1,8 +1,8 @@
-"""Calibration boards: what a board file (TOML) may hold, and where its points are.
+"""Calibration boards: the content of a board file (TOML), and the places of its points.
 
-Board frame: origin at the first point, x along the columns, y along the rows, z away from who looks
-at the front; the points lie in z = 0. Points run along x first, then row by row, as OpenCV orders
-them.
+The board frame has its origin at the first point, x along the columns, y along the rows, and z away
+from an observer who looks at the front; the points lie in z = 0. Points run along x first, then row
+by row, as OpenCV orders them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,16 @@ Count = Annotated[int, Field(ge=3, le=200)]
 
 
 class Board(Section):
-    """A flat board.
+    """Flat board.
 
-    kind        "chessboard", "dots" (rows and columns at right angles) or "asymmetric_dots" (every
-    other row shifted) columns     points along x: inner corners of a chessboard, dots in one row
-    rows        points along y spacing     m between neighbouring points; asymmetric_dots: between
-    rows, dots of one row being twice as far apart radius      m of the dots (dots and
-    asymmetric_dots only) dark        whether dots are darker than the board (dots and
-    asymmetric_dots only)
+    kind     "chessboard", "dots" (rows and columns at right angles) or "asymmetric_dots" (every
+             other row shifted)
+    columns  points along x: inner corners of a chessboard, or dots in one row
+    rows     points along y
+    spacing  m between neighbouring points; for asymmetric_dots between rows, whose own dots are
+             twice as far apart
+    radius   m, of dots only
+    dark     True if dots are darker than the board
     """
 
     model_config = ConfigDict(strict=True)
@@ -52,14 +54,13 @@ class Board(Section):
         elif self.radius > 0.4 * self.nearest:
             raise ValueError(
                 f"dots of radius {self.radius:g} m, {self.nearest:g} m from centre to centre, "
-                "nearly "
-                f"touch: the largest radius is {0.4 * self.nearest:.4g} m"
+                f"nearly touch: the largest radius is {0.4 * self.nearest:.4g} m"
             )
         return self
 
     @property
     def dot_radius(self) -> float:
-        """Radius of the dots, m; 0 of a chessboard, which has none."""
+        """Radius of the dots, m; 0 for a chessboard."""
         return self.radius or 0.0
 
     @property
@@ -76,10 +77,10 @@ class Board(Section):
 
     @property
     def symmetries(self) -> list[NDArray[np.int_]]:
-        """Orders (points,) in which the same board may be read: as it is, half a turn, and quarter
-        turns if square.
+        """Orders (points,) in which the same board may be read.
 
-        Which of them a picture shows cannot be seen in the picture.
+        They are the order as it is, half a turn, and quarter turns of a square board. A picture
+        does not show which of them is the true one.
         """
         order = np.arange(self.rows * self.columns)
         if self.kind == "asymmetric_dots":
@@ -90,7 +91,7 @@ class Board(Section):
         return [np.rot90(grid, k).ravel() for k in range(4)]
 
     def as_toml(self) -> str:
-        """The board as the text of a board file."""
+        """Return the board as the text of a board file."""
         lines = [
             f'kind = "{self.kind}"',
             f"columns = {self.columns}",
@@ -103,7 +104,7 @@ class Board(Section):
 
 
 def read_board(path: str | Path) -> Board:
-    """The board of a TOML file.
+    """Read the board of a TOML file.
 
     Raises CalibrationError with the valid names for an unknown key, and with the value for a wrong
     one.

@@ -1,59 +1,75 @@
-"""A board in a picture: which of its points are seen, and where.
+"""A board in a picture: the points that are seen, and their pixels.
 
-Corners of a chessboard are those that OpenCV finds. Dots OpenCV finds and orders, and a fit of a
-bright ellipse to each makes their centres exact: the centre is that of the dot's ellipse in the
-image, not the image of the dot's centre, see cmmsim.geometry.disc_image. The fits also tell the
-dots' radius, whatever the board file says.
+OpenCV finds the corners of a chessboard. A board of dots is read at once if one threshold parts all
+dots from their ground, and the dots lie as a plane's grid does. The four sharpest corners of the
+dots' convex hull are then those of the board, and a homography names the rest. Any other picture of
+dots is left to OpenCV, which tries two dozen thresholds and knows asymmetric grids; it is thorough,
+and six times as slow.
+
+A fit of a bright ellipse to each dot makes its centre exact. The centre is that of the dot's
+ellipse in the image, not the image of the dot's centre, see cmmsim.geometry.disc_image. The fits
+also measure the dots' radius, whatever the board file says.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.dot_search import search_dots
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
-FEWEST_SHARE = 0.7  # of the board's points that must be measured
-LARGEST_POINT_GAP = (
-    0.25  # of the distance of neighbours, by which a point may leave the plane's perspective
-)
-LARGEST_RADIUS_GAP = (
-    0.1  # of a dot's radius, by which the measured one may differ: more costs its correction 20 %
-)
-FINE_WINDOW_SHARE = 0.3  # half window of cornerSubPix over the distance of neighbouring corners
+# Share of the board's points that must be measured.
+FEWEST_SHARE = 0.7
+# Distance by which a point may leave the plane's perspective, as a share of that of neighbours.
+LARGEST_POINT_GAP = 0.25
+# Share of a dot's radius by which the measured one may differ: more costs its correction 20 %.
+LARGEST_RADIUS_GAP = 0.1
+# Half the window of cornerSubPix over the distance of neighbouring corners.
+FINE_WINDOW_SHARE = 0.3
 
 FIT_ITERATIONS = 5
-WINDOW_REACH = 2.2  # dot radii around the centre that are looked at
-GROUND_FROM = 1.2  # dot radii from which the ground is taken
-SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)  # blurs that are tried, sigma
-PROBED = 12  # dots on which they are tried
-LARGEST_MOVE = (
-    0.3  # a fit that ends farther from OpenCV's centre, in dot radii, has caught something else
-)
-# of the dots whose fits tell their radius; where fewer succeed, the area they cover tells it
+# Dot radii around a centre that are looked at, and those from which the ground is taken.
+WINDOW_REACH = 2.2
+GROUND_FROM = 1.2
+# Sigmas of blur that are tried, and the number of dots on which they are tried.
+SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)
+PROBED = 12
+# A fit that ends farther from OpenCV's centre, in dot radii, has caught something else.
+LARGEST_MOVE = 0.3
+# Share of dots whose fits must succeed to tell their radius; otherwise the covered area tells it.
 FITTED_SHARE = 0.5
-CELL_SIDE = 41  # samples along each side of the square around a dot, whose area is measured
-EXTREMES = (2.0, 98.0)  # percentiles of a cell whose middle parts ground from dot
+# Samples along each side of the square around a dot in which its area is measured.
+CELL_SIDE = 41
+# Percentiles of a cell's grey values whose mean parts ground from dot.
+EXTREMES = (2.0, 98.0)
 # A photograph's noise is not known and its edges are blurred: all grey values count alike, and the
 # limit only refuses what is no ellipse at all (residuals of 25 grey values rms).
 PLAIN_NOISE = CameraNoise(
     electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0
 )
 LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
+SMALLEST_AREA_PX = 20.0
+# Area of a dot as a share of the image.
+LARGEST_AREA = 0.01
+# OpenCV first looks in an image of at most this size, which is faster and has less noise.
+FIND_SIDE_PX = 1600
+# Share of the distance of neighbours by which a dot may lie off the grid of the four corners.
+LARGEST_GRID_GAP = 0.3
 
 
 @dataclass(frozen=True)
 class BoardView:
-    """View of a board by one camera: index (n,) of the points, their pixels (n, 2), and the radius
-    of its dots, m.
+    """View of a board by one camera.
+
+    It has the index (n,) of the points, their pixels (n, 2), and the radius of the dots, m.
     """
 
     index: NDArray[np.int_]
@@ -61,14 +77,14 @@ class BoardView:
     radius: float | None = None
 
     def read_as(self, order: NDArray[np.int_]) -> BoardView:
-        """The same view with its points renamed by one of the board's symmetries."""
+        """Return the view with its points renamed by one of the board's symmetries."""
         renamed = order[self.index]
         by_index = np.argsort(renamed)
         return replace(self, index=renamed[by_index], pixels=self.pixels[by_index])
 
 
 def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
-    """The board in one grey image, or in words why not."""
+    """Find the board in one grey image, or say in words why it is not there."""
     radius: float | None = None
     if board.kind == "chessboard":
         found = find_chessboard(grey, board.columns, board.rows)
@@ -87,8 +103,9 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
 
 
 def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
-    """The view with its rows turned round if it was read mirrored: a board is seen from its front
-    only.
+    """Return the view with its rows turned round if it was read mirrored.
+
+    A board is seen from its front only.
     """
     grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
     plane = board.points[view.index, :2]
@@ -112,7 +129,7 @@ def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
 
 
 def radius_differs(measured: float | None, given: float | None) -> bool:
-    """Tell whether a measured radius contradicts a given one; not where either is missing."""
+    """Tell whether a measured radius contradicts a given one; False where either is missing."""
     return (
         measured is not None
         and given is not None
@@ -121,8 +138,9 @@ def radius_differs(measured: float | None, given: float | None) -> bool:
 
 
 def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
-    """Corners (rows * columns, 2) px, or None. The sector-based search first, then the older one,
-    refined.
+    """Return the corners (rows * columns, 2) px, or None.
+
+    The sector-based search comes first, then the older one with refined corners.
     """
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     found, corners = cv2.findChessboardCornersSB(grey, (columns, rows), flags=flags)
@@ -142,8 +160,10 @@ def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array |
 
 
 def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | None:
-    """Dot centres (rows * columns, 2) px in the board's order, NaN where a dot is no clean ellipse,
-    and the dots' measured radius, m; None: no board."""
+    """Return dot centres (rows * columns, 2) px in the board's order, and their measured radius, m.
+
+    A dot that is no clean ellipse is NaN. The result is None where there is no board.
+    """
     bright = 255 - grey if board.dark else grey
     rough = search_dots(bright, board)
     if rough is None:
@@ -159,10 +179,13 @@ def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | No
 def _refine(
     bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
 ) -> tuple[Array, Array]:
-    """Fitted centres (n, 2), and fitted over expected radii (n,); dots that need windows of one
-    size are fitted together."""
+    """Return fitted centres (n, 2), and fitted over expected radii (n,).
+
+    Dots that need windows of one size are fitted together.
+    """
     largest = np.linalg.norm(shapes, axis=2).max(axis=1)
-    reach = min(WINDOW_REACH, board.nearest / board.dot_radius - 1.15)  # neighbours stay outside
+    # Neighbouring dots must stay outside.
+    reach = min(WINDOW_REACH, board.nearest / board.dot_radius - 1.15)
     sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
     fine = np.full_like(rough, np.nan)
     ratios = np.full(len(rough), np.nan)
@@ -183,12 +206,13 @@ def _refine(
 
 
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
-    """Sigma in px of the Gaussian blur with which ellipses fit these windows best: that of lens and
-    focus together.
+    """Return the sigma in px of the Gaussian blur with which ellipses fit windows best.
+
+    It is the blur of lens and focus together.
     """
     best = SPREADS_PX[0]
     least = np.inf
-    # the misfit has one minimum: it falls towards the true blur and rises from there on
+    # The misfit has one minimum: it falls towards the true blur, and rises from there on.
     for spread in SPREADS_PX:
         fits = fit_ellipses(
             windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS, spread
@@ -202,8 +226,8 @@ def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
 
 
 def _dot_shapes(rough: Array, board: Board) -> Array:
-    """Matrices (n,2,2) px that carry the unit disc to each dot, by the perspective of the whole
-    board.
+    """Return matrices (n, 2, 2) px that carry the unit disc to each dot, by the board's
+    perspective.
     """
     plane = board.points[:, :2]
     flat, _ = cv2.findHomography(plane, rough)
@@ -218,11 +242,11 @@ def _dot_shapes(rough: Array, board: Board) -> Array:
 def _without_neighbours(
     windows: NDArray[np.uint8], centres: Array, shapes: Array, reach: float
 ) -> Array:
-    """Windows (n,h,h) whose pixels beyond ``reach`` dot radii are set to the ground around the
-    dot."""
-    from cmmsim.detection.start_kernels import (
-        isolate_dots,
-    )  # compiles, so it is loaded where it is first needed
+    """Return windows (n, h, h) whose pixels beyond ``reach`` dot radii are set to the dot's
+    ground.
+    """
+    # Late, as numba takes time to import.
+    from cmmsim.detection.start_kernels import isolate_dots
 
     alone = np.array(windows, dtype=float)
     isolate_dots(alone, np.ascontiguousarray(centres), np.linalg.inv(shapes), GROUND_FROM, reach)
@@ -230,13 +254,12 @@ def _without_neighbours(
 
 
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
-    """Median radius of bright dots in units of the reach of the cells: half the distance to the
-    nearest neighbour.
+    """Return the median radius of bright dots over half the distance to their nearest neighbour.
 
-    Parameters: image; centres (n,2) px; steps (n,2,2) px that carry the unit disc to each dot's
-    cell. In each cell the grey values' share of the step from ground to dot adds up to the dot's
-    area. Dots that blur leaves without a level top seem larger: of 2.5 px radius, blurred by 1 px,
-    by a quarter.
+    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px carry the unit disc to each dot's cell. In
+    each cell the grey values' share of the step from ground to dot adds up to the dot's area. Dots
+    without a level top, because of blur, seem larger: by a quarter at 2.5 px radius and 1 px of
+    blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0
@@ -248,3 +271,111 @@ def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> f
     dot = np.nanmedian(np.where(values >= middle, values, np.nan), axis=1)
     area = (values.mean(axis=1) - ground) / np.maximum(dot - ground, 1.0)
     return float(np.sqrt(max(np.median(area), 0.0)))
+
+
+def search_dots(bright: NDArray[np.uint8], board: Board) -> Array | None:
+    """Return rough centres (rows * columns, 2) px of bright dots in the board's order, or None."""
+    rough = read_at_once(bright, board) if board.kind == "dots" else None
+    for side in (FIND_SIDE_PX, max(bright.shape)):
+        if rough is None:
+            rough = found_by_opencv(bright, board, min(1.0, side / max(bright.shape)))
+    return rough
+
+
+def read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
+    """Return the centres by one threshold, Otsu's; None where it does not show exactly the board's
+    grid.
+    """
+    points = _bright_spots(bright)
+    if len(points) != len(board.points):
+        return None
+    corners = _sharpest_corners(points)
+    last = np.array([board.columns - 1, board.rows - 1], dtype=np.float32)
+    grid = last * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
+    for turn in range(4):
+        flat = cv2.getPerspectiveTransform(np.roll(corners, turn, axis=0).astype(np.float32), grid)
+        places = cv2.perspectiveTransform(points[None], flat)[0]
+        cells = np.rint(places)
+        inside = np.all((cells >= 0) & (cells <= last))
+        index = (cells[:, 1] * board.columns + cells[:, 0]).astype(int)
+        if (
+            inside
+            and len(set(index)) == len(points)
+            and np.abs(places - cells).max() < LARGEST_GRID_GAP
+        ):
+            return np.asarray(points[np.argsort(index)])
+    return None
+
+
+def _bright_spots(bright: NDArray[np.uint8]) -> Array:
+    """Return the centroids (n, 2) px of bright spots whose area may be a dot's."""
+    _, shown = cv2.threshold(bright, 0.0, 1.0, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    found = []
+    for contour in cv2.findContours(shown, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
+        of = cv2.moments(contour)
+        if SMALLEST_AREA_PX <= of["m00"] <= LARGEST_AREA * bright.size:
+            x = of["m10"] / of["m00"]
+            y = of["m01"] / of["m00"]
+            if shown[round(y), round(x)]:
+                found.append((x, y))
+    return np.array(found).reshape(-1, 2)
+
+
+def _sharpest_corners(points: Array) -> Array:
+    """Return the four corners (4, 2) of the convex hull of points (n, 2) with the smallest angles.
+
+    They are clockwise as an observer sees them, as the board's are from its front.
+    """
+    hull = cv2.convexHull(points.astype(np.float32), clockwise=False)[:, 0].astype(float)
+    before, after = (hull - np.roll(hull, step, axis=0) for step in (1, -1))
+    cosine = np.sum(before * after, axis=1) / (
+        np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    )
+    return np.asarray(hull[np.sort(np.argsort(-cosine)[:4])])
+
+
+def found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
+    """Return OpenCV's centres (n, 2) px, or None.
+
+    OpenCV returns (n, 1, 2) up to version 4, and (n, 2) from version 5 on.
+    """
+    small = (
+        bright
+        if scale == 1.0
+        else cv2.resize(bright, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    )
+    small = cv2.GaussianBlur(small, (3, 3), 0.0)
+    kind = (
+        cv2.CALIB_CB_ASYMMETRIC_GRID
+        if board.kind == "asymmetric_dots"
+        else cv2.CALIB_CB_SYMMETRIC_GRID
+    )
+    for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
+        found, centres = cv2.findCirclesGrid(
+            small, (board.columns, board.rows), flags=flags, blobDetector=_blob_detector(small.size)
+        )
+        if found:
+            rough = np.asarray(centres, dtype=float).reshape(-1, 2)
+            # Scaling keeps the first pixel's corner in place, not its middle.
+            return (rough + 0.5) / scale - 0.5
+    return None
+
+
+def _blob_detector(pixels: int) -> Any:
+    opencv: Any = cv2  # its type stubs leave the blob detector out
+    options = opencv.SimpleBlobDetector_Params()
+    options.filterByColor = True
+    options.blobColor = 255
+    options.filterByArea = True
+    options.minArea = SMALLEST_AREA_PX
+    options.maxArea = max(LARGEST_AREA * pixels, 2.0 * SMALLEST_AREA_PX)
+    options.filterByConvexity = True
+    options.minConvexity = 0.85
+    options.filterByInertia = True
+    options.minInertiaRatio = 0.08
+    options.filterByCircularity = False
+    options.minThreshold = 20.0
+    options.maxThreshold = 240.0
+    options.thresholdStep = 10.0
+    options.minDistBetweenBlobs = 3.0
+    return opencv.SimpleBlobDetector_create(options)

@@ -1,5 +1,5 @@
-"""The result of a calibration: its figures, its text (TOML, JSON), and the sensor file whose
-cameras it replaces.
+"""Result of a calibration: its figures, its text (TOML, JSON), and the sensor file that it
+completes.
 """
 
 import json
@@ -27,13 +27,14 @@ from cmmsim.uncertainty.known_rig import KnownRig
 TABLES = ("rig.left", "rig.right", "rig.right_from_left")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
-LARGEST_RATIO = 1.5  # of the baselines of calibration and sensor file, one over the other
+# Ratio of the baselines of calibration and sensor file, the larger over the smaller.
+LARGEST_RATIO = 1.5
 
 
 @dataclass(frozen=True)
 class UsedView:
-    """name of the pair; its place in left_from_boards; root mean square residual in px of each
-    image that was used.
+    """Name of a used pair, its place in left_from_boards, and the rms residual in px of each used
+    image.
     """
 
     name: str
@@ -43,11 +44,10 @@ class UsedView:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Both cameras with their covariance, and all that it rests on.
+    """Both cameras with their covariance, and all that they rest on.
 
-    rig; board; distortion and fix_aspect as chosen; adjustment; sightings as adjusted (dots without
-    eccentricity); used pairs; rejected: pair name -> reason, also for pairs of which one image is
-    used; warnings, one line each.
+    ``sightings`` are those adjusted, where dots have no eccentricity. ``rejected`` has the reason
+    by the pair's name, also for pairs of which one image is used. ``warnings`` are one line each.
     """
 
     rig: StereoRig
@@ -73,15 +73,16 @@ class Calibration:
 
     @property
     def covariance(self) -> Array:
-        """Covariance (24,24) in the order of PARAMETER_NAMES; rows of what was not free are
-        zero."""
+        """Covariance (24, 24) in the order of PARAMETER_NAMES; rows of fixed parameters are
+        zero.
+        """
         spread = np.eye(len(PARAMETER_NAMES))
         spread[-3:, -3:] = _inverse_left_jacobian(self.rotation_vector)
         return np.asarray(spread @ self.adjustment.covariance @ spread.T)
 
     @property
     def known(self) -> KnownRig:
-        """Both cameras as they are known by it, with their covariance."""
+        """Both cameras as the calibration knows them, with their covariance."""
         return KnownRig(self.rig, self.covariance)
 
     @property
@@ -91,11 +92,13 @@ class Calibration:
 
 
 def _inverse_left_jacobian(vector: Array) -> Array:
-    """Change (3,3) of a rotation vector (3,) by a small turn applied on the left (Sola et al. 2018,
-    eq. 146).
+    """Return the change (3, 3) of a rotation vector (3,) by a small turn applied on the left.
+
+    See Sola et al. 2018, eq. 146.
     """
     angle = float(np.linalg.norm(vector))
     k = skew(vector)
+    # The general formula divides rounding by the square of a small angle; this is its series.
     if angle < 1e-4:
         return np.eye(3) - 0.5 * k + k @ k / 12.0
     return (
@@ -106,7 +109,7 @@ def _inverse_left_jacobian(vector: Array) -> Array:
 
 
 def rig_tables(found: Calibration) -> str:
-    """Tables [rig.left], [rig.right] and [rig.right_from_left] of a sensor file."""
+    """Return the tables [rig.left], [rig.right] and [rig.right_from_left] of a sensor file."""
     state = found.adjustment.state
     lines = []
     for side, values in zip(SIDES, state.intrinsics, strict=True):
@@ -126,9 +129,7 @@ def rig_tables(found: Calibration) -> str:
 
 
 def as_dict(found: Calibration) -> dict[str, Any]:
-    """Everything of a calibration, ready for JSON: estimates, covariance, residuals, images, board,
-    versions.
-    """
+    """Return everything of a calibration, ready for JSON."""
     solved = found.adjustment
     return {
         "opencv": cv2.__version__,
@@ -169,9 +170,12 @@ def as_dict(found: Calibration) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class SensorTemplate:
-    """text: the sensor file without its calibrated cameras, as it may stand in the folder it was
-    made for; size (width, height) px of its images; baseline m between its cameras; name or path of
-    it."""
+    """Sensor file without its calibrated cameras.
+
+    ``text`` may stand in the folder that it was made for. ``size`` is (width, height) of the
+    images, px, and ``baseline`` the distance of the cameras, m. ``name`` is that of the file, or
+    its path.
+    """
 
     text: str
     size: tuple[int, int]
@@ -187,29 +191,30 @@ class SensorTemplate:
             )
 
     def filled(self, found: Calibration) -> str:
-        """Text of the sensor file with the calibrated cameras. Raises CalibrationError for images
-        of another size.
+        """Return the text of the sensor file with the calibrated cameras.
+
+        Raises CalibrationError for images of another size.
         """
         self.require_size((found.rig.left.width, found.rig.left.height))
         return self.text + rig_tables(found)
 
     def disagreements(self, found: Calibration) -> list[str]:
-        """One line where the calibrated baseline is far from the sensor file's."""
+        """Return one line where the calibrated baseline is far from the sensor file's."""
         baseline = float(np.linalg.norm(found.rig.right_from_left[:3, 3]))
         if max(baseline / self.baseline, self.baseline / baseline) <= LARGEST_RATIO:
             return []
         return [
             f"the cameras stand {baseline:.4g} m apart, those of the sensor file {self.name} "
-            f"{self.baseline:.4g} "
-            "m: are the lengths of the board file in m, and is it the file of these cameras?"
+            f"{self.baseline:.4g} m: are the lengths of the board file in m, and is it the file of "
+            "these cameras?"
         ]
 
 
 def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:
-    """The sensor file of a built-in name or a path, to be filled and written into ``folder``.
+    """Return a sensor file of a built-in name or a path, to be filled and written into ``folder``.
 
-    A file beside the sensor file that it is based on is named as seen from the folder. Raises what
-    read_sensor_file raises, and CalibrationError where the cameras stand in inline tables.
+    A file that the sensor file is based on is named as seen from the folder. Raises as
+    read_sensor_file, and CalibrationError where the cameras stand in inline tables.
     """
     section = read_sensor_file(name).rig
     text = (
@@ -227,14 +232,12 @@ def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:
 
 
 def require_sensor(path: str | Path) -> None:
-    """Raise SensorFileError where a file describes no sensor, such as one whose right camera stands
-    on the left.
-    """
+    """Raise SensorFileError where a file describes no sensor."""
     rig_from_file(read_sensor_file(path).rig)
 
 
 def _based_from(text: str, name: str | Path, folder: Path) -> str:
-    """The text whose based_on, where it is a file, names that file from ``folder``."""
+    """Return the text whose based_on, where it is a file, names that file from ``folder``."""
     basis = tomllib.loads(text).get("based_on")
     if basis is None or basis in built_in_names() or Path(basis).is_absolute():
         return text
@@ -249,8 +252,10 @@ def _based_from(text: str, name: str | Path, folder: Path) -> str:
 
 
 def _without_tables(text: str, names: Sequence[str]) -> str:
-    """TOML text without some tables; comments before the next header go with the table they
-    follow."""
+    """Return a TOML text without some tables.
+
+    Comments before the next header go with the table that they follow.
+    """
     kept = []
     skipping = False
     for line in text.splitlines():

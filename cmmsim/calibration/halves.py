@@ -1,6 +1,6 @@
 """Comparison of two halves of the pictures, each calibrated for itself.
 
-It is the one proof of a stated covariance that needs no truth.
+It is the only proof of a stated covariance that needs no truth.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,26 +18,33 @@ from cmmsim.uncertainty.known_rig import KnownRig
 
 @dataclass(frozen=True)
 class Halves:
-    """squares (n, p): of n splits, squared differences of the halves' p free parameters, each of
-    independent directions divided by the variance that both state; 1 is expected of each."""
+    """Squared differences of the halves' calibrations, for n splits.
+
+    ``squares`` (n, p) belong to p independent directions of the free parameters. Each is divided by
+    the variance that both halves state, so that 1 is expected.
+    """
 
     squares: np.ndarray
 
     @property
     def mean_square(self) -> float:
         """Mean over splits and directions; well above 1 where the stated covariance is too
-        small."""
+        small.
+        """
         return float(self.squares.mean())
 
     @property
     def chance(self) -> float:
-        """Standard deviation of the mean of one split, were the covariance right; splits of the
-        same pictures are not independent, so that more of them help less than their number says."""
+        """Standard deviation of the mean of one split if the covariance is right.
+
+        Splits of the same pictures are not independent, so that many of them help less than their
+        number says.
+        """
         return float(np.sqrt(2.0 / self.squares.shape[1]))
 
     @property
     def verdict(self) -> str:
-        """Statement on the covariance, where it is beyond two standard deviations of a single
+        """Statement on the covariance, which holds beyond two standard deviations of a single
         split.
         """
         if abs(self.mean_square - 1.0) <= 2.0 * self.chance:
@@ -45,7 +52,7 @@ class Halves:
         return f"the stated covariance is too {'small' if self.mean_square > 1.0 else 'large'}"
 
     def to_dict(self) -> dict[str, float | int | str]:
-        """For JSON."""
+        """Return the figures for JSON."""
         return {
             "splits": len(self.squares),
             "mean_square": self.mean_square,
@@ -63,8 +70,7 @@ def compare_halves(
     rng: np.random.Generator,
     advance: Callable[[], None] = lambda: None,
 ) -> Halves:
-    """Split pairs of pictures at random into two halves, time and again, and compare what the
-    halves calibrate to.
+    """Split pairs of pictures at random into two halves, repeatedly, and compare the calibrations.
 
     Raises CalibrationError where halves are too few pictures, or do not determine the cameras.
     """
@@ -87,8 +93,9 @@ def compare_halves(
 
 
 def squared_differences(one: KnownRig, other: KnownRig) -> np.ndarray:
-    """Squared differences (p,) of two rigs along independent directions, over the sum of their
-    variances.
+    """Return squared differences (p,) of two rigs along independent directions.
+
+    They are divided by the sum of both variances.
     """
     covariance = one.covariance + other.covariance
     free = np.flatnonzero(np.diag(covariance) > 0.0)

@@ -1,5 +1,4 @@
-"""Rendered calibration images: seeded poses of a board, and what the cameras of a sensor see
-of it."""
+"""Rendered calibration images: seeded poses of a board, and the views of a sensor's cameras."""
 
 from __future__ import annotations
 
@@ -22,31 +21,36 @@ from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame
 
 # The drawn board
-# of the spacing: rim of the plate beyond its outermost points; a chessboard's outer squares reach
-# there
+# Rim of the plate beyond its outermost points, in spacings. The outer squares of a chessboard reach
+# there, and a bright rim surrounds them.
 MARGIN = 1.0
-RIM = 0.35  # of the spacing: bright rim beyond the outer squares of a chessboard
+RIM = 0.35
 THICKNESS = 0.008  # m
 BRIGHT = 0.86
-DARK = 0.06  # share of white light sent back
-FRONT = frozen([0.0, 0.0, -1.0])  # the front looks against the board's z axis
+DARK = 0.06  # shares of white light sent back
+# The front looks against the board's z axis.
+FRONT = frozen([0.0, 0.0, -1.0])
 # Its poses
-LARGEST_TILT = 0.75  # rad between the board's normal and the view from the middle of the baseline
-DEPTH_RANGE = (0.8, 1.2)  # of the depth at which the optical axes come nearest
-CELLS = 3  # each image is divided into 3 x 3 cells that the board visits in turn
-GRAZING = 0.35  # cosine between the board's normal and the view of either camera, at the least
-TRIES = 4000  # poses drawn for one image before giving up
-AT_ONCE = 200  # poses that are looked at together, of which the first good one is taken
+# rad between the board's normal and the view from the middle of the baseline.
+LARGEST_TILT = 0.75
+# Shares of the depth at which the optical axes come nearest.
+DEPTH_RANGE = (0.8, 1.2)
+# Each image is divided into 3 x 3 cells that the board visits in turn.
+CELLS = 3
+# Least cosine between the board's normal and the view of either camera.
+GRAZING = 0.35
+# Poses drawn for one image before giving up, and poses that are examined together.
+TRIES = 4000
+AT_ONCE = 200
 # Its images
 TILE_PX = 64
 SUPERSAMPLING = 12
-OUTLINE_POINTS = 15  # along each side of the plate, to know where a bent one reaches
+# Points along each side of the plate, which show where a bent image of it reaches.
+OUTLINE_POINTS = 15
 
 
 def board_drawable(board: Board, distance: float) -> Drawable:
-    """Everything of a board as one body in the board frame, seen from ``distance`` m; the points
-    lie in z = 0.
-    """
+    """Return everything of a board as one body in the board frame, seen from ``distance`` m."""
     ground, mark = (BRIGHT, DARK) if board.dark else (DARK, BRIGHT)
     dots = [DiscStack((Disc(point, FRONT, board.dot_radius, mark),)) for point in board.points]
     patches: list[Patch] = [
@@ -57,7 +61,7 @@ def board_drawable(board: Board, distance: float) -> Drawable:
 
 
 def plate_corners(board: Board) -> Array:
-    """Corners (4,3) of the plate's front, m."""
+    """Return the corners (4, 3) of the plate's front, m."""
     points = board.points
     rim = board.spacing * (MARGIN + (RIM if board.kind == "chessboard" else 0.0))
     x0, y0 = points[:, :2].min(axis=0) - rim
@@ -74,7 +78,7 @@ def _plate(board: Board, level: float) -> Mesh:
 
 
 def _squares(board: Board, level: float) -> list[Mesh]:
-    """The dark squares of a chessboard, its outermost ones included."""
+    """Return the dark squares of a chessboard, with its outermost ones."""
     corners = board.spacing * np.array(
         [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
     )
@@ -91,7 +95,7 @@ def _squares(board: Board, level: float) -> list[Mesh]:
 
 
 def default_board(rig: StereoRig) -> Board:
-    """A board of 13 x 9 dots whose width is a third of what the left camera sees where the axes
+    """Return a board of 13 x 9 dots, a third as wide as the left camera's view where the axes
     meet.
     """
     spacing = round(meeting_depth(rig) * rig.left.width / rig.left.focal_px / 3.0 / 13.0, 3)
@@ -99,28 +103,30 @@ def default_board(rig: StereoRig) -> Board:
 
 
 def meeting_depth(rig: StereoRig) -> float:
-    """Depth along the left axis at which the right one comes nearest, m; for parallel axes 1.5
-    baselines.
+    """Return the depth along the left axis at which the right one comes nearest, m.
+
+    It is 1.5 baselines for parallel axes.
     """
     right_axis = invert(rig.right_from_left)[:3, 2]
     eye = _right_eye(rig)
+    # The closest approach of two lines, of which parallel axes have none.
     across = 1.0 - right_axis[2] ** 2
     depth = (eye[2] - (eye @ right_axis) * right_axis[2]) / across if across > 1e-6 else 0.0
     return float(depth) if depth > 0.0 else 1.5 * float(np.linalg.norm(eye))
 
 
 def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generator) -> list[Array]:
-    """``count`` poses left_from_board (4,4).
+    """Return ``count`` poses left_from_board (4, 4).
 
-    Raises CalibrationError when no such pose is found: the board is too large or too small for the
-    rig.
+    Raises CalibrationError when no such pose is found, because the board is too large or too small.
     """
     return [_draw_pose(rig, board, k, rng) for k in range(count)]
 
 
 def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generator) -> Array:
-    """One pose in the cell whose turn it is, or in any where that cell shows no whole board to both
-    cameras.
+    """Draw one pose in the cell whose turn it is.
+
+    Where that cell shows no whole board to both cameras, the pose may be in any cell.
     """
     corners = plate_corners(board)
     depth = meeting_depth(rig)
@@ -133,7 +139,8 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
         )
         if good.any():
             chosen = int(np.argmax(good))
-            rng.bit_generator.state = before  # as if no pose had been drawn beyond the chosen one
+            # The stream goes on as if no pose had been drawn beyond the chosen one.
+            rng.bit_generator.state = before
             _drawn_numbers(number, first, chosen + 1, rng)
             return np.asarray(poses[chosen])
     width, height = np.ptp(corners[:, :2], axis=0)
@@ -146,9 +153,7 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
 def _drawn_numbers(
     number: int, first: int, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int_], Array]:
-    """For each of ``count`` poses from the ``first`` on, the cell (n,) and six numbers (n,6) from 0
-    to 1.
-    """
+    """Draw the cell (n,) and six numbers (n, 6) from 0 to 1 for each of ``count`` poses."""
     turn = (4 + 2 * number) % CELLS**2
     if first < TRIES // 2:
         return np.full(count, turn), rng.random((count, 6))
@@ -159,11 +164,11 @@ def _drawn_numbers(
 def _poses_of(
     rig: StereoRig, middle: Array, depth: float, side: int, cells: NDArray[np.int_], numbers: Array
 ) -> Array:
-    """Poses left_from_board (n,4,4) of a board with this middle (3,) that shows in cells (n,) of
-    one camera's image at about this depth; numbers (n,6), 0 to 1, say where exactly and how tilted.
+    """Return poses left_from_board (n, 4, 4) of a board with a middle (3,).
 
-    Its front looks at the middle of the baseline, then it is turned within its plane, then tilted
-    about a random axis in it.
+    The middle shows in cells (n,) of one camera's image, at about this depth. Numbers (n, 6) from 0
+    to 1 say where exactly, and how tilted. The front looks at the middle of the baseline; then the
+    board is turned within its plane, and tilted about a random axis in it.
     """
     camera = rig.cameras[side]
     from_left = rig.from_camera[side]
@@ -190,8 +195,10 @@ def _right_eye(rig: StereoRig) -> Array:
 
 
 def _facing(towards: Array) -> Array:
-    """Rotations (n,3,3) of boards whose fronts look along ``towards`` (n,3), their x axes
-    horizontal in the left image."""
+    """Return rotations (n, 3, 3) of boards whose fronts look along ``towards`` (n, 3).
+
+    Their x axes are horizontal in the left image.
+    """
     z = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -199,7 +206,7 @@ def _facing(towards: Array) -> Array:
 
 
 def _front_to_both(rig: StereoRig, poses: Array, corners: Array) -> NDArray[np.bool_]:
-    """Tell whether both cameras see the fronts of boards at poses (n,4,4), at more than a grazing
+    """Tell whether both cameras see the fronts of boards at poses (n, 4, 4), not at a grazing
     angle.
     """
     places = poses[:, :3, :3] @ corners.mean(axis=0) + poses[:, :3, 3]
@@ -221,10 +228,10 @@ def render_pairs(
     noise: CameraNoise,
     rng: np.random.Generator,
 ) -> Iterator[StereoFrame]:
-    """Noisy images of both cameras for each pose left_from_board (4,4).
+    """Yield noisy images of both cameras for each pose left_from_board (4, 4).
 
-    Raises CalibrationError for a chessboard with the analytic renderer, which draws discs and
-    convex solids only.
+    Raises CalibrationError for a chessboard with the analytic renderer, which draws only discs and
+    convex solids.
     """
     if board.kind == "chessboard" and renderer.name == "analytic":
         raise CalibrationError(
@@ -243,7 +250,9 @@ def render_pairs(
 def _radiance(
     formation: ImageFormation, camera: PinholeCamera, camera_from_board: Array, board: Board
 ) -> NDArray[np.float32]:
-    """Radiance (height, width) of one image; only tiles that the board reaches are drawn."""
+    """Return the radiance (height, width) of one image; only tiles that the board reaches are
+    drawn.
+    """
     image = np.zeros(
         (-(-camera.height // TILE_PX) * TILE_PX, -(-camera.width // TILE_PX) * TILE_PX),
         dtype=np.float32,
@@ -260,7 +269,7 @@ def _radiance(
 def _reached_tiles(
     camera: PinholeCamera, camera_from_board: Array, board: Board, margin: int
 ) -> NDArray[np.int_]:
-    """First pixels (k,2) of the tiles within the bounds of the board's plate."""
+    """Return the first pixels (k, 2) of the tiles within the bounds of the board's plate."""
     plate = plate_corners(board)
     share = np.linspace(0.0, 1.0, OUTLINE_POINTS)[:, None, None]
     outline = ((1.0 - share) * plate + share * np.roll(plate, -1, axis=0)).reshape(-1, 3)

@@ -1,25 +1,24 @@
-"""Errors that the points of one view share: found from the views' scores, and the covariance with
-them.
+"""Errors that the points of one view share, found from the views' scores, and their covariance.
 
 Independent errors of pixels are an assumption. In photographs a bent board, uneven light or the
 bias of the corner search moves neighbouring points alike, so that a view tells less than its number
-of points promises. The residuals' size does not show it, the scores do: what the residuals of view
-v still pull at the common unknowns, s_v = J_v' r_v with the view's own pose eliminated, whose sum
-over all views is zero at the solution. With the views' reduced normal matrices I_v, which add up to
-N, independent errors of variance sigma² leave
+of points promises. The scores show it, not the size of the residuals. A score is the pull that the
+residuals of view v still exert on the common unknowns, s_v = J_v' r_v with the view's own pose
+eliminated; the sum over all views is zero at the solution. With the views' reduced normal matrices
+I_v, which add up to N, independent errors of variance sigma² leave
 
     cov(s_u, s_v) = sigma² (delta_uv I_v - I_u N^-1 I_v),
 
 so that Q = sum s_v' N^-1 s_v / sigma² has the mean c - sum tr(W_v²), W_v = N^-1/2 I_v N^-1/2. Q
-over its mean estimates the mean eigenvalue of the true covariance relative to sigma² N^-1: the mean
-generalised design effect of Rao and Scott (1981, J. Am. Stat. Assoc. 76, 221-230), with the
-correction for leverage in the mean.
+over its mean estimates the mean eigenvalue of the true covariance relative to sigma² N^-1. This is
+the mean generalised design effect of Rao and Scott (1981, J. Am. Stat. Assoc. 76, 221-230), with
+the correction for leverage in the mean.
 
-Which directions suffer most tells the sandwich of Liang and Zeger (1986, Biometrika 73, 13-22),
-whitened N^-1/2 (sum s_v s_v') N^-1/2. Of 10 to 25 views and 24 unknowns it is singular, its rank
-being the number of views less one. So it is shrunk towards the unit matrix as Ledoit and Wolf
-(2004, J. Multivar. Anal. 88, 365-411) do, and scaled to the mean above. An error that all views
-share, such as one bend of the board, stays hidden from any comparison of views.
+The sandwich of Liang and Zeger (1986, Biometrika 73, 13-22) shows the directions that suffer most;
+whitened, it is N^-1/2 (sum s_v s_v') N^-1/2. For 10 to 25 views and 24 unknowns it is singular: its
+rank is the number of views less one. It is therefore shrunk towards the unit matrix as by Ledoit
+and Wolf (2004, J. Multivar. Anal. 88, 365-411), and scaled to the mean above. An error that all
+views share, such as one bend of the board, stays hidden from any comparison of views.
 """
 
 from dataclasses import dataclass
@@ -29,15 +28,19 @@ from scipy.stats import chi2
 
 from cmmsim.geometry.pose import Array
 
-CHANCE = 1e-3  # of a ratio at the limit where the errors of points are independent
+# Probability of a ratio beyond the limit where the errors of points are independent.
+CHANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """ratio: mean eigenvalue of the covariance over that of independent errors, as the views show
-    it; limit: the ratio that independent errors exceed with probability CHANCE; independent and
-    covariance (c,c) of the common unknowns for independent errors, sigma² N^-1, and for those
-    found: the same where the ratio may be chance."""
+    """Errors that points of a view share.
+
+    ``ratio`` is the mean eigenvalue of the covariance over that of independent errors, as the views
+    show it. Independent errors exceed ``limit`` with probability CHANCE. ``independent`` (c, c) is
+    the covariance of the common unknowns for independent errors, sigma² N^-1, and ``covariance``
+    that for the errors found. Both are equal where the ratio may be chance.
+    """
 
     ratio: float
     limit: float
@@ -46,18 +49,18 @@ class SharedErrors:
 
     @property
     def factor(self) -> float:
-        """By how much the covariance is enlarged in the mean of all directions, beside that of
-        independent errors.
+        """Mean enlargement of the covariance over all directions, against that of independent
+        errors.
         """
         return self.ratio if self.ratio > self.limit else 1.0
 
 
 def shared_errors(scores: Array, information: Array, sigma2: float) -> SharedErrors:
-    """Errors that views with scores (v,c) and reduced normal matrices (v,c,c) share within, at
-    sigma² px².
+    """Find the errors that views share within, from scores (v, c) and reduced normal matrices (v,
+    c, c).
 
-    The limit is that of the chi-square distribution with the mean and variance of Q for independent
-    normal errors.
+    ``sigma2`` is the variance of a pixel coordinate, px². The limit is that of the chi-square
+    distribution with the mean and variance of Q for independent normal errors.
     """
     whiten = _whitening(information.sum(axis=0))
     independent = sigma2 * whiten @ whiten.T
@@ -75,15 +78,16 @@ def shared_errors(scores: Array, information: Array, sigma2: float) -> SharedErr
 
 
 def _whitening(total: Array) -> Array:
-    """A matrix R (c,c) with R' N R = 1, of the normal matrix N."""
+    """Return a matrix R (c, c) with R' N R = 1, of the normal matrix N."""
     scale = 1.0 / np.sqrt(np.diag(total))
     eigenvalues, vectors = np.linalg.eigh(total * scale[:, None] * scale)
     return np.asarray(scale[:, None] * vectors / np.sqrt(eigenvalues))
 
 
 def _moments(shares: Array) -> tuple[float, float]:
-    """Mean and variance of Q for independent normal errors, from the views' shares W_v (v,c,c) that
-    add up to one.
+    """Return mean and variance of Q for independent normal errors.
+
+    The views' shares W_v (v, c, c) add up to one.
     """
     squares = shares @ shares
     traced = float(np.einsum("vii->", squares))
@@ -97,8 +101,11 @@ def _moments(shares: Array) -> tuple[float, float]:
 
 
 def _enlargement(pulls: Array, ratio: float) -> Array:
-    """Covariance (c,c) relative to that of independent errors: the sandwich of whitened scores
-    (v,c), shrunk, of the mean eigenvalue ``ratio``, and in no direction below one."""
+    """Return the covariance (c, c) relative to that of independent errors.
+
+    It is the shrunk sandwich of whitened scores (v, c), with the mean eigenvalue ``ratio``, and in
+    no direction below one.
+    """
     views, size = pulls.shape
     sandwich = pulls.T @ pulls
     mean = np.trace(sandwich) / size

@@ -1,4 +1,4 @@
-"""From pairs of image files to what both cameras saw of the board, as the adjustment takes it."""
+"""Pairs of image files, and the points of the board that both cameras saw in them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,23 +15,23 @@ from cmmsim.geometry.pose import Array
 
 SIDES = ("left", "right")
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
-# percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit
+# Percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit.
 WHITE_SHARE = 99.9
 HOW_PAIRED = "pairs are made in the order of the sorted file names"
 
 
 @dataclass(frozen=True)
 class ImagePair:
-    """Files of one exposure of both cameras; name is the left file's, with the right one's where
-    they differ.
-    """
+    """Files of one exposure of both cameras."""
 
     left: Path
     right: Path
 
     @property
     def name(self) -> str:
-        """Name of the pair in results and messages."""
+        """Name of the pair in results and messages: the left file's, with the right one's if they
+        differ.
+        """
         return (
             self.left.name
             if self.left.name == self.right.name
@@ -40,11 +40,11 @@ class ImagePair:
 
 
 def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
-    """Pairs of the images in two folders.
+    """Return pairs of the images in two folders.
 
-    The order of the sorted names makes the pairs; the names may differ throughout (left_01.png,
-    right_01.png), but where some are the same all must be. Raises CalibrationError: a folder is
-    missing or empty, both are one, or numbers or names differ, with names that stand in one folder
+    The order of the sorted names makes the pairs. All names may differ (left_01.png, right_01.png),
+    but if some are the same, all must be. Raises CalibrationError if a folder is missing or empty,
+    if both are one, and if numbers or names differ; it then lists names that stand in one folder
     only.
     """
     if Path(left).resolve() == Path(right).resolve():
@@ -57,18 +57,17 @@ def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
         alone = [sorted(names[0] - names[1]), sorted(names[1] - names[0])]
         raise CalibrationError(
             f"{left} holds {len(found[0])} images and {right} {len(found[1])}; {HOW_PAIRED}, so "
-            "each image needs its "
-            f"partner. Only on the left: {some(alone[0])}; only on the right: {some(alone[1])}"
+            f"each image needs its partner. Only on the left: {some(alone[0])}; only on the right: "
+            f"{some(alone[1])}"
         )
     return [ImagePair(a, b) for a, b in zip(*found, strict=True)]
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """Grey values (height, width) of an image file as the camera took it: a turn noted beside it is
-    not applied.
+    """Read the grey values (height, width) of an image file as the camera took it.
 
-    Colours become grey; more than 8 bit are scaled so that the brightest 0.1 % are white. Raises
-    CalibrationError.
+    A turn that is noted in the file is not applied. Colours become grey. More than 8 bit are scaled
+    so that the brightest 0.1 % are white. Raises CalibrationError.
     """
     try:
         data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
@@ -132,7 +131,7 @@ class PairView:
 
     @property
     def sides(self) -> tuple[BoardView | str, BoardView | str]:
-        """Left and right."""
+        """Left and right side."""
         return self.left, self.right
 
     @property
@@ -142,7 +141,7 @@ class PairView:
 
     @property
     def reasons(self) -> str:
-        """Why sides are missing; empty when none is."""
+        """Reasons why sides are missing; empty when none is."""
         if isinstance(self.left, str) and self.left == self.right:
             return f"both: {self.left}"
         return "; ".join(
@@ -152,7 +151,7 @@ class PairView:
         )
 
     def without(self, side: int, reason: str) -> "PairView":
-        """The pair with one side (0 left, 1 right) given up."""
+        """Return the pair with one side (0 left, 1 right) given up."""
         return replace(self, left=reason) if side == 0 else replace(self, right=reason)
 
 
@@ -161,7 +160,7 @@ def view_pairs(
 ) -> tuple[list[PairView], tuple[int, int]]:
     """Find the board in each pair, and the size (width, height) px that all images have.
 
-    advance is called after each pair. Raises CalibrationError for images that cannot be read or
+    ``advance`` is called after each pair. Raises CalibrationError for images that cannot be read or
     differ in size.
     """
     if not pairs:
@@ -177,8 +176,7 @@ def view_pairs(
             if (width, height) != size:
                 raise CalibrationError(
                     f"{path} is {width} x {height} px, {pairs[0].left} {size[0]} x {size[1]}: all "
-                    "images must have one "
-                    "size, unturned and uncropped"
+                    "images must have one size, unturned and uncropped"
                 )
             sides.append(find_board(grey, board))
         seen.append(PairView(pair.name, *sides))
@@ -188,8 +186,9 @@ def view_pairs(
 
 @dataclass(frozen=True)
 class Sightings:
-    """Points seen by one camera in all pairs: view (m,) ascending, point (m,) of the board, pixels
-    (m, 2).
+    """Points that one camera saw in all pairs.
+
+    They have the view (m,), ascending, the point (m,) of the board, and pixels (m, 2).
     """
 
     view: NDArray[np.int_]
@@ -197,18 +196,21 @@ class Sightings:
     pixels: Array
 
     def shifted(self, by: Array) -> "Sightings":
-        """The sightings with their pixels moved by (m, 2)."""
+        """Return the sightings with their pixels moved by (m, 2)."""
         return replace(self, pixels=self.pixels + by)
 
 
 def sightings_of(pairs: Sequence[PairView]) -> tuple[Sightings, Sightings]:
-    """Sightings of the left and of the right camera; a pair's place in the list is its view."""
+    """Return the sightings of the left and of the right camera.
+
+    A pair's place in the list is the number of its view.
+    """
     left, right = (views_of(pairs, side) for side in range(2))
     return _joined(left), _joined(right)
 
 
 def views_of(pairs: Sequence[PairView], side: int) -> dict[int, BoardView]:
-    """The views of one camera by the place of their pair in the list."""
+    """Return the views of one camera by the place of their pair in the list."""
     return {
         k: view
         for k, view in enumerate(pair.sides[side] for pair in pairs)
@@ -225,6 +227,6 @@ def _joined(views: dict[int, BoardView]) -> Sightings:
 
 
 def some(names: Sequence[str]) -> str:
-    """The first three names and the number of the others; "none" where there is none."""
+    """Name the first three and count the others; "none" where there is none."""
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more if names else "none"

@@ -1,8 +1,8 @@
 """Start of the adjustment: OpenCV's calibration of each camera and of the pair.
 
 A symmetric board can be read in several orders (half a turn, quarter turns), and each picture is
-read by itself. Both pictures of a pair must be read alike: the right camera then stands in the same
-place for all pairs, and only then.
+read by itself. Both pictures of a pair must be read alike. They are if, and only if, the right
+camera stands in the same place for all pairs.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,11 @@ from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array, invert, rigid
 
 FEWEST_VIEWS = 3
-ALIKE_PX = 2.0  # rms distance of the points of two pictures that show the board in one place
+# px rms between the points of two pictures that show the board in one place.
+ALIKE_PX = 2.0
+# Places of the right camera count as the same within this angle, rad, and share of the baseline.
 ALIKE_ANGLE = 0.06
-ALIKE_SHARE = 0.12  # rad; of the baseline: places of the right camera that count as the same
+ALIKE_SHARE = 0.12
 MISFIT = (
     "the two places of the board fit no other pair: wrong partner, or moved between the exposures"
 )
@@ -30,11 +32,10 @@ MISFIT = (
 def start_values(
     board: Board, pairs: Sequence[PairView], size: tuple[int, int], bend: bool, fix_aspect: bool
 ) -> tuple[RigState, list[PairView]]:
-    """First state, and the pairs with right images read like the left ones; pairs that do not fit
-    lose both sides.
+    """Return the first state, and the pairs with right images read like the left ones.
 
-    bend: whether two radial terms of distortion are estimated; size: (width, height) px. Raises
-    CalibrationError.
+    Pairs that do not fit lose both sides. ``bend`` frees two radial terms of distortion, and
+    ``size`` is (width, height) px. Raises CalibrationError.
     """
     left, from_left = _one_camera(board, pairs, 0, size, bend, fix_aspect)
     right, from_right = _one_camera(board, pairs, 1, size, bend, fix_aspect)
@@ -55,8 +56,9 @@ def _one_camera(
     bend: bool,
     fix_aspect: bool,
 ) -> tuple[Array, dict[int, Array]]:
-    """Intrinsics (9,) of one camera, and camera_from_board (4,4) of each view by the pair's
-    place."""
+    """Return the intrinsics (9,) of one camera, and camera_from_board (4, 4) by the pair's
+    place.
+    """
     views = views_of(pairs, side)
     if len(views) < FEWEST_VIEWS:
         raise CalibrationError(
@@ -97,7 +99,7 @@ def _require_variety(
 ) -> None:
     """Raise CalibrationError where the views of a camera show the board in too few places.
 
-    orders: the board's symmetries, in any of which a view may be read.
+    ``orders`` are the board's symmetries, in any of which a view may be read.
     """
     different: list[BoardView] = []
     for view in views:
@@ -110,14 +112,13 @@ def _require_variety(
         places = "one place" if len(different) == 1 else f"{len(different)} places"
         raise CalibrationError(
             f"the {len(views)} pictures of the {camera} camera are alike, they show the board in "
-            f"{places} only (within {ALIKE_PX:g} px), {FEWEST_VIEWS} at the least are needed: "
-            "move and "
-            "tilt the board from picture to picture"
+            f"{places} only (within {ALIKE_PX:g} px), {FEWEST_VIEWS} at the least are needed: move "
+            "and tilt the board from picture to picture"
         )
 
 
 def _distance(a: BoardView, b: BoardView) -> float:
-    """Root mean square distance of the points that both show, px."""
+    """Return the root mean square distance of the points that both views show, px."""
     _, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
     gap: Array = a.pixels[in_a] - b.pixels[in_b]
     return float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))) if len(gap) else np.inf
@@ -129,8 +130,11 @@ def _read_alike(
     from_left: dict[int, Array],
     from_right: dict[int, Array],
 ) -> tuple[list[PairView], dict[int, Array], Array]:
-    """Pairs whose right images are read in the order that most pairs agree on; the places of the
-    board that the right camera then sees; right_from_left (4,4)."""
+    """Return pairs whose right images are read in the order that most pairs agree on.
+
+    The other results are the places of the board that the right camera then sees, and
+    right_from_left (4, 4).
+    """
     orders = board.symmetries
     turned = [_renaming_move(board, order) for order in orders]
     names = [(k, j) for k, pair in enumerate(pairs) if pair.both for j in range(len(orders))]
@@ -139,6 +143,7 @@ def _read_alike(
     pair_of = np.array([k for k, _ in names])
     support = np.array([len(set(pair_of[row])) for row in alike])
     angle = _angles(places, np.eye(3)[None])[:, 0]
+    # Among orders with equal support, the cameras are most likely turned least against each other.
     best = int(np.lexsort((angle, -support))[0])
     count = sum(pair.both for pair in pairs)
     if support[best] < max(FEWEST_VIEWS, 0.5 * count):
@@ -159,8 +164,9 @@ def _read_alike(
 
 
 def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
-    """Rigid move (4,4) in the board's plane that carries points[order] to points: to undo the
-    renaming.
+    """Return the rigid move (4, 4) in the board's plane that carries points[order] to points.
+
+    It undoes the renaming.
     """
     points = board.points
     renamed = board.points[order]
@@ -174,7 +180,7 @@ def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
 
 
 def _alike(places: Array) -> Array:
-    """Mask (n,n) of the transforms (n,4,4) that are about the same."""
+    """Return the mask (n, n) of transforms (n, 4, 4) that are about the same."""
     shifts = places[:, :3, 3]
     gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
     near = gap < ALIKE_SHARE * np.linalg.norm(shifts, axis=1)[:, None]
@@ -182,7 +188,9 @@ def _alike(places: Array) -> Array:
 
 
 def _angles(places: Array, rotations: Array) -> Array:
-    """Angles (n,m) rad between the rotations of transforms (n,4,4) and rotations (m,3,3)."""
+    """Return the angles (n, m) rad between the rotations of transforms (n, 4, 4) and others (m, 3,
+    3).
+    """
     trace = np.einsum("nij,mij->nm", places[:, :3, :3], rotations)
     return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
@@ -194,8 +202,10 @@ def _stereo(
     size: tuple[int, int],
     guess: Array,
 ) -> Array:
-    """right_from_left (4,4) by OpenCV with the cameras as they are, from the points that both
-    see."""
+    """Return right_from_left (4, 4) by OpenCV, from the points that both cameras see.
+
+    The cameras stay as they are.
+    """
     points = []
     left = []
     right = []

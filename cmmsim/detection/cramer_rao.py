@@ -1,14 +1,15 @@
-"""The Cramer-Rao bound: how well a disc's centre can be known at all from the grey values of its
-image.
+"""The Cramer-Rao bound: the smallest error with which a disc's centre can be known from its image.
 
-Mean grey value of a pixel: ground + contrast * its share of light, the exact coverage by the
-ellipse blurred by a Gaussian point spread. Unknown are the centre, the shape, contrast and ground.
-The grey value is the mean plus normal noise, whose variance depends on the mean, rounded and
-clipped; the Fisher information of such a number is summed over the numbers that may come out. Where
-the noise is below half a grey value, it depends on where the mean lies between two numbers, and no
-estimator is unbiased at each single place of a centre. So it is averaged over one grey value: the
-bound holds on average over places that are not known beforehand. With more noise the average
-changes nothing.
+The mean grey value of a pixel is ground + contrast * its share of light, which is the exact
+coverage by the ellipse blurred by a Gaussian point spread. Unknown are the centre, the shape,
+contrast and ground. The grey value is the mean plus normal noise, whose variance depends on the
+mean, rounded and clipped. The Fisher information of such a number is summed over all numbers that
+may come out.
+
+Where the noise is below half a grey value, the information depends on the mean's place between two
+numbers, and no estimator is unbiased at each single place of a centre. The information is therefore
+averaged over one grey value: the bound holds on average over places that are not known beforehand.
+With more noise the average changes nothing.
 """
 
 import numpy as np
@@ -19,17 +20,17 @@ from cmmsim.geometry.disc_image import coverage
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 
-REACH = 6.0  # standard deviations within which noise is followed
-TABLE_STEPS = (
-    64  # tabulated informations in one grey value; fewer where the noise hides the rounding
-)
+# Standard deviations within which noise is followed.
+REACH = 6.0
+# Tabulated informations in one grey value; fewer where the noise hides the rounding.
+TABLE_STEPS = 64
 
 
 def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
-    """Fisher information about its mean that one rounded and clipped grey value holds, per grey
-    value squared.
+    """Return the Fisher information that one rounded and clipped grey value holds about its mean.
 
-    Raises CmmError for a camera without noise: what it shows is certain, so there is no bound.
+    It is per grey value squared. Raises CmmError for a camera without noise, whose values are
+    certain, so that there is no bound.
     """
     mean_grey = np.asarray(mean_grey, dtype=float)
     variance, slope = _analog_variance(mean_grey, noise)
@@ -45,7 +46,7 @@ def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
         (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None],
     )
     possible = (numbers >= 0) & (numbers <= noise.white_level)
-    # the upper tail is taken from above, where differences of numbers close to one would lose all
+    # The upper tail is taken from above: differences of numbers close to one would lose all
     # digits
     probability = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
     change = -(_rise(high, slope, variance) - _rise(low, slope, variance)) / deviation[..., None]
@@ -62,10 +63,10 @@ def cramer_rao_bound(
     noise: CameraNoise,
     psf_px: float = 0.0,
 ) -> Array:
-    """Smallest covariance (n,2,2) px² of an unbiased centre, from windows of ``size`` px; contrast,
-    ground grey values.
+    """Return the smallest covariance (n, 2, 2) px² of an unbiased centre in windows of ``size`` px.
 
-    Other parameters as of ``disc_image.coverage``. Raises CmmError.
+    Contrast and ground are grey values; the other parameters are those of ``disc_image.coverage``.
+    Raises CmmError.
     """
     shares, derivatives = coverage(centres, shapes, size, psf_px)
     information = np.interp(
@@ -79,23 +80,25 @@ def cramer_rao_bound(
 
 
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
-    """Means that reach from ``lowest`` to ``highest``, and the information at each, averaged over
-    one grey value.
+    """Return means from ``lowest`` to ``highest``, and the information averaged over one grey
+    value.
     """
     least_noise = float(
         np.sqrt(_analog_variance(np.array([lowest - 1.5, highest + 1.5]), noise)[0].min())
     )
+    # An even number, so that the middle of the averaging window is an entry of the table.
     steps = 2 * int(np.ceil(0.5 * min(TABLE_STEPS, 16.0 / least_noise)))
     count = int(np.ceil((highest - lowest + 2.0) * steps)) + 1
     means = lowest - 1.5 + np.arange(count + steps) / steps
     window = np.full(steps + 1, 1.0 / steps)
+    # The trapezoidal rule over one grey value.
     window[[0, -1]] *= 0.5
     averaged = np.convolve(grey_value_information(means, noise), window, mode="valid")
     return means[steps // 2 :][:count], averaged
 
 
 def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array]:
-    """Variance before rounding, and its derivative by the mean."""
+    """Return the variance before rounding, and its derivative by the mean."""
     variance = noise.variance(mean_grey) - 1.0 / (12.0 * noise.frames)
     if not noise.enabled or variance.min() <= 0.0:
         raise CmmError(f"without noise there is no Cramer-Rao bound, got {noise}")
@@ -106,8 +109,9 @@ def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array
 
 
 def _rise(limit: Array, slope: Array, variance: Array) -> Array:
-    """Deviation times the derivative of -ndtr(limit) by the mean, which shifts and widens the
-    noise.
+    """Return deviation times the derivative of -ndtr(limit) by the mean.
+
+    The mean shifts and widens the noise.
     """
     finite = np.where(np.isfinite(limit), limit, 0.0)
     density = np.where(np.isfinite(limit), np.exp(-0.5 * finite**2) / np.sqrt(2.0 * np.pi), 0.0)

@@ -1,5 +1,5 @@
-"""The contract of all detectors of sticker centres: what they are given, what they hand back, and
-which is taken.
+"""Contract of all detectors of sticker centres: their input, their result, and the choice of
+one.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from cmmsim.radiometry.noise import CameraNoise
 
 @dataclass(frozen=True)
 class FitLimits:
-    """When a window counts as one whole sticker.
+    """Limits within which a window counts as one whole sticker.
 
-    smallest_contrast in grey values; largest_misfit of the reduced chi-square, for noise of a grey
-    value and more.
+    ``smallest_contrast`` is in grey values. ``largest_misfit`` limits the reduced chi-square, for
+    noise of a grey value and more.
     """
 
     smallest_contrast: float = 40.0
@@ -33,13 +33,13 @@ class FitLimits:
 
 @dataclass(frozen=True)
 class DetectedCentres:
-    """Ellipse centres in n windows, in full-image px.
+    """Ellipse centres in n windows, in px of the whole image.
 
-    centres (n,2); covariances (n,2,2) px², what the pixel noise does to the centres to first order;
-    good (n,) whether the window holds one whole bright spot. shapes (n,2,2) px and
-    shape_covariances (n,3,3) px² of A_xx, A_xy, A_yy where a detector states them, as misfits (n,),
-    the reduced chi-square of the grey values. Values of windows that are not good are finite but
-    mean nothing.
+    ``centres`` (n, 2) have ``covariances`` (n, 2, 2) px², which are the effect of pixel noise to
+    first order. ``good`` (n,) says whether a window holds one whole bright spot. Values of other
+    windows are finite but mean nothing. A detector may also state ``shapes`` (n, 2, 2) px,
+    ``shape_covariances`` (n, 3, 3) px² of A_xx, A_xy, A_yy, and ``misfits`` (n,), the reduced
+    chi-square of the grey values.
     """
 
     centres: Array
@@ -52,8 +52,10 @@ class DetectedCentres:
     def with_others(
         self, at: NDArray[np.int_], others: DetectedCentres, which: NDArray[np.bool_]
     ) -> Self:
-        """The same, but in windows ``at`` (m,) those of ``which`` (k,) of other windows; states
-        what both state.
+        """Return the result with windows ``at`` (m,) replaced by those of ``which`` (k,) of other
+        windows.
+
+        It states what both results state.
         """
         changed: dict[str, Any] = {}
         for name, own in vars(self).items():
@@ -65,19 +67,18 @@ class DetectedCentres:
 
 
 def no_centres() -> DetectedCentres:
-    """The result for no windows."""
+    """Return the result for no windows."""
     return DetectedCentres(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
 
 
 @dataclass(frozen=True)
 class SpotWindows:
-    """n windows with one bright spot each, and what is known of them.
+    """Windows with one bright spot each, and what is known of them.
 
-    windows (n,h,h) grey values; corners (n,2) the full-image pixel (x, y) of each window's first
-    pixel; noise: the camera's noise; fit_size: side in px of the part around the bright spot that
-    is looked at; limits: when a window counts as one whole sticker; psf_px: sigma of the Gaussian
-    point spread; smears (n,2) px: how far each spot moves during the exposure, for whose middle the
-    centres are.
+    ``windows`` (n, h, h) are grey values, and ``corners`` (n, 2) the pixel (x, y) of the whole
+    image that each begins at. ``fit_size`` is the side in px of the part around the bright spot
+    that is looked at. ``psf_px`` is the sigma of the Gaussian point spread. ``smears`` (n, 2) px
+    are the movements of the spots during the exposure; centres are for its middle.
     """
 
     windows: NDArray
@@ -95,10 +96,13 @@ Detect = Callable[[SpotWindows], DetectedCentres]
 
 @dataclass(frozen=True)
 class Detector:
-    """name; detect; bias_px: rms error of a centre without noise, at the built-in sensors' radius
-    (3.8 px, 45 degrees, sharp images). It differs from place to place within a pixel, so it acts
-    like noise that detect does not state. margin_px: how much wider than for the maximum-likelihood
-    fit a window must be on each side."""
+    """Detector of sticker centres.
+
+    ``bias_px`` is the rms error of a centre without noise at the built-in sensors' radius (3.8 px,
+    45 degrees, sharp images). It differs from place to place within a pixel, so it acts like noise
+    that ``detect`` does not state. ``margin_px`` is the additional width of a window on each side,
+    against that of the maximum-likelihood fit.
+    """
 
     name: str
     detect: Detect
@@ -108,10 +112,11 @@ class Detector:
 
 @lru_cache
 def find_detector(name: str) -> Detector:
-    """The detector of a built-in name, or of ``module:name``: a Detector, or a ``Detect`` function.
+    """Return the detector of a built-in name, or of ``module:name``.
 
-    A function may carry its own ``bias_px`` and ``margin_px``. Raises UnknownOptionError with the
-    valid names, CmmError for what cannot be imported or called.
+    The latter is a Detector, or a ``Detect`` function that may carry ``bias_px`` and ``margin_px``.
+    Raises UnknownOptionError with the valid names, and CmmError for what cannot be imported or
+    called.
     """
     return find("detector", name, DETECTORS, Detector, _check_centres)
 

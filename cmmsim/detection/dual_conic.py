@@ -1,24 +1,24 @@
-"""Centre of an ellipse from the grey value gradients at all pixels of its edge: the dual conic
-operator.
+"""Centre of an ellipse from the gradients at all pixels of its edge: the dual conic operator.
 
 Each pixel of the edge gives a line l = (a, b, c), c = -(a x + b y), through the pixel and across
 the gradient (a, b). Lines that touch the ellipse fulfil l' C* l = 0 with its dual conic C* = [[A,
-B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]: linear in the five unknowns, and (D/2, E/2) is the centre.
-The residual of each line of unit length is weighted by |gradient|², which is the same as leaving
-(a, b) unnormalised; so pixels away from the edge need not be sorted out.
-Source: J.-N. Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction,
-Machine Vision and Applications 21 (2009).
+B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]. This is linear in the five unknowns, and (D/2, E/2) is the
+centre. The residual of each line of unit length is weighted by |gradient|², which is the same as
+leaving (a, b) unnormalised, so that pixels away from the edge need not be sorted out. Source: J.-N.
+Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction, Machine Vision and
+Applications 21 (2009).
 
-The noise of a pixel enters the gradients around it; its effect on the centre follows from the
+The noise of a pixel enters the gradients around it. Its effect on the centre follows from the
 normal equations sum of k (k' u + c²) = 0, k = (a², a b, b², a c, b c), by the implicit function
 theorem.
 
 A line that is missing where the rim comes near the window's edge pulls the centre by up to a tenth
-of a pixel, so such a window is not good; EDGE_PX is what the lines need around the ellipse.
+of a pixel, so such a window is not good; EDGE_PX is the room that the lines need around the
+ellipse.
 
-Gradients of a sharp edge are not exact: noise-free and tilted by 45 degrees, the centre is off by
-about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. This bias is no part of the
-covariance.
+Gradients of a sharp edge are not exact. Without noise, and tilted by 45 degrees, the centre is off
+by about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. The covariance does not
+include this bias.
 """
 
 import numpy as np
@@ -29,19 +29,19 @@ from cmmsim.detection.grey_centroid import BrightSpots, bright_spots, whole_insi
 from cmmsim.geometry.pose import Array
 
 SLOPE = (-0.5, 0.0, 0.5)
-SMOOTHING = (
-    0.1875,
-    0.625,
-    0.1875,
-)  # across the slope (Scharr): the most nearly isotropic of this size
-# from the rim to the window's side: a gradient reaches 1.5 px from a sharp rim, the last pixel has
-# none
+# Smoothing across the slope (Scharr): the most nearly isotropic of this size.
+SMOOTHING = (0.1875, 0.625, 0.1875)
+# px from the rim to the window's side: a gradient reaches 1.5 px from a sharp rim, and the last
+# pixel has none.
 EDGE_PX = 2
-SMALLEST_CONDITION = 1e-9  # reciprocal condition below which the lines do not determine an ellipse
+# Reciprocal condition below which the lines do not determine an ellipse.
+SMALLEST_CONDITION = 1e-9
 
 
 def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
-    """Centres by the dual conic; the point spread only widens the rim, and smears play no part."""
+    """Return centres by the dual conic; the point spread only widens the rim, and smears play no
+    part.
+    """
     if len(given.windows) == 0:
         return no_centres()
     spots = bright_spots(given)
@@ -71,9 +71,11 @@ DUAL_CONIC = Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX)
 
 
 class _EdgeLines:
-    """Lines (a, b, c), each (n, h, h), from the centroids and in units of unit_px (n,); x, y of the
-    pixels; scale (n, h, h): one over the contrast where a line counts, within the dark ring with
-    all neighbours in the window."""
+    """Lines (a, b, c), each (n, h, h), from the centroids and in units of ``unit_px`` (n,).
+
+    ``x`` and ``y`` are those of the pixels. ``scale`` (n, h, h) is one over the contrast where a
+    line counts: within the dark ring, with all neighbours in the window.
+    """
 
     def __init__(
         self, a: Array, b: Array, x: Array, y: Array, unit_px: Array, scale: Array
@@ -88,12 +90,13 @@ class _EdgeLines:
 
 
 def _edge_lines(spots: BrightSpots) -> _EdgeLines:
-    """Lines from the gradients of the grey values, which are divided by the contrast."""
+    """Return lines from the gradients of the grey values, which are divided by the contrast."""
     radius = 2.0 * np.sqrt(np.maximum(0.5 * np.trace(spots.spreads, axis1=1, axis2=2), 0.25))
     ticks = np.arange(spots.windows.shape[1], dtype=float)
     x = (ticks - spots.centroids[:, :1])[:, None, :] / radius[:, None, None]
     y = (ticks - spots.centroids[:, 1:])[:, :, None] / radius[:, None, None]
     counted = spots.within.copy()
+    # The outermost pixels lack neighbours for their gradients.
     counted[:, [0, -1]] = counted[:, :, [0, -1]] = False
     scale = counted / np.maximum(spots.contrast, 1.0)[:, None, None]
     a = _filtered(spots.windows, SLOPE, SMOOTHING) * scale
@@ -104,8 +107,9 @@ def _edge_lines(spots: BrightSpots) -> _EdgeLines:
 def _filtered(
     values: Array, along_x: tuple[float, ...], along_y: tuple[float, ...], adjoint: bool = False
 ) -> Array:
-    """Correlation of (n, h, h) with a separable kernel, or its adjoint; nothing lies outside of the
-    window.
+    """Return the correlation of (n, h, h) with a separable kernel, or its adjoint.
+
+    Values outside of the window are zero.
     """
     turn = -1 if adjoint else 1
     across = ndimage.correlate1d(values, along_x[::turn], axis=2, mode="constant")
@@ -113,7 +117,7 @@ def _filtered(
 
 
 def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Array) -> Array:
-    """Derivative (n, 2, h, h) of the centres by each grey value, px."""
+    """Return the derivative (n, 2, h, h) of the centres by each grey value, px."""
     a = lines.a
     b = lines.b
     c = lines.c
@@ -135,7 +139,7 @@ def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Arra
 
 
 def _squared_shape(dual: Array) -> Array:
-    """A A' (n,2,2) of the ellipse: centre centre' minus the upper left of C*."""
+    """Return A A' (n, 2, 2) of the ellipse: centre centre' minus the upper left of C*."""
     centre = 0.5 * dual[:, 3:]
     upper_left = np.stack(
         [dual[:, 0], 0.5 * dual[:, 1], 0.5 * dual[:, 1], dual[:, 2]], axis=1

@@ -1,11 +1,10 @@
-"""Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows at
-once.
+"""Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows.
 
-Model of a pixel: ground + contrast * (exact share of the pixel covered by the ellipse, blurred by
-the point spread and, where it is known, by the movement during the exposure). Gauss-Newton on the
-seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast, ground], weighted by the camera's noise
-variance at the fitted grey value. The inverse of the normal matrix is the covariance of the
-parameters.
+A pixel is modelled as ground + contrast * share, where share is the exact part of the pixel that
+the ellipse covers, blurred by the point spread and, where it is known, by the movement during the
+exposure. Gauss-Newton solves for the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast,
+ground]. Grey values are weighted by the camera's noise variance at the fitted value. The inverse of
+the normal matrix is the covariance of the parameters.
 """
 
 import threading
@@ -25,24 +24,23 @@ from cmmsim.radiometry.noise import CameraNoise
 if TYPE_CHECKING:
     from cmmsim.detection.fit_kernels import FitSettings
 
-RING_REACH = (
-    2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
-)
+# Pixels beyond this many sticker radii may lie outside the dark ring and are left out.
+RING_REACH = 2.4
 SMALLEST_RADIUS_PX = 0.8
-ELLIPSE_UNKNOWNS = 5  # the first parameters: c_x, c_y, A_xx, A_xy, A_yy
-SMEAR_STEP_PX = (
-    0.2  # or half a point spread: between two places of a moving ellipse whose light is added
-)
-CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
-MODEL_ERROR = (
-    0.0025  # of the contrast: rms of what images and the model of a pixel differ by without noise
-)
+# The first parameters: c_x, c_y, A_xx, A_xy, A_yy.
+ELLIPSE_UNKNOWNS = 5
+# Step between two places of a moving ellipse whose light is added, or half a point spread.
+SMEAR_STEP_PX = 0.2
+# A step shorter than this ends a fit.
+CONVERGED_PX = 1e-4
+# Difference without noise between images and the model of a pixel, rms, as a share of the contrast.
+MODEL_ERROR = 0.0025
 FEWEST_FOR_A_THREAD = 16  # windows
 
 
 @dataclass(frozen=True)
 class EllipseFits(DetectedCentres):
-    """Result for n windows: all that a detector may state, and contrast and ground (n,), grey
+    """Result for n windows: all that a detector may state, and contrast and ground (n,) in grey
     values.
     """
 
@@ -53,7 +51,7 @@ class EllipseFits(DetectedCentres):
     ground: Array
 
     def within(self, limits: FitLimits, noise: CameraNoise) -> "EllipseFits":
-        """The same fits, of which only those are still good that keep within limits."""
+        """Return the fits, of which only those are still good that keep within limits."""
         good = self.good & (self.contrast >= limits.smallest_contrast)
         return replace(
             self,
@@ -63,7 +61,7 @@ class EllipseFits(DetectedCentres):
 
 
 def detect_by_maximum_likelihood(spots: SpotWindows) -> DetectedCentres:
-    """Centres of the maximum-likelihood fit of a blurred ellipse."""
+    """Return centres of the maximum-likelihood fit of a blurred ellipse."""
     return fit_ellipses(**vars(spots))
 
 
@@ -80,13 +78,12 @@ def fit_ellipses(
     psf_px: float = 0.0,
     smears: Array | None = None,
 ) -> EllipseFits:
-    """Fit one ellipse in each window.
+    """Fit one ellipse in each of n windows (n, h, h) of grey values.
 
-    Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each
-    window's first pixel; noise: the camera's noise; fit_size: side in px of the part around the
-    bright spot that is fitted; psf_px: sigma of the Gaussian point spread that blurs the ellipse;
-    smears (n, 2) px: how far each spot moves during the exposure, whose middle the centre is for.
-    Raises CmmError for one too narrow to be followed.
+    The windows begin at pixels ``corners`` (n, 2) (x, y) of the whole image. The part of
+    ``fit_size`` px around the bright spot is fitted. ``psf_px`` is the sigma of the Gaussian point
+    spread. The spots move by ``smears`` (n, 2) px during the exposure, and the centres are for its
+    middle. Raises CmmError for a point spread too narrow to be followed.
     """
     require_psf(psf_px)
     from cmmsim.detection.fit_kernels import UNKNOWNS, fit_windows
@@ -120,7 +117,7 @@ def fit_ellipses(
 
 @lru_cache(maxsize=16)
 def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "FitSettings":
-    """Settings of the fit for windows with this noise and point spread."""
+    """Return the settings of the fit for windows with this noise and point spread."""
     from cmmsim.detection.fit_kernels import FitSettings
 
     scale = noise.white_level / 255.0
@@ -140,12 +137,10 @@ def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "Fit
 
 
 def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
-    """Fit windows 0 to count, which know nothing of each other, half of them in a second thread
-    where that pays.
+    """Fit windows 0 to count, half of them in a second thread where that pays.
 
     The thread is a new one each time: it costs 50 us, and a lasting one would be missing in forked
-    processes. Where NUMBA_NUM_THREADS or the machine allows one thread only, as with a process a
-    core, there is no second one.
+    processes. There is no second thread where NUMBA_NUM_THREADS or the machine allows one only.
     """
     from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
 
@@ -158,15 +153,17 @@ def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
     other.join()
 
 
+# Largest steps of a fit: px of centre and shape, grey values of 255 of contrast and ground.
 _LARGEST_STEP = frozen([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
 _GREYS = frozen(np.arange(-64.0, 512.0, 0.25))  # at these of 255 the noise variance is tabulated
 
 
 def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, ground: Array) -> Array:
-    """Largest reduced chi-square (n,) of good fits with this contrast and ground, grey values.
+    """Return the largest reduced chi-square (n,) of good fits with this contrast and ground, grey
+    values.
 
-    The fit takes each grey value's variance for that over all means. With noise below half a grey
-    value that of an even ground differs, and what is left of the model's own error shows.
+    The fit takes each grey value's variance as the mean over all means. With noise below half a
+    grey value, that of an even ground differs, and what is left of the model's own error shows.
     """
     model = (MODEL_ERROR * contrast) ** 2 / noise.variance(ground)
     return limits.largest_misfit * (noise.rounding_excess(ground) + model)

@@ -1,5 +1,6 @@
-"""Compiled: the maximum-likelihood fit of one ellipse to the grey values of one window, see
-``ellipse_fit``.
+"""Compiled: the maximum-likelihood fit of an ellipse to the grey values of a window.
+
+See ``ellipse_fit``.
 """
 
 from __future__ import annotations
@@ -19,10 +20,14 @@ UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 
 
 class FitSettings(NamedTuple):
-    """ring_reach: radii of the ellipse within which pixels are fitted; smallest radius px;
-    largest_step (7,); iterations at most, and the step in px below which they end; psf_px of the
-    point spread, or 0; smear_step px between two places of a moving ellipse whose light is added;
-    variances of grey values from ``first_grey`` on, ``entries_a_grey`` for each."""
+    """Settings of a fit.
+
+    Pixels within ``ring_reach`` radii of the ellipse are fitted, and no radius is below
+    ``smallest`` px. A step is cut to ``largest_step`` (7,). There are at most so many
+    ``iterations``, which end at a step below ``converged`` px. ``psf_px`` is the point spread, or
+    0. Two places of a moving ellipse whose light is added are ``smear_step`` px apart.
+    ``variances`` belong to grey values from ``first_grey`` on, ``entries_a_grey`` for each.
+    """
 
     ring_reach: float
     smallest: float
@@ -38,7 +43,7 @@ class FitSettings(NamedTuple):
 
 @compiled
 def variance_at(mean: float, settings: FitSettings) -> float:
-    """Noise variance of a grey value, linear between the table's entries."""
+    """Return the noise variance of a grey value, linear between the table's entries."""
     place = (mean - settings.first_grey) * settings.entries_a_grey
     k = min(max(int(place), 0), len(settings.variances) - 2)
     return settings.variances[k] + (place - k) * (settings.variances[k + 1] - settings.variances[k])
@@ -56,12 +61,12 @@ def accumulate(
     normal: Array,
     right: Array,
 ) -> float:
-    """Add up the normal matrix (7,7), lower triangle, and right-hand side (7,); returns the
-    weighted squared misfit.
+    """Add up the normal matrix (7, 7), lower triangle, and the right-hand side (7,).
 
-    Pixels wholly outside or inside of the ellipse share a mean, and only their residuals' sums are
-    needed.
+    Return the weighted squared misfit. Pixels wholly outside or inside of the ellipse share a mean,
+    so that only the sums of their residuals are needed.
     """
+    # Slopes by the parameters, then the residual and the weight, of each pixel on the rim.
     rows = np.empty((window.size, UNKNOWNS + 2))
     count = 0
     misfit = 0.0
@@ -111,9 +116,11 @@ def accumulate(
 
 @compiled
 def add_products(rows: Array, normal: Array, right: Array) -> None:
-    """Fill the normal matrix (7,7) and the right-hand side (7,) of rows (n,9): the slopes by seven
-    parameters, the residual, and the weight. Sums that are variables of their own are added in
-    vector lanes."""
+    """Fill the normal matrix (7, 7) and the right-hand side (7,) of rows (n, 9).
+
+    A row has the slopes by seven parameters, the residual, and the weight. Sums that are variables
+    of their own are added in vector lanes.
+    """
     for i in range(UNKNOWNS):
         s_0 = 0.0
         s_1 = 0.0
@@ -147,7 +154,7 @@ def add_products(rows: Array, normal: Array, right: Array) -> None:
 
 @compiled
 def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int:
-    """Mark the pixels within ``reach`` radii of the ellipse; returns their number."""
+    """Mark the pixels within ``reach`` radii of the ellipse; return their number."""
     m = inverse_shape(shape)
     count = 0
     for row in range(mask.shape[0]):
@@ -163,10 +170,9 @@ def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int
 
 @compiled
 def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, size: int) -> float:
-    """Add a step (7,), cut to its largest values, and keep the centre in the window and the radii
-    between limits.
+    """Add a step (7,), cut to its largest values, and return how far the ellipse was to move, px.
 
-    Returns how far the ellipse was to move, px.
+    The centre stays in the window, and the radii between limits.
     """
     moved = 0.0
     for k in range(UNKNOWNS):
@@ -184,7 +190,7 @@ def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, si
 
 @compiled
 def set_shape(parameters: Array, shape: Array) -> None:
-    """The matrix A (2,2) of an ellipse's parameters."""
+    """Fill the matrix A (2, 2) of an ellipse's parameters."""
     shape[0, 0] = parameters[2]
     shape[0, 1] = parameters[3]
     shape[1, 0] = parameters[3]
@@ -206,8 +212,9 @@ def light_of_still(
 def add_light(
     shares: Array, derivatives: Array, weight: float, to_shares: Array, to_derivatives: Array
 ) -> None:
-    """Add shares (h, w) and derivatives (h, w, 5), weighted, to others; whole-array sums would
-    compile for seconds.
+    """Add shares (h, w) and derivatives (h, w, 5), weighted, to others.
+
+    Sums of whole arrays would compile for seconds.
     """
     for row in range(shares.shape[0]):
         for column in range(shares.shape[1]):
@@ -225,9 +232,11 @@ def light_of_moving(
     shares: Array,
     derivatives: Array,
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly by
-    ``smear`` (2,) px during the exposure, by the midpoint rule; its parameters are those in the
-    middle."""
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly.
+
+    It moves by ``smear`` (2,) px during the exposure, by the midpoint rule; its parameters are
+    those in the middle.
+    """
     count = math.ceil(math.hypot(smear[0], smear[1]) / settings.smear_step)
     if count <= 1:
         light_of_still(parameters[0], parameters[1], shape, settings.psf_px, shares, derivatives)
@@ -272,6 +281,7 @@ def fit_window(
     normal = np.empty((UNKNOWNS, UNKNOWNS))
     right = np.empty(UNKNOWNS)
     set_shape(parameters, shape)
+    # The mask stays that of the start, so that all steps minimise the same sum.
     freedom = max(mask_ring(parameters, shape, settings.ring_reach, mask) - UNKNOWNS, 1)
     misfit = 0.0
     for iteration in range(settings.iterations + 1):
@@ -280,6 +290,7 @@ def fit_window(
             window, mask, shares, derivatives, parameters[5], parameters[6], settings, normal, right
         )
         for k in range(UNKNOWNS):
+            # Keeps the factor finite where the window leaves a parameter undetermined.
             normal[k, k] += 1e-9
         factor(normal)
         if iteration == settings.iterations:
@@ -305,11 +316,11 @@ def fit_windows(
     covariances: Array,
     misfits: Array,
 ) -> None:
-    """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats, which
-    moved by ``smears`` (n,2) px during the exposure.
+    """Fit the part of ``size`` px around the bright spot of each window (n, h, h) of floats.
 
-    Fills the corners (n,2) of these parts, and in their px the parameters (n,7), shapes (n,2,2),
-    covariances (n,m,m) of the first m parameters and misfits (n,).
+    The spots move by ``smears`` (n, 2) px during the exposure. Fills the corners (n, 2) of these
+    parts, and in their px the parameters (n, 7), shapes (n, 2, 2), covariances (n, m, m) of the
+    first m parameters and misfits (n,).
     """
     for k in range(len(windows)):
         spot = moments(windows[k])

@@ -1,14 +1,14 @@
 """Centre of a bright spot as the centroid of its grey values above a threshold.
 
-A pixel weighs what it has above ground + THRESHOLD * contrast, and nothing below: the weight is
+A pixel weighs what it has above ground + THRESHOLD * contrast, and nothing below. The weight is
 continuous, so that noise at the threshold moves the centroid smoothly. Pixels that may lie beyond
 the dark ring do not count.
 
-The centroid is biased: a pixel's light acts as if it all fell on the pixel's middle, and the
-threshold takes away more on one side of the spot than on the other. The bias depends on where the
-centre lies within its pixel. Noise-free and sharp, tilted by 45 degrees, it is about 0.01 px rms at
-radius 3.8 px, 0.013 at 2.5 and 0.005 at 10; a point spread of 0.6 px halves it. It is no part of
-the covariance.
+The centroid is biased. A pixel's light acts as if it all fell on the pixel's middle, and the
+threshold takes away more on one side of the spot than on the other. The bias depends on the
+centre's place within its pixel. Without noise, sharp and tilted by 45 degrees, it is about 0.01 px
+rms at radius 3.8 px, 0.013 at 2.5 and 0.005 at 10; a point spread of 0.6 px halves it. The
+covariance does not include it.
 """
 
 from dataclasses import dataclass
@@ -20,18 +20,19 @@ from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no
 from cmmsim.detection.ellipse_fit import RING_REACH
 from cmmsim.geometry.pose import Array
 
-THRESHOLD = 0.1  # share of the contrast
-CORE_THRESHOLD = 0.4  # the same where only the spot itself is wanted, whatever surrounds it
+# Share of the contrast.
+THRESHOLD = 0.1
+# Share of the contrast where only the spot itself is wanted, whatever surrounds it.
+CORE_THRESHOLD = 0.4
 
 
 @dataclass(frozen=True)
 class BrightSpots:
-    """n windows cut down to the surroundings of their bright spots.
+    """Windows cut down to the surroundings of their bright spots.
 
-    windows (n, h, h) grey values; corners (n, 2) full-image pixel (x, y) of each first pixel;
-    contrast (n,) grey values; weights (n, h, h) of the centroid; within (n, h, h) whether a pixel
-    counts; centroids (n, 2) px in the window; spreads (n, 2, 2) px² second moments of the spot's
-    core.
+    ``windows`` (n, h, h) begin at pixels ``corners`` (n, 2) of the whole image. ``weights`` (n, h,
+    h) are those of the centroid, and ``within`` says whether a pixel counts. ``centroids`` (n, 2)
+    are px of the window, and ``spreads`` (n, 2, 2) second moments of the spot's core, px².
     """
 
     windows: Array
@@ -44,14 +45,13 @@ class BrightSpots:
 
 
 def detect_by_centroid(given: SpotWindows) -> DetectedCentres:
-    """Grey centroids; neither the point spread nor smears play a part."""
+    """Return grey centroids; neither the point spread nor smears play a part."""
     if len(given.windows) == 0:
         return no_centres()
     spots = bright_spots(given)
     x, y = _offsets(spots.centroids, given.fit_size)
-    influence = (spots.weights > 0.0) / _total(spots.weights)[
-        :, None, None
-    ]  # a threshold pixel has derivative 0 or 1
+    # A pixel's weight has the derivative 1 above the threshold, and 0 below.
+    influence = (spots.weights > 0.0) / _total(spots.weights)[:, None, None]
     jacobian = np.stack([x * influence, y * influence], axis=1)
     variance = given.noise.variance(spots.windows)
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
@@ -87,8 +87,9 @@ def bright_spots(given: SpotWindows) -> BrightSpots:
 def whole_inside(
     centres: Array, spreads: Array, size: int, margin: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Tell whether ellipses with these centres (n,2) and second moments (n,2,2) lie wholly inside
-    their windows, ``margin`` px away from the sides.
+    """Tell whether whole ellipses lie inside their windows, ``margin`` px away from the sides.
+
+    They have centres (n, 2) and second moments (n, 2, 2).
     """
     reach = 2.0 * np.sqrt(np.maximum(np.diagonal(spreads, axis1=1, axis2=2), 0.0))
     return np.all(
@@ -98,7 +99,7 @@ def whole_inside(
 
 
 def _weights(windows: Array, threshold: float) -> tuple[Array, Array]:
-    """Grey values above the threshold (n, h, h) and contrast (n,).
+    """Return the grey values above the threshold (n, h, h), and the contrast (n,).
 
     Ground and contrast are medians below and above the middle between the darkest and the brightest
     pixel.
@@ -135,17 +136,19 @@ def _spreads(weights: Array, centroids: Array) -> Array:
 
 
 def _within_ring(centroids: Array, spreads: Array, size: int) -> NDArray[np.bool_]:
-    """Pixels (n, size, size) nearer than the dark ring's rim; an ellipse with radius r has second
-    moment r² / 4.
+    """Tell which pixels (n, size, size) are nearer than the dark ring's rim.
+
+    An ellipse with radius r has the second moment r² / 4.
     """
     x, y = _offsets(centroids, size)
+    # A flat window has no spread, but must have an inverse.
     inverse = np.linalg.inv(spreads + 1e-3 * np.eye(2))[..., None, None]
     reach = inverse[:, 0, 0] * x * x + 2.0 * inverse[:, 0, 1] * x * y + inverse[:, 1, 1] * y * y
     return np.asarray(reach < 4.0 * RING_REACH**2)
 
 
 def _offsets(centroids: Array, size: int) -> tuple[Array, Array]:
-    """x (n, 1, size) and y (n, size, 1) of all pixels from the centroids, px."""
+    """Return x (n, 1, size) and y (n, size, 1) of all pixels from the centroids, px."""
     ticks = np.arange(size, dtype=float)
     return ticks[None, None, :] - centroids[:, 0, None, None], ticks[None, :, None] - centroids[
         :, 1, None, None

@@ -1,6 +1,4 @@
-"""Compiled: where the fit of an ellipse starts, from the ranks and moments of a window's grey
-values.
-"""
+"""Compiled: the start of an ellipse's fit, from ranks and moments of a window's grey values."""
 
 from __future__ import annotations
 
@@ -10,18 +8,19 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-CORE_SHARE = (
-    0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
-)
+# A pixel with this share of the contrast belongs to the bright spot when the fit starts.
+CORE_SHARE = 0.4
 SMALLEST_START_PX = 1.2
-RANK_STEPS = 256  # a grey value each at 8 bit
+# One step a grey value at 8 bit.
+RANK_STEPS = 256
 
 
 @compiled
 def nth_smallest(values: Array, n: int) -> float:
-    """The value with ``n`` smaller ones (Hoare's selection); reorders ``values``."""
+    """Return the value with ``n`` smaller ones, by Hoare's selection; ``values`` are reordered."""
     first = 0
     last = len(values) - 1
+    # Even windows are common, and need no selection.
     if last > 0 and all_alike(values):
         return values[0]
     while first < last:
@@ -55,11 +54,10 @@ def all_alike(values: Array) -> bool:
 
 @compiled
 def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
-    """The values of a window (h, w) with ``low_rank`` and with ``high_rank`` smaller ones; all are
-    finite.
+    """Return the values of a window (h, w) with ``low_rank`` and with ``high_rank`` smaller ones.
 
-    They are counted in even steps from the smallest to the largest, and sorted only within the
-    steps that hold these.
+    All are finite. They are counted in even steps from the smallest to the largest, and sorted only
+    within the steps that hold these.
     """
     width = window.shape[1]
     smallest = window[0, 0]
@@ -83,7 +81,7 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
     found = np.empty((2, window.size + 1))
     count = np.zeros(2, np.int64)
     for row in range(window.shape[0]):
-        # a place is taken by the next one where the value was none to be kept
+        # The next value takes the place of one that was not to be kept, without a branch.
         for column in range(width):
             found[0, count[0]] = found[1, count[1]] = window[row, column]
             count[0] += steps[row, column] == low
@@ -96,7 +94,9 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
 
 @compiled
 def step_of_rank(counts: Array, rank: int) -> tuple:
-    """The step in which the value with ``rank`` smaller ones falls, and how many fall before."""
+    """Return the step in which the value with ``rank`` smaller ones falls, and how many fall
+    before.
+    """
     step = 0
     before = 0
     while before + counts[step] <= rank:
@@ -107,9 +107,10 @@ def step_of_rank(counts: Array, rank: int) -> tuple:
 
 @compiled
 def moments(window: Array) -> tuple:
-    """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w)
-    of floats.
+    """Return ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a
+    window.
     """
+    # Ranks instead of extremes: single noisy pixels decide neither the ground nor the top.
     ground, bright = two_of_rank(window, window.size // 3, window.size - 6)
     contrast = max(bright - ground, 1.0)
     area = 1e-300
@@ -120,6 +121,7 @@ def moments(window: Array) -> tuple:
     yy = 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
+            # The division comes after a comparison that most pixels fail.
             if window[row, column] - ground < 0.9 * CORE_SHARE * contrast:
                 continue
             share = (window[row, column] - ground) / contrast
@@ -138,9 +140,7 @@ def moments(window: Array) -> tuple:
 
 @compiled
 def bound_radii(xx: float, xy: float, yy: float, lowest: float, highest: float) -> tuple:
-    """A symmetric (2,2) matrix with its eigenvalues kept between two limits, given and returned as
-    xx, xy, yy.
-    """
+    """Return a symmetric (2, 2) matrix with eigenvalues between two limits, as xx, xy, yy."""
     mean = 0.5 * (xx + yy)
     half = math.hypot(0.5 * (xx - yy), xy)
     large = mean + half
@@ -158,13 +158,14 @@ def bound_radii(xx: float, xy: float, yy: float, lowest: float, highest: float) 
 
 @compiled
 def start_ellipse(spot: tuple, size: int, parameters: Array) -> None:
-    """First parameters (7,) from the moments of a window of ``size`` px; a uniform ellipse has
-    spread A A / 4.
+    """Fill the first parameters (7,) from the moments of a window of ``size`` px.
+
+    A uniform ellipse has the spread A A / 4.
     """
     ground, contrast, x, y, xx, xy, yy = spot
     xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * SMALLEST_START_PX) ** 2, (0.25 * size) ** 2)
     root = math.sqrt(xx * yy - xy * xy)
-    # the root of a matrix M is (M + sqrt(det) 1) / sqrt(...)
+    # The root of a matrix M is (M + sqrt(det) 1) / sqrt(trace + 2 sqrt(det)).
     scale = 2.0 / math.sqrt(xx + yy + 2.0 * root)
     parameters[0] = x
     parameters[1] = y
@@ -179,10 +180,10 @@ def start_ellipse(spot: tuple, size: int, parameters: Array) -> None:
 def isolate_dots(
     windows: Array, centres: Array, inverses: Array, ground_from: float, reach: float
 ) -> None:
-    """Set the pixels of windows (n,h,w) beyond ``reach`` dot radii to the median of those from
-    ``ground_from`` radii to there, or to 0 where there are none.
+    """Set the pixels of windows (n, h, w) beyond ``reach`` dot radii to the ground.
 
-    Parameters: centres (n,2) px of the window; inverses (n,2,2) that carry px to dot radii.
+    The ground is the median of those from ``ground_from`` radii to there, or 0 where there are
+    none. Centres (n, 2) are px of the window, and ``inverses`` (n, 2, 2) carry px to dot radii.
     """
     _, height, width = windows.shape
     distances = np.empty((height, width))

@@ -1,9 +1,8 @@
-"""The instrument that a sensor file describes: its stereo rig, and the bodies that carry stickers,
-as it knows them.
+"""The instrument that a sensor file describes: its stereo rig, and the bodies that carry stickers.
 
-A rig is nominal and toed in, or as calibrated. A body carries its stickers on three machined
-planes: the planes are exact, the sticker places only nominal, since a sticker sits up to about a
-millimetre beside its place.
+A rig is nominal and toed in, or calibrated. A body carries its stickers on three machined planes.
+The planes are exact, but the sticker places are nominal: a sticker sits up to about a millimetre
+beside its place.
 """
 
 from dataclasses import dataclass, replace
@@ -18,19 +17,21 @@ from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig
 
-BORDER_POINTS = 65  # along each side of the image, asked whether the distortion model holds there
+# Points along each side of the image at which the distortion model must hold.
+BORDER_POINTS = 65
 SHORTEST_BASELINE = 1e-3  # m
-SMALLEST_CORNER = (
-    0.001  # volume that the unit normals of three planes span: of a cube's corner it is 1
-)
+# Volume that the unit normals of three planes span: that of a cube's corner is 1.
+SMALLEST_CORNER = 0.001
 
 
 def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
-    """The rig and the true camera_from_base (4,4). Raises SensorFileError naming the camera at
-    fault.
+    """Return the rig and the true camera_from_base (4, 4).
+
+    Raises SensorFileError, which names the camera at fault.
     """
     position = np.array(section.position)
     target = np.array(section.target)
+    # The horizontal axis of a view straight up or down is not defined.
     if np.linalg.norm(np.cross(target - position, [0.0, 0.0, 1.0])) < 1e-6:
         raise SensorFileError(
             f"rig.target {list(section.target)} must not stand straight above or below, or at, "
@@ -73,8 +74,8 @@ def _require_whole_image(camera: PinholeCamera, name: str) -> None:
     if not found.all():
         raise SensorFileError(
             f"rig.{name}.distortion: the image folds back before pixel "
-            f"{np.round(border[~found][0]).tolist()}, "
-            f"{camera.distortion.fold_radius:.4g} focal lengths from the optical axis"
+            f"{np.round(border[~found][0]).tolist()}, {camera.distortion.fold_radius:.4g} focal "
+            "lengths from the optical axis"
         )
 
 
@@ -89,8 +90,8 @@ def _right_from_left(section: RightFromLeft) -> Array:
     if right_centre[0] <= 0.0 or right_from_left[2, 2] <= 0.0:
         raise SensorFileError(
             "rig.right_from_left: the right camera must stand on the right of the left one "
-            "(translation x below zero "
-            f"where both look the same way) and look its way, got {section.model_dump()}"
+            "(translation x below zero where both look the same way) and look its way, got "
+            f"{section.model_dump()}"
         )
     return right_from_left
 
@@ -99,9 +100,9 @@ def _right_from_left(section: RightFromLeft) -> Array:
 class MarkedBody:
     """Planes and nominal stickers in body axes.
 
-    normals (3,3) by row and offsets (3,) of planes A, B, C (n . p = d, m); sticker_ids (n,) such as
-    "A1"; plane_index (n,); nominal (n,3) m; in_plane (n,3,2) the u and v axes of each sticker's
-    plane.
+    Planes A, B, C are n . p = d with ``normals`` (3, 3) by row and ``offsets`` (3,), m. Stickers
+    have ``sticker_ids`` (n,) such as "A1", a ``plane_index`` (n,), places ``nominal`` (n, 3) m, and
+    ``in_plane`` (n, 3, 2), the u and v axes of their planes.
     """
 
     name: str
@@ -128,7 +129,7 @@ class MarkedBody:
 
 
 def marked_body(name: str, body: Body) -> MarkedBody:
-    """MarkedBody of a sensor file's section."""
+    """Return the body of a sensor file's section."""
     planes = [getattr(body.planes, plane) for plane in PLANE_NAMES]
     normals = np.stack([unit(p.normal) for p in planes])
     offsets = np.array([n @ np.array(p.point) for n, p in zip(normals, planes, strict=True)])
@@ -154,20 +155,19 @@ def marked_body(name: str, body: Body) -> MarkedBody:
 
 
 def require_corner(body: MarkedBody) -> None:
-    """Raise TeachingError unless the three planes of a body meet in one point, which its frame
-    hangs on.
+    """Raise TeachingError unless the planes of a body meet in one point, from which its frame
+    hangs.
     """
     volume = abs(float(np.linalg.det(body.normals)))
     if volume < SMALLEST_CORNER:
         raise TeachingError(
             f"{body.name}: planes A, B and C meet in no point, so no frame can be taught: their "
-            "unit "
-            f"normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is needed"
+            f"unit normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is needed"
         )
 
 
 def _plane_axes(plane: StickerPlane) -> Array:
-    """u and v axes (3,2) in the plane."""
+    """Return the u and v axes (3, 2) in the plane."""
     normal = unit(plane.normal)
     across = np.array(plane.across)
     u = unit(across - (across @ normal) * normal)

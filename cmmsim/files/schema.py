@@ -1,50 +1,105 @@
-"""Schema of a sensor file (TOML), with units."""
+"""Schema of a sensor file (TOML), with units and ranges.
+
+The ranges are those of stereo cameras, from microscopes to surveying. A number outside of its range
+is a slip of the keyboard or of a unit, and loses all its digits in what is computed with it.
+Schemas for editors show the ranges as well.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    model_validator,
+)
+from pydantic_core import CoreSchema, core_schema
 
 from cmmsim.allowed_plugins import AUTO, DEFAULT_DETECTOR, require_detector, require_renderer
 from cmmsim.checks import Section, check_name
 from cmmsim.errors import SensorFileError
 from cmmsim.geometry.pose import Array
-from cmmsim.quantities import (
-    Angle,
-    Component,
-    Distance,
-    Distortion,
-    Duration,
-    Electrons,
-    Frequency,
-    Grey,
-    GreyPerElectron,
-    ImagePlace,
-    Length,
-    Pixels,
-    Place,
-)
+
+Level = Annotated[int, Field(ge=0, le=255)]
+# Standard deviations: no frame's latency is farther from the mean.
+WIDEST_JITTER = 3.0
+# px: a narrower point spread is lost between the points that images are drawn on.
+NARROWEST_PSF = 0.1
+
+
+@dataclass(frozen=True)
+class Within:
+    """Range of a number from ``least`` to ``most``, in a unit; ``zero`` says that 0 is valid as
+    well.
+    """
+
+    least: float
+    most: float
+    unit: str = ""
+    zero: bool = False
+
+    def check(self, value: float | None) -> float | None:
+        """Return the value. Raises ValueError, with the range, if it lies outside."""
+        if value is None or self.least <= value <= self.most or (self.zero and value == 0.0):
+            return value
+        also = "0 or " if self.zero else ""
+        words = f"{also}{self.least:g} to {self.most:g} {self.unit}".rstrip()
+        raise ValueError(f"{value:g} is beyond what a machine can have, {words}")
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        inner = handler(source)
+        # Neither texts nor truth values are numbers.
+        if inner["type"] == "float":
+            inner = {**inner, "strict": True, "allow_inf_nan": False}
+        return core_schema.no_info_after_validator_function(self.check, inner)
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        least = min(self.least, 0.0) if self.zero else self.least
+        return {**handler(schema), "minimum": least, "maximum": self.most}
+
+
+Length = Annotated[float, Within(1e-6, 1e3, "m")]
+Distance = Annotated[float, Within(1e-9, 1e3, "m", zero=True)]
+Place = Annotated[float, Within(-1e3, 1e3, "m")]
+"""Coordinate of a point."""
+Angle = Annotated[float, Within(-1e2, 1e2, "rad")]
+Component = Annotated[float, Within(-1e6, 1e6)]
+"""Component of a direction, whose length does not count."""
+Pixels = Annotated[float, Within(1.0, 1e7, "px")]
+ImagePlace = Annotated[float, Within(-1e6, 1e6, "px")]
+Distortion = Annotated[float, Within(-1e4, 1e4)]
+Electrons = Annotated[float, Within(1e-6, 1e9, "electrons", zero=True)]
+GreyPerElectron = Annotated[float, Within(1e-9, 1e6, "grey values per electron")]
+Grey = Annotated[float, Within(1e-6, 1e5, "grey values", zero=True)]
+Frequency = Annotated[float, Within(1e-3, 1e6, "Hz")]
+Duration = Annotated[float, Within(1e-9, 1e4, "s", zero=True)]
+
 
 Vector3 = tuple[Place, Place, Place]
 Turn3 = tuple[Angle, Angle, Angle]
 Direction3 = tuple[Component, Component, Component]
-Level = Annotated[int, Field(ge=0, le=255)]
-WIDEST_JITTER = 3.0  # standard deviations: no frame's latency is farther from the mean
-NARROWEST_PSF = (
-    0.1  # px: a narrower point spread is lost between the points that images are drawn on
-)
 
 
 def quantity(default: Any, unit: str, what: str) -> Any:
-    """A field with a unit, empty where it has none; ``...`` is no default."""
+    """Return a field with a unit, which may be empty; the default ``...`` means that there is
+    none.
+    """
     return Field(default, description=what, json_schema_extra={"unit": unit} if unit else None)
 
 
 class Timing(Section):
-    """When the sensor looks, and when its poses can be used; a measured pose is that in the middle
-    of its exposure.
+    """Times at which the sensor looks, and at which its poses can be used.
+
+    A measured pose is that in the middle of its exposure.
     """
 
     frame_rate: Frequency = quantity(..., "Hz", "stereo frames a second")
@@ -70,8 +125,8 @@ class Timing(Section):
             )
         if self.latency_jitter > self.latency:
             raise ValueError(
-                f"latency_jitter {self.latency_jitter:g} s is larger than latency "
-                f"{self.latency:g} s"
+                f"latency_jitter {self.latency_jitter:g} s is larger than latency {self.latency:g} "
+                "s"
             )
         return self
 
@@ -81,12 +136,12 @@ class Timing(Section):
         return self.latency + self._widest_deviation
 
     def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array:
-        """Latency of each frame (frames,), s, from the middle of its exposure to the use of its
-        pose.
+        """Draw the latency of each frame (frames,), s, from the middle of its exposure to the
+        pose's use.
 
-        Normal about ``latency`` with standard deviation ``latency_jitter``, clipped on both sides
-        to 3 of those or to the latency itself, whichever is less: none is negative, and the mean
-        stays the stated latency.
+        It is normal about ``latency`` with standard deviation ``latency_jitter``. It is clipped on
+        both sides to 3 of those or to the latency itself, whichever is less: no latency is
+        negative, and the mean stays the stated one.
         """
         widest = self._widest_deviation
         return self.latency + np.clip(rng.normal(0.0, self.latency_jitter, frames), -widest, widest)
@@ -118,11 +173,11 @@ class RightFromLeft(Section):
 
 
 class Rig(Section):
-    """Both cameras and where they stand.
+    """Both cameras and their places.
 
-    distance, where given: the position is moved along its line to the target to stand that far from
-    it. left and right, where given, replace focal_px and the principal point in the middle of the
-    image; right_from_left replaces the baseline and the toe-in towards the target.
+    With ``distance``, the position is moved along its line to the target to stand that far from it.
+    ``left`` and ``right`` replace focal_px and the principal point in the middle of the image.
+    ``right_from_left`` replaces the baseline and the toe-in towards the target.
     """
 
     baseline: Length = quantity(..., "m", "distance between the cameras")
@@ -149,10 +204,10 @@ class Rig(Section):
 
 
 class Camera(Section):
-    """EMVA 1288 figures.
+    """EMVA 1288 figures of a camera.
 
-    noise = false leaves out all noise, the pattern of prnu and dsnu too; pattern_seed makes another
-    specimen.
+    ``noise = false`` leaves out all noise, and the pattern of prnu and dsnu. ``pattern_seed`` makes
+    another specimen.
     """
 
     electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a white pixel")
@@ -175,8 +230,7 @@ class Camera(Section):
         if self.black_level >= 2**self.bit_depth - 1:
             raise ValueError(
                 f"black_level {self.black_level:g} must lie below the largest grey value of "
-                "bit_depth "
-                f"{self.bit_depth}, {2**self.bit_depth - 1}"
+                f"bit_depth {self.bit_depth}, {2**self.bit_depth - 1}"
             )
         return self
 
@@ -202,11 +256,9 @@ class Lens(Section):
 
 
 class Detection(Section):
-    """detector: which one finds the centres of stickers in windows when poses are measured, see
-    :mod:`cmmsim.allowed_plugins`.
+    """Detector of stickers in windows when poses are measured, see :mod:`cmmsim.allowed_plugins`.
 
-    Teaching always takes the maximum-likelihood one, whichever is named here; see
-    :mod:`cmmsim.teaching`.
+    Teaching always takes the maximum-likelihood one, see :mod:`cmmsim.teaching`.
     """
 
     detector: Annotated[str, AfterValidator(require_detector)] = quantity(
@@ -217,8 +269,8 @@ class Detection(Section):
 class Stickers(Section):
     """Bright discs in dark rings.
 
-    per_plane: that many stickers on each plane of the platform instead of those listed there,
-    evenly on an ellipse.
+    ``per_plane`` puts that many stickers on each plane of the platform instead of those listed
+    there, evenly on an ellipse.
     """
 
     radius: Length = quantity(..., "m", "radius of a sticker")
@@ -257,14 +309,16 @@ class Stickers(Section):
 
 
 class HalfSpace(Section):
-    """normal outwards, any length; point on the plane, m."""
+    """Half space with an outward normal of any length, and a point on its plane, m."""
 
     normal: Direction3
     point: Vector3
 
 
 class StickerPlane(HalfSpace):
-    """across gives the u axis; stickers are nominal places [u, v], m from the point."""
+    """Plane with stickers at nominal places [u, v], m from its point; ``across`` gives the u
+    axis.
+    """
 
     across: Direction3
     stickers: Annotated[list[tuple[Place, Place]], Field(min_length=3)]
@@ -286,7 +340,7 @@ class Body(Section):
 
 
 class Platform(Body):
-    """The moving body; home is its pose at teaching, [m, rad]."""
+    """Moving body; ``home`` is its pose at teaching, m and rad."""
 
     home: tuple[Place, Place, Place, Angle, Angle, Angle] = quantity(
         ..., "m, rad", "pose of the platform at teaching"
@@ -294,12 +348,12 @@ class Platform(Body):
 
 
 class SensorFile(Section):
-    """A whole sensor file.
+    """Whole sensor file.
 
-    based_on: a built-in sensor, or a file beside this one, whose entries hold where this file has
-    none; note: what a user must know of the figures, such as that they are assumed; renderer: which
-    one draws, see :mod:`cmmsim.allowed_plugins`; "auto" takes pyrender where OpenGL works, else
-    analytic.
+    ``based_on`` is a built-in sensor, or a file beside this one, whose entries hold where this file
+    has none. ``note`` tells what a user must know of the figures, such as that they are assumed.
+    ``renderer`` is one of :mod:`cmmsim.allowed_plugins`; "auto" takes pyrender where OpenGL works,
+    and otherwise analytic.
     """
 
     name: Annotated[str, AfterValidator(check_name)] = quantity(..., "", "name of the sensor")
@@ -323,7 +377,7 @@ class SensorFile(Section):
 
 
 def unit(vector: Vector3 | Array) -> Array:
-    """Vector (3,) of length one. Raises SensorFileError for a zero vector."""
+    """Return a vector (3,) of length one. Raises SensorFileError for a zero vector."""
     values = np.asarray(vector, dtype=float)
     length = float(np.linalg.norm(values))
     if length < 1e-9:

@@ -1,8 +1,7 @@
-"""Reading sensor files (TOML): how a name becomes a file, and a file with changes a checked
-content.
+"""Reading of sensor files (TOML), by name or path, with changes.
 
-Changes are other entries than a file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested
-as in it.
+Changes are entries other than a file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested
+as in the file.
 """
 
 from __future__ import annotations
@@ -22,8 +21,9 @@ from cmmsim.geometry.pose import Array
 
 
 def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Changes by dotted key, whether given so or as tables in tables; a later one replaces an
-    earlier one.
+    """Return changes by dotted key, whether given so or as tables in tables.
+
+    A later one replaces an earlier one.
     """
     found: dict[str, Any] = {}
     for key, value in changes.items():
@@ -39,7 +39,7 @@ def require_keys(name: str | Path, changes: object) -> None:
     if not isinstance(changes, Mapping):
         raise SensorFileError(
             f"sensor file {name}: changes = {changes!r} must be given by key, as "
-            f"{{'camera.dark_noise': 40.0}}"
+            "{'camera.dark_noise': 40.0}"
         )
     for key, value in changes.items():
         if not isinstance(key, str):
@@ -52,10 +52,10 @@ def require_keys(name: str | Path, changes: object) -> None:
 
 
 def change(content: dict[str, Any], changes: Mapping[str, Any], source: str) -> None:
-    """Put changes in their places in a file's content; what is no key of it is found later, with
-    the valid names.
+    """Put changes in their places in a file's content.
 
-    source: what the content is of, for messages. Raises SensorFileError for what no change can be.
+    Unknown keys are found later, with the valid names. ``source`` names the content in messages.
+    Raises SensorFileError for what cannot be a change.
     """
     for path, value in dotted(changes).items():
         if path == "based_on":
@@ -79,12 +79,12 @@ def _replace(content: dict[str, Any], path: str, value: Any, source: str) -> Non
 
 
 def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array:
-    """Places (count, 2) [u, v], m, on the ellipse one standard deviation around the middle of those
-    listed (n, 2).
+    """Return places (count, 2) [u, v], m, on the ellipse of one standard deviation of those listed
+    (n, 2).
 
-    Points evenly spaced in angle on an ellipse have the same mean and the same second moments
-    whatever their number is, from three on: n stickers know a plane or a pose sqrt(n) times better
-    than one would.
+    Points evenly spaced in angle on an ellipse have the same mean and second moments whatever their
+    number is, from three on. So n stickers determine a plane or a pose sqrt(n) times better than
+    one would.
     """
     places = np.asarray(listed, dtype=float)
     reach = np.linalg.cholesky(np.cov(places.T, bias=True))
@@ -119,7 +119,7 @@ def built_in_names() -> list[str]:
 
 
 def sensor_text(name: str | Path) -> str:
-    """Text of the sensor file of a built-in name or a path.
+    """Return the text of the sensor file of a built-in name or a path.
 
     Raises UnknownSensorError for a name that is neither, SensorFileError for a file that cannot be
     read, and CmmError for what is neither text nor a path.
@@ -145,11 +145,10 @@ def sensor_text(name: str | Path) -> str:
 
 
 def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
-    """The sensor file of a built-in name or a path.
+    """Read the sensor file of a built-in name or a path.
 
-    changes: entries that hold instead of the file's, by dotted key as ``{"camera.dark_noise":
-    40.0}`` or nested as in the file. Raises UnknownSensorError for a name that is neither,
-    SensorFileError (with the valid names) for a bad content.
+    Changes hold instead of the file's entries. Raises UnknownSensorError for a name that is
+    neither, and SensorFileError, with the valid names, for a bad content.
     """
     require_keys(name, changes)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
@@ -159,9 +158,9 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
 
 
 def sensor_schema() -> dict[str, Any]:
-    """JSON schema of sensor files, for editors; `sensors/sensor.schema.json` holds it.
+    """Return the JSON schema of sensor files, for editors; `sensors/sensor.schema.json` holds it.
 
-    A file that is based on another need have neither all tables nor all entries of one.
+    A file that is based on another may lack tables, and entries of tables.
     """
     schema = SensorFile.model_json_schema()
     tables = {
@@ -178,7 +177,7 @@ def sensor_schema() -> dict[str, Any]:
 
 
 def _with_stickers(file: SensorFile, source: str) -> SensorFile:
-    """The file with as many stickers on each plane of the platform as it asks for."""
+    """Return the file with as many stickers on each plane of the platform as it asks for."""
     count = file.stickers.per_plane
     room = 2.0 * file.stickers.ring_radius
     if count is None:
@@ -189,8 +188,7 @@ def _with_stickers(file: SensorFile, source: str) -> SensorFile:
         if closest(places) < room:
             raise SensorFileError(
                 f"{source}: stickers.per_plane = {count} puts stickers {closest(places):.4f} m "
-                "apart "
-                f"on plane {name}, two rings need {room:g} m"
+                f"apart on plane {name}, two rings need {room:g} m"
             )
         planes[name] = plane.model_copy(update={"stickers": [(u, v) for u, v in places.tolist()]})
     platform = file.platform.model_copy(
@@ -200,8 +198,9 @@ def _with_stickers(file: SensorFile, source: str) -> SensorFile:
 
 
 def _content(name: str | Path) -> dict[str, Any]:
-    """Content of a file, completed by the sensor it is based on: entry by entry in each section, no
-    deeper.
+    """Return the content of a file, completed by the sensor that it is based on.
+
+    Each section is completed entry by entry, and no deeper.
     """
     own = _table(name)
     basis = own.get("based_on")

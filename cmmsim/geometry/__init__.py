@@ -1,3 +1,4 @@
-"""Poses, cameras, the stereo rig, frames from planes, and the image of a disc. Knows no file and no
-image.
+"""Poses, cameras, the stereo rig, frames from planes, and the image of a disc.
+
+Nothing here knows files or images.
 """

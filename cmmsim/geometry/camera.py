@@ -10,7 +10,7 @@ coordinates (x, y) = (X/Z, Y/Z); with s = x² + y²:
     x_d = x (1 + k1 s + k2 s² + k3 s³) + 2 p1 x y + p2 (s + 2 x²)
     y_d = y (1 + k1 s + k2 s² + k3 s³) + p1 (s + 2 y²) + 2 p2 x y
 
-The model holds up to the radius where the radial part stops growing: beyond it the image folds back
+The model holds up to the radius where the radial part stops growing; beyond it the image folds back
 onto itself. Source: D. C. Brown, Close-range camera calibration, Photogrammetric Engineering 37
 (1971).
 """
@@ -29,10 +29,11 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array, frozen
 
 NDArrayBool = NDArray[np.bool_]
-# largest distance, in normalised coordinates, between a point and the image of its inverse
-FARTHEST_FOLD = 1e3  # focal lengths: a fold beyond is none
+# Focal lengths: a fold farther out is taken for none.
+FARTHEST_FOLD = 1e3
 INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-PSF_REACH = 5.0  # standard deviations after which the point spread is cut off
+# Standard deviations after which the point spread is cut off.
+PSF_REACH = 5.0
 
 
 @dataclass(frozen=True)
@@ -60,23 +61,26 @@ class Distortion:
     @cached_property
     def fold_radius(self) -> float:
         """Undistorted radius at which the radial part stops growing; infinite where it never
-        does."""
-        roots = np.roots([1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3])  # of the slope, in 1/s
+        does.
+        """
+        # Roots of the slope of the radial part, in 1/s.
+        roots = np.roots([1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3])
         turning = roots[
             (np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / FARTHEST_FOLD**2)
         ].real
         return float(1.0 / np.sqrt(turning.max())) if len(turning) else np.inf
 
     def distort(self, points: Array) -> Array:
-        """Distorted points (..., 2) of undistorted ones (..., 2)."""
+        """Return distorted points (..., 2) of undistorted ones (..., 2)."""
         return self._bent(points)[0]
 
     def jacobian(self, points: Array) -> Array:
-        """Derivative (..., 2, 2) of the distorted by the undistorted points (..., 2)."""
+        """Return the derivative (..., 2, 2) of the distorted by the undistorted points (..., 2)."""
         return self._bent(points)[1]
 
     def _bent(self, points: Array) -> tuple[Array, Array]:
-        from cmmsim.geometry.camera_kernels import bend_all  # late, as numba takes time to import
+        # Late, as numba takes time to import.
+        from cmmsim.geometry.camera_kernels import bend_all
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
         bent = np.empty_like(flat)
@@ -85,19 +89,22 @@ class Distortion:
         return bent.reshape(points.shape), slopes.reshape(*points.shape, 2)
 
     def holds(self, points: Array) -> NDArrayBool:
-        """Tell whether the model is one-to-one at undistorted points (..., 2): within the fold and
-        not turned over.
+        """Tell whether the model is one-to-one at undistorted points (..., 2).
+
+        It is within the fold, where the image is not turned over.
         """
         within = np.sum(points * points, axis=-1) < self.fold_radius**2
         return within & (np.linalg.det(self.jacobian(points)) > 0.0)
 
     def undistort(self, points: Array) -> tuple[Array, NDArrayBool]:
-        """Undistorted points (..., 2) of distorted ones (..., 2), and whether each was found.
+        """Return undistorted points (..., 2) of distorted ones (..., 2), and whether each was
+        found.
 
-        Newton's method to 1e-12. A point that no undistorted one within the fold reaches is not
-        found; its value is finite and means nothing.
+        Newton's method ends at 1e-12. A point that no undistorted one within the fold reaches is
+        not found; its value is finite and means nothing.
         """
-        from cmmsim.geometry.camera_kernels import straighten_all  # late: numba takes time
+        # Late, as numba takes time to import.
+        from cmmsim.geometry.camera_kernels import straighten_all
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
         straight = np.empty_like(flat)
@@ -109,10 +116,34 @@ class Distortion:
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Focal length and principal point in px, image size in px.
+    """Pinhole camera with a lens.
 
-    focal_px is the focal length along x; aspect: the one along y divided by it; distortion of the
-    lens.
+    Parameters
+    ----------
+    focal_px : float
+        Focal length along x, px.
+    centre_x_px, centre_y_px : float
+        Principal point, px.
+    width, height : int
+        Size of the image, px.
+    aspect : float
+        Focal length along y over that along x.
+    distortion : Distortion
+        Distortion of the lens.
+
+    Raises
+    ------
+    ShapeError
+        If a figure is not a finite number.
+    CmmError
+        If focal length, aspect or size are not above zero.
+
+    Examples
+    --------
+    >>> camera = PinholeCamera(1000.0, 319.5, 239.5, 640, 480)
+    >>> pixels, inside = camera.project(np.array([[0.1, 0.0, 2.0]]))
+    >>> pixels.tolist(), inside.tolist()
+    ([[369.5, 239.5]], [True])
     """
 
     focal_px: float
@@ -168,8 +199,9 @@ class PinholeCamera:
         return self if self.distortion.is_zero else replace(self, distortion=Distortion())
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
-        """Pixels (..., 2) of points (..., 3) in camera axes, and whether each lies before the
-        camera and inside.
+        """Return pixels (..., 2) of points (..., 3) in camera axes, and whether each is seen.
+
+        A point is seen if it lies before the camera and inside its image.
         """
         depth = points[..., 2]
         ahead = depth > 1e-6
@@ -181,8 +213,9 @@ class PinholeCamera:
         return pixels, ahead & self.shows(pixels)
 
     def shows(self, pixels: Array, margin: float = -0.5) -> NDArrayBool:
-        """Tell whether pixels (..., 2) lie inside the image, more than ``margin`` px from its
-        outermost pixels' middles.
+        """Tell whether pixels (..., 2) lie inside the image.
+
+        They are more than ``margin`` px from the middles of its outermost pixels.
         """
         return np.all(
             (pixels > margin) & (pixels < (self.width - 1 - margin, self.height - 1 - margin)),
@@ -190,8 +223,8 @@ class PinholeCamera:
         )
 
     def distort(self, ideal: Array) -> tuple[Array, NDArrayBool]:
-        """Pixels (..., 2) of the image for ideal pixels (..., 2), and whether the distortion model
-        holds there.
+        """Return pixels (..., 2) of the image for ideal pixels (..., 2), and where the model
+        holds.
         """
         if self.distortion.is_zero:
             return ideal, np.ones(ideal.shape[:-1], dtype=bool)
@@ -201,7 +234,7 @@ class PinholeCamera:
         ) * self.focal_lengths + self.centre, self.distortion.holds(normalised)
 
     def undistort(self, pixels: Array) -> tuple[Array, NDArrayBool]:
-        """Ideal pixels (..., 2) for pixels (..., 2) of the image, and whether each has one.
+        """Return ideal pixels (..., 2) for pixels (..., 2) of the image, and whether each has one.
 
         The values of those without one are finite and mean nothing.
         """
@@ -211,13 +244,13 @@ class PinholeCamera:
         return normalised * self.focal_lengths + self.centre, found
 
     def distortion_jacobian(self, ideal: Array) -> Array:
-        """Derivative (..., 2, 2) of the image's pixels by the ideal ones (..., 2)."""
+        """Return the derivative (..., 2, 2) of the image's pixels by the ideal ones (..., 2)."""
         focal = self.focal_lengths
         return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal
 
 
 def camera_from(intrinsics: Array, width: int, height: int) -> PinholeCamera:
-    """The camera of nine intrinsics (9,), see INTRINSIC_NAMES."""
+    """Return the camera of nine intrinsics (9,), see INTRINSIC_NAMES."""
     fx, fy, cx, cy, *terms = (float(value) for value in intrinsics)
     return PinholeCamera(fx, cx, cy, width, height, aspect=fy / fx, distortion=Distortion(*terms))
 
@@ -226,9 +259,10 @@ def camera_from(intrinsics: Array, width: int, height: int) -> PinholeCamera:
 class Optics:
     """Point spread and darkening towards the corners of a lens.
 
-    psf_px: standard deviation of the Gaussian point spread, px of the image; vignetting: share of
-    the light that is missing in the corner farthest from the principal point; the loss grows with
-    the square of the distance from there. Both zero: the image of a pinhole.
+    ``psf_px`` is the standard deviation of the Gaussian point spread, px. ``vignetting`` is the
+    share of the light that is missing in the corner farthest from the principal point; the loss
+    grows with the square of the distance from there. If both are zero, the image is that of a
+    pinhole.
     """
 
     psf_px: float = 0.0
@@ -244,8 +278,8 @@ class Optics:
         return ceil(PSF_REACH * self.psf_px)
 
     def illumination(self, camera: PinholeCamera, pixels: Array) -> Array:
-        """Relative illumination (...) of pixels (..., 2) of the image, 1 at the principal point, 0
-        at the least.
+        """Return the relative illumination (...) of pixels (..., 2), 1 at the principal point and
+        at least 0.
         """
         corners = np.array(
             [[x, y] for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)]
@@ -258,7 +292,9 @@ class Optics:
     def window_illumination(
         self, camera: PinholeCamera, corners: NDArray[np.int_], size: int
     ) -> Array:
-        """Relative illumination (k, size, size) of windows with first pixels ``corners`` (k, 2)."""
+        """Return the relative illumination (k, size, size) of windows with first pixels ``corners``
+        (k, 2).
+        """
         ticks = np.arange(size)
         x = corners[:, 0, None, None] + ticks
         y = corners[:, 1, None, None] + ticks[:, None]

@@ -1,15 +1,14 @@
-"""The image of a disc: its ellipse, where the ellipse's centre lies, and how much of each pixel it
-covers.
+"""The image of a disc: its ellipse, the centre of the ellipse, and its share of each pixel.
 
-**Ellipse.** Exact in perspective: with C the centre, n the unit normal and R the radius in camera
-axes, D = C C' - R² (I - n n') is the dual conic of the rim; carried to pixels by the camera matrix
-it gives the ellipse's centre and, in
-its upper left, its shape: a matrix A (2,2), symmetric, that carries the unit disc onto the ellipse.
+**Ellipse.** It is exact in perspective. With C the centre, n the unit normal and R the radius in
+camera axes, D = C C' - R² (I - n n') is the dual conic of the rim. Carried to pixels by the camera
+matrix it gives the ellipse's centre and, in its upper left, its shape: a symmetric matrix A (2, 2)
+that carries the unit disc onto the ellipse.
 
 **Eccentricity.** The centre of a circle's image is not the image of the circle's centre. Through a
 perfect lens the ellipse's centre is f (D13/D33, D23/D33), while the circle's centre projects to f
-(X/Z, Y/Z). Distortion bends the ellipse c + A u, |u| = 1, into a curve, and what is fitted to it is
-an ellipse again. With J the Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with
+(X/Z, Y/Z). Distortion bends the ellipse c + A u, |u| = 1, into a curve, to which an ellipse is
+fitted again. With J the Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with
 small w(u). A fit to grey values minimises the squared distance between curve and ellipse along its
 length, which is the integral over the angle of u of (u'w - u'a)² / |J A t|, where t is the tangent
 of the unit circle and a the shift of the ellipse's centre. So
@@ -20,15 +19,15 @@ For a round J A and a quadratic w_i = ½ H_ijk u_j u_k this is a_i = (H_ijj + 2 
 
 **Coverage.** By Green's theorem the area of the ellipse in a pixel is the integral of (x - left) dy
 over the arcs of the rim in it, plus the whole rise dy of those arcs of its row that lie right of
-it. On an arc x = c
-+ A u, where u = (cos t, sin t) goes from one crossing of the lines between pixels to the next, and
-the integrals of u_i du_j follow from its ends and its angle. A change of c or A moves the rim with
-a velocity v = dc + dA u, and changes the share by the flux of v through the pixel's own arcs, whose
-outward normal is (dy, -dx): integrals of the same kind.
+it. On an arc x = c + A u, u = (cos t, sin t) goes from one crossing of the lines between pixels to
+the next, and the integrals of u_i du_j follow from its ends and its angle. A change of c or A moves
+the rim with a velocity v = dc + dA u. It changes the share by the flux of v through the pixel's own
+arcs, whose outward normal is (dy, -dx): integrals of the same kind.
 
 **Blurred coverage.** With a Gaussian point spread the share of light in a pixel is the integral
-over the ellipse of g_i(x) g_j(y), where g_i(x) is what the point spread carries from a point x into
-pixel i. By the divergence theorem it is an integral along the rim x(t) = c + A (cos t, sin t),
+over the ellipse of g_i(x) g_j(y), where g_i(x) is the light that the point spread carries from a
+point x into pixel i. By the divergence theorem it is an integral along the rim x(t) = c + A (cos t,
+sin t),
 
     share = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i,
 
@@ -49,21 +48,24 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, frozen
 from cmmsim.geometry.stereo_rig import StereoRig
 
-RIM_POINTS = 24  # of a bent ellipse, over which its fit is integrated
-NARROWEST_PX = 0.05  # standard deviation of a point spread that can be followed
+# Points of a bent ellipse over which its fit is integrated.
+RIM_POINTS = 24
+# Standard deviation of the narrowest point spread that can be followed.
+NARROWEST_PX = 0.05
 SHAPE_BASIS = frozen([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
 
 
 def project_discs(
     camera: PinholeCamera, centres: Array, normals: Array, radii: Array
 ) -> tuple[Array, Array]:
-    """Ellipses of n discs wholly before the camera: ideal centres (n,2) px and shapes A (n,2,2) px,
-    symmetric.
+    """Return the ellipses of n discs wholly before the camera, through a perfect lens.
 
-    Parameters: centres (n,3) m and normals (n,3) unit, in camera axes; radii (n,) m. The ellipse is
-    the image of the unit disc under x -> centre + A x.
+    Discs have centres (n, 3) m and unit normals (n, 3) in camera axes, and radii (n,) m. Ellipses
+    have centres (n, 2) px and symmetric shapes A (n, 2, 2) px: they are the images of the unit disc
+    under x -> centre + A x.
     """
-    from cmmsim.geometry.disc_kernels import project_all  # late, as numba takes time to import
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.disc_kernels import project_all
 
     pixels = np.empty((len(centres), 2))
     shapes = np.empty((len(centres), 2, 2))
@@ -75,11 +77,11 @@ def project_discs(
 def sticker_outlines(
     rig: StereoRig, camera_from_body: Array, places: Array, normals: Array, radius: float
 ) -> tuple[Array, Array]:
-    """Centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of n stickers in the images
-    as they are.
+    """Return centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of stickers in both
+    images.
 
-    Parameters: camera_from_body (4,4), or one for each sticker (n,4,4); places (n,3) m and normals
-    (n,3) in body axes; radius m. Distortion is taken as linear across a sticker.
+    ``camera_from_body`` is (4, 4), or (n, 4, 4) for one each. Stickers have places (n, 3) m and
+    normals (n, 3) in body axes, and a radius in m. Distortion is taken as linear across a sticker.
     """
     centres = []
     shapes = []
@@ -95,21 +97,23 @@ def sticker_outlines(
 
 
 def bend_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> None:
-    """Replace ellipses of a perfect lens by those in the camera's image, with ``middles`` (n, 2).
+    """Replace ellipses of a perfect lens by those in the camera's image.
 
-    Distortion is taken as linear across the ``shapes`` (n, 2, 2).
+    They have ``middles`` (n, 2) and ``shapes`` (n, 2, 2), across which distortion is taken as
+    linear.
     """
-    from cmmsim.geometry.disc_kernels import bend_ellipses  # late, as numba takes time to import
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.disc_kernels import bend_ellipses
 
     if not camera.distortion.is_zero:
         bend_ellipses(camera.intrinsics, middles, shapes)
 
 
 def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius: float) -> Array:
-    """Centre of the ellipse fitted to a circle's image, minus the projected circle centre, px of
-    the image (n, 2).
+    """Return the centre of the ellipse fitted to a circle's image minus the projected centre (n,
+    2), px.
 
-    Parameters: centres (n, 3) m and normals (n, 3) unit, in camera axes; radius in m.
+    Circles have centres (n, 3) m and unit normals (n, 3) in camera axes, and a radius in m.
     """
     middles, shapes = project_discs(camera.ideal, centres, normals, np.full(len(centres), radius))
     projected = camera.project(centres)[0]
@@ -119,10 +123,10 @@ def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius:
 
 
 def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
-    """Centre fitted to a distorted ellipse minus the distorted centre of the ellipse, px of the
-    image (n, 2).
+    """Return the centre fitted to a distorted ellipse minus the ellipse's distorted centre (n, 2),
+    px.
 
-    Parameters: middles (n, 2) and shapes A (n, 2, 2) of the ellipses in ideal px.
+    Ellipses have middles (n, 2) and shapes A (n, 2, 2) in ideal px.
     """
     angle = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
     u = np.stack([np.cos(angle), np.sin(angle)])
@@ -140,13 +144,12 @@ def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
 
 
 def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
-    """Share of light (n, size, size), 0 to 1, in each pixel, and its derivatives (n, size, size, 5)
-    by [c_x, c_y, A_xx, A_xy, A_yy].
+    """Return the share of light (n, size, size), 0 to 1, in each pixel, and its derivatives.
 
-    Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes
-    (n, 2, 2) px, symmetric and positive definite; size: window side in px; psf_px: sigma of the
-    point spread, 0: the covered share. Raises CmmError for a point spread narrower than
-    NARROWEST_PX.
+    The derivatives (n, size, size, 5) are by [c_x, c_y, A_xx, A_xy, A_yy]. Centres (n, 2) px count
+    from the middle of the window's first pixel; shapes (n, 2, 2) px are symmetric and positive
+    definite. ``psf_px`` is the sigma of the point spread; 0 gives the covered share. Raises
+    CmmError for a point spread narrower than NARROWEST_PX.
     """
     from cmmsim.geometry.disc_kernels import blur_windows  # compile, so they are loaded only here
     from cmmsim.geometry.rim_kernels import cover_windows
@@ -163,7 +166,7 @@ def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> t
 
 
 def _contiguous(*arrays: Array) -> Iterator[Array]:
-    """Arrays of floats in the layout for which kernels are compiled."""
+    """Yield arrays of floats in the layout for which kernels are compiled."""
     return (np.ascontiguousarray(values, dtype=float) for values in arrays)
 
 

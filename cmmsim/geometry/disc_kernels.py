@@ -1,5 +1,6 @@
-"""Compiled: discs as a camera sees them, and their blurred light in pixels; the formulas stand in
-``disc_image``.
+"""Compiled: discs as a camera sees them, and their blurred light in pixels.
+
+The formulas stand in ``disc_image``.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ def disc_ellipse(centre: Array, normal: Array, radius: float, focal: Array) -> t
     carries the unit disc onto the ellipse.
     """
     squared = radius * radius
+    # The dual conic D of ``disc_image``, over its last entry D33.
     depth = centre[2] * centre[2] - squared * (1.0 - normal[2] * normal[2])
     x = (centre[0] * centre[2] + squared * normal[0] * normal[2]) / depth
     y = (centre[1] * centre[2] + squared * normal[1] * normal[2]) / depth
@@ -101,8 +103,11 @@ def bend_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
 def place_discs(
     moves: Array, owners: Array, places: Array, directions: Array, centres: Array, normals: Array
 ) -> None:
-    """Centres and normals (n,3) in camera axes of discs at ``places`` with normals ``directions``
-    (n,3) in the axes of their ``owners`` (n,); moves (b,4,4) camera from bodies."""
+    """Fill centres and normals (n, 3) in camera axes of discs.
+
+    ``places`` and ``directions`` (n, 3) are in the axes of their ``owners`` (n,), and ``moves`` (b,
+    4, 4) lead from the bodies to the camera.
+    """
     for n in range(len(places)):
         move = moves[owners[n]]
         for i in range(3):
@@ -125,8 +130,9 @@ def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> 
             if abs(normal[i]) < abs(normal[least]):
                 least = i
         length = math.sqrt(1.0 - normal[least] ** 2)
+        # u = normal x e_least / length lies in the plane.
         i = (least + 1) % 3
-        j = (least + 2) % 3  # u = normal x e_least / length, which lies in the plane
+        j = (least + 2) % 3
         u[least] = 0.0
         u[i] = normal[j] / length
         u[j] = -normal[i] / length
@@ -144,7 +150,7 @@ def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> 
 
 @compiled
 def inverse_shape(shape: Array) -> Array:
-    """Inverse (2,2) of a (2,2) matrix."""
+    """Return the inverse (2, 2) of a (2, 2) matrix."""
     det = shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0]
     m = np.empty((2, 2))
     m[0, 0] = shape[1, 1] / det
@@ -154,8 +160,10 @@ def inverse_shape(shape: Array) -> Array:
     return m
 
 
-REACH = 5.5  # standard deviations from the rim beyond which no light is followed: 4e-8 of it
-POINTS_PER_SIGMA = 1.1  # rim points to one standard deviation of the point spread
+# Standard deviations from the rim beyond which no light is followed: 4e-8 of it.
+REACH = 5.5
+# Rim points to one standard deviation of the point spread.
+POINTS_PER_SIGMA = 1.1
 FEWEST_POINTS = 24
 SQRT_HALF = math.sqrt(0.5)
 SQRT_TWO_PI = math.sqrt(2.0 * math.pi)
@@ -165,11 +173,11 @@ SQRT_TWO_PI = math.sqrt(2.0 * math.pi)
 def carried(
     start: float, first: int, last: int, psf_px: float, across: Array, passed: Array
 ) -> None:
-    """Fill the light that the point spread carries from ``start``, px along one axis, into pixels
-    first..last.
+    """Fill the light that the point spread carries from ``start`` into pixels first to last of one
+    axis.
 
     ``across`` g is the share of a point's light, and ``passed`` P its integral from -infinity to
-    ``start``.
+    ``start``, px.
     """
     u = (first - 0.5 - start) / psf_px
     below = 0.5 * (1.0 + math.erf(u * SQRT_HALF))
@@ -186,7 +194,7 @@ def carried(
 
 @compiled
 def rim_points(shape: Array, psf_px: float) -> int:
-    """Points on the rim so close that the trapezoidal rule has converged."""
+    """Return a number of points on the rim at which the trapezoidal rule has converged."""
     extent = math.sqrt(
         max(shape[0, 0] ** 2 + shape[0, 1] ** 2, shape[1, 0] ** 2 + shape[1, 1] ** 2)
     )
@@ -197,7 +205,7 @@ def rim_points(shape: Array, psf_px: float) -> int:
 def blur_window(
     centre_x: float, centre_y: float, shape: Array, psf_px: float, shares: Array, derivatives: Array
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5)."""
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of a blurred ellipse."""
     height, width = shares.shape
     shares[:] = 0.0
     derivatives[:] = 0.0
@@ -205,9 +213,11 @@ def blur_window(
     passed_x = np.empty(width)
     across_y = np.empty(height)
     passed_y = np.empty(height)
-    whole = np.zeros((height, width + 1))  # what passes all pixels left of a column
+    # Light that passes all pixels left of a column.
+    whole = np.zeros((height, width + 1))
     m = inverse_shape(shape)
     count = rim_points(shape, psf_px)
+    # On the rim, n ds = det(A) A^-T u dt.
     scale = 2.0 * math.pi / count * (shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0])
     reach = REACH * psf_px + 0.5
     for k in range(count):
@@ -226,6 +236,7 @@ def blur_window(
         carried(y, low, high, psf_px, across_y, passed_y)
         for row in range(low, high + 1):
             through = across_y[row] * n_x
+            # Pixels left of the reach get all of it; the last loop adds that up from the right.
             whole[row, min(left, width)] += through
             for column in range(left, right + 1):
                 shares[row, column] += through * passed_x[column]
@@ -247,8 +258,6 @@ def blur_window(
 def blur_windows(
     centres: Array, shapes: Array, psf_px: float, shares: Array, derivatives: Array
 ) -> None:
-    """``blur_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives
-    (n,h,w,5).
-    """
+    """Fill shares (n, h, w) and derivatives (n, h, w, 5) of n ellipses, see ``blur_window``."""
     for k in range(len(centres)):
         blur_window(centres[k, 0], centres[k, 1], shapes[k], psf_px, shares[k], derivatives[k])

@@ -19,6 +19,7 @@ def factor(matrix: Array) -> None:
             rest = matrix[i, j]
             for k in range(j):
                 rest -= matrix[i, k] * matrix[j, k]
+            # A matrix that rounding has made indefinite keeps a tiny pivot.
             matrix[i, j] = math.sqrt(max(rest, SMALLEST_PIVOT)) if i == j else rest / matrix[j, j]
 
 

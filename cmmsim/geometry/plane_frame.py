@@ -1,7 +1,7 @@
 """The frame that three planes define (paper section 4.2).
 
-Origin at the intersection of planes A, B and C, z along A's normal, x along the line A and B share,
-y = z x x. A plane is n . p = d with unit normal n.
+Its origin is the intersection of planes A, B and C, its z axis A's normal, its x axis the line that
+A and B share, and y = z x x. A plane is n . p = d with unit normal n.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,12 @@ FEWEST_STICKERS = 3
 
 @dataclass(frozen=True)
 class FittedPlane:
-    """A plane, or several (...): normal (..., 3) unit; offset (...) d, m; tangents (..., 3, 2);
-    covariance (..., 3, 3) of [turn about each tangent..., d]: the normal moves by tangents @
-    parameters[:2]."""
+    """A plane, or several (...).
+
+    They have unit normals (..., 3), offsets d (...), m, and tangents (..., 3, 2). The covariance
+    (..., 3, 3) belongs to [turn about each tangent..., d]: the normal moves by tangents @
+    parameters[:2].
+    """
 
     normal: Array
     offset: Array
@@ -31,11 +34,10 @@ class FittedPlane:
 
 
 def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "") -> FittedPlane:
-    """Weighted least-squares plane through ``points`` (n,3) with covariances (n,3,3), or planes
-    through several sets (..., n, 3) of them.
+    """Fit a weighted least-squares plane through points (n, 3) with covariances (n, 3, 3).
 
-    ``towards`` (..., 3) is a rough normal that fixes the sign. Raises LostError with fewer than
-    three points off one line.
+    Several sets of points (..., n, 3) give as many planes. ``towards`` (..., 3) is a rough normal
+    that fixes the sign. Raises LostError with fewer than three points off one line.
     """
     count = points.shape[-2]
     if count < FEWEST_STICKERS:
@@ -47,12 +49,14 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
     _, spread, axes = np.linalg.svd(arms)
     if (width := float(spread[..., 1].min())) < SMALLEST_SPREAD:
         raise LostError(
-            f"plane {name}: its {count} visible stickers lie on one line "
-            f"to {width * 1e3:.1f} mm, at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
+            f"plane {name}: its {count} visible stickers lie on one line to {width * 1e3:.1f} mm, "
+            f"at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
         )
     normal = axes[..., 2, :]
     normal = normal * np.where(_dot(normal, towards) > 0.0, 1.0, -1.0)[..., None]
-    shift = np.zeros(normal.shape[:-1])  # of the plane from the middle, along the normal
+    # Shift of the plane from the middle, along the normal.
+    shift = np.zeros(normal.shape[:-1])
+    # The start is the unweighted plane, so two weighted steps reach rounding.
     for _ in range(2):
         tangents = _tangents(normal)
         jacobian = np.concatenate([arms @ tangents, np.full((*arms.shape[:-1], 1), -1.0)], axis=-1)
@@ -66,7 +70,7 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
         normal = normal + (tangents @ change[..., :2, None])[..., 0]
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     tangents = _tangents(normal)
-    # parameters were [turn, shift about the middle]; the offset is shift + n . middle
+    # The parameters were [turn, shift about the middle]; the offset is shift + n . middle.
     to_offset = np.zeros((*shift.shape, 3, 3)) + np.eye(3)
     to_offset[..., 2, :2] = (middle[..., None, :] @ tangents)[..., 0, :]
     spread = to_offset @ covariance @ to_offset.swapaxes(-1, -2)
@@ -74,8 +78,10 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
 
 
 def frame_from_planes(normals: Array, offsets: Array) -> Array:
-    """camera_from_planes (..., 4, 4): the frame of planes A, B, C given as unit normals (..., 3, 3)
-    by row and offsets (..., 3)."""
+    """Return camera_from_planes (..., 4, 4): the frame of planes A, B, C.
+
+    They are given as unit normals (..., 3, 3) by row and offsets (..., 3).
+    """
     first = normals[..., 0, :]
     z = first / np.linalg.norm(first, axis=-1, keepdims=True)
     x = np.cross(first, normals[..., 1, :])
@@ -87,11 +93,11 @@ def frame_from_planes(normals: Array, offsets: Array) -> Array:
 def frame_of_points(
     points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
 ) -> tuple[Array, Array]:
-    """Frame (4,4) of the planes through measured stickers, and the covariance (6,6) of its small
-    error [dt, dphi].
+    """Return the frame (4, 4) of planes through measured stickers, and its covariance (6, 6).
 
-    Parameters: points (n,3) and covariances (n,3,3); plane_index (n,) 0, 1, 2 for A, B, C; towards
-    (3,3) rough normals by row. Raises LostError that names the plane, the count and the limit.
+    The covariance is that of the small error [dt, dphi]. Stickers are points (n, 3) with
+    covariances (n, 3, 3), on planes ``plane_index`` (n,) 0, 1, 2 for A, B, C; ``towards`` (3, 3)
+    are rough normals by row. Raises LostError that names the plane, the count and the limit.
     """
     frame, planes = frames_of_points(points, covariances, plane_index, towards)
     sensitivity = _frame_sensitivity(
@@ -103,8 +109,9 @@ def frame_of_points(
 def frames_of_points(
     points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
 ) -> tuple[Array, list[FittedPlane]]:
-    """As ``frame_of_points`` for sets of points (..., n, 3): their frames (..., 4, 4), and planes
-    A, B and C.
+    """Return the frames (..., 4, 4) of sets of points (..., n, 3), and planes A, B and C.
+
+    The arguments are those of ``frame_of_points``.
     """
     planes = []
     for k, name in enumerate(PLANE_NAMES):
@@ -117,23 +124,27 @@ def frames_of_points(
 
 
 def _dot(first: Array, second: Array) -> Array:
-    """Inner products (...) of vectors (..., 3)."""
+    """Return inner products (...) of vectors (..., 3)."""
     return np.einsum("...i,...i->...", first, second)
 
 
 def _tangents(normal: Array) -> Array:
-    """Two unit vectors (..., 3, 2) that span the plane of ``normal`` (..., 3)."""
+    """Return two unit vectors (..., 3, 2) that span the plane of ``normal`` (..., 3)."""
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=-1)])
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(normal, first)], axis=-1)
 
 
 def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:
-    """Change (6, 9) of [t, phi] of a frame by two turns and the offset of plane A, of B, and of C,
-    whose tangents are (3, 3, 2): the derivative of `frame_from_planes`."""
+    """Return the change (6, 9) of [t, phi] of a frame by two turns and the offset of planes A, B
+    and C.
+
+    It is the derivative of `frame_from_planes`; the planes' tangents are (3, 3, 2).
+    """
     x, y, z, origin = frame[:3].T
+    # Changes of all normals and offsets by each parameter.
     turned = np.zeros((9, 3, 3))
-    shifted = np.zeros((9, 3))  # changes of all normals and offsets
+    shifted = np.zeros((9, 3))
     for plane in range(3):
         turned[3 * plane : 3 * plane + 2, plane] = tangents[plane].T
         shifted[3 * plane + 2, plane] = 1.0

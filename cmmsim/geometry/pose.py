@@ -16,14 +16,12 @@ from cmmsim.errors import ShapeError
 
 Array = NDArray[np.float64]
 
+# Deviation of the entries of a rigid transform that is accepted: single precision passes.
 RIGID = 1e-6
-"""By how much entries of what is given as a rigid transform may be off one: single precision
-passes.
-"""
 
 
 def frozen(values: ArrayLike) -> Array:
-    """Values as an array of its own that cannot be changed."""
+    """Return values as an array of its own that cannot be changed."""
     array = np.array(values, dtype=float)
     array.setflags(write=False)
     return array
@@ -33,7 +31,9 @@ IDENTITY = frozen(np.eye(4))
 
 
 def checked_pose(pose: ArrayLike) -> Array:
-    """The pose (6,) as an array of its own. Raises ShapeError when it is not six finite numbers."""
+    """Return a pose (6,) as an array of its own. Raises ShapeError unless it is six finite
+    numbers.
+    """
     return finite_array(pose, (6,), "a pose is six finite numbers [x y z alpha beta gamma]")
 
 
@@ -63,8 +63,9 @@ def pose_to_transform(pose: ArrayLike) -> Array:
 
 
 def transforms_of(poses: Array) -> Array:
-    """Transforms (..., 4, 4) of poses (..., 6)."""
-    from cmmsim.geometry.transform_kernels import pose_transforms  # late: numba takes time
+    """Return the transforms (..., 4, 4) of poses (..., 6)."""
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.transform_kernels import pose_transforms
 
     transforms = np.empty((*poses.shape[:-1], 4, 4))
     flat = np.ascontiguousarray(poses, dtype=float).reshape(-1, 6)
@@ -73,8 +74,11 @@ def transforms_of(poses: Array) -> Array:
 
 
 def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
-    """The transform (4,4) as an array of its own. Raises ShapeError, with the ``name``, when it is
-    not 4x4 finite numbers or no rigid motion: transposed, scaled or mirrored."""
+    """Return a transform (4, 4) as an array of its own.
+
+    Raises ShapeError, with the ``name``, unless it is 4x4 finite numbers and a rigid motion: not
+    transposed, scaled or mirrored.
+    """
     values = finite_array(transform, (4, 4), f"{name} must be (4,4) and finite")
     rotation = values[:3, :3]
     last = values[3]
@@ -86,17 +90,18 @@ def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
     if error > RIGID or np.linalg.det(rotation) < 0.0:
         raise ShapeError(
             f"{name} must be rigid: its rotation R has |R^T R - I| = {error:.3g} (at most "
-            f"{RIGID:g}) and "
-            f"determinant {np.linalg.det(rotation):.6g} (1)"
+            f"{RIGID:g}) and determinant {np.linalg.det(rotation):.6g} (1)"
         )
     return values
 
 
 def all_rigid(transforms: Array) -> bool:
-    """Tell whether ``checked_transform`` passes all of the transforms (k,4,4): asked at once,
-    without naming a wrong one.
+    """Tell whether ``checked_transform`` accepts all transforms (k, 4, 4).
+
+    They are checked at once, so that a wrong one is not named.
     """
-    from cmmsim.geometry.transform_kernels import farthest_from_rigid  # late: numba takes time
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.transform_kernels import farthest_from_rigid
 
     return bool(farthest_from_rigid(np.ascontiguousarray(transforms)) <= RIGID)
 
@@ -130,7 +135,8 @@ def transform_to_pose(transform: ArrayLike) -> Array:
 
 def poses_of(transforms: Array) -> Array:
     """Poses (..., 6) of rigid transforms (..., 4, 4)."""
-    from cmmsim.geometry.transform_kernels import transform_poses  # late: numba takes time
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.transform_kernels import transform_poses
 
     poses = np.empty((*transforms.shape[:-2], 6))
     flat = np.ascontiguousarray(transforms, dtype=float).reshape(-1, 4, 4)
@@ -154,13 +160,15 @@ def invert(transform: Array) -> Array:
 
 
 def apply(transform: Array, points: Array) -> Array:
-    """Points (..., 3) carried by a transform (4,4)."""
+    """Return points (..., 3) carried by a transform (4, 4)."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def apply_each(transforms: Array, points: Array) -> Array:
-    """Points (..., n, 3): points (n,3), or a set of them for each (..., n, 3), carried by each of
-    the transforms (..., 4, 4)."""
+    """Return points (..., n, 3) carried by each of the transforms (..., 4, 4).
+
+    The points are (n, 3), or a set of them for each transform.
+    """
     return np.asarray(
         points @ transforms[..., :3, :3].swapaxes(-1, -2) + transforms[..., None, :3, 3]
     )
@@ -182,10 +190,11 @@ def skew(vectors: Array) -> Array:
 
 
 def rotation_exp(vector: Array) -> Array:
-    """Rotation (3,3) of a rotation vector (3,) (Rodrigues)."""
+    """Return the rotation (3, 3) of a rotation vector (3,), by Rodrigues' formula."""
     angle = float(np.linalg.norm(vector))
     k = skew(vector)
     return (
+        # Rodrigues' formula in sinc, which keeps all digits at small angles.
         np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * k @ k
     )
 
@@ -201,12 +210,16 @@ def rotation_log(rotation: Array) -> Array:
     )
     sine = float(np.linalg.norm(axis))
     cosine = 0.5 * (np.trace(rotation) - 1.0)
+    # For a tiny turn, the axis is the rotation vector to first order.
     return axis if sine < 1e-12 else axis * (np.arctan2(sine, cosine) / sine)
 
 
 def euler_rates_matrix(pose: Array) -> Array:
-    """Matrix (..., 3, 3) from [d alpha, d beta, d gamma] of poses (..., 6) to the rotation vector,
-    in the axes of the output frame."""
+    """Return the matrix (..., 3, 3) from rates of the angles of poses (..., 6) to the rotation
+    vector.
+
+    It is in the axes of the output frame.
+    """
     ca = np.cos(pose[..., 3])
     sa = np.sin(pose[..., 3])
     cb = np.cos(pose[..., 4])
@@ -223,7 +236,8 @@ def euler_rates_matrix(pose: Array) -> Array:
 
 def pose_jacobian(poses: Array) -> Array:
     """Change (..., 6, 6) of poses (..., 6) by the small errors [dt, dphi] of their transforms."""
-    from cmmsim.geometry.transform_kernels import all_angle_rates  # late: numba takes time
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.transform_kernels import all_angle_rates
 
     flat = np.ascontiguousarray(poses, dtype=float).reshape(-1, 6)
     rates = np.empty((len(flat), 3, 3))
@@ -239,7 +253,8 @@ def pose_covariance(transforms: Array, covariances: Array) -> Array:
 
     ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi].
     """
-    from cmmsim.geometry.transform_kernels import pose_covariances  # late: numba takes time
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.transform_kernels import pose_covariances
 
     spreads = np.empty(covariances.shape)
     poses = poses_of(transforms).reshape(-1, 6)
@@ -249,8 +264,9 @@ def pose_covariance(transforms: Array, covariances: Array) -> Array:
 
 
 def compose_covariance(outer: Array, covariance: Array) -> Array:
-    """Covariance (..., 6, 6) of the error of ``outer @ inner`` from that of ``inner``; ``outer``
-    (4,4) is exact.
+    """Return the covariance (..., 6, 6) of the error of ``outer @ inner`` from that of ``inner``.
+
+    ``outer`` (4, 4) is exact.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = outer[:3, :3]

@@ -1,6 +1,4 @@
-"""Weighted rigid registration (paper eq. 27): the transform that carries known points onto measured
-ones.
-"""
+"""Weighted rigid registration (paper eq. 27): the transform from known points to measured ones."""
 
 from dataclasses import dataclass
 
@@ -9,15 +7,19 @@ import numpy as np
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array
 
-STEPS = 2  # of Gauss-Newton after the unweighted start
-SMALLEST_SPREAD = 0.005  # m; points closer than this to one line do not determine a rotation
+# Steps of Gauss-Newton after the unweighted start.
+STEPS = 2
+# m: points closer than this to one line do not determine a rotation.
+SMALLEST_SPREAD = 0.005
 
 
 @dataclass(frozen=True)
 class Registration:
-    """transform (4,4) output-from-input; covariance (6,6) of its small error [dt, dphi]; misfit
-    (n,): squared residual of each point in units of its noise (three degrees of freedom less its
-    share of the fit)."""
+    """Transform (4, 4) output-from-input, with the covariance (6, 6) of its small error [dt, dphi].
+
+    ``misfit`` (n,) is the squared residual of each point in units of its noise. It has three
+    degrees of freedom, less the point's share of the fit.
+    """
 
     transform: Array
     covariance: Array
@@ -25,8 +27,11 @@ class Registration:
 
 
 def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
-    """Rigid transforms (c,4,4) from ``source``, (n,3) or one each (c,n,3), to ``targets`` (c,n,3)
-    with weights (c,n), by singular values."""
+    """Return rigid transforms (c, 4, 4) from ``source`` to ``targets`` (c, n, 3), by singular
+    values.
+
+    The source is (n, 3), or one each (c, n, 3); weights are (c, n).
+    """
     shares = (weights / weights.sum(axis=1, keepdims=True))[..., None]
     source_means = (shares * source).sum(axis=1)
     target_means = (shares * targets).sum(axis=1)
@@ -35,6 +40,7 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
     )
     u, _, vt = np.linalg.svd(products)
     turns = np.ones((len(targets), 3))
+    # The nearest orthogonal matrix may mirror; the least singular direction is then turned back.
     turns[:, 2] = np.sign(np.linalg.det(u @ vt))
     transforms = np.tile(np.eye(4), (len(targets), 1, 1))
     transforms[:, :3, :3] = (u * turns[:, None]) @ vt
@@ -45,7 +51,7 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
 
 
 def require_spread(points: Array) -> None:
-    """Raise LostError unless ``points`` (n,3) hold three that are clearly not on one line."""
+    """Raise LostError unless points (n, 3) hold three that are clearly not on one line."""
     if len(points) < 3:
         raise LostError(
             f"{len(points)} visible stickers, at least 3 that are not on one line are needed"
@@ -53,8 +59,8 @@ def require_spread(points: Array) -> None:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
     if spread < SMALLEST_SPREAD:
         raise LostError(
-            f"the {len(points)} visible stickers lie on one line to {spread * 1e3:.1f} mm, "
-            f"at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
+            f"the {len(points)} visible stickers lie on one line to {spread * 1e3:.1f} mm, at "
+            f"least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
         )
 
 
@@ -75,7 +81,8 @@ def register_sets(source: Array, targets: Array, covariances: Array) -> Registra
     The source is (n,3), or one each (c,n,3). The result has transforms (c,4,4), covariances
     (c,6,6) and misfits (c n,).
     """
-    from cmmsim.geometry.rigid_kernels import rigid_fits  # late, as numba takes time to import
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.rigid_kernels import rigid_fits
 
     sets, count = targets.shape[:2]
     transforms = rigid_starts(source, targets, np.ones((sets, count)))

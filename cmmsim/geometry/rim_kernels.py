@@ -1,9 +1,8 @@
-"""Compiled: how much of each pixel an ellipse covers, arc by arc of its rim; the formulas stand in
-``disc_image``.
+"""Compiled: the share of each pixel that an ellipse covers, arc by arc of its rim.
 
-The rim is followed once around, from one line between pixels to the next. An ellipse comes as its
-centre and the matrix A (2,2) that carries the unit circle onto it; pixel (row, column) reaches half
-a pixel to all sides of its middle.
+The formulas stand in ``disc_image``. The rim is followed once around, from one line between pixels
+to the next. An ellipse is given as its centre and the matrix A (2, 2) that carries the unit circle
+onto it. Pixel (row, column) reaches half a pixel to all sides of its middle.
 """
 
 from __future__ import annotations
@@ -15,9 +14,8 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-SHORT_ARC = (
-    0.2  # tangent of half an arc's angle, up to which eleven terms of its series give all digits
-)
+# Tangent of half an arc's angle, up to which eleven terms of its series give all digits.
+SHORT_ARC = 0.2
 
 
 class Cover(NamedTuple):
@@ -35,8 +33,9 @@ class Cover(NamedTuple):
 
 
 class Arcs(NamedTuple):
-    """Arcs in the order of the rim: rows and columns (n,) of their pixels, and starts and ends
-    (n,4) as u, v, u, v.
+    """Arcs in the order of the rim.
+
+    They have rows and columns (n,) of their pixels, and starts and ends (n, 4) as u, v, u, v.
     """
 
     rows: Array
@@ -46,12 +45,13 @@ class Arcs(NamedTuple):
 
 @compiled
 def angle_between(cross: float, dot: float) -> float:
-    """Angle from one unit vector to another, by their cross and dot products."""
-    half = cross / (1.0 + dot)  # its tangent
+    """Return the angle from one unit vector to another, by their cross and dot products."""
+    half = cross / (1.0 + dot)  # the tangent of half of it
     if not abs(half) < SHORT_ARC:
         return math.atan2(cross, dot)
     z = half * half
     w = z * z
+    # The series of the arctangent as two short chains of products, which run side by side.
     even = 1.0 + w * (1.0 / 5.0 + w * (1.0 / 9.0 + w * (1.0 / 13.0 + w * (1.0 / 17.0 + w / 21.0))))
     odd = 1.0 / 3.0 + w * (1.0 / 7.0 + w * (1.0 / 11.0 + w * (1.0 / 15.0 + w / 19.0)))
     return 2.0 * half * (even - z * odd)
@@ -59,7 +59,7 @@ def angle_between(cross: float, dot: float) -> float:
 
 @compiled
 def add_arcs(count: int, arcs: Arcs, centre_x: float, shape: Array, cover: Cover) -> None:
-    """Add what ``count`` arcs do to a window."""
+    """Add the areas that ``count`` arcs leave in a window."""
     width = cover.shares.shape[1]
     sloping = len(cover.derivatives) > 0
     a = shape[0, 0]
@@ -77,8 +77,9 @@ def add_arcs(count: int, arcs: Arcs, centre_x: float, shape: Array, cover: Cover
         cover.touched[row, column] = True
         angle = angle_between(u_0 * v_1 - u_1 * v_0, u_0 * u_1 + v_0 * v_1)
         gain = u_1 * v_1 - u_0 * v_0
+        # Integrals of u du, v dv, u dv and v du along the arc.
         u_by_u = 0.5 * (u_1 - u_0) * (u_1 + u_0)
-        v_by_v = 0.5 * (v_1 - v_0) * (v_1 + v_0)  # integrals of u du, v dv
+        v_by_v = 0.5 * (v_1 - v_0) * (v_1 + v_0)
         u_by_v = 0.5 * (gain + angle)
         v_by_u = 0.5 * (gain - angle)
         u_by_y = c * u_by_u + d * u_by_v
@@ -95,9 +96,11 @@ def add_arcs(count: int, arcs: Arcs, centre_x: float, shape: Array, cover: Cover
 
 @compiled
 def crossings(centre: float, reach: float, crossed: Array) -> None:
-    """Fill ``crossed`` (n,2) for the lines before, between and behind n - 1 pixels: how far they
-    lie from the centre, in units of the ``reach`` of the rim, and half their length in the unit
-    circle."""
+    """Fill ``crossed`` (n, 2) for the lines before, between and behind n - 1 pixels.
+
+    They are the distances of the lines from the centre, in units of the ``reach`` of the rim, and
+    half their lengths in the unit circle.
+    """
     share = 1.0 / reach
     for k in range(len(crossed)):
         t = (k - 0.5 - centre) * share
@@ -116,12 +119,12 @@ def follow_quarter(
     count: int,
     arcs: Arcs,
 ) -> int:
-    """Follow a part of the rim on which x and y only rise or fall; returns the number of arcs with
-    those found before.
+    """Follow a part of the rim on which x and y only rise or only fall.
 
-    quarter: 0 from the largest x to the largest y, and so on; ends: (u, v) of these four; columns
-    (w + 1, 2) and rows (h + 1, 2): ``crossings`` of the lines between pixels. Arcs above, below and
-    left of the window are left out, those right of it stand in the column behind the last.
+    Return the number of arcs, with those found before. Quarter 0 leads from the largest x to the
+    largest y, and so on; ``ends`` are (u, v) of these four. ``columns`` (w + 1, 2) and ``rows`` (h
+    + 1, 2) are ``crossings`` of the lines between pixels. Arcs above, below and left of the window
+    are left out. Arcs right of it stand in the column behind the last.
     """
     x_u, x_v = ends[0]
     y_u, y_v = ends[1]
@@ -153,6 +156,7 @@ def follow_quarter(
             not (above or (column == width and way_x > 0)) and (end_x - line_x) * way_x > 0.0
         )
         crosses_y = (end_y - row - 0.5 * way_y) * way_y > 0.0
+        # The crossing with the next line between rows is computed once a row.
         if new_row and crosses_y:
             t = rows[row + side[1], 0]
             s = -way_y * rows[row + side[1], 1]
@@ -164,6 +168,7 @@ def follow_quarter(
         to_v = last_v
         to_column = column
         to_row = row
+        # Of both lines, the one that the rim meets first ends the arc.
         if crosses_x and (not crosses_y or (down_x - line_x) * way_x >= 0.0):
             t = columns[column + side[0], 0]
             s = -way_x * columns[column + side[0], 1]
@@ -179,6 +184,7 @@ def follow_quarter(
                 to_column = within(down_x, width)
         else:
             left = False
+        # Arcs left of the window cover none of its pixels.
         if not above and column >= 0:
             arcs.rows[count] = row
             arcs.columns[count] = column
@@ -196,13 +202,13 @@ def follow_quarter(
 
 @compiled
 def within(place: float, size: int) -> int:
-    """The row or column of a place in a window; -1 before it, and ``size`` behind."""
+    """Return the row or column of a place in a window; -1 before it, and ``size`` behind."""
     return math.floor(min(max(place + 0.5, -1.0), float(size)))
 
 
 @compiled
 def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> None:
-    """Fill ``cover`` but for what the pixels get from arcs right of them."""
+    """Fill ``cover``, except for the light that pixels get from arcs right of them."""
     cover.shares[:] = 0.0
     cover.past[:] = 0.0
     cover.touched[:] = False
@@ -220,7 +226,8 @@ def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> 
     count = 0
     crossings(centre_x, reach_x, columns)
     crossings(centre_y, reach_y, rows)
-    most = 2 * (width + height) + 12  # each line is crossed twice, and each quarter ends once
+    # Each line is crossed twice, and each quarter ends once.
+    most = 2 * (width + height) + 12
     arcs = Arcs(np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, 4)))
     for quarter in range(4):
         count = follow_quarter(
@@ -233,8 +240,9 @@ def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> 
 def cover_window(
     centre_x: float, centre_y: float, shape: Array, shares: Array, derivatives: Array
 ) -> None:
-    """Fill ``shares`` (h, w), 0 or 1 exactly where the rim does not pass, and ``derivatives`` (h,
-    w, 5).
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5).
+
+    Shares are exactly 0 or 1 where the rim does not pass.
     """
     height, width = shares.shape
     cover = Cover(
@@ -245,6 +253,7 @@ def cover_window(
     first = max(within(centre_y - reach, height), 0)
     last = min(within(centre_y + reach, height), height - 1)
     for row in range(first, last + 1):
+        # From the right, add the rise of all arcs that were passed: whole pixels have 0 or 1.
         risen = cover.past[row, width]
         whole = np.rint(risen)
         for column in range(width - 1, -1, -1):
@@ -258,8 +267,6 @@ def cover_window(
 
 @compiled
 def cover_windows(centres: Array, shapes: Array, shares: Array, derivatives: Array) -> None:
-    """``cover_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives
-    (n,h,w,5).
-    """
+    """Fill shares (n, h, w) and derivatives (n, h, w, 5) of n ellipses, see ``cover_window``."""
     for k in range(len(centres)):
         cover_window(centres[k, 0], centres[k, 1], shapes[k], shares[k], derivatives[k])

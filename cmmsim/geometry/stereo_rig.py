@@ -25,16 +25,36 @@ PARAMETER_NAMES = (
     *(f"{side}.{name}" for side in ("left", "right") for name in INTRINSIC_NAMES),
     *(f"right_from_left.{name}" for name in PLACE_NAMES),
 )
-"""What a rig is made of: the intrinsics of both cameras, and translation and rotation vector of
-``right_from_left``.
+"""Names of a rig's parameters: the intrinsics of both cameras, and translation and rotation vector
+of ``right_from_left``.
 """
 
-SETTLED = 1e-8  # m: length of the last step of a triangulation
+# m: length of the last step of a triangulation.
+SETTLED = 1e-8
 
 
 @dataclass(frozen=True)
 class StereoRig:
-    """Left and right camera, and the pose of the right one: ``right_from_left`` (4,4)."""
+    """Two cameras on one rigid bar.
+
+    Parameters
+    ----------
+    left, right : PinholeCamera
+        The cameras.
+    right_from_left : ndarray, shape (4, 4)
+        Transform from the left camera's axes into the right one's.
+
+    Raises
+    ------
+    ShapeError
+        If ``right_from_left`` is not (4, 4).
+
+    Examples
+    --------
+    >>> camera = PinholeCamera(1000.0, 319.5, 239.5, 640, 480)
+    >>> StereoRig(camera, camera, rigid(np.eye(3), (-0.3, 0.0, 0.0)))
+    StereoRig(640 x 480 px and 640 x 480 px, 0.3 m apart)
+    """
 
     left: PinholeCamera
     right: PinholeCamera
@@ -56,7 +76,7 @@ class StereoRig:
 
     @property
     def from_camera(self) -> tuple[Array, Array]:
-        """Transforms (4,4) from the camera frame C into the axes of the left and of the right
+        """Transforms (4, 4) from the camera frame C into the axes of the left and of the right
         camera.
         """
         return np.eye(4), self.right_from_left
@@ -70,7 +90,8 @@ class StereoRig:
     @cached_property
     def figures(self) -> Cameras:
         """Both cameras as compiled functions take them, for points in the camera frame C."""
-        from cmmsim.geometry.camera_kernels import Cameras  # late, as numba takes time to import
+        # Late, as numba takes time to import.
+        from cmmsim.geometry.camera_kernels import Cameras
 
         return Cameras(
             np.array([camera.intrinsics for camera in self.cameras]),
@@ -85,16 +106,17 @@ class StereoRig:
 
     @property
     def fundamental(self) -> Array:
-        """Fundamental matrix F (3,3): right' F left = 0 for homogeneous ideal pixels of the same
-        point.
+        """Fundamental matrix F (3, 3) of ideal pixels: right' F left = 0 for homogeneous pixels of
+        one point.
         """
         rotation = self.right_from_left[:3, :3]
         shift = self.right_from_left[:3, 3]
+        # The essential matrix is [t]x R.
         essential = np.cross(np.eye(3), shift) @ rotation
         return np.linalg.inv(self.right.matrix).T @ essential @ np.linalg.inv(self.left.matrix)
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
-        """Pixels (2, n, 2) of points (n, 3) in C for the left and right camera, and their validity
+        """Return pixels (2, n, 2) of points (n, 3) in C in both images, and whether they are seen
         (2, n).
         """
         seen = [
@@ -104,8 +126,11 @@ class StereoRig:
         return np.stack([s[0] for s in seen]), np.stack([s[1] for s in seen])
 
     def derivatives(self, points: Array) -> tuple[Array, Array]:
-        """Derivatives (2, n, 2, 3) of both pixels of points (n, 3) in C by the points, and (2, n,
-        2, 24) by what the rig is made of, in the order of PARAMETER_NAMES."""
+        """Return the derivatives of both pixels of points (n, 3) in C.
+
+        They are by the points (2, n, 2, 3), and by the rig's parameters (2, n, 2, 24) in the order
+        of PARAMETER_NAMES.
+        """
         by_points = np.empty((2, len(points), 2, 3))
         by_rig = np.zeros((2, len(points), 2, len(PARAMETER_NAMES)))
         for side, (camera, move) in enumerate(zip(self.cameras, self.from_camera, strict=True)):
@@ -131,8 +156,9 @@ class StereoRig:
         )
 
     def moved(self, changes: Array) -> StereoRig:
-        """The rig with changes (24,) of its parameters; its camera frame C stays that of the left
-        camera.
+        """Return the rig with changes (24,) of its parameters.
+
+        Its camera frame C stays that of the left camera.
         """
         if not changes.any():
             return self
@@ -147,10 +173,10 @@ class StereoRig:
 def toed_in_rig(
     camera: PinholeCamera, baseline: float, position: Array, target: Array
 ) -> tuple[StereoRig, Array]:
-    """Rig whose cameras look at one point, and the true ``camera_from_base`` (4,4).
+    """Return a rig whose cameras look at one point, and the true ``camera_from_base`` (4, 4).
 
-    ``position`` (3,) is the middle of the baseline and ``target`` (3,) the point looked at, base
-    frame, m; the baseline is horizontal and perpendicular to the viewing direction.
+    ``position`` (3,) is the middle of the baseline and ``target`` (3,) the point looked at, m in
+    the base frame. The baseline is horizontal and perpendicular to the viewing direction.
     """
     forward = target - position
     right_axis = np.cross(forward, [0.0, 0.0, 1.0])
@@ -160,14 +186,15 @@ def toed_in_rig(
 
 
 def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
-    """camera_from_base (4,4) of a rig whose baseline has its middle at ``position`` (3,) and which
-    looks at ``target``.
+    """Return camera_from_base (4, 4) of a rig with the middle of its baseline at ``position`` (3,).
 
-    The direction of view is the mean of both optical axes, made perpendicular to the baseline. A
-    toed-in rig is put where ``toed_in_rig`` puts it, as long as its baseline is horizontal there.
+    The rig looks at ``target``. The direction of view is the mean of both optical axes, made
+    perpendicular to the baseline. A toed-in rig is put where ``toed_in_rig`` puts it, as long as
+    its baseline is horizontal there.
     """
     right_centre = invert(rig.right_from_left)[:3, 3]
     x = right_centre / np.linalg.norm(right_centre)
+    # The sum of both optical axes, in the axes of the left camera, is the direction of view.
     y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
     y /= np.linalg.norm(y)
     return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * right_centre) @ _look_at(
@@ -176,8 +203,9 @@ def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
 
 
 def _look_at(eye: Array, target: Array) -> Array:
-    """camera_from_base (4,4) of a camera at ``eye`` (3,) looking at ``target`` (3,), its x axis
-    horizontal.
+    """Return camera_from_base (4, 4) of a camera at ``eye`` (3,) that looks at ``target`` (3,).
+
+    Its x axis is horizontal.
     """
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
@@ -187,8 +215,11 @@ def _look_at(eye: Array, target: Array) -> Array:
 
 @dataclass(frozen=True)
 class StereoPoints:
-    """points (n,3) and covariances (n,3,3) in the camera frame, m; ray_gap (n,): the squared
-    distance of the two rays in units of the pixel noise (one degree of freedom)."""
+    """Points (n, 3) with covariances (n, 3, 3) in the camera frame, m.
+
+    ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise, with one
+    degree of freedom.
+    """
 
     points: Array
     covariances: Array
@@ -204,16 +235,19 @@ def triangulate(
     near: Array | None = None,
     parted: float = 0.0,
 ) -> StereoPoints:
-    """Points seen at pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2), px².
+    """Return the points seen at pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2),
+    px².
 
-    The search starts ``near`` points (n, 3), or where the linear method finds them. ``parted`` px²
-    is added to the covariances while the rays are laid onto each other, but not to the result's.
+    The search starts at ``near`` points (n, 3), or where the linear method finds them. ``parted``
+    px² is added to the covariances while the rays are laid onto each other, but not to the
+    result's.
     """
     if left.shape != right.shape or left.ndim != 2 or left.shape[1] != 2:
         raise ShapeError(
             f"left and right pixels must both be (n,2), got {left.shape} and {right.shape}"
         )
-    from cmmsim.geometry.point_kernels import triangulate_all  # late: numba takes time to import
+    # Late, as numba takes time to import.
+    from cmmsim.geometry.camera_kernels import triangulate_all
 
     if near is None:
         near = linear_triangulation(rig, rig.left.undistort(left)[0], rig.right.undistort(right)[0])
@@ -227,7 +261,7 @@ def triangulate(
 
 
 def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:
-    """Points (n, 3) in the camera frame by OpenCV's linear method (float64)."""
+    """Return points (n, 3) in the camera frame by OpenCV's linear method (float64)."""
     if len(left) == 0:
         return np.zeros((0, 3))
     first, second = rig.projection_matrices

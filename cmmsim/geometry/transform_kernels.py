@@ -45,6 +45,7 @@ def transform_pose(transform: Array, pose: Array) -> None:
     """Fill the pose (6,) of a rigid transform (4,4)."""
     for i in range(3):
         pose[i] = transform[i, 3]
+    # R = Rx Ry Rz: its first row and its last column tell the angles.
     pose[3] = math.atan2(-transform[1, 2], transform[2, 2])
     pose[4] = math.atan2(transform[0, 2], math.hypot(transform[1, 2], transform[2, 2]))
     pose[5] = math.atan2(-transform[0, 1], transform[0, 0])
@@ -86,6 +87,7 @@ def move_by(transform: Array, change: Array) -> None:
     """Move a transform (4,4) by ``change`` (6,) [dt, dphi], in the axes of its output."""
     turn = change[3:]
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    # Rodrigues' formula, with its limits for small angles.
     first = math.sin(angle) / angle if angle > 1e-9 else 1.0
     second = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
     for j in range(3):
@@ -159,6 +161,7 @@ def angle_rates(pose: Array, rates: Array) -> None:
     cb = math.cos(pose[4])
     sb = math.sin(pose[4])
     rates[0, 0] = 1.0
+    # The inverse of the matrix of eq. 2, which is singular at beta = pi/2 and -pi/2.
     rates[0, 1] = sa * sb / cb
     rates[0, 2] = -ca * sb / cb
     rates[1, 0] = 0.0

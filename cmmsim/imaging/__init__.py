@@ -1,1 +1,1 @@
-"""The true side: scene, renderers, exposure. Nothing that estimates may look in here."""
+"""The true side: scene, renderers and exposure. Estimators must not import it."""

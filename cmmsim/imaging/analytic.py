@@ -1,10 +1,12 @@
 """Drawing without OpenGL: each disc covers exactly its share of each pixel.
 
-Layers are laid over each other: background, solids from far to near, discs. A disc turned away is
-not drawn. Where a solid stands before any of a disc's probed points, the disc shows only outside of
-that solid's outline. Simplified against `pyrender`: solids are convex hulls, ordered by the depth
-of their middles, and their edges are sampled by scan lines; in a pixel with the edges of two layers
-the covered shares are taken as independent.
+Layers are laid over each other: the background, solids from far to near, then discs. A disc turned
+away is not drawn. Where a solid stands before any of a disc's probed points, the disc shows only
+outside of that solid's outline.
+
+Three things are simpler than in `pyrender`. Solids are convex hulls, ordered by the depth of their
+middles. Their edges are sampled by scan lines. In a pixel with the edges of two layers, the covered
+shares are taken as independent.
 """
 
 from collections.abc import Sequence
@@ -15,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array
-from cmmsim.imaging.renderer import Drawable, Renderer
+from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, View, Views
 from cmmsim.imaging.scene_bodies import TOUCHING, ConvexSolid, DiscStack, Mesh
-from cmmsim.imaging.views import NEAR, View, Views
 
 if TYPE_CHECKING:
     from cmmsim.imaging.view_kernels import Scene
@@ -26,12 +27,12 @@ if TYPE_CHECKING:
 def draw_windows(
     drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
 ) -> NDArray[np.float32]:
-    """Radiance (n, h, w) float32, 0 to 1, of n windows of one size; ``supersampling``: scan lines a
-    pixel at edges.
+    """Draw the radiance (n, h, w) float32, 0 to 1, of n windows of one size.
+
+    ``supersampling`` is the number of scan lines a pixel at edges.
     """
-    from cmmsim.imaging.view_kernels import (
-        draw_view,
-    )  # compiles, so it is loaded where it is first needed
+    # Late, as numba takes time to import.
+    from cmmsim.imaging.view_kernels import draw_view
 
     if drawable not in _SCENES:
         _SCENES[drawable] = scene_of(drawable)
@@ -54,10 +55,9 @@ ANALYTIC = Renderer("analytic", draw_windows)
 
 
 def scene_of(drawable: Drawable) -> "Scene":
-    """Discs, in the axes of their bodies, and solids of a drawable."""
-    from cmmsim.imaging.view_kernels import (
-        Scene,
-    )  # compiles, so it is loaded where it is first needed
+    """Return the discs, in the axes of their bodies, and the solids of a drawable."""
+    # Late, as numba takes time to import.
+    from cmmsim.imaging.view_kernels import Scene
 
     rows = [
         (disc, body)
@@ -82,13 +82,13 @@ def scene_of(drawable: Drawable) -> "Scene":
 
 
 def _joined(parts: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
-    """Arrays (k,3) one after the other, and where each begins."""
+    """Return arrays (k, 3) one after the other, and where each begins."""
     starts = np.cumsum([0, *(len(part) for part in parts)])
     return np.ascontiguousarray(np.concatenate([np.zeros((0, 3)), *parts])), starts
 
 
 def _faces(faces: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, NDArray[np.int_]]:
-    """Normals and offsets of the faces of solids, and where those of each begin."""
+    """Return normals and offsets of the faces of solids, and where those of each begin."""
     normals, starts = _joined([normal for normal, _ in faces])
     return normals, np.concatenate([np.zeros(0), *(offset for _, offset in faces)]), starts
 

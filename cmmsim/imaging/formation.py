@@ -1,48 +1,65 @@
-"""From posed bodies to the light on each pixel, before noise: draw, bend, spread, average, darken.
+"""Image formation from posed bodies to the light on each pixel, before noise.
 
 Windows are drawn through perfect lenses on a grid finer than the pixels, with a margin for the
-light that comes in from outside; distortion takes each fine pixel from where the lens takes it; the
-point spread and the mean over each pixel follow, then the relative illumination. All of it in
-linear light. A perfect lens with no point spread is drawn on the pixels at once.
+light that comes in from outside. Distortion takes each fine pixel from where the lens takes it. The
+point spread, the mean over each pixel, and the relative illumination follow. All of it is linear
+light. A perfect lens with no point spread is drawn on the pixels at once.
 
-Where the lens takes the light of a pixel from is known exactly on three by three nodes of a window
-and quadratic in both directions in between; over some tens of pixels the rest is below 1e-4 px.
-Values between drawn pixels come from Keys' cubic convolution, which reproduces quadratics, so that
+The place from which the lens takes the light of a pixel is exact on three by three nodes of a
+window, and quadratic in both directions in between; over some tens of pixels the rest is below 1e-4
+px. Values between drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so that
 no edge is moved or widened. Source: R. G. Keys, Cubic convolution interpolation for digital image
 processing, IEEE Trans. ASSP 29 (1981).
+
+A whole image is drawn finely only around bright spots. Most of the scene stands still during an
+exposure: a window that nothing reaches shows the background and is not drawn, and one that no
+moving body reaches is drawn once.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.pose import Array, frozen
-from cmmsim.imaging.renderer import Drawable, Renderer
-from cmmsim.imaging.views import Views
+from cmmsim.imaging.renderer import Drawable, Renderer, View, Views
 
-# from values at -1, 0, 1
+# Coefficients of a quadratic from its values at -1, 0 and 1.
 _QUADRATIC = frozen([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
 # Fine pixels along each side of a pixel: the point spread smooths what resampling leaves, without
 # it edges need more.
 SUB_PIXELS = 6
 SHARP_SUB_PIXELS = 12
-SIDE_STEP = 4  # px: sides of drawn windows are multiples, so that few frame buffers serve all
-REACH = 2  # drawn pixels that the cubic needs on either side
+# px: sides of drawn windows are multiples of this, so that few frame buffers serve all.
+SIDE_STEP = 4
+# Drawn pixels that the cubic needs on either side.
+REACH = 2
+# px: side of the finely drawn window around a bright spot.
+PASTED_SIZE = 24
+# px: a larger spot is left coarse.
+LARGEST_PASTED_SIZE = 96
+# px around a spot longer than a sticker that are drawn finely with it.
+DARK_RIM = 8
+# Radiance above which a spot is drawn finely.
+BRIGHT = 0.4
+# px: side of the pieces that are bent and blurred at a time.
+TILE = 64
+# Drawn samples a pixel and axis away from bright spots.
+COARSE = 2
 
 
 def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.float32]:
-    """Windows (n, size, size) whose pixels are taken from drawn windows (n, h, w).
+    """Return windows (n, size, size) whose pixels are taken from drawn windows (n, h, w).
 
-    Parameters: nodes (n, 3, 3, 2): places (x, y) in the drawn window for the first, middle and last
-    row and column.
+    Nodes (n, 3, 3, 2) are places (x, y) in the drawn window for the first, middle and last row and
+    column.
     """
-    from cmmsim.imaging.window_kernels import (
-        resample_windows,
-    )  # compiles, so it is loaded where it is first needed
+    # Late, as numba takes time to import.
+    from cmmsim.imaging.window_kernels import resample_windows
 
     coefficients = np.einsum("ar,bc,nrcx->nabx", _QUADRATIC, _QUADRATIC, nodes)
     result = np.empty((len(drawn), size, size), dtype=np.float32)
@@ -52,8 +69,8 @@ def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class Side:
-    """One camera, camera_from_body transforms (b,4,4), and the first pixels (k,2) of the windows it
-    is asked for.
+    """One camera, camera_from_body transforms (b, 4, 4), and the first pixels (k, 2) of its
+    windows.
     """
 
     camera: PinholeCamera
@@ -63,7 +80,7 @@ class Side:
 
 @dataclass(frozen=True)
 class ImageFormation:
-    """The renderer, what it draws, the radiance of the background, and the lenses."""
+    """Renderer, drawn bodies, radiance of the background, and lenses."""
 
     renderer: Renderer
     drawable: Drawable
@@ -71,9 +88,7 @@ class ImageFormation:
     optics: Optics
 
     def centre_error_px(self, cameras: Sequence[PinholeCamera], supersampling: int) -> float:
-        """Error of a sticker's centre that drawing leaves, px rms, when ``supersampling`` is asked
-        for.
-        """
+        """Return the error of a sticker's centre that drawing leaves at a supersampling, px rms."""
         fine = 1 if self.draws_pixels(cameras) else self.sub_pixels
         return self.renderer.centre_error_px(-(-supersampling // fine) * fine)
 
@@ -94,10 +109,10 @@ class ImageFormation:
         sub_pixels: int | None = None,
         shade: bool = True,
     ) -> list[NDArray[np.float32]]:
-        """Radiance (k, size, size) of each side's windows.
+        """Return the radiance (k, size, size) of each side's windows.
 
-        supersampling: drawn samples a pixel and axis, at the least; sub_pixels instead of the usual
-        ones; shade: lay the relative illumination over them.
+        ``supersampling`` is the least number of drawn samples a pixel and axis. ``sub_pixels``
+        replace the usual ones. ``shade`` lays the relative illumination over the windows.
         """
         if self.draws_pixels([side.camera for side in sides]):
             windows = self._drawn(
@@ -120,10 +135,10 @@ class ImageFormation:
         size: int,
         sub_pixels: int | None = None,
     ) -> NDArray[np.bool_]:
-        """Mask of the patches that may show at each of several moments (m, k, patches).
+        """Return the mask of the patches that may show at each of several moments (m, k, patches).
 
-        Bodies (b,4,4) stand at each, and windows have first pixels ``corners`` (k,2); size and
-        sub_pixels are as of ``windows``.
+        Bodies (b, 4, 4) stand at each moment, and windows have first pixels ``corners`` (k, 2).
+        Size and sub_pixels are as of ``windows``.
         """
         first = corners
         drawn_size = size
@@ -139,7 +154,7 @@ class ImageFormation:
     def _drawn(
         self, sides: Sequence[tuple[PinholeCamera, Array, NDArray]], size: int, supersampling: int
     ) -> list[NDArray[np.float32]]:
-        """Windows of one size as the renderer draws them."""
+        """Return windows of one size as the renderer draws them."""
         images = self.renderer.draw(
             self.drawable, Views.of_sides(sides, (size, size)), supersampling, self.background
         )
@@ -148,7 +163,7 @@ class ImageFormation:
     def _formed(
         self, sides: Sequence[Side], size: int, supersampling: int, sub_pixels: int
     ) -> list[NDArray[np.float32]]:
-        """Windows drawn finely, bent, spread and averaged."""
+        """Return windows drawn finely, bent, spread and averaged."""
         margin = self.optics.margin_px
         fine_size = (size + 2 * margin) * sub_pixels
         nodes = [_shown_places(s.camera, s.corners, size, margin, fine_size) for s in sides]
@@ -169,8 +184,10 @@ class ImageFormation:
 def _shown_places(
     camera: PinholeCamera, corners: NDArray[np.int_], size: int, margin: int, fine_size: int
 ) -> Array:
-    """Ideal pixels (k, 3, 3, 2) that show in the first, middle and last fine row and column of
-    windows with margin.
+    """Return ideal pixels (k, 3, 3, 2) that show in the first, middle and last fine rows and
+    columns.
+
+    They are those of windows with margin.
     """
     half = 0.5 * (size + 2 * margin) * (1.0 - 1.0 / fine_size)
     ticks = 0.5 * (size - 1) + half * np.array([-1.0, 0.0, 1.0])
@@ -179,8 +196,10 @@ def _shown_places(
 
 
 def _drawn_parts(nodes: Sequence[Array]) -> tuple[list[NDArray[np.int_]], int]:
-    """First ideal pixels (k, 2) on each side, and the common size in px, of what is drawn for
-    places (k, 3, 3, 2).
+    """Return the first ideal pixels (k, 2) on each side, and the common size in px, of the drawn
+    parts.
+
+    The parts hold the places (k, 3, 3, 2).
     """
     first = [np.floor(places.min(axis=(1, 2))).astype(int) - REACH for places in nodes]
     reach = max(
@@ -193,8 +212,9 @@ def _drawn_parts(nodes: Sequence[Array]) -> tuple[list[NDArray[np.int_]], int]:
 def _bent(
     side: Side, drawn: NDArray[np.float32], nodes: Array, fine_size: int
 ) -> NDArray[np.float32]:
-    """Fine windows (k, fine_size, fine_size) as the lens shows them; those of a perfect lens are
-    only cut out.
+    """Return fine windows (k, fine_size, fine_size) as the lens shows them.
+
+    Those of a perfect lens are only cut out.
     """
     if not side.camera.distortion.is_zero:
         return resample(drawn, nodes, fine_size)
@@ -209,10 +229,11 @@ def _bent(
 
 @lru_cache(maxsize=16)
 def _finer(camera: PinholeCamera, sub_pixels: int) -> PinholeCamera:
-    """The same camera with ``sub_pixels`` times as many pixels along each side."""
+    """Return the camera with ``sub_pixels`` times as many pixels along each side."""
     return replace(
         camera,
         focal_px=camera.focal_px * sub_pixels,
+        # Pixels are counted from their middles, which move; their corners stay.
         centre_x_px=(camera.centre_x_px + 0.5) * sub_pixels - 0.5,
         centre_y_px=(camera.centre_y_px + 0.5) * sub_pixels - 0.5,
         width=camera.width * sub_pixels,
@@ -222,11 +243,11 @@ def _finer(camera: PinholeCamera, sub_pixels: int) -> PinholeCamera:
 
 @lru_cache(maxsize=32)
 def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> NDArray[np.float32]:
-    """Weights (size, (size + 2 margin) sub_pixels) float32 with which drawn sub-pixels count in
-    each pixel of a row.
+    """Return the weights (size, (size + 2 margin) sub_pixels) of drawn sub-pixels in each pixel of
+    a row.
 
-    The mean over a pixel of a Gaussian of ``psf_px``: the drawn sub-pixels, means over their own
-    width, make up the exact mean over a pixel wherever the Gaussian puts it.
+    They are the mean over a pixel of a Gaussian of ``psf_px``. The drawn sub-pixels, means over
+    their own width, make up the exact mean over a pixel wherever the Gaussian puts it.
     """
     total = (size + 2 * margin) * sub_pixels
     into_pixels = np.kron(
@@ -241,3 +262,106 @@ def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> ND
     weights = into_pixels.astype(np.float32)
     weights.setflags(write=False)
     return weights
+
+
+def exposed_windows(
+    formation: ImageFormation,
+    camera: PinholeCamera,
+    moments: Sequence[Array],
+    corners: NDArray[np.int_],
+    size: int,
+    supersampling: int,
+    sub_pixels: int | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the mean and the largest radiance (k, size, size) of windows over moments.
+
+    Bodies stand at (b, 4, 4) at each moment, windows have first pixels ``corners`` (k, 2), and
+    there is no vignetting. Supersampling and sub_pixels are as of ``ImageFormation.windows``.
+    """
+    reached = formation.reached(camera, moments, corners, size, sub_pixels)
+    moves = np.ptp(np.stack(moments), axis=0).any(axis=(1, 2))[formation.drawable.body_index]
+    drawn_often = np.asarray(reached[:, :, moves].any(axis=(0, 2)))
+    drawn_once = np.asarray(reached.any(axis=(0, 2))) & ~drawn_often
+
+    def draw(bodies: Array, which: NDArray[np.bool_]) -> NDArray[np.float32]:
+        if not which.any():
+            return np.empty((0, size, size), dtype=np.float32)
+        sides = [Side(camera, bodies, corners[which])]
+        return formation.windows(sides, size, supersampling, sub_pixels, shade=False)[0]
+
+    mean = np.full((len(corners), size, size), formation.background, dtype=np.float32)
+    mean[drawn_once] = draw(moments[0], drawn_once)
+    total = draw(moments[0], drawn_often)
+    largest = total.copy()
+    for bodies in moments[1:]:
+        window = draw(bodies, drawn_often)
+        total += window
+        np.maximum(largest, window, out=largest)
+    brightest = mean.copy()
+    mean[drawn_often] = total / np.float32(len(moments))
+    brightest[drawn_often] = largest
+    return mean, brightest
+
+
+def whole_image(
+    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array], supersampling: int
+) -> NDArray[np.float32]:
+    """Return the mean radiance (height, width) of one camera's image over moments.
+
+    Bodies stand at (b, 4, 4) at each. The image is drawn coarsely, and as finely as windows around
+    each bright spot.
+    """
+    image, bright = _coarse(formation, camera, moments)
+    corners, size = _spots(
+        bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera])
+    )
+    if len(corners):
+        fine = exposed_windows(formation, camera, moments, corners, size, supersampling)[0]
+        for (x, y), window in zip(corners, fine, strict=True):
+            image[y : y + size, x : x + size] = window
+    if formation.optics.vignetting == 0.0:
+        return image
+    pixels = np.stack(
+        np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1
+    )
+    return image * formation.optics.illumination(camera, pixels).astype(np.float32)
+
+
+def _coarse(
+    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the mean radiance (height, width) with COARSE² drawn samples a pixel.
+
+    The second result says where it is bright at any moment.
+    """
+    if len(moments) == 1 and formation.draws_pixels([camera]):
+        view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))
+        image = formation.renderer.draw(formation.drawable, [view], COARSE, formation.background)[0]
+        return image, image > BRIGHT
+    rows = -(-camera.height // TILE)
+    columns = -(-camera.width // TILE)
+    x, y = np.meshgrid(TILE * np.arange(columns), TILE * np.arange(rows))
+    corners = np.column_stack([x.ravel(), y.ravel()])
+    mean, brightest = (
+        tiles.reshape(rows, columns, TILE, TILE)
+        .swapaxes(1, 2)
+        .reshape(rows * TILE, columns * TILE)[: camera.height, : camera.width]
+        for tiles in exposed_windows(
+            formation, camera, moments, corners, TILE, COARSE, sub_pixels=1
+        )
+    )
+    return mean, brightest > BRIGHT
+
+
+def _spots(bright: NDArray[np.bool_], fixed_size: bool) -> tuple[NDArray[np.int_], int]:
+    """Return the first pixels (k, 2) of the windows around bright spots, and their side in px."""
+    _, _, stats, centres = cv2.connectedComponentsWithStats(bright.astype(np.uint8))
+    keep = np.isfinite(centres[1:]).all(axis=1)
+    sides = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+    size = PASTED_SIZE
+    if not fixed_size:
+        keep &= sides <= LARGEST_PASTED_SIZE - 2 * DARK_RIM
+        size = max(size, int(sides[keep].max(initial=0)) + 2 * DARK_RIM)
+    size = min(size, *bright.shape)
+    highest = np.array(bright.shape[::-1]) - size
+    return np.clip(np.rint(centres[1:][keep]).astype(int) - size // 2, 0, highest), size

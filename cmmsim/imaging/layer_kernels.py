@@ -12,9 +12,12 @@ from cmmsim.geometry.rim_kernels import cover_window
 
 
 class Solids(NamedTuple):
-    """Solids from far to near: half_planes (m,3) are a, b, c of a x + b y <= c, px, those of solid
-    k from starts[k] to starts[k + 1]; boxes (k,4) are lowest x, y and highest x, y; levels (k,);
-    slots (k,) where its cover is kept, or -1."""
+    """Solids from far to near.
+
+    ``half_planes`` (m, 3) are a, b, c of a x + b y <= c, px; those of solid k stand from starts[k]
+    to starts[k + 1]. ``boxes`` (k, 4) are lowest x, y and highest x, y. ``slots`` (k,) say where
+    the cover of a solid is kept, or -1.
+    """
 
     half_planes: Array
     starts: Array
@@ -24,9 +27,11 @@ class Solids(NamedTuple):
 
 
 class Discs(NamedTuple):
-    """Discs in the order in which they are laid: ellipses' centres (m,2) px, shapes (m,2,2) px,
-    half extents (m,2) px; levels (m,); behind (m,slots) whether the solid of that slot stands
-    before the disc."""
+    """Discs in the order in which they are laid.
+
+    Their ellipses have centres (m, 2), shapes (m, 2, 2) and half extents (m, 2), px. ``behind`` (m,
+    slots) says whether the solid of that slot stands before the disc.
+    """
 
     centres: Array
     shapes: Array
@@ -47,8 +52,9 @@ def polygon_holds(half_planes: Array, x: float, y: float, width: int, height: in
 
 @compiled
 def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: Array) -> None:
-    """Share (h, w) of the pixels of a box from (x, y) on: exact along x, the mean of ``lines`` scan
-    lines along y.
+    """Fill the share (h, w) of the pixels of a box from (x, y) on that a convex polygon covers.
+
+    It is exact along x, and the mean of ``lines`` scan lines along y.
     """
     height, width = share.shape
     share[:] = 0.0
@@ -59,6 +65,7 @@ def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: 
             right = float(width)
             for k in range(len(half_planes)):
                 a, b, c = half_planes[k]
+                # Each half plane shortens the scan line from one of its ends.
                 room = c - b * at - a * x
                 if a > 0.0:
                     right = min(right, room / a)
@@ -75,9 +82,7 @@ def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: 
 
 @compiled
 def lay_solids(image: Array, x: float, y: float, solids: Solids, lines: int, covers: Array) -> None:
-    """Lay solids over a window (h, w) whose first pixel begins at (x, y), and note the ``covers``
-    (slots, h, w).
-    """
+    """Lay solids over a window (h, w) whose first pixel begins at (x, y), and note their covers."""
     height, width = image.shape
     share = np.empty((height, width))
     for k in range(len(solids.levels)):
@@ -98,7 +103,7 @@ def lay_solids(image: Array, x: float, y: float, solids: Solids, lines: int, cov
 
 @compiled
 def shown_share(behind: Array, covers: Array, row: int, column: int) -> float:
-    """Share of a pixel that none of the solids before a disc covers."""
+    """Return the share of a pixel that none of the solids before a disc covers."""
     shown = 1.0
     for slot in range(len(behind)):
         if behind[slot]:
@@ -137,8 +142,8 @@ def lay_disc(
 def lay_layers(
     images: Array, group: Array, corners: Array, solids: Solids, lines: int, discs: Discs
 ) -> None:
-    """Lay solids, then discs, over the windows ``images[group]`` (h, w) with first pixels
-    ``corners`` (n, 2).
+    """Lay solids, then discs, over the windows ``images[group]`` (h, w) with first pixels (n,
+    2).
     """
     _, height, width = images.shape
     covers = np.empty((discs.behind.shape[1], height, width))
@@ -165,8 +170,10 @@ def enters(
     eye: Array, point: Array, normals: Array, offsets: Array, wider: float, touching: float
 ) -> bool:
     """Tell whether the solid normal . x + offset <= ``wider`` stands between ``eye`` and ``point``
-    (3,), all in its axes; ``touching``: share of the way to the point in which meeting it is
-    taken for lying on it.
+    (3,).
+
+    All are in its axes. Meeting the solid within the share ``touching`` of the way to the point
+    counts as the point's lying on it.
     """
     enter = -np.inf
     leave = np.inf
@@ -176,6 +183,8 @@ def enters(
         for i in range(3):
             distance -= normals[k, i] * eye[i]
             closing += normals[k, i] * (point[i] - eye[i])
+        # Each face cuts the way from the eye to the point: the solid is entered at the last face
+        # that is met from outside, and left at the first one from inside.
         if closing < 0.0:
             enter = max(enter, distance / closing)
         elif closing > 0.0:
@@ -196,8 +205,10 @@ def hidden_points(
     touching: float,
     hidden: Array,
 ) -> None:
-    """Fill ``hidden`` (n,): whether the convex solid normal . x + offset <= 0, in its axes, stands
-    between the camera and points (n,3) in camera axes."""
+    """Fill ``hidden`` (n,): whether a convex solid stands between the camera and points (n, 3).
+
+    The points are in camera axes. The solid is normal . x + offset <= 0 in its own axes.
+    """
     eye = np.empty(3)
     point = np.empty(3)
     for n in range(len(points)):

@@ -1,17 +1,15 @@
-"""Meshes for pyrender: stickers as softened triangles, and patches laid over each other in a known
-order.
+"""Meshes for pyrender: stickers as softened triangles, and patches laid over each other in order.
 
 **Soft discs.** The rim of a sharp disc aliases between the samples that a pixel is drawn with. Here
-the uppermost disc's rim falls off to the level around it over RIM_SAMPLES distances of samples,
-which leaves its centre and its light what they are, so that what is drawn comes close to the disc
-faster with more samples than that of a sharp rim.
+the level of the uppermost disc falls off to the level around it over RIM_SAMPLES distances of
+samples. This changes neither its centre nor its light, and the drawing comes close to the disc with
+fewer samples than that of a sharp rim.
 
-**Painter's order.** Windows that show one solid and at most one stack of discs that lies on it need
-no depths: a camera before the plane of a disc sees the disc, for all of the solid lies behind that
-plane. Where the solid is convex and fills a window, its level is all that shows of it. A sticker's
-dark ring, then, is most of the
-window: it is taken for the ground, over which the solid is drawn as a band around the ring, with
-the same edge, in far fewer drawn pixels.
+**Painter's order.** Windows need no depths if they show one solid and at most one stack of discs
+that lies on it. A camera before the plane of a disc sees the disc, for all of the solid lies behind
+that plane. A convex solid that fills a window shows only its level. A sticker's dark ring is then
+most of the window: it is taken for the ground, and the solid is drawn over it as a band around the
+ring, with the same edge, in far fewer drawn pixels.
 """
 
 from collections.abc import Sequence
@@ -22,25 +20,30 @@ import trimesh
 from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array, frozen
-from cmmsim.imaging.renderer import Drawable
+from cmmsim.imaging.renderer import FAR, NEAR, Drawable, Exposure, Views
 from cmmsim.imaging.scene_bodies import ConvexSolid, Disc, DiscStack, Mesh
-from cmmsim.imaging.views import FAR, NEAR, Exposure, Views
 
 RIM_SAMPLES = 1.8
-LARGEST_SAG = 0.08  # samples by which a side of the polygon may fall short of the rim
+# Samples by which a side of the polygon may fall short of the rim.
+LARGEST_SAG = 0.08
 FEWEST_SIDES = 16
 GROUND_SIDES = 16
-BAND_REACH = 5.0  # radii of a ring to which a band around it reaches
-RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
-CLEARANCE = 1e-6  # m by which a disc must lie over its solid
-FLATTEST = 1e-6  # volume of a solid over that of a cube as long; a flatter one fills no window
-SMALLEST_SLOPE = 1e-3  # of a ray across a disc's plane, below which it runs along it
+# Radii of a ring to which a band around it reaches.
+BAND_REACH = 5.0
+# px around a window that the solid must fill as well: far more than rounding.
+RIM_PX = 0.5
+# m by which a disc must lie over its solid.
+CLEARANCE = 1e-6
+# Volume of a solid over that of a cube as long; a flatter one fills no window.
+FLATTEST = 1e-6
+# Slope of a ray across a disc's plane, below which it runs along it.
+SMALLEST_SLOPE = 1e-3
 OUTWARDS = frozen([-1.0, -1.0, 1.0, 1.0])
 CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # of bounds: lowest x, y and highest x, y
 
 
 def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
-    """Triangles of discs that are drawn with samples ``sample`` m apart.
+    """Return triangles of discs that are drawn with samples ``sample`` m apart.
 
     The uppermost disc has a soft rim where another one lies below it; the others are coarse and
     sharp.
@@ -55,8 +58,9 @@ def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
 
 
 def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
-    """As ``disc_mesh``, where the lowest of several discs is a window's ground: a band of ``level``
-    lies around it.
+    """Return ``disc_mesh`` where the lowest of several discs is a window's ground.
+
+    A band of ``level`` lies around it.
     """
     lowest, *grounds = stack.discs[:-1]
     corners = [_corners(lowest, reach * lowest.radius, GROUND_SIDES) for reach in (1.0, BAND_REACH)]
@@ -71,7 +75,7 @@ def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
 
 
 def _joined(pieces: Sequence[Mesh]) -> Mesh:
-    """One mesh of several."""
+    """Join several meshes."""
     first = np.cumsum([0, *(len(p.vertices) for p in pieces)])
     return Mesh(
         np.concatenate([p.vertices for p in pieces]),
@@ -81,7 +85,7 @@ def _joined(pieces: Sequence[Mesh]) -> Mesh:
 
 
 def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
-    """A disc whose level falls to that ``around`` it within a band that is laid about its rim."""
+    """Return a disc whose level falls to that ``around`` it within a band about its rim."""
     width = min(RIM_SAMPLES * sample, disc.radius)
     middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # as much light as the sharp disc
     sides = _sides(disc.radius, sample)
@@ -101,21 +105,23 @@ def _sharp_disc(disc: Disc, sides: int) -> Mesh:
 
 
 def _sides(radius: float, sample: float) -> int:
-    """Sides of a polygon that follows a circle to LARGEST_SAG."""
+    """Return the number of sides of a polygon that follows a circle to LARGEST_SAG."""
     return max(FEWEST_SIDES, int(np.ceil(np.pi * np.sqrt(radius / (2.0 * LARGEST_SAG * sample)))))
 
 
 def _corners(disc: Disc, radius: float, sides: int) -> Array:
-    """Corners (sides, 3) of the regular polygon in a disc's plane that has the area of the
-    circle."""
+    """Return corners (sides, 3) of the regular polygon in a disc's plane with the area of the
+    circle.
+    """
     u, v = np.linalg.svd(disc.normal[None])[2][1:]
     angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
+    # The polygon has the area of the circle, and so as much light.
     fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
     return disc.centre + fill * radius * (np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v)
 
 
 def _band_triangles(sides: int) -> NDArray[np.int_]:
-    """Triangles (2 sides, 3) between ``sides`` corners and as many around them."""
+    """Return triangles (2 sides, 3) between ``sides`` corners and as many around them."""
     here = np.arange(sides)
     there = np.roll(np.arange(sides), -1)
     return np.concatenate(
@@ -127,8 +133,9 @@ def _band_triangles(sides: int) -> NDArray[np.int_]:
 
 
 def _balanced_triangles(sides: int) -> NDArray[np.int_]:
-    """Triangles (sides - 2, 3) of a convex polygon, large ones inside: faster to draw than a fan of
-    slivers.
+    """Return triangles (sides - 2, 3) of a convex polygon, with large ones inside.
+
+    They are faster to draw than a fan of slivers.
     """
     triangles: list[tuple[int, int, int]] = []
     arcs = [(0, sides - 1)]
@@ -143,8 +150,12 @@ def _balanced_triangles(sides: int) -> NDArray[np.int_]:
 
 @dataclass(frozen=True)
 class Laid:
-    """For each of n windows the patch of its only solid, or -1 where depths are needed; whether
-    that fills it; and the stack whose lowest disc may then be taken for its ground, or -1."""
+    """Windows that need no depths.
+
+    ``solid`` (n,) is the patch of a window's only solid, or -1 where depths are needed. ``filled``
+    says whether that solid fills the window. ``ringed`` is the stack whose lowest disc may then be
+    taken for its ground, or -1.
+    """
 
     solid: NDArray[np.int_]
     filled: NDArray[np.bool_]
@@ -152,9 +163,9 @@ class Laid:
 
 
 class LaidSolids:
-    """The convex solids of a drawable, each of one level, and the stacks of discs that lie on them.
+    """Convex solids of a drawable, each of one level, and the stacks of discs that lie on them.
 
-    levels (patches,): of the solids, and of the lowest discs of stacks; NaN for other patches.
+    ``levels`` (patches,) are those of the solids and of the lowest discs of stacks; NaN for others.
     """
 
     def __init__(self, drawable: Drawable) -> None:
@@ -207,7 +218,7 @@ class LaidSolids:
         }
 
     def laid(self, views: Views, reaching: NDArray[np.bool_]) -> Laid:
-        """Mask of the windows that need no depths; ``reaching`` as of Drawable."""
+        """Tell which windows need no depths; ``reaching`` is that of Drawable."""
         laid = Laid(
             np.full(len(views), -1), np.zeros(len(views), dtype=bool), np.full(len(views), -1)
         )
@@ -237,14 +248,16 @@ class LaidSolids:
         return laid
 
     def carrier(self, stack: int) -> int | None:
-        """The solid on which a stack with a lowest disc lies, or None."""
+        """Return the solid on which a stack with a lowest disc lies, or None."""
         return next(
             (k for k in self._solids if self._ring_reach[stack] > 0.0 and self._lying[k][stack]),
             None,
         )
 
     def _seen_over(self, solid: int, view: Exposure) -> NDArray[np.bool_]:
-        """The solid itself, and the stacks of discs on it that show their upper side (patches,)."""
+        """Tell which patches show over a solid: itself, and the stacks on it that show their upper
+        side.
+        """
         move = view.camera_from_bodies[self._body_index[solid]]
         eye = -move[:3, 3] @ move[:3, :3]
         seen = self._lying[solid] & (self._normals @ eye - self._heights > CLEARANCE)
@@ -252,8 +265,9 @@ class LaidSolids:
         return seen
 
     def _fills(self, solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
-        """Tell whether the solid shows along ``rays`` (n,4,3) to all corners of windows, and so all
-        over them.
+        """Tell whether the solid shows along ``rays`` (n, 4, 3) to all corners of windows.
+
+        It is convex, so that it then shows all over them.
         """
         move = view.camera_from_bodies[self._body_index[solid]]
         depths = self._solids[solid].vertices @ move[2, :3] + move[2, 3]
@@ -264,11 +278,12 @@ class LaidSolids:
     def _banded(
         self, stacks: NDArray[np.int_], solid: int, view: Exposure, rays: Array
     ) -> NDArray[np.bool_]:
-        """Tell whether a band around the lowest disc of each stack (n,) on the solid covers the
-        corners of its window, along ``rays`` (n,4,3).
+        """Tell whether a band around each stack's lowest disc covers the corners of its window.
+
+        The stacks (n,) lie on the solid, and the corners along ``rays`` (n, 4, 3).
         """
         move = view.camera_from_bodies[self._body_index[solid]]
-        # from the camera, in the axes of the body
+        # From the camera, in the axes of the body.
         gaps = self._ring_centres[stacks] + move[:3, 3] @ move[:3, :3]
         along = rays @ move[:3, :3]
         normals = self._normals[stacks]

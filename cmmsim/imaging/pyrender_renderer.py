@@ -1,14 +1,16 @@
-"""Rendering of many small windows in one pass. The only module that imports pyrender.
+"""Rendering of many small windows in one pass. It is the only module that imports pyrender.
 
-pyrender supplies the OpenGL context, the mesh buffers and the flat shader; the frame buffers hold
+pyrender supplies the OpenGL context, the mesh buffers and the flat shader. The frame buffers hold
 one channel only, which draws faster than pyrender's four. Each window is drawn into its own cell of
-one large frame buffer with its own projection, drawn larger by the supersampling factor, and
+one large frame buffer, with its own projection. It is drawn larger by the supersampling factor and
 averaged in linear light. Every drawn pixel has one sample: several of pyrender's multisampling cost
-more than they gain on the stickers' soft rims. A cell draws only the patches whose bounding box
-reaches into it. Projection and camera_from_body are multiplied in double precision, so that the
-shader sees one well-scaled matrix. Depths are asked for only where they are needed, and a solid
-that fills a cell, or the dark ring of its sticker, is its ground, see ``LaidSolids``. Pieces of the
-atlas are handed over as they are ready, so that OpenGL fills them while the next ones are prepared.
+more than they gain on the stickers' soft rims.
+
+A cell draws only the patches whose bounding box reaches into it. Projection and camera_from_body
+are multiplied in double precision, so that the shader sees one well-scaled matrix. Depths are asked
+for only where they are needed. A solid that fills a cell, or the dark ring of its sticker, is the
+cell's ground, see ``LaidSolids``. Pieces of the atlas are handed over as they are ready, so that
+OpenGL fills them while the next ones are prepared.
 """
 
 import ctypes
@@ -24,26 +26,25 @@ from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError, OpenGLMissingError
 from cmmsim.imaging.pyrender_meshes import LaidSolids, disc_mesh, ringed_mesh
-from cmmsim.imaging.renderer import Drawable, Renderer
+from cmmsim.imaging.renderer import Drawable, Renderer, View, Views
 from cmmsim.imaging.scene_bodies import DiscStack, Mesh, Patch
-from cmmsim.imaging.views import View, Views
 
 ATLAS_SIDE_PX = 2048
 KEPT_FRAME_BUFFERS = 12
-PIECES = 3  # of an atlas that are handed over one after another
+# Pieces of an atlas that are handed over one after another.
+PIECES = 3
 
 
 def render_windows(
     drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
 ) -> NDArray[np.float32]:
-    """Radiance (n, h, w) float32, 0 to 1, of n windows of one size.
+    """Draw the radiance (n, h, w) float32, 0 to 1, of n windows of one size.
 
     Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises
     OpenGLMissingError.
     """
-    from cmmsim.imaging.window_kernels import (
-        mean_of_cells,
-    )  # compiles, so it is loaded where it is first needed
+    # Late, as numba takes time to import.
+    from cmmsim.imaging.window_kernels import mean_of_cells
 
     views = Views.of(views)
     width, height = views.size
@@ -65,13 +66,19 @@ PYRENDER = Renderer("pyrender", render_windows, 0.00058)
 
 
 def require_opengl() -> None:
-    """Raise OpenGLMissingError, naming the packages to install, where nothing can be rendered."""
+    """Check that pyrender can draw.
+
+    Raises
+    ------
+    OpenGLMissingError
+        If it cannot; the message names the packages to install.
+    """
     _shared_atlas()
 
 
 @lru_cache(maxsize=1)
 def _shared_atlas() -> "_Atlas":
-    """The one renderer of this process; making another would leak memory."""
+    """Return the only renderer of this process; making another would leak memory."""
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     try:
@@ -84,9 +91,11 @@ def _shared_atlas() -> "_Atlas":
 
 @dataclass(frozen=True)
 class _Patch:
-    """A patch in OpenGL's memory: ``indices`` of its triangles from the front to the back, then,
-    from ``backwards`` on, as many for the other way, at a place in bytes; solid: whether it is no
-    stack of discs."""
+    """Patch in OpenGL's memory.
+
+    The ``indices`` of its triangles stand from the front to the back; as many for the other way
+    begin at ``backwards``, in bytes. ``solid`` says that it is no stack of discs.
+    """
 
     vertex_array: int
     indices: int
@@ -96,9 +105,10 @@ class _Patch:
 
 @dataclass(frozen=True)
 class _Uploaded:
-    """Uploaded parts of a drawable: its patches by the number of drawn pixels a radian, those of
-    them that may be drawn around their own lowest disc, and the order in which they lie over
-    each other.
+    """Uploaded parts of a drawable.
+
+    ``patches`` are known by the number of drawn pixels a radian, and so are those that may be
+    ``ringed``: drawn around their own lowest disc.
     """
 
     patches: dict[float, list[_Patch]]
@@ -107,7 +117,7 @@ class _Uploaded:
 
 
 class _Atlas:
-    """Draws cells into pyrender's frame buffers."""
+    """Frame buffers of pyrender, into whose cells windows are drawn."""
 
     def __init__(self, pyrender: Any) -> None:
         from OpenGL import GL
@@ -144,11 +154,12 @@ class _Atlas:
         rows: int,
         background: float,
     ) -> NDArray[np.uint8]:
-        """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid
-        until the next.
+        """Draw the atlas (rows * cell_h, columns * cell_w) uint8, with cells in reading order.
+
+        It is valid until the next one.
         """
         self._context._platform.make_current()
-        # drawn pixels a radian
+        # Drawn pixels a radian.
         samples = views.exposures[0].camera.focal_px * cell[0] / views.size[0]
         known = self._uploaded(drawable, samples)
         frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
@@ -185,8 +196,8 @@ class _Atlas:
         return frame_buffer.read()
 
     def _draw_by_depth(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
-        """The patches shown in a cell, the nearest of which is seen; matrices: addresses of theirs
-        by their numbers.
+        """Draw the patches shown in a cell, of which the nearest is seen; ``matrices`` are
+        addresses.
         """
         gl = self._gl
         triangles, unsigned = self._constants
@@ -198,8 +209,10 @@ class _Atlas:
         gl.glDisable(gl.GL_DEPTH_TEST)
 
     def _lay(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
-        """The patches shown in a cell, all of one body, over each other: the solid, then what lies
-        on it.
+        """Draw the patches shown in a cell over each other: the solid, then the stack that lies on
+        it.
+
+        All belong to one body.
         """
         triangles, unsigned = self._constants
         for p in sorted(matrices, key=lambda p: not patches[p].solid):
@@ -210,7 +223,7 @@ class _Atlas:
     def _clear(
         self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool
     ) -> None:
-        """Give each cell its ground's level, and the farthest depth where depths are asked for."""
+        """Give each cell its ground's level, and the farthest depth where depths are needed."""
         gl = self._gl
         level = float(grounds[0])
         gl.glClearColor(level, level, level, 1.0)
@@ -225,8 +238,9 @@ class _Atlas:
             gl.glDisable(gl.GL_SCISSOR_TEST)
 
     def _uploaded(self, drawable: Drawable, samples: float) -> _Uploaded:
-        """The drawable, with its patches in OpenGL's memory, their discs made for ``samples`` drawn
-        pixels a radian.
+        """Return the drawable with its patches in OpenGL's memory.
+
+        Discs are made for ``samples`` drawn pixels a radian.
         """
         known = self._known.get(drawable)
         if known is None:
@@ -296,8 +310,9 @@ class _Atlas:
 
 
 def _called(name: str, *arguments: type) -> Any:
-    """A function of OpenGL that takes plain numbers and addresses, and is not asked for errors
-    after each call.
+    """Return a function of OpenGL that takes plain numbers and addresses.
+
+    It is not asked for errors after each call, which would take most of the time.
     """
     from OpenGL.platform import PLATFORM
 
@@ -305,7 +320,7 @@ def _called(name: str, *arguments: type) -> Any:
 
 
 class _FrameBuffer:
-    """Red channel and depth with one sample a pixel."""
+    """Frame buffer with a red channel and depth, one sample a pixel."""
 
     def __init__(self, gl: Any, width: int, height: int) -> None:
         from OpenGL.raw.GL.VERSION import GL_1_0  # reads into given memory
@@ -330,7 +345,7 @@ class _FrameBuffer:
         self._gl.glBindFramebuffer(self._gl.GL_FRAMEBUFFER, self._name)
 
     def read(self) -> NDArray[np.uint8]:
-        """The image (height, width), in memory that the next one takes, too."""
+        """Return the image (height, width), in memory that the next one overwrites."""
         self._read_pixels(
             0, 0, *self._size, self._gl.GL_RED, self._gl.GL_UNSIGNED_BYTE, self._target
         )

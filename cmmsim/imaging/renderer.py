@@ -1,15 +1,16 @@
-"""The contract of all renderers: what is to be drawn, what comes back, and which renderer draws.
+"""Contract of all renderers: windows of a scene, the result, and the choice of a renderer.
 
-A renderer draws windows of cameras with perfect lenses, of the patches that reach into each of
-them.
+A renderer draws windows of cameras with perfect lenses, from the patches that reach into each.
 """
+
+from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import Protocol
+from typing import Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +21,151 @@ from cmmsim.errors import CmmError, OpenGLMissingError
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene_bodies import Patch
-from cmmsim.imaging.views import NEAR, View, Views
 
-_WARNED: dict[
-    str | tuple[str, type[Warning], int], int
-] = {}  # what this process has said once is not said again
+# m: bodies nearer or farther than these planes are not drawn.
+NEAR = 0.2
+FAR = 10.0
+
+
+@dataclass(frozen=True)
+class View:
+    """One window of a camera with a perfect lens.
+
+    It has camera_from_body transforms (b, 4, 4), its first pixel (x, y) and its size (w, h), px.
+    """
+
+    camera: PinholeCamera
+    camera_from_bodies: Array
+    corner: tuple[float, float]
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Camera with a perfect lens, camera_from_body transforms (b, 4, 4), and the windows (k,) of
+    both.
+    """
+
+    camera: PinholeCamera
+    camera_from_bodies: Array
+    windows: NDArray[np.int_]
+
+
+class Views(Sequence[View]):
+    """Windows of one size (w, h) px with first pixels ``corners`` (n, 2), by their exposures."""
+
+    def __init__(
+        self, exposures: Sequence[Exposure], corners: Array, size: tuple[int, int]
+    ) -> None:
+        self.exposures = tuple(exposures)
+        self.corners = corners
+        self.size = size
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> Views:
+        """Gather single windows by camera and exposure."""
+        if isinstance(views, Views):
+            return views
+        groups: dict[tuple[int, int], list[int]] = {}
+        for k, view in enumerate(views):
+            groups.setdefault((id(view.camera), id(view.camera_from_bodies)), []).append(k)
+        shown = [
+            Exposure(views[group[0]].camera, views[group[0]].camera_from_bodies, np.array(group))
+            for group in groups.values()
+        ]
+        return cls(
+            shown,
+            np.array([view.corner for view in views], dtype=float).reshape(-1, 2),
+            views[0].size,
+        )
+
+    @classmethod
+    def of_sides(
+        cls, sides: Sequence[tuple[PinholeCamera, Array, NDArray]], size: tuple[int, int]
+    ) -> Views:
+        """Return windows of cameras that see bodies (b, 4, 4), one side after the other.
+
+        Each side has the first pixels (k, 2) of its windows.
+        """
+        starts = np.cumsum([0, *(len(corners) for _, _, corners in sides)])
+        shown = [
+            Exposure(camera, bodies, np.arange(start, start + len(corners)))
+            for (camera, bodies, corners), start in zip(sides, starts, strict=False)
+            if len(corners)
+        ]
+        return cls(shown, np.concatenate([corners for _, _, corners in sides]), size)
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    @overload
+    def __getitem__(self, index: int) -> View: ...
+    @overload
+    def __getitem__(self, index: slice) -> Views: ...
+    def __getitem__(self, index: int | slice) -> View | Views:
+        if isinstance(index, slice):
+            start, stop, _ = index.indices(len(self))
+            parts = [
+                Exposure(
+                    e.camera,
+                    e.camera_from_bodies,
+                    e.windows[(e.windows >= start) & (e.windows < stop)] - start,
+                )
+                for e in self.exposures
+            ]
+            return Views(
+                [part for part in parts if len(part.windows)], self.corners[start:stop], self.size
+            )
+        place = range(len(self))[index]
+        shown = next(e for e in self.exposures if place in e.windows)
+        x, y = self.corners[place].tolist()
+        return View(shown.camera, shown.camera_from_bodies, (x, y), self.size)
+
+    @property
+    def bounds(self) -> Array:
+        """Lowest x, y and highest x, y (n, 4) of the windows, px: the outer edges of their
+        outermost pixels.
+        """
+        return np.hstack([self.corners - 0.5, self.corners - 0.5 + self.size])
+
+    @property
+    def projections(self) -> Array:
+        """Clip-from-camera matrices (n, 4, 4) for OpenCV camera axes.
+
+        Row 0 of a drawing is a window's top row. The half pixel turns OpenCV's pixel-centre
+        convention into OpenGL's pixel-corner convention.
+        """
+        matrices = np.zeros((len(self), 4, 4))
+        for shown in self.exposures:
+            principal = shown.camera.centre + 0.5 - self.corners[shown.windows]
+            for i in range(2):
+                matrices[shown.windows, i, i] = 2.0 * shown.camera.focal_lengths[i] / self.size[i]
+                matrices[shown.windows, i, 2] = 2.0 * principal[:, i] / self.size[i] - 1.0
+        matrices[:, 2, 2] = (FAR + NEAR) / (FAR - NEAR)
+        matrices[:, 2, 3] = -2.0 * FAR * NEAR / (FAR - NEAR)
+        matrices[:, 3, 2] = 1.0
+        return matrices
+
+    def clip_from_bodies(self) -> Array:
+        """Return the clip-from-body matrices (n, b, 4, 4) of the windows."""
+        projections = self.projections
+        matrices = np.empty((len(self), len(self.exposures[0].camera_from_bodies), 4, 4))
+        for shown in self.exposures:
+            matrices[shown.windows] = projections[shown.windows, None] @ shown.camera_from_bodies
+        return matrices
+
+
+# Warnings that this process has given, which are not repeated.
+_WARNED: dict[str | tuple[str, type[Warning], int], int] = {}
 
 
 class Drawable:
-    """Patches of several bodies: which body each belongs to, the corners of its bounding box as
-    columns (n,4,8), m and 1, and the distance m from which they are usually looked at, for which
-    discs are triangulated."""
+    """Patches of several bodies.
+
+    ``body_index`` tells the body of each, and ``boxes`` (n, 4, 8) the corners of its bounding box
+    as columns, m and 1. Discs are triangulated for ``distance`` m, from which they are usually
+    seen.
+    """
 
     def __init__(
         self, patches: Sequence[Patch], body_index: Sequence[int], distance: float
@@ -43,7 +178,9 @@ class Drawable:
         self.distance = distance
 
     def reaching(self, views: Views) -> NDArray[np.bool_]:
-        """Mask (n views, n patches) of those that may show in each window, by bounding boxes."""
+        """Return the mask (n views, n patches) of those that may show in each window, by bounding
+        boxes.
+        """
         windows = views.bounds
         result = np.zeros((len(views), len(self.patches)), dtype=bool)
         for shown in views.exposures:
@@ -55,14 +192,14 @@ class Drawable:
     def reaching_windows(
         self, camera: PinholeCamera, camera_from_bodies: Array, bounds: Array
     ) -> NDArray[np.bool_]:
-        """Mask of the patches that may show in each window (n windows, n patches) of one camera
-        with a perfect lens.
+        """Return the mask of the patches that may show in each window (n windows, n patches) of one
+        camera.
 
-        Parameters: camera_from_bodies (b,4,4); bounds (n,4): lowest x, y and highest x, y, px.
+        The camera has a perfect lens. Bodies stand at (b, 4, 4), and ``bounds`` (n, 4) are lowest
+        x, y and highest x, y, px.
         """
-        from cmmsim.imaging.window_kernels import (
-            boxes_reaching,
-        )  # compiles, so it is loaded where it is first needed
+        # Late, as numba takes time to import.
+        from cmmsim.imaging.window_kernels import boxes_reaching
 
         reaching = np.empty((len(bounds), len(self.patches)), dtype=bool)
         boxes_reaching(
@@ -77,17 +214,22 @@ class Drawable:
 
 
 class DrawWindows(Protocol):
-    """Radiance (n, h, w) float32, 0 to 1, of n views of one size; row 0 is a window's top row."""
+    """Function that draws the radiance (n, h, w) float32, 0 to 1, of n views of one size.
+
+    Row 0 is a window's top row.
+    """
 
     def __call__(
         self, drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
     ) -> NDArray[np.float32]:
-        """Draw; supersampling: how finely edges are sampled within a pixel."""
+        """Draw; ``supersampling`` says how finely edges are sampled within a pixel."""
 
 
 @dataclass(frozen=True)
 class Renderer:
-    """name; draw; sampling_error_px: rms error of a sticker's centre at supersampling 9, see
+    """Renderer with a name and its function.
+
+    ``sampling_error_px`` is the rms error of a sticker's centre at supersampling 9, see
     ``centre_error_px``.
     """
 
@@ -96,20 +238,20 @@ class Renderer:
     sampling_error_px: float = 0.0
 
     def centre_error_px(self, supersampling: int) -> float:
-        """Error of a sticker's centre that sampling leaves, px rms.
+        """Return the error of a sticker's centre that sampling leaves, px rms.
 
-        Measured with pyrender: 0.0041 at 3, 0.000069 at 32.
+        It was measured with pyrender: 0.0041 at supersampling 3, and 0.000069 at 32.
         """
         return self.sampling_error_px * (9.0 / supersampling) ** 1.7
 
 
 def choose_renderer(name: str) -> Renderer:
-    """The renderer of that name; "auto" is pyrender where OpenGL works, else analytic with one line
-    of warning.
+    """Return the renderer of a name.
 
-    ``module:name`` of one's own is a Renderer, or a function as ``DrawWindows`` describes, which
-    may carry its ``sampling_error_px``. Raises UnknownOptionError with the valid names, CmmError
-    for what cannot be imported or called.
+    "auto" is pyrender where OpenGL works, and otherwise analytic, with one line of warning.
+    ``module:name`` of a user's own is a Renderer, or a function as ``DrawWindows``, which may carry
+    its ``sampling_error_px``. Raises UnknownOptionError with the valid names, and CmmError for what
+    cannot be imported or called.
     """
     if name == AUTO:
         from cmmsim.imaging.pyrender_renderer import require_opengl  # which imports this module
@@ -119,7 +261,7 @@ def choose_renderer(name: str) -> Renderer:
         except OpenGLMissingError as error:
             reason = " ".join(str(error.__cause__ or error).split())
             text = f"images are drawn by the analytic renderer, pyrender found no OpenGL: {reason}"
-            # a place without source: one line
+            # A place without source, so that the warning is one line.
             warnings.warn_explicit(text, UserWarning, __name__, 0, registry=_WARNED)
             return _renderer("analytic")
         return _renderer("pyrender")

@@ -20,14 +20,17 @@ from cmmsim.files.schema import Body, Stickers, unit
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, invert
 
-SUNK = 0.0003  # m the solid surface lies below the sticker planes
-RING_SUNK = 0.0001  # m the dark ring lies below its sticker
-SHORTEST_ROD = 1e-9  # m: of a shorter one rounding is the direction
-TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
+# m by which the solid surface lies below the sticker planes, and a dark ring below its sticker.
+SUNK = 0.0003
+RING_SUNK = 0.0001
+# m: the direction of a shorter rod is rounding.
+SHORTEST_ROD = 1e-9
+# Share of the way to a point in which meeting a solid counts as lying on it.
+TOUCHING = 1e-6
 
 
 class ConvexSolid:
-    """The convex hull of vertices (n,3), m."""
+    """Convex hull of vertices (n, 3), m."""
 
     def __init__(self, vertices: Array) -> None:
         hull = ConvexHull(vertices)
@@ -39,15 +42,13 @@ class ConvexSolid:
 
     @property
     def faces(self) -> tuple[Array, Array]:
-        """Normals (f,3), outwards, and offsets (f,) of its faces: normal . x + offset <= 0
-        inside."""
+        """Outward normals (f, 3) and offsets (f,) of its faces: normal . x + offset <= 0 inside."""
         return self._normals, self._offsets
 
     def hides(self, camera_from_body: Array, points: Array) -> NDArray[np.bool_]:
         """Tell whether the solid stands between the camera and points (..., 3) in camera axes."""
-        from cmmsim.imaging.layer_kernels import (
-            hidden_points,
-        )  # compiles, so it is loaded where it is first needed
+        # Late, as numba takes time to import.
+        from cmmsim.imaging.layer_kernels import hidden_points
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
         hidden = np.empty(len(flat), dtype=bool)
@@ -59,7 +60,7 @@ class ConvexSolid:
 
 @dataclass(frozen=True)
 class Disc:
-    """A flat disc: centre (3,) and radius m, outward unit normal (3,), level 0 to 1."""
+    """Flat disc: centre (3,) and radius in m, outward unit normal (3,), level 0 to 1."""
 
     centre: Array
     normal: Array
@@ -69,8 +70,9 @@ class Disc:
 
 @dataclass(frozen=True)
 class DiscStack:
-    """Discs that lie over each other, the largest and lowest first; each renderer draws them in its
-    own way.
+    """Discs that lie over each other, the largest and lowest first.
+
+    Each renderer draws them in its own way.
     """
 
     discs: tuple[Disc, ...]
@@ -87,7 +89,9 @@ class DiscStack:
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices (n,3) m, faces (m,3), levels (n,) 0 to 1 of the vertices; a solid has one level."""
+    """Vertices (n, 3) m, faces (m, 3), and levels (n,) 0 to 1 of the vertices; a solid has one
+    level.
+    """
 
     vertices: Array
     faces: NDArray[np.int_]
@@ -100,13 +104,15 @@ class Mesh:
 
 
 Patch = DiscStack | Mesh
-"""A piece of a body that is drawn as one call."""
+"""Piece of a body that is drawn by one call."""
 
 
 @dataclass(frozen=True)
 class SceneBody:
-    """A rigid body as drawn: its solid and one stack of discs for each sticker; sticker_places
-    (n,3) are the true ones, m."""
+    """Rigid body as drawn: its solid and one stack of discs for each sticker.
+
+    ``sticker_places`` (n, 3) are the true ones, m.
+    """
 
     solid: Mesh
     stickers: tuple[DiscStack, ...]
@@ -114,8 +120,9 @@ class SceneBody:
 
 
 def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
-    """True sticker places (n,3): the nominal ones moved within their planes, by a seeded distance
-    and direction.
+    """Return the true sticker places (n, 3).
+
+    They are the nominal ones, moved within their planes by a seeded distance and direction.
     """
     rng = np.random.default_rng([stickers.placement_seed, stream])
     distance = rng.uniform(*stickers.placement, len(body.nominal))
@@ -125,7 +132,7 @@ def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
 
 
 def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int) -> SceneBody:
-    """The drawn body of a sensor file's section."""
+    """Return the drawn body of a sensor file's section."""
     places = placed_stickers(body, stickers, stream)
     drawn = tuple(
         _sticker(place, axes, stickers) for place, axes in zip(places, body.in_plane, strict=True)
@@ -135,7 +142,7 @@ def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int)
 
 
 def solid_mesh(mesh: trimesh.Trimesh, level: float) -> Mesh:
-    """A solid in one grey level."""
+    """Return a solid in one grey level."""
     vertices = np.asarray(mesh.vertices, dtype=float)
     return Mesh(vertices, np.asarray(mesh.faces), np.full(len(vertices), level))
 
@@ -208,12 +215,12 @@ def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
 
 
 def rod_transforms(starts: Array, ends: Array) -> Array:
-    """As ``rod_transform`` of k rods at once: (k,4,4) of starts and ends (k,3). Raises CmmError for
-    one too short.
+    """Return ``rod_transform`` (k, 4, 4) of k rods at once, from starts and ends (k, 3).
+
+    Raises CmmError for one that is too short.
     """
-    from cmmsim.imaging.view_kernels import (
-        place_rods,
-    )  # compiles, so it is loaded where it is first needed
+    # Late, as numba takes time to import.
+    from cmmsim.imaging.view_kernels import place_rods
 
     transforms = np.zeros((len(starts), 4, 4))
     lengths = np.empty(len(starts))
@@ -222,15 +229,16 @@ def rod_transforms(starts: Array, ends: Array) -> Array:
         k = np.flatnonzero(~(lengths >= SHORTEST_ROD))[0]
         raise CmmError(
             f"a rod of {lengths[k]:g} m from {starts[k].tolist()} m points nowhere, at least "
-            f"{SHORTEST_ROD:g} m is "
-            "needed"
+            f"{SHORTEST_ROD:g} m is needed"
         )
     return transforms
 
 
 class PlacedBodies(Mapping[str, Array]):
-    """Bodies by their names, at base_from_body ``together`` (k,4,4): a mapping that need not be put
-    together again, for a sensor that is asked for every frame."""
+    """Mapping of bodies, by their names, to base_from_body ``together`` (k, 4, 4).
+
+    A sensor that is asked for every frame need not put the matrices together again.
+    """
 
     def __init__(self, names: tuple[str, ...], together: Array) -> None:
         self.names = names
@@ -250,8 +258,9 @@ class PlacedBodies(Mapping[str, Array]):
 
 
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
-    """Convex solid of the sunk sticker planes and the cuts. Raises SensorFileError where they
-    enclose none.
+    """Return the convex solid of the sunk sticker planes and the cuts.
+
+    Raises SensorFileError where they enclose none.
     """
     normals = [*body.normals, *(unit(c.normal) for c in section.cuts)]
     points = [
@@ -259,6 +268,7 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
         *(np.array(c.point) for c in section.cuts),
     ]
     half_spaces = np.array([[*n, -(n @ p)] for n, p in zip(normals, points, strict=True)])
+    # A point a centimetre below the middle of the stickers must lie within all half spaces.
     inside = body.nominal.mean(axis=0) - 0.01 * body.normals.sum(axis=0)
     outside = half_spaces @ [*inside, 1.0]
     if outside.max() >= 0.0:
@@ -269,8 +279,7 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
         raise SensorFileError(
             f"{body.name}: the middle of its stickers, {np.round(inside, 4).tolist()} m, lies "
             f"{outside.max():.4f} m outside of {side[outside.argmax()]}: the stickers do not sit "
-            "on "
-            "the solid that its planes and cuts enclose"
+            "on the solid that its planes and cuts enclose"
         )
     try:
         corners = HalfspaceIntersection(half_spaces, inside).intersections
@@ -287,7 +296,7 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
 
 
 def _sticker(place: Array, axes: Array, stickers: Stickers) -> DiscStack:
-    """A bright disc, and RING_SUNK below it a dark one that shows as a ring."""
+    """Return a bright disc, and RING_SUNK below it a dark one that shows as a ring."""
     normal = np.cross(axes[:, 0], axes[:, 1])
     return DiscStack(
         (

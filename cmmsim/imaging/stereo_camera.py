@@ -1,6 +1,4 @@
-"""Exposures of two cameras: the poses that they see, and the light and noise of windows or whole
-images over them.
-"""
+"""Exposures of two cameras: the poses that they see, and the light and noise over them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,32 +10,28 @@ from numpy.typing import NDArray
 from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array, apply_each, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.formation import ImageFormation, Side, whole_image
 from cmmsim.imaging.scene_bodies import DiscStack
-from cmmsim.imaging.whole_image import whole_image
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 from cmmsim.radiometry.stereo_images import StereoFrame, Windows
 
-LARGEST_STEP_PX = 0.3  # between two sub-frames no sticker moves farther
+# No sticker moves farther between two sub-frames.
+LARGEST_STEP_PX = 0.3
 MOST_SUB_FRAMES = 500
 SUPERSAMPLING = 9
 
 Moments = Sequence[Sequence[Array]]
-"""camera_from_body (b,4,4) of all bodies for the left and the right camera, at each sub-frame of an
-exposure.
-"""
+"""Transforms camera_from_body (b, 4, 4) of all bodies for both cameras, at each sub-frame."""
 
 
 def sub_frame_poses(
     poses: Array, pose_rates: Array, exposure: float, sticker_pixels: Callable[[Array], Array]
 ) -> list[Array]:
-    """For each of N exposures poses (m, 6) whose mean image is that of the whole exposure, by the
-    midpoint rule.
+    """Return, for each of N exposures, poses (m, 6) whose mean image is that of the whole exposure.
 
-    Parameters: poses (N, 6) in the middle of the exposures; pose_rates (N, 6) their time
-    derivatives, which are constant; exposure s; sticker_pixels: places (2, N, n, 2) px of all
-    stickers in the images at poses (N, 6). Raises CmmError where the stickers move farther than an
-    image can show.
+    The exposures are centred at ``poses`` (N, 6), and ``pose_rates`` (N, 6) are constant; the
+    midpoint rule divides them. ``sticker_pixels`` gives places (2, N, n, 2) px of all stickers at
+    poses (N, 6). Raises CmmError where the stickers move farther than an image can show.
     """
     halves = 0.5 * exposure * pose_rates
     moved = np.linalg.norm(
@@ -60,7 +54,7 @@ def sub_frame_poses(
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of windows: supersampling per pixel and axis, and the number of exposures that are
+    """Quality of windows: supersampling a pixel and axis, and the number of exposures that are
     averaged.
     """
 
@@ -72,10 +66,10 @@ class Quality:
 class VirtualStereoCamera:
     """Two cameras that look at the true scene and hand out noisy grey values.
 
-    rig and camera_from_base (4,4), its place in the base frame, the true ones; formation: how light
-    becomes images, its drawable's body 0 the platform and body 1 the base, the others being
-    ``obstacle_names`` in order; noise; exposure in s; pattern_seed: of what differs from pixel to
-    pixel; right_later: by how much the right camera exposes later, s.
+    ``rig`` and ``camera_from_base`` (4, 4) are the true ones. In the drawable of ``formation``,
+    body 0 is the platform and body 1 the base; the others are ``obstacle_names`` in order.
+    ``exposure`` is in s. ``pattern_seed`` is that of the differences from pixel to pixel. The right
+    camera exposes ``right_later`` s later.
     """
 
     rig: StereoRig
@@ -95,9 +89,9 @@ class VirtualStereoCamera:
         quality: Quality | None = None,
         pose_rate: Array | None = None,
     ) -> "LiveImages":
-        """One exposure of the platform and of the obstacles at base_from_body (4,4) each.
+        """Take one exposure of the platform, and of obstacles at base_from_body (4, 4) each.
 
-        ``pose`` (6,) of the platform in the middle of the exposure, ``pose_rate`` (6,) its time
+        ``pose`` (6,) is that in the middle of the exposure, and ``pose_rate`` (6,) its time
         derivative; obstacles stand still.
         """
         rates = None if pose_rate is None else pose_rate[None]
@@ -112,13 +106,16 @@ class VirtualStereoCamera:
         obstacles: Mapping[str, Array],
         pose_rates: Array,
     ) -> "ManyLiveImages":
-        """Exposures of the platform at poses (N,6) in motion at pose_rates (N,6), each with its own
-        noise, as ``look`` for each of them."""
+        """Take exposures of the platform at poses (N, 6) in motion at pose_rates (N, 6), as
+        ``look`` each.
+
+        Each has its own noise.
+        """
         return ManyLiveImages(self, self._moments(poses, pose_rates, obstacles), rngs)
 
     def moved(self, changes: Array) -> "VirtualStereoCamera":
-        """The same cameras with changes (24,) of their rig's parameters; their pixels stay what
-        they are.
+        """Return the cameras with changes (24,) of their rig's parameters; their pixels stay the
+        same.
         """
         camera = replace(self, rig=self.rig.moved(changes))
         camera.__dict__["patterns"] = self.patterns
@@ -131,11 +128,12 @@ class VirtualStereoCamera:
         size: int,
         supersampling: int,
     ) -> list[NDArray[np.float32]]:
-        """Mean radiance (2, n, size, size) of windows at ``corners`` (2, n, 2) in the left and
-        right image over the moments of an exposure, for each of several exposures.
+        """Return the mean radiance (2, n, size, size) of windows over the moments of several
+        exposures.
 
-        One moment of all exposures is drawn after the other: no more is held at once than without
-        motion.
+        The windows begin at ``corners`` (2, n, 2) in the left and right image, for each exposure.
+        One moment of all exposures is drawn after the other, so that no more is held at once than
+        without motion.
         """
         light = self._drawn([first for first, *_ in moments], corners, size, supersampling)
         for k in range(1, max(map(len, moments))):
@@ -157,9 +155,11 @@ class VirtualStereoCamera:
         size: int,
         supersampling: int,
     ) -> list[NDArray[np.float32]]:
-        """As ``radiances``, of one moment each. Exposures are drawn together where nothing finer
-        than their pixels is drawn: finer windows of many exposures would not fit into the
-        processor's caches."""
+        """Return ``radiances`` of one moment each.
+
+        Exposures are drawn together where nothing finer than their pixels is drawn. Finer windows
+        of many exposures would not fit into the processor's caches.
+        """
         sides = [
             Side(*side)
             for at, first in zip(placed, corners, strict=True)
@@ -178,11 +178,13 @@ class VirtualStereoCamera:
     def whole_exposure(
         self, side: int, moments: Sequence[Array], supersampling: int
     ) -> NDArray[np.float32]:
-        """Mean radiance (height, width) of one whole image over the moments of an exposure."""
+        """Return the mean radiance (height, width) of one whole image over the moments of an
+        exposure.
+        """
         return whole_image(self.formation, self.rig.cameras[side], moments, supersampling)
 
     def centre_error_px(self, quality: Quality) -> float:
-        """Error of a sticker's centre that drawing leaves, px rms."""
+        """Return the error of a sticker's centre that drawing leaves, px rms."""
         return self.formation.centre_error_px(self.rig.cameras, quality.supersampling)
 
     @cached_property
@@ -205,7 +207,9 @@ class VirtualStereoCamera:
         ]
 
     def pattern_in(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
-        """Differences from pixel to pixel in windows of a size at ``corners`` (2, n, 2)."""
+        """Return the differences from pixel to pixel in windows of a size at ``corners`` (2, n,
+        2).
+        """
         cut = [
             p.windows(at, size)
             for p, at in zip(self.patterns, corners, strict=True)
@@ -220,7 +224,7 @@ class VirtualStereoCamera:
     def _moments(
         self, poses: Array, rates: Array | None, obstacles: Mapping[str, Array]
     ) -> list[Moments]:
-        """The moments of exposures at poses (N,6) in motion at rates (N,6)."""
+        """Return the moments of exposures at poses (N, 6) in motion at rates (N, 6)."""
         parts = list(poses[:, None])
         lag = np.zeros(poses.shape)
         if rates is not None:
@@ -237,9 +241,11 @@ class VirtualStereoCamera:
     def _placed(
         self, left: Array, right: Array, obstacles: Mapping[str, Array]
     ) -> list[tuple[Array, Array]]:
-        """camera_from_body (b,4,4) of all bodies for the left and the right camera, each at its own
-        poses (N,6) of the platform, for each of N moments."""
-        # an obstacle without a place stands far behind both cameras
+        """Return camera_from_body (b, 4, 4) of all bodies for both cameras, for each of N moments.
+
+        Each camera has its own poses (N, 6) of the platform.
+        """
+        # An obstacle without a place stands far behind both cameras.
         absent = rigid(np.eye(3), (0.0, 0.0, -1e3))
         still = np.stack(
             [np.eye(4), *(obstacles.get(name, absent) for name in self.obstacle_names)]
@@ -253,7 +259,7 @@ class VirtualStereoCamera:
         return list(zip(*sides, strict=True))
 
     def _sticker_pixels(self, poses: Array) -> Array:
-        """Pixels (2, N, n, 2) of the platform's stickers at poses (N,6)."""
+        """Return pixels (2, N, n, 2) of the platform's stickers at poses (N, 6)."""
         return self.rig.project(
             apply_each(self.camera_from_base @ transforms_of(poses), self._sticker_places)
         )[0]
@@ -287,7 +293,7 @@ class LiveImages:
         self._quality = quality
 
     def full(self) -> StereoFrame:
-        """Both whole images."""
+        """Return both whole images."""
         images = []
         for side, pattern in enumerate(self._camera.patterns):
             moments = [placed[side] for placed in self._moments]
@@ -296,7 +302,7 @@ class LiveImages:
         return StereoFrame(*images)
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x,
+        """Return the grey values (2, n, size, size) of windows with first pixels (2, n, 2) as (x,
         y).
         """
         (radiance,) = self._camera.radiances(
@@ -326,8 +332,11 @@ class ManyLiveImages:
     def windows_of(
         self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
     ) -> Windows:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2), of
-        ``exposures`` (n,) in rising order."""
+        """Return the grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n,
+        2).
+
+        They belong to ``exposures`` (n,), in rising order.
+        """
         camera = self._camera
         shown = np.unique(exposures)
         own = np.split(corners, np.searchsorted(exposures, shown[1:]), axis=1)

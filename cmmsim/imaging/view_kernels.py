@@ -1,4 +1,4 @@
-"""Compiled: what a camera shows of a scene of discs and convex solids, see ``analytic``."""
+"""Compiled: the view of a camera on a scene of discs and convex solids, see ``analytic``."""
 
 from __future__ import annotations
 
@@ -11,14 +11,19 @@ from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.disc_kernels import place_discs, probe_discs, project_all
 from cmmsim.imaging.layer_kernels import Discs, Solids, enters, lay_layers
 
-PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
-NEAREST = 1e-3  # m: a solid that comes nearer has no outline
+# Points on a disc's rim that are probed, with its middle, for solids that hide them.
+PROBES = 8
+# m: a solid that comes nearer has no outline.
+NEAREST = 1e-3
 
 
 class Scene(NamedTuple):
-    """Discs at places (m,3) with normals (m,3), radii and levels (m,), in the axes of their owners
-    (m,); convex solids of bodies (s,), with levels (s,), middles (s,3), vertices (v,3) from
-    vertex_starts[k] on, and faces normal . x + offset <= 0 (f,3), (f,) from face_starts[k] on."""
+    """Discs and convex solids, in the axes of their bodies.
+
+    Discs have places and normals (m, 3), radii, levels and owners (m,). Solids belong to ``bodies``
+    (s,) and have levels (s,) and middles (s, 3). Vertices (v, 3) of solid k stand from
+    vertex_starts[k] on. Its faces normal . x + offset <= 0 stand from face_starts[k] on.
+    """
 
     places: Array
     normals: Array
@@ -37,8 +42,11 @@ class Scene(NamedTuple):
 
 @compiled
 def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) -> None:
-    """Fill base_from_body (k,4,4), zero before, of rods from starts (k,3) to ends (k,3) along their
-    z axes, and their lengths (k,); x is across z and the axis that is farthest from it."""
+    """Fill base_from_body (k, 4, 4), zero before, of rods along their z axes, and their lengths
+    (k,).
+
+    The rods lead from starts to ends (k, 3). x is across z and the axis that is farthest from it.
+    """
     for k in range(len(starts)):
         move = transforms[k]
         squared = 0.0
@@ -65,9 +73,10 @@ def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) ->
 
 @compiled
 def convex_hull(points: Array) -> Array:
-    """Corners (k,2) of the convex hull of points (n,2) (Andrew's monotone chain)."""
+    """Return corners (k, 2) of the convex hull of points (n, 2), by Andrew's monotone chain."""
     n = len(points)
-    for i in range(1, n):  # few and never many: sorted by x, then y
+    # Sorted by x, then y, by insertion: there are never many.
+    for i in range(1, n):
         for j in range(i, 0, -1):
             before = points[j - 1]
             after = points[j]
@@ -96,8 +105,10 @@ def convex_hull(points: Array) -> Array:
 
 @compiled
 def half_planes_of(corners: Array, half_planes: Array) -> int:
-    """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2);
-    returns their number, sides of no length being left out."""
+    """Fill half planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n, 2).
+
+    Return their number; sides without length are left out.
+    """
     n = len(corners)
     count = 0
     middle_x = 0.0
@@ -120,9 +131,11 @@ def half_planes_of(corners: Array, half_planes: Array) -> int:
 
 @compiled
 def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near: float) -> tuple:
-    """The discs turned towards the camera, far to near and outer before inner: which (m,), the
-    centres (m,2) px, shapes (m,2,2) px and extents (m,2) px of their ellipses, and points (m,k,3) m
-    on them."""
+    """Return the discs turned towards the camera, far to near and outer before inner.
+
+    The results are their numbers (m,), the centres (m, 2), shapes (m, 2, 2) and extents (m, 2) of
+    their ellipses, px, and points (m, k, 3) m on them.
+    """
     total = len(scene.radii)
     places = np.empty((total, 3))
     normals = np.empty((total, 3))
@@ -138,6 +151,7 @@ def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near
         )
         if not (facing and places[n, 2] - scene.radii[n] > near):
             continue
+        # Depths are compared to a millimetre, so that the discs of one sticker keep their order.
         depth = np.rint(1e3 * places[n, 2])
         at = count
         while at > 0:
@@ -175,8 +189,10 @@ def stand_before(
     touching: float,
     slots: Array,
 ) -> Array:
-    """Tell whether solids stand before discs (m,h), of each solid that does before any; ``slots``
-    (s,) is filled with its column, or -1. owners (m,) and probes (m,k,3) of the discs.
+    """Tell whether solids stand before discs (m, h), of each solid that stands before any disc.
+
+    ``slots`` (s,) is filled with the column of each solid, or -1. The discs have owners (m,) and
+    probes (m, k, 3).
     """
     behind = np.zeros((len(owners), len(slots)), np.bool_)
     hiding = 0
@@ -185,6 +201,7 @@ def stand_before(
     for k in range(len(slots)):
         slots[k] = -1
         move = moves[scene.bodies[k]]
+        # Bodies behind the cameras, such as absent obstacles, hide nothing.
         if move[2, 3] < -near:
             continue
         own = slice(scene.face_starts[k], scene.face_starts[k + 1])
@@ -210,8 +227,9 @@ def stand_before(
 
 @compiled
 def outlined(scene: Scene, moves: Array, focal: Array, principal: Array, slots: Array) -> Solids:
-    """The solids wholly before the camera from far to near; ``slots`` (s,): where the cover of each
-    is kept, or -1.
+    """Return the solids wholly before the camera, from far to near.
+
+    ``slots`` (s,) say where the cover of each is kept, or -1.
     """
     total = len(slots)
     depths = np.empty(total)
@@ -238,7 +256,7 @@ def outlined(scene: Scene, moves: Array, focal: Array, principal: Array, slots: 
             nearest = min(nearest, depth)
             for i in range(2):
                 at = move[i, 0] * x + move[i, 1] * y + move[i, 2] * z + move[i, 3]
-                # finer edges would not show
+                # Single precision: finer edges would not show.
                 pixels[v, i] = np.float32(at / depth * focal[i] + principal[i])
         if nearest <= NEAREST:
             continue
@@ -269,9 +287,11 @@ def draw_view(
     corners: Array,
     lines: int,
 ) -> None:
-    """Draw the windows ``images[group]`` (h, w) with first pixels ``corners`` (n, 2) of one
-    exposure of a camera with a perfect lens, focal lengths (2,) and principal point (2,) px, at
-    which bodies stand by ``moves`` (b,4,4)."""
+    """Draw the windows ``images[group]`` (h, w) of one exposure of a camera with a perfect lens.
+
+    They have first pixels ``corners`` (n, 2). The camera has focal lengths (2,) and a principal
+    point (2,), px, and bodies stand at ``moves`` (b, 4, 4).
+    """
     kept, pixels, shapes, extents, probes = shown_discs(scene, moves, focal, principal, near)
     slots = np.empty(len(scene.bodies), np.int64)
     behind = stand_before(scene, moves, scene.owners[kept], probes, near, touching, slots)

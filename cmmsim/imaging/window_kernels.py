@@ -1,6 +1,4 @@
-"""Compiled: which patches reach into windows, and what becomes of drawn windows: means of cells,
-and bent ones.
-"""
+"""Compiled: patches that reach into windows, means of drawn cells, and bent windows."""
 
 from __future__ import annotations
 
@@ -18,12 +16,11 @@ def boxes_reaching(
     near: float,
     reaching: Array,
 ) -> None:
-    """Fill reaching (n, patches) for windows (n,4) of one exposure: lowest x, y and highest x, y,
-    px.
+    """Fill ``reaching`` (n, patches) for windows (n, 4) of one exposure.
 
-    Projection matrices pixels_from_bodies (b,3,4); corners of each patch's box as columns boxes
-    (patches,4,8), m and 1. A box not wholly farther than ``near`` may show anywhere, one behind the
-    camera nowhere.
+    Windows are lowest x, y and highest x, y, px. ``boxes`` (patches, 4, 8) are the corners of each
+    patch's box as columns, m and 1. A box that is not wholly farther than ``near`` may show
+    anywhere, and one behind the camera nowhere.
     """
     box = np.empty(4)
     point = np.empty(3)
@@ -64,11 +61,12 @@ def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array
     """Fill windows (n, h, w) float32, 0 to 1, with the means of ``supersampling``² drawn pixels, 0
     to 255.
 
-    ``drawn`` holds the cell of each window in reading order, ``columns`` of them a row.
+    ``drawn`` holds the cell of each window in reading order, ``columns`` of them in a row.
     """
     count, height, width = windows.shape
     share = np.float32(1.0 / (supersampling * supersampling))
     white = np.float32(255.0)
+    # Sums of 8-bit pixels are exact in whole numbers.
     sums = np.empty(width * supersampling, dtype=np.uint32)
     for n in range(count):
         top = n // columns * height * supersampling
@@ -88,8 +86,9 @@ def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array
 
 @compiled
 def keys_weights(share: float) -> tuple:
-    """Weights of the four pixels around a place that lies ``share`` (0 to 1) after the second
-    one."""
+    """Return the weights of the four pixels around a place that lies ``share``, 0 to 1, after the
+    second.
+    """
     s = min(max(share, 0.0), 1.0)
     return (
         s * (-0.5 + s * (1.0 - 0.5 * s)),
@@ -101,8 +100,11 @@ def keys_weights(share: float) -> tuple:
 
 @compiled
 def mark_plain(drawn: Array, along: Array, plain: Array) -> None:
-    """Mark in ``plain`` (h, w) the pixels of a drawn window (h, w) that are equal to all others
-    from one before to two behind them in both directions; ``along`` (h, w) is overwritten."""
+    """Mark in ``plain`` (h, w) the pixels of a drawn window (h, w) that equal all their neighbours.
+
+    The neighbours reach from one before to two behind in both directions; ``along`` (h, w) is
+    overwritten.
+    """
     height, width = drawn.shape
     for y in range(height):
         row = drawn[y]
@@ -120,8 +122,9 @@ def mark_plain(drawn: Array, along: Array, plain: Array) -> None:
 
 @compiled
 def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
-    """Fill windows (n, size, size) from drawn ones (n, h, w) at places given by biquadratic
-    coefficients (n,3,3,2).
+    """Fill windows (n, size, size) from drawn ones (n, h, w).
+
+    The places are biquadratic, with coefficients (n, 3, 3, 2).
     """
     n, height, width = drawn.shape
     size = result.shape[1]
@@ -131,6 +134,7 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
     for k in range(n):
         mark_plain(drawn[k], along, plain)
         for row in range(size):
+            # From -1 to 1 over the window, as the nodes of the quadratic stand.
             t = 2.0 * row / (size - 1) - 1.0
             for b in range(3):
                 for axis in range(2):
@@ -145,7 +149,8 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
                 y = at[0, 1] + s * (at[1, 1] + s * at[2, 1])
                 first_x = min(max(int(np.floor(x)), 1), width - 3)
                 first_y = min(max(int(np.floor(y)), 1), height - 3)
-                if plain[first_y, first_x]:  # weights add up to one
+                # The weights add up to one.
+                if plain[first_y, first_x]:
                     result[k, row, column] = drawn[k, first_y, first_x]
                 else:
                     result[k, row, column] = interpolated(drawn[k], x, y, first_x, first_y)
@@ -153,8 +158,9 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
 
 @compiled
 def interpolated(drawn: Array, x: float, y: float, first_x: int, first_y: int) -> float:
-    """Value of a drawn window (h, w) at a place between pixels, by those from one before the first
-    to two behind it.
+    """Return the value of a drawn window (h, w) at a place between pixels.
+
+    It comes from those from one before the first pixel to two behind it.
     """
     weights_x = keys_weights(x - first_x)
     weights_y = keys_weights(y - first_y)

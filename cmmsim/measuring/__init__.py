@@ -1,1 +1,3 @@
-"""Measurement of a pose and its covariance from detected stickers. Knows nothing of true poses."""
+"""Measurement of a pose and its covariance from detected stickers. It knows nothing of true
+poses.
+"""

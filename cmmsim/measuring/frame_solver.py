@@ -1,18 +1,18 @@
 """Poses of a body from its observed stickers, which must agree with each other.
 
 The taught places are laid onto the observed stickers. A sticker is left out, the worst one first,
-when
+in two cases:
 
-- its place differs from where all others put it (data snooping: the residual r against its own
-  covariance S - J C J', which a sticker's pull on the pose makes smaller than its noise S), or
-- its ellipse in one image differs from the one that a whole sticker would show there: a partly
-  hidden sticker, or a bright spot that touches it, moves the centre and the rim alike.
+- Its place differs from where all others put it. This is data snooping: the residual r is judged by
+  its own covariance S - J C J', which a sticker's pull on the pose makes smaller than its noise S.
+- Its ellipse in one image differs from that of a whole sticker. A partly hidden sticker, or a
+  bright spot that touches it, moves the centre and the rim alike.
 
 Undetected errors of both kinds are then of the size of the noise. At least four stickers must be
-left, since with three a wrong one cannot be told, and more than were left out.
+left, since a wrong one among three cannot be told, and more than were left out.
 
 All residuals may be larger than noise: a camera has drifted since its calibration, or several
-stickers are a little wrong. Places are then judged against the residuals of the others, and the
+stickers are a little wrong. Places are then judged by the residuals of the others, and the
 covariances grow by the same factor (Birge ratio), up to a limit.
 
 The computation is compiled, in ``solver_kernels``.
@@ -38,13 +38,18 @@ from cmmsim.measuring.observation import Observer, StickerObservation
 if TYPE_CHECKING:
     from cmmsim.measuring.solver_kernels import Belief, Outlines
 
-CHANCE = 1e-4  # of a good sticker to be left out, for its place and for each of its two ellipses
-EXCESS_CHANCE = 1e-4  # of a good frame's residuals to be taken for larger than noise
-LARGEST_EXCESS = 6.0  # of the residuals' mean square over that of noise
+# Probability that a good sticker is left out, for its place and for each of its two ellipses.
+CHANCE = 1e-4
+# Probability that a good frame's residuals are taken for larger than noise.
+EXCESS_CHANCE = 1e-4
+# Largest mean square of the residuals over that of noise.
+LARGEST_EXCESS = 6.0
 LARGEST_MISFIT = float(chi2.isf(CHANCE, 3))
 FEWEST = 4
-SMALLEST_SHARE = 0.01  # of a sticker's noise in its residual, below which nothing can be checked
-SETTLED = 1e-8  # rad: turn of the last step of a fit
+# Share of a sticker's noise in its residual, below which nothing can be checked.
+SMALLEST_SHARE = 0.01
+# rad: turn of the last step of a fit.
+SETTLED = 1e-8
 
 
 @dataclass(frozen=True)
@@ -72,15 +77,18 @@ class SolvedFrames:
         return self.verdicts[:, 0] != 0
 
     def of(self, frame: int) -> StickerObservation:
-        """Stickers that the pose of a frame rests on, with their index into the body's stickers."""
+        """Return the stickers that a frame's pose rests on, with their index into the body's
+        stickers.
+        """
         own = np.zeros(len(self.used), dtype=bool)
         own[self.starts[frame] : self.starts[frame + 1]] = True
         seen = self.stickers.selected(own & self.used)
         return replace(seen, index=seen.index % len(self.places))
 
     def reason(self, frame: int) -> str:
-        """The reason why a frame is lost."""
-        from cmmsim.measuring.solver_kernels import FIRST  # late, as numba takes time to import
+        """Return the reason why a frame is lost."""
+        # Late, as numba takes time to import.
+        from cmmsim.measuring.solver_kernels import FIRST
 
         verdict = self.verdicts[frame]
         first = ""
@@ -97,7 +105,8 @@ def solve_frames(
 
     The observation's index says frame and sticker, as that of ``Observer.read``.
     """
-    from cmmsim.measuring import solver_kernels as kernels  # late, as numba takes time to import
+    # Late, as numba takes time to import.
+    from cmmsim.measuring import solver_kernels as kernels
 
     frames = len(near)
     of, sticker = np.divmod(seen.index, len(places))
@@ -134,9 +143,10 @@ def solve_frames(
 def consistent(
     seen: StickerObservation, near: Array, observer: Observer, body: MarkedBody, places: Array
 ) -> tuple[StickerObservation, Array, Array]:
-    """The stickers of one frame that agree, camera_from_body (4,4) and its covariance (6,6).
+    """Return the stickers of one frame that agree, camera_from_body (4, 4) and its covariance (6,
+    6).
 
-    ``near`` (4,4) is about camera_from_body. Raises LostError when too few agree.
+    ``near`` (4, 4) is about camera_from_body. Raises LostError when too few agree.
     """
     solved = solve_frames(seen, near[None], observer, body, places)
     if solved.lost[0]:
@@ -145,8 +155,11 @@ def consistent(
 
 
 def belief_for(stickers: int, settled: float = SETTLED) -> Belief:
-    """The limits for frames with up to so many stickers, as the compiled solver takes them."""
-    from cmmsim.measuring.solver_kernels import Belief  # late, as numba takes time to import
+    """Return the limits for frames with up to so many stickers, as the compiled solver takes
+    them.
+    """
+    # Late, as numba takes time to import.
+    from cmmsim.measuring.solver_kernels import Belief
 
     return Belief(
         LARGEST_MISFIT,
@@ -160,12 +173,13 @@ def belief_for(stickers: int, settled: float = SETTLED) -> Belief:
 
 
 def lost_reason(verdict: Array, first: str, left: Array) -> str:
-    """The reason why a frame is lost.
+    """Return the reason why a frame is lost.
 
-    ``first`` names the sticker that was left out first, and ``left`` (n,3) are the places of those
+    ``first`` names the sticker that was left out first, and ``left`` (n, 3) are the places of those
     that were not.
     """
-    from cmmsim.measuring import solver_kernels as kernels  # late, as numba takes time to import
+    # Late, as numba takes time to import.
+    from cmmsim.measuring import solver_kernels as kernels
 
     seen = int(verdict[kernels.SEEN])
     count = int(verdict[kernels.LEFT])
@@ -188,20 +202,21 @@ def lost_reason(verdict: Array, first: str, left: Array) -> str:
 
 @lru_cache(maxsize=16)
 def _largest_totals(freedom: int) -> Array:
-    """Sums of squares (freedom + 1,), by their freedom, beyond which they exceed noise."""
+    """Return sums of squares (freedom + 1,), by their freedom, beyond which they exceed noise."""
     return np.asarray(chi2.isf(EXCESS_CHANCE, np.maximum(np.arange(freedom + 1), 1)))
 
 
 def no_outlines(rig: StereoRig) -> Outlines:
-    """Outlines of a detector that states none, as the compiled solver takes them."""
-    from cmmsim.measuring.solver_kernels import Outlines  # late, as numba takes time to import
+    """Return the outlines of a detector that states none, as the compiled solver takes them."""
+    # Late, as numba takes time to import.
+    from cmmsim.measuring.solver_kernels import Outlines
 
     shapes = np.zeros((0, 2, 3))
     return Outlines(shapes, np.zeros((0, 2, 6)), np.zeros((0, 3)), 0.0, rig.figures)
 
 
 def _outlines(seen: StickerObservation, observer: Observer, normals: Array) -> Outlines:
-    """The ellipses of stickers with normals (k,3), as the compiled solver takes them."""
+    """Return the ellipses of stickers with normals (k, 3), as the compiled solver takes them."""
     known = no_outlines(observer.rig)
     if seen.outlines is None:
         return known

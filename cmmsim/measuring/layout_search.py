@@ -1,11 +1,10 @@
-"""Search of whole images with no prior pose: bright spots, their pairs in both images, and which is
-which sticker.
+"""Search of whole images without a prior pose: bright spots, their pairs, and the known layout.
 
 Bright spots that a window holds are fitted with ellipses. Spots of both images that lie on each
 other's epipolar lines are pairs, true and false ones together, and each pair is a point in space.
-In this cloud of points the known layout of the stickers is looked for: three stickers far from each
-other by their three mutual distances; each find proposes a pose, which is judged by how many
-stickers of the layout then have a point close by.
+The known layout of the stickers is looked for in this cloud of points. Three stickers far from each
+other are found by their three mutual distances, and each find proposes a pose. A pose is judged by
+the number of stickers of the layout that then have a point close by.
 """
 
 from collections.abc import Iterator
@@ -28,28 +27,35 @@ from cmmsim.radiometry.noise import GreyImage, cut_windows
 from cmmsim.radiometry.stereo_images import StereoImages
 
 SMALLEST_AREA_PX = 8
-LARGEST_SHARE = 25 / 36  # of a square with the largest side
-BRIGHT_SHARE = 1e-4  # share of the image's pixels that are taken as the brightest
-# of the largest grey value: between the ground and the brightest pixels
+# Share of a square with the largest side.
+LARGEST_SHARE = 25 / 36
+# Share of the image's pixels that are taken as the brightest.
+BRIGHT_SHARE = 1e-4
+# Step between the ground and the brightest pixels, as a share of the largest grey value.
 SMALLEST_STEP = 40.0 / 255.0
 SMALLEST_WINDOW_PX = 24
-ROOM_PX = 8  # a bright spot's rough centre differs from a prediction of it
-FEWEST_TAUGHT = 4  # stickers by whose taught places a platform is found
+# Distance of a bright spot's rough centre from a prediction of it.
+ROOM_PX = 8
+# Stickers by whose taught places a platform is found.
+FEWEST_TAUGHT = 4
 LINE_TOLERANCE_PX = 0.5
-LINE_STDS = 4.0  # of what is not known of the rig
+# Standard deviations of what is not known of the rig.
+LINE_STDS = 4.0
+# m from the camera.
 NEAREST = 0.3
-FURTHEST = 6.0  # m
-SMALLEST_TRIANGLE = 0.002  # m² area
-MOST_TOGETHER = 64  # triangles judged together
-ENOUGH = 0.8  # share of the layout that ends the search
+FURTHEST = 6.0
+# m²: area.
+SMALLEST_TRIANGLE = 0.002
+# Triangles that are judged together.
+MOST_TOGETHER = 64
+# Share of the layout that ends the search.
+ENOUGH = 0.8
 
 
 def bright_ellipses(
     images: StereoImages | StickerExposure, observer: Observer
 ) -> tuple[EllipseFits, EllipseFits]:
-    """Ellipses of any misfit fitted to all bright spots of the left and of the right image that a
-    window holds.
-    """
+    """Fit ellipses of any misfit to all bright spots of both images that a window holds."""
     if isinstance(images, StickerExposure):
         return images.bright(observer)
     frame = images.full()
@@ -72,14 +78,16 @@ def bright_ellipses(
 def candidate_points(
     ellipses: tuple[EllipseFits, EllipseFits], observer: Observer, limits: FitLimits
 ) -> Array:
-    """Points (m,3) in the camera frame that may be stickers, of ellipses that keep within
-    ``limits``; true and false pairings together. Raises LostError where there are too few bright
-    spots."""
+    """Return points (m, 3) in the camera frame that may be stickers.
+
+    They come from ellipses that keep within ``limits``, by true and false pairings together. Raises
+    LostError where there are too few bright spots.
+    """
     left, right = (fits.centres[fits.within(limits, observer.noise).good] for fits in ellipses)
     if not len(left) or not len(right):
         raise LostError(
-            f"{len(left)} bright spots in the left image and {len(right)} in the right, "
-            f"at least {FEWEST_TAUGHT} in each needed"
+            f"{len(left)} bright spots in the left image and {len(right)} in the right, at least "
+            f"{FEWEST_TAUGHT} in each needed"
         )
     ideal = []
     for camera, centres in zip(observer.rig.cameras, (left, right), strict=True):
@@ -90,9 +98,9 @@ def candidate_points(
 
 
 def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
-    """Rough centres (n, 2) px of compact bright spots of an image (height, width).
+    """Return rough centres (n, 2) px of compact bright spots of an image (height, width).
 
-    Parameters: white_level: largest grey value; largest_side of a spot's bounding box, px.
+    ``largest_side`` is that of a spot's bounding box, px.
     """
     counts = np.bincount(image.ravel())
     from_top = np.cumsum(counts[::-1])
@@ -106,13 +114,17 @@ def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
     sides = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
     keep = (area >= SMALLEST_AREA_PX) & (area <= round(LARGEST_SHARE * largest_side**2))
     keep &= sides.max(axis=1) <= largest_side
+    # A disc fills pi/4 of its box, a tilted one less; streaks and frames of other shapes fill
+    # little.
     keep &= area > 0.4 * sides.prod(axis=1)
     return centres[1:][keep]
 
 
 def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
-    """Distance (n, m) of each right pixel (m, 2) from the epipolar line of each left pixel (n, 2),
-    ideal px.
+    """Return the distance (n, m) of each right pixel (m, 2) from the epipolar line of each left
+    one.
+
+    All are ideal px.
     """
     lines = np.column_stack([left, np.ones(len(left))]) @ rig.fundamental.T
     lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
@@ -122,12 +134,11 @@ def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
 def candidate_pairs(
     rig: StereoRig, left: Array, right: Array, off_line: float = LINE_TOLERANCE_PX
 ) -> tuple[NDArray[np.int_], Array]:
-    """All pairs (m, 2) of left and right spots that may be one point, and their points (m, 3) in
-    the camera frame.
+    """Return all pairs (m, 2) of left and right spots that may be one point, and their points (m,
+    3).
 
-    Parameters: left (k, 2) and right (l, 2) in ideal px; off_line: how far, px, a spot may be off
-    the other's line. A spot may appear in several pairs; the known layout decides later which of
-    them is true.
+    Spots (k, 2) and (l, 2) are in ideal px. A spot may be ``off_line`` px from the other's line,
+    and may appear in several pairs: the known layout decides later which is true.
     """
     pairs = np.argwhere(epipolar_distance(rig, left, right) < off_line)
     points = linear_triangulation(rig, left[pairs[:, 0]], right[pairs[:, 1]])
@@ -138,12 +149,12 @@ def candidate_pairs(
 def find_layout(
     layout: Array, points: Array, tolerance: float, fewest: int, name: str
 ) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
-    """Pose of a layout in a cloud of points.
+    """Find the pose of a layout in a cloud of points.
 
-    Parameters: layout (n,3) m in body axes; points (m,3) m in the camera frame; tolerance in m of
-    the layout's places; fewest stickers to be found. Returns camera_from_body (4,4), and the
-    indices of the stickers (k,) and of their points (k,). Raises LostError when fewer are found, or
-    two different poses explain the points about equally well.
+    The layout (n, 3) m is in body axes and the points (m, 3) m in the camera frame. The layout's
+    places have a tolerance in m, and ``fewest`` stickers must be found. Return camera_from_body (4,
+    4), and the indices of the stickers (k,) and of their points (k,). Raises LostError when fewer
+    are found, or when two different poses explain the points about equally well.
     """
     gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
     tree = cKDTree(points)
@@ -152,7 +163,8 @@ def find_layout(
     for triples in _blocks(_triangles(layout)):
         proposer, poses, counts = _proposed(layout, triples, points, gaps, tree, tolerance)
         ended = len(triples)
-        for k in np.flatnonzero(counts > min(count, rival)).tolist():  # others change neither
+        # Poses with smaller counts change neither the best nor its rival.
+        for k in np.flatnonzero(counts > min(count, rival)).tolist():
             if proposer[k] > ended:
                 break
             if best is not None and not _same(best, poses[k], layout, tolerance):
@@ -161,7 +173,8 @@ def find_layout(
                 best = poses[k]
                 count = int(counts[k])
             if count >= ENOUGH * len(layout):
-                ended = min(ended, proposer[k])  # this triangle's other finds may be rivals yet
+                # This triangle's other finds may still be rivals.
+                ended = min(ended, proposer[k])
         if count >= ENOUGH * len(layout):
             break
     if best is None or count < fewest:
@@ -177,16 +190,18 @@ def find_layout(
 
 
 def _triangles(layout: Array) -> NDArray[np.int_]:
-    """Triples (t,3) of stickers with a large triangle, in a fixed mixed order."""
+    """Return triples (t, 3) of stickers with a large triangle, in a fixed mixed order."""
     triples = np.array(list(combinations(range(len(layout)), 3)), dtype=int).reshape(-1, 3)
     a, b, c = layout[triples.T]
     triples = triples[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 2.0 * SMALLEST_TRIANGLE]
+    # Mixed, so that the first triangles differ, and always alike, so that a frame has one result.
     return np.random.default_rng(0).permutation(triples)
 
 
 def _blocks(triples: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
-    """The triples (t,3) in parts that are judged together: the first ones alone, since they mostly
-    end the search.
+    """Yield the triples (t, 3) in parts that are judged together.
+
+    The first ones come alone, since they mostly end the search.
     """
     first = 0
     while first < len(triples):
@@ -196,8 +211,9 @@ def _blocks(triples: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
 
 
 def _congruent(gaps: Array, corners: Array, tolerance: float) -> NDArray[np.int_]:
-    """All ordered triples (c,3) of points whose distances (``gaps``, (m,m)) are those of three
-    corners (3,3).
+    """Return all ordered triples (c, 3) of points with the distances of three corners (3, 3).
+
+    ``gaps`` (m, m) are the distances of the points.
     """
     d01, d02, d12 = (np.linalg.norm(corners[a] - corners[b]) for a, b in ((0, 1), (0, 2), (1, 2)))
     first, second = np.nonzero(np.abs(gaps - d01) < tolerance)
@@ -214,14 +230,13 @@ def _proposed(
     tree: cKDTree,
     tolerance: float,
 ) -> tuple[NDArray[np.int_], Array, NDArray[np.int_]]:
-    """Find the triples (t,3) of stickers that propose poses (c,), where three points are as far
-    from each other.
+    """Find poses (c, 4, 4) that triples (t, 3) of stickers propose.
 
-    Returned are also the poses (c,4,4), laid onto all stickers that then have a point close by, and
-    the number (c,) of those that have one in the end.
-
-    Poses with fewer than three stickers are left out.
+    A triple proposes a pose where three points are as far from each other. Return the number of the
+    proposing triple (c,), the poses laid onto all stickers that then have a point close by, and the
+    number (c,) of stickers that have one in the end. Poses with fewer than three are left out.
     """
+    # Both ends of a side may be off by the tolerance.
     corners = [_congruent(gaps, layout[triple], 2.0 * tolerance) for triple in triples]
     proposer = np.repeat(np.arange(len(triples)), [len(c) for c in corners])
     start = rigid_starts(
@@ -235,8 +250,10 @@ def _proposed(
 
 
 def _nearest(poses: Array, layout: Array, tree: cKDTree, tolerance: float) -> NDArray[np.int_]:
-    """Measured point (c,n) of each sticker within the tolerance at poses (c,4,4), each point used
-    once; -1: none.
+    """Return the measured point (c, n) of each sticker within the tolerance at poses (c, 4, 4), or
+    -1.
+
+    Each point is used once.
     """
     places = layout @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
     nearest = tree.query(places, distance_upper_bound=1.5 * tolerance)[1]

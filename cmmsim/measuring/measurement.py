@@ -1,8 +1,11 @@
-"""Measurement of one stereo frame: a pose with its covariance, or the reason why it was lost."""
+"""Measurement of a stereo frame: a pose with its covariance, or the reason why it was lost.
+
+The poses of many frames stand together as well.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -14,7 +17,7 @@ from cmmsim.geometry.pose import Array
 
 
 def _nothing_in_common(pose: Array) -> Array:
-    """Covariance (6,6) that a pose (6,) has in common with others: none, or not known where it is
+    """Return the covariance (6, 6) that a pose (6,) has in common with others: zero, or NaN if
     lost.
     """
     return np.full((6, 6), 0.0 if np.isfinite(pose).all() else np.nan)
@@ -24,18 +27,42 @@ def _nothing_in_common(pose: Array) -> Array:
 class Measurement:
     """Pose of the platform in the base frame, and what it was made from.
 
-    Its error has two parts. covariance (6,6) of pose (6,), m and rad, is that of the noise, new in
-    every frame. common_covariance (6,6) is that of what is not known of rig and taught frames: one
-    draw, the same in every frame, so that no mean over frames makes it smaller; NaN where it is not
-    known (poses by planes with a rig that is not exact). They are never added in silence: the mean
-    of N frames errs by covariance / N + common_covariance, a single one by ``single_covariance``.
-    ``Sensor.common_errors`` says how the common part of one pose goes with that of another.
+    The error of a pose has two parts, which are never added in silence. The noise is new in every
+    frame. The common part comes from rig and taught frames that are not known exactly. It is one
+    draw, the same in every frame, so that no mean over frames makes it smaller. The mean of N
+    frames errs by covariance / N + common_covariance. ``Sensor.common_errors`` tells how the common
+    part of one pose goes with that of another.
 
-    points (n,3) and point_covariances (n,3,3) in the camera frame, m; left_pixels and right_pixels
-    (n,2) sticker centres in the images as they are, distorted, and pixel_variances (n,) of a
-    coordinate, px²; target_ids (n,) such as "A1"; common_at: what gives the common part at a pose
-    (6,). When nothing could be measured ok is False, reason says why, and pose and covariances are
-    NaN.
+    Attributes
+    ----------
+    pose : ndarray, shape (6,)
+        Pose in m and rad; NaN where the frame is lost.
+    covariance : ndarray, shape (6, 6)
+        Covariance of the noise; NaN where the frame is lost.
+    points, point_covariances : ndarray, shapes (n, 3) and (n, 3, 3)
+        Stickers in the camera frame, m.
+    left_pixels, right_pixels : ndarray, shape (n, 2)
+        Sticker centres in the images as they are, distorted.
+    target_ids : ndarray of str, shape (n,)
+        Names of the stickers, such as "A1".
+    ok : bool
+        False where nothing could be measured.
+    reason : str
+        Reason why the frame is lost; empty otherwise.
+    common_at : callable
+        Function that gives the common covariance at a pose (6,).
+    pixel_variances : ndarray, shape (n,)
+        Mean variance of a coordinate of a centre, px².
+
+    Raises
+    ------
+    ShapeError
+        If shapes differ, or the state contradicts itself.
+
+    Examples
+    --------
+    >>> lost_measurement("2 visible stickers")
+    Measurement(lost: 2 visible stickers)
     """
 
     pose: Array
@@ -52,15 +79,18 @@ class Measurement:
 
     @cached_property
     def common_covariance(self) -> Array:
-        """Covariance (6,6) of the common part; found when it is asked for, which takes longer than
-        to measure.
+        """Covariance (6, 6) of the common part; NaN where it is not known.
+
+        It is not known for poses by planes with a rig that is not exact. It is computed when it is
+        asked for, because that takes longer than to measure.
         """
         return self.common_at(self.pose)
 
     @property
     def single_covariance(self) -> Array:
-        """Covariance (6,6) of this pose alone against the true one: noise and common part
-        together."""
+        """Covariance (6, 6) of this pose alone against the true one: noise and common part
+        together.
+        """
         return self.covariance + self.common_covariance
 
     def __post_init__(self) -> None:
@@ -87,19 +117,20 @@ class Measurement:
 
 
 def _shown(covariance: Array) -> str:
-    """Standard deviations of place and turn in words."""
+    """Show standard deviations of place and turn in words."""
     shift, turn = (np.sqrt(np.trace(covariance[k : k + 3, k : k + 3])) for k in (0, 3))
     return f"{1e6 * shift:.2g} um and {1e6 * turn:.2g} urad"
 
 
 def lost_measurement(reason: str) -> Measurement:
-    """A measurement that holds no pose, and says why."""
+    """Return a measurement that holds no pose, and says why."""
     return measurement_without_stickers(np.full(6, np.nan), np.full((6, 6), np.nan), reason)
 
 
 def measurement_without_stickers(pose: Array, covariance: Array, reason: str = "") -> Measurement:
-    """A pose (6,) and its covariance (6,6) that no sticker stands behind; the reason why there is
-    none where NaN.
+    """Return a pose (6,) with its covariance (6, 6) that rests on no sticker.
+
+    Where it is NaN, ``reason`` says why.
     """
     points = np.zeros((0, 3))
     covariances = np.zeros((0, 3, 3))
@@ -108,3 +139,47 @@ def measurement_without_stickers(pose: Array, covariance: Array, reason: str = "
     return Measurement(
         pose, covariance, points, covariances, pixels, pixels, names, not reason, reason
     )
+
+
+@dataclass(frozen=True)
+class MeasuredPoses:
+    """Poses of N frames, m and rad.
+
+    Attributes
+    ----------
+    poses : ndarray, shape (N, 6)
+        Poses, NaN where a frame is lost.
+    covariances : ndarray, shape (N, 6, 6)
+        Their covariances, NaN where a frame is lost.
+    stickers : ndarray, shape (N,)
+        Number of stickers used, 0 where a frame is lost.
+    """
+
+    poses: Array
+    covariances: Array
+    stickers: NDArray[np.int_]
+
+    @classmethod
+    def of(cls, parts: Sequence[MeasuredPoses]) -> MeasuredPoses:
+        """Join the frames of several parts."""
+        none = MeasuredPoses(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros(0, dtype=int))
+        every = [vars(part).values() for part in (none, *parts)]
+        return cls(*(np.concatenate(values) for values in zip(*every, strict=True)))
+
+    @classmethod
+    def of_each(cls, found: Sequence[Measurement]) -> MeasuredPoses:
+        """Collect the poses of single frames."""
+        return cls(
+            np.array([one.pose for one in found]).reshape(-1, 6),
+            np.array([one.covariance for one in found]).reshape(-1, 6, 6),
+            np.array([len(one.target_ids) for one in found], dtype=int),
+        )
+
+    def without(self, dropped: NDArray[np.bool_]) -> MeasuredPoses:
+        """Return the frames, of which those that are ``dropped`` (N,) are lost."""
+        gone = dropped[:, None]
+        return MeasuredPoses(
+            np.where(gone, np.nan, self.poses),
+            np.where(gone[:, None], np.nan, self.covariances),
+            np.where(dropped, 0, self.stickers),
+        )

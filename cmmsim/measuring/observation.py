@@ -1,5 +1,6 @@
-"""Stickers of one body, observed near where they are expected: windows, detected centres,
-triangulation.
+"""Stickers of one body, observed near where they are expected.
+
+The steps are windows, detected centres, and triangulation.
 """
 
 from __future__ import annotations
@@ -32,23 +33,26 @@ from cmmsim.geometry.stereo_rig import StereoRig, triangulate
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoImages, Windows
 
-LONGEST_SMEAR_PX = 8.0  # about the size of a sticker
-SHORTEST_SMEAR = (
-    1.5  # standard deviations of the point spread: shorter ones do not change what the fit finds
-)
-GRAZING = 0.15  # cosine between a sticker's normal and the view below which it is not looked for
+# About the size of a sticker.
+LONGEST_SMEAR_PX = 8.0
+# Standard deviations of the point spread: shorter smears do not change what the fit finds.
+SHORTEST_SMEAR = 1.5
+# Cosine between a sticker's normal and the view, below which it is not looked for.
+GRAZING = 0.15
 
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap:
-    squared distance of the two rays of a sticker in units of its noise (one degree of freedom, so
-    25 is five sigma); centre_error_px: rms error of a centre that is not noise, such as the image
-    formation's own; it is added to the noise's covariance, as is the detector's; line_error_px: std
-    of how far what is not known of the rig takes images off their epipolar lines, which the two
-    rays of a sticker may miss each other by beside their noise; detector: name of the one that is
-    taken; optics: point spread and vignetting of the cameras as known; exposed_share: share of the
-    time from frame to frame during which the cameras are exposed."""
+    """Settings of the search for stickers.
+
+    Windows and fitted parts have sides in px, and ``radius`` is a sticker's, m. ``largest_ray_gap``
+    is the squared distance of a sticker's two rays in units of its noise (one degree of freedom, so
+    that 25 is five sigma). ``centre_error_px`` is the rms error of a centre that is not noise, such
+    as the image formation's own. It is added to the noise's covariance, as is the detector's bias.
+    ``line_error_px`` is the standard deviation by which errors of the rig move images off their
+    epipolar lines; the rays of a sticker may miss each other by as much. ``exposed_share`` is the
+    share of the time from frame to frame during which the cameras are exposed.
+    """
 
     window_size: int = 16
     fit_size: int = 14
@@ -64,8 +68,11 @@ class DetectionSettings:
 
 @dataclass(frozen=True)
 class Outlines:
-    """shapes (2,k,2,2): symmetric matrices A of the ellipses of k stickers in the left and the
-    right image, px, and covariances (2,k,3,3) of A_xx, A_xy, A_yy, px²."""
+    """Ellipses of k stickers in both images.
+
+    They are symmetric matrices A (2, k, 2, 2), px, with covariances (2, k, 3, 3) of A_xx, A_xy,
+    A_yy, px².
+    """
 
     shapes: Array
     covariances: Array
@@ -77,12 +84,13 @@ class Outlines:
 
 @dataclass(frozen=True)
 class StickerObservation:
-    """k stickers seen by both cameras.
+    """Stickers seen by both cameras, k of them.
 
-    index (k,) into the body's stickers; left_pixels and right_pixels (k,2) of the sticker centres
-    in the images as they are, distorted (eccentricity removed); points (k,3) and covariances
-    (k,3,3) in the camera frame, m; pixel_variances (k,): mean variance of a coordinate of its two
-    centres, px². outlines: the ellipses' shapes, where the detector states them.
+    ``index`` (k,) points into the body's stickers. Pixels (k, 2) are the sticker centres in the
+    images as they are, distorted, with the eccentricity removed. ``points`` (k, 3) and
+    ``covariances`` (k, 3, 3) are in the camera frame, m. ``pixel_variances`` (k,) are mean
+    variances of a coordinate of both centres, px². ``outlines`` are the ellipses' shapes, where the
+    detector states them.
     """
 
     index: NDArray[np.int_]
@@ -94,7 +102,7 @@ class StickerObservation:
     outlines: Outlines | None = None
 
     def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
-        """The observation with only some of its stickers."""
+        """Return the observation with only some of its stickers."""
         kept = {name: values[keep] for name, values in vars(self).items() if name != "outlines"}
         return StickerObservation(
             **kept, outlines=None if self.outlines is None else self.outlines.selected(keep)
@@ -103,15 +111,15 @@ class StickerObservation:
 
 @runtime_checkable
 class StickerExposure(Protocol):
-    """An exposure without images: what the fit of ellipses would find in windows of them, and in
-    whole ones.
+    """Exposure without images: the results that fits of ellipses would have in windows and whole
+    images.
     """
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """Detect stickers in 2k windows of ``size`` px with first pixels ``corners`` (2, k, 2)."""
 
     def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
-        """Ellipses in the left and in the right image."""
+        """Return the ellipses in the left and in the right image."""
 
 
 @runtime_checkable
@@ -121,14 +129,17 @@ class ManyExposures(Protocol):
     def windows_of(
         self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
     ) -> Windows:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2), of
-        ``exposures`` (n,) in rising order."""
+        """Return the grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n,
+        2).
+
+        They belong to ``exposures`` (n,), in rising order.
+        """
 
 
 @dataclass(frozen=True)
 class Observer:
-    """Observer of stickers: the stereo rig and its cameras' noise as they are known, and the
-    settings of the search.
+    """Observer of stickers: the rig and the noise of its cameras as known, and settings of the
+    search.
     """
 
     rig: StereoRig
@@ -148,11 +159,11 @@ class Observer:
         normals: Array,
         swept: tuple[Array, Array] | None = None,
     ) -> StickerObservation:
-        """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected
-        pose of the body.
+        """Observe stickers at ``places`` (n, 3) with ``normals`` (n, 3), body axes, near an
+        expected pose.
 
-        ``swept``: camera_from_body at the beginning and at the end of the exposure, where they are
-        thought to be known.
+        ``swept`` holds camera_from_body at the beginning and at the end of the exposure, where they
+        are thought to be known.
         """
         return self.read(images, camera_from_body, places, normals).observed(swept)
 
@@ -163,11 +174,12 @@ class Observer:
         places: Array,
         normals: Array,
     ) -> StickerWindows:
-        """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near
-        an expected pose.
+        """Read the windows of stickers at ``places`` (n, 3) with ``normals`` (n, 3), near an
+        expected pose.
 
-        Of many exposures camera_from_body is (N,4,4), and sticker k of exposure j has the index j n
-        + k: all of them are looked for, fitted and triangulated like the stickers of a single one.
+        For many exposures camera_from_body is (N, 4, 4), and sticker k of exposure j has the index
+        j n + k. All of them are looked for, fitted and triangulated like the stickers of a single
+        exposure.
         """
         moves = [move @ camera_from_body for move in self.rig.from_camera]
         centres = [apply_each(move, places).reshape(-1, 3) for move in moves]
@@ -198,10 +210,10 @@ class Observer:
         return StickerWindows(self, index, exposures, *body, corners, windows, offsets, found)
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
-        """Windows (2, n, size, size) with the light within each made even: that of its middle.
+        """Return windows (2, n, size, size) whose light is made even: that of their middles.
 
-        Only the slope of the light across a sticker would move its centre; the noise stays what it
-        is to a few per mille.
+        Only the slope of the light across a sticker would move its centre. The noise stays the same
+        to a few per mille.
         """
         optics = self.settings.optics
         black = self.noise.black_level
@@ -223,11 +235,12 @@ class Observer:
 class StickerWindows:
     """Grey values around the k stickers of a body that both cameras of an observer should see.
 
-    index (k,) into the body's stickers; exposures (k,) that show them, in rising order, 0 where
-    there is one; camera_from_body (4,4) or (N,4,4) near which they are expected; places (k,3) m and
-    normals (k,3) in body axes; corners (2,k,2) px of the first pixels of windows (2,k,h,h), evenly
-    lit; offsets (2,k,2) px of the ellipses' centres from those of the stickers (eccentricity).
-    found: what a detector finds in them, where there are no images; then the windows are empty.
+    ``index`` (k,) points into the body's stickers, and ``exposures`` (k,) show them, in rising
+    order, 0 for a single one. Stickers are expected near ``camera_from_body`` (4, 4) or (N, 4, 4),
+    at places (k, 3) m with normals (k, 3) in body axes. Windows (2, k, h, h), evenly lit, have
+    first pixels ``corners`` (2, k, 2). ``offsets`` (2, k, 2) px lead from the stickers' centres to
+    those of their ellipses (eccentricity). Without images, ``found`` is what a detector finds, and
+    the windows are empty.
     """
 
     observer: Observer
@@ -242,9 +255,7 @@ class StickerWindows:
     found: DetectedCentres | None = None
 
     def observed(self, swept: tuple[Array, Array] | None = None) -> StickerObservation:
-        """The stickers in these windows; ``swept`` as of ``Observer.observe``, (N,4,4) each where
-        the expected are.
-        """
+        """Return the stickers in these windows; ``swept`` is that of ``Observer.observe``."""
         if len(self.index) == 0:
             none = np.zeros((0, 3))
             return StickerObservation(
@@ -265,6 +276,7 @@ class StickerWindows:
         left, right = seen_at
         seen = triangulate(self.observer.rig, left, right, spread[0], spread[1], near, parted)
         good = np.all(fits.good.reshape(2, -1), axis=0)
+        # Mean over two coordinates in two images.
         noise = 0.25 * np.einsum("ckii->k", spread)
         outlines = _outlines(fits, settings.centre_error_px**2)
         return StickerObservation(
@@ -272,8 +284,9 @@ class StickerWindows:
         ).selected(good & (seen.ray_gap < settings.largest_ray_gap))
 
     def ellipses(self, smears: Array | None = None) -> EllipseFits:
-        """Ellipses fitted to all 2k windows, good ones of any misfit; ``smears`` (2k,2) as of
-        ``SpotWindows``.
+        """Fit ellipses to all 2k windows; good ones may have any misfit.
+
+        ``smears`` (2k, 2) are those of ``SpotWindows``.
         """
         settings = self.observer.settings
         limits = replace(settings.limits, largest_misfit=np.inf)
@@ -288,13 +301,14 @@ class StickerWindows:
 
     @cached_property
     def ellipses_at_rest(self) -> EllipseFits:
-        """``ellipses`` if nothing moved: streaks are told from them, and what stands still is
-        measured by them.
+        """Result of ``ellipses`` if nothing moved.
+
+        Streaks are told from them, and a body at rest is measured by them.
         """
         return self.ellipses()
 
     def _detected(self, smears: Array | None = None) -> DetectedCentres:
-        """Centres that the detector finds in the windows."""
+        """Return the centres that the detector finds in the windows."""
         detector = self.observer.detector
         noise = self.observer.noise
         settings = self.observer.settings
@@ -309,14 +323,14 @@ class StickerWindows:
 
     @property
     def _flat(self) -> tuple[Windows, NDArray[np.int_]]:
-        """Windows (2k,h,h) and corners (2k,2) of both images together."""
+        """Windows (2k, h, h) and corners (2k, 2) of both images together."""
         return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
 
     def _likelier(self, still: DetectedCentres, swept: tuple[Array, Array]) -> DetectedCentres:
-        """Choose what agrees better with the images of each exposure: ``still``, or what is found
-        of a body in motion.
+        """Choose, for each exposure, the result that agrees better with the images.
 
-        The movement is only expected, and the platform may have stopped.
+        It is ``still``, or that of a body in motion: the movement is only expected, and the
+        platform may have stopped.
         """
         smears, shown = self._smears(swept)
         if still.misfits is None or not shown.any():
@@ -332,11 +346,10 @@ class StickerWindows:
         return still.with_others(np.flatnonzero(again)[taken], moving, taken)
 
     def _smears(self, swept: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
-        """Movement (2, k, 2) px of the stickers in both images during the exposure, and where it
-        counts (k,).
+        """Return the stickers' movement (2, k, 2) px during the exposure, and where it counts (k,).
 
-        It does not in exposures where it is too short to show beside the point spread, or so long
-        that it cannot be told.
+        It does not count where it is too short to show beside the point spread, or so long that it
+        cannot be told.
         """
         moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in swept)
         first, last = (
@@ -349,7 +362,7 @@ class StickerWindows:
         return last - first, ((shortest < longest) & (longest < LONGEST_SMEAR_PX))[self.exposures]
 
     def _selected(self, keep: NDArray[np.bool_]) -> StickerWindows:
-        """The windows of only some of the stickers."""
+        """Return the windows of only some of the stickers."""
         each = {
             name: getattr(self, name)[keep] for name in ("index", "exposures", "places", "normals")
         }
@@ -358,8 +371,9 @@ class StickerWindows:
 
 
 def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
-    """Tell whether a camera sees stickers with centres (n,3) m and normals (n,3), camera axes, not
-    at grazing incidence.
+    """Tell whether a camera sees stickers, not at grazing incidence.
+
+    They have centres (n, 3) m and normals (n, 3) in camera axes.
     """
     return np.asarray(
         -np.einsum("ni,ni->n", centres, normals) > GRAZING * np.linalg.norm(centres, axis=1)
@@ -367,8 +381,9 @@ def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
 
 
 def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
-    """Shapes of both images' ellipses; ``systematic`` px²: variance of a rim's place that is not
-    noise.
+    """Return the shapes of both images' ellipses.
+
+    ``systematic`` px² is the variance of a rim's place that is not noise.
     """
     if fits.shapes is None or fits.shape_covariances is None:
         return None

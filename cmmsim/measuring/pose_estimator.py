@@ -1,4 +1,4 @@
-"""From one stereo frame to a measurement (paper eq. 27 and 28). Knows nothing of true poses."""
+"""Measurement of one stereo frame (paper eq. 27 and 28). It knows nothing of true poses."""
 
 from __future__ import annotations
 
@@ -13,14 +13,7 @@ from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError, ShapeError, UnknownOptionError
 from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points, frames_of_points
-from cmmsim.geometry.pose import (
-    Array,
-    compose_covariance,
-    invert,
-    pose_covariance,
-    poses_of,
-    skew,
-)
+from cmmsim.geometry.pose import Array, compose_covariance, invert, pose_covariance, poses_of, skew
 from cmmsim.geometry.registration import register
 from cmmsim.measuring.frame_solver import SolvedFrames, consistent
 from cmmsim.measuring.layout_search import (
@@ -40,21 +33,20 @@ Solution = tuple[Array, Array, StickerObservation]
 
 
 def by_registration(observation: StickerObservation, places: Array) -> Solution:
-    """camera_from_body (4,4), its covariance (6,6) and the stickers used, by a rigid fit of taught
-    ``places`` (n,3).
+    """Return camera_from_body (4, 4), its covariance (6, 6) and the stickers used, by a rigid fit.
 
-    Raises LostError with fewer than three stickers off one line.
+    The stickers were taught at ``places`` (n, 3). Raises LostError with fewer than three off one
+    line.
     """
     result = register(places[observation.index], observation.points, observation.covariances)
     return result.transform, result.covariance, observation
 
 
 def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array) -> Solution:
-    """camera_from_body (4,4), its covariance (6,6) and the stickers used, by intersecting the three
-    sticker planes.
+    """Return camera_from_body (4, 4), its covariance (6, 6) and the stickers used, by three planes.
 
-    ``towards`` (3,3): rough normals of planes A, B, C in the camera frame. Raises LostError that
-    names the plane.
+    ``towards`` (3, 3) are rough normals of planes A, B, C in the camera frame. Raises LostError
+    that names the plane.
     """
     frame, covariance = frame_of_points(
         observation.points, observation.covariances, body.plane_index[observation.index], towards
@@ -68,19 +60,22 @@ def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array)
 
 
 def frames_by_planes(body: MarkedBody, points: Array, covariances: Array, towards: Array) -> Array:
-    """camera_from_body (...,4,4) as of ``by_planes`` where all stickers of a body are at points
-    (..., n, 3) with covariances (..., n, 3, 3); ``towards`` (..., 3, 3)."""
+    """Return camera_from_body (..., 4, 4), as ``by_planes``, where all stickers are seen.
+
+    They are at points (..., n, 3) with covariances (..., n, 3, 3); ``towards`` is (..., 3, 3).
+    """
     return frames_of_points(points, covariances, body.plane_index, towards)[0] @ _planes_from(body)
 
 
 def _planes_from(body: MarkedBody) -> Array:
-    """planes_from_body (4,4)."""
+    """Return planes_from_body (4, 4)."""
     return invert(frame_from_planes(body.normals, body.offsets))
 
 
 def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
-    """Covariance (6,6) of [dt, dphi] for another origin of the same rigid frame, ``origin`` (3,) in
-    its own axes.
+    """Return the covariance (6, 6) of [dt, dphi] for another origin of a rigid frame.
+
+    ``origin`` (3,) is in the frame's own axes.
     """
     lever = np.eye(6)
     lever[:3, 3:] = -skew(frame[:3, :3] @ origin)
@@ -88,18 +83,41 @@ def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
 
 
 METHODS: tuple[str, ...] = ("registration", "planes")
-NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
-# m: taught places are known to microns, points in a whole image to tenths of a millimetre
+# m: nominal places are known to about a millimetre.
+NOMINAL_TOLERANCE = 0.003
+# m: taught places are known to microns, points in a whole image to tenths of a millimetre.
 TAUGHT_TOLERANCE = 0.0005
-FEWEST_NOMINAL = 6  # stickers by whose nominal places a body is found
+# Stickers by whose nominal places a body is found.
+FEWEST_NOMINAL = 6
 
 
 @dataclass(frozen=True)
 class PoseEstimator(Observer):
-    """Everything that turns images into poses: an observer, the platform, and what was taught of
-    it.
+    """Estimator that turns images into poses: an observer, the platform, and what was taught of it.
 
-    common_covariance: (6,6) that all poses have in common at a pose (6,); None: what teaching left.
+    Parameters
+    ----------
+    rig, noise, settings
+        Those of the observer.
+    platform : MarkedBody
+        Body that is measured.
+    taught : Taught
+        Its stickers and the place of the base.
+    method : {"registration", "planes"}
+        Method by which a pose is made of the stickers.
+    common_covariance : callable, optional
+        Covariance (6, 6) that all poses have in common, at a pose (6,), instead of that of
+        teaching.
+
+    Raises
+    ------
+    UnknownOptionError
+        If there is no such method.
+
+    Examples
+    --------
+    >>> sensor.estimator.method
+    'registration'
     """
 
     platform: MarkedBody
@@ -117,7 +135,8 @@ class PoseEstimator(Observer):
         )
 
     def locate(self, images: StereoImages) -> Array:
-        """Rough camera_from_platform (4,4) from whole images, without prior. Raises LostError.
+        """Return a rough camera_from_platform (4, 4) from whole images, without a prior. Raises
+        LostError.
 
         Where the cameras are exposed for some time and many stickers are missing, streaks are
         looked for as well.
@@ -142,18 +161,18 @@ class PoseEstimator(Observer):
     def measure(
         self, images: StereoImages, expected: Array, swept: tuple[Array, Array] | None = None
     ) -> tuple[Measurement, Array]:
-        """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises
-        LostError.
+        """Return the measurement near an expected camera_from_platform (4, 4), and the measured
+        one.
 
-        ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are
-        smeared over more than half a pixel and it is not told, a pose without point spread is worse
-        than its covariance: ``measure_anew``.
+        ``swept`` holds the expected ones at the beginning and the end of the exposure. Without it,
+        stickers that are smeared over more than half a pixel give a pose worse than its covariance
+        if there is no point spread: use ``measure_anew``. Raises LostError.
         """
         return self.measured(self.observe(images, expected, *self._stickers, swept), expected)
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
-        """As ``measure`` where nothing is known of the movement: it is told from the streaks of the
-        stickers.
+        """Measure as ``measure`` where nothing is known of the movement, which the streaks then
+        tell.
 
         Raises LostError, which states the length of the streaks where they show.
         """
@@ -177,8 +196,9 @@ class PoseEstimator(Observer):
     def _found(
         self, ellipses: tuple[EllipseFits, EllipseFits], limits: FitLimits
     ) -> tuple[Array, int]:
-        """Rough camera_from_platform (4,4) and the number of stickers that were recognised. Raises
-        LostError.
+        """Return a rough camera_from_platform (4, 4), and the number of recognised stickers.
+
+        Raises LostError.
         """
         points = candidate_points(ellipses, self, limits)
         place, stickers, _ = find_layout(
@@ -187,15 +207,17 @@ class PoseEstimator(Observer):
         return place, len(stickers)
 
     def measured(self, seen: StickerObservation, near: Array) -> tuple[Measurement, Array]:
-        """Measurement from stickers near an expected camera_from_platform (4,4), and the measured
-        one. Raises LostError.
+        """Return the measurement from stickers near an expected camera_from_platform, and the
+        measured one.
+
+        Raises LostError.
         """
         places = self.taught.platform_places
         used, move, covariance = consistent(seen, near, self, self.platform, places)
         return self._measured(used, move, covariance)
 
     def measurement_of(self, solved: SolvedFrames, frame: int) -> Measurement:
-        """Measurement from one of several frames, or a lost one."""
+        """Return the measurement from one of several frames, or a lost one."""
         if solved.lost[frame]:
             return lost_measurement(solved.reason(frame))
         used = solved.of(frame)
@@ -214,7 +236,8 @@ class PoseEstimator(Observer):
         return self.measurement(pose, spread, used), move
 
     def in_base(self, moves: Array, covariances: Array) -> tuple[Array, Array]:
-        """Poses (..., 6) of the platform in the base frame, and their covariances (..., 6, 6).
+        """Return poses (..., 6) of the platform in the base frame, and their covariances (..., 6,
+        6).
 
         ``moves`` (..., 4, 4) are camera_from_platform, ``covariances`` those of its small errors.
         """
@@ -226,7 +249,7 @@ class PoseEstimator(Observer):
         return poses_of(base_from_platform), spread
 
     def measurement(self, pose: Array, covariance: Array, used: StickerObservation) -> Measurement:
-        """Measurement of a pose (6,) in the base frame that rests on stickers."""
+        """Return the measurement of a pose (6,) in the base frame that rests on stickers."""
         return Measurement(
             pose,
             covariance,
@@ -241,7 +264,7 @@ class PoseEstimator(Observer):
         )
 
     def common_at(self, pose: Array) -> Array:
-        """Covariance (6,6) that all poses have in common at a pose (6,)."""
+        """Return the covariance (6, 6) that all poses have in common at a pose (6,)."""
         if self.common_covariance is None:
             return self.taught.calibration_covariance(pose, self.method)
         return self.common_covariance(pose)
@@ -301,7 +324,8 @@ def measure_frame(
 
 def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
     """Raise ShapeError for images of another size or bit depth than the estimator's cameras
-    have."""
+    have.
+    """
     for name, image, camera in zip(
         ("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True
     ):

@@ -1,9 +1,8 @@
 """Compiled: the pose of a body from the stickers that are seen in one frame.
 
 Images and drawn centres feed this solver alike, one frame or many. Taught places are laid onto the
-triangulated stickers. Then the sticker that differs most from where the others put it, or whose
-ellipse differs most from that of a whole sticker, is left out, as long as one differs too much.
-``frame_solver`` says why.
+triangulated stickers. Then the worst sticker is left out, as long as one differs too much: from
+where the others put it, or from the ellipse of a whole sticker. ``frame_solver`` says why.
 """
 
 from __future__ import annotations
@@ -55,10 +54,11 @@ class Seen(NamedTuple):
 
 
 class Outlines(NamedTuple):
-    """Entries xx, xy, yy of the ellipses' shapes (n,2,3) in both images, px.
+    """Entries xx, xy, yy of the ellipses' shapes (n, 2, 3) in both images, px.
 
-    ``informations`` (n,2,6) are the entries of their inverse covariances. No rows: no ellipses are
-    known. The cameras see stickers with normals (n,3) in the body's axes, and a radius, m.
+    ``informations`` (n, 2, 6) are the entries of their inverse covariances. Without rows, no
+    ellipses are known. The cameras see stickers with normals (n, 3) in the body's axes, and a
+    radius, m.
     """
 
     shapes: Array
@@ -71,11 +71,12 @@ class Outlines(NamedTuple):
 class Belief(NamedTuple):
     """Limits for the stickers of a frame.
 
-    largest_misfit: squared difference of one sticker from the others. largest_excess: mean square
-    of all residuals. fewest: number of stickers. smallest_share: of a sticker's noise that shows in
-    its residual. smallest_width: distance of the stickers from one line, m. settled: turn of the
-    last step of a fit, rad. totals (f,): sums of squared residuals, by their freedom, beyond which
-    they are larger than noise.
+    ``largest_misfit`` limits the squared difference of one sticker from the others, and
+    ``largest_excess`` the mean square of all residuals. ``fewest`` is a number of stickers.
+    ``smallest_share`` is the share of a sticker's noise that must show in its residual.
+    ``smallest_width`` is the distance of the stickers from one line, m. ``settled`` is the turn of
+    the last step of a fit, rad. ``totals`` (f,) are sums of squared residuals, by their freedom,
+    beyond which they are larger than noise.
     """
 
     largest_misfit: float
@@ -111,12 +112,14 @@ def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
             yy += b * b
             yz += b * c
             zz += c * c
-    xx -= x * x / count  # from squares about the first to those about the middle
+    # From squares about the first place to those about the middle.
+    xx -= x * x / count
     xy -= x * y / count
     xz -= x * z / count
     yy -= y * y / count
     yz -= y * z / count
     zz -= z * z / count
+    # With eigenvalues a >= b >= c, the sum of the principal minors is at most 2 b (a + b + c).
     minors = xx * yy + xx * zz + yy * zz - xy * xy - xz * xz - yz * yz
     if minors >= 2.0 * (xx + yy + zz) * width * width:
         return False
@@ -149,6 +152,7 @@ def fit(
             for n in range(len(seen.used)):
                 arm = seen.arms[n]
                 gap = seen.gaps[n]
+                # The last step is so small that its effect on arms and gaps is linear.
                 gap[0] -= change[0] + change[4] * arm[2] - change[5] * arm[1]
                 gap[1] -= change[1] + change[5] * arm[0] - change[3] * arm[2]
                 gap[2] -= change[2] + change[3] * arm[1] - change[4] * arm[0]
@@ -208,6 +212,8 @@ def worst_sticker(
         misfit = residual_misfit(
             seen.gaps[n], seen.covariances[n], left, belief.smallest_share, inverse
         )
+        # Judged by the others: their squares are the total less this sticker's, with three fewer
+        # numbers.
         misfit /= excess_of(total - misfit, freedom - 3, belief.totals)
         outline = 0.0
         if len(outlines.shapes):
@@ -238,6 +244,7 @@ def solve(
     left_out = 0
     verdict[FIRST] = -1
     verdict[SEEN] = np.sum(seen.used)
+    # One sticker at a time is left out, because a wrong one makes good ones look wrong.
     while True:
         count = np.sum(seen.used)
         verdict[LEFT] = count
@@ -253,7 +260,8 @@ def solve(
         worst = worst_sticker(
             seen, places, outlines, belief, place, covariance, total, freedom, misfits
         )
-        if worst < 0:  # what is not a number differs from nothing
+        # NaN differs from nothing: residuals that are no numbers single out no sticker.
+        if worst < 0:
             verdict[STATE] = TOO_FEW
             return
         if max(misfits[0], misfits[1]) <= belief.largest_misfit and excess <= belief.largest_excess:
@@ -303,7 +311,8 @@ def solve_frames(
             outlines.cameras,
         )
         taught = places[first:last]
-        make_rigid(moves[f])  # a tracker extrapolates it from those that were found before
+        # A tracker extrapolates a pose from those that were found before, which adds up rounding.
+        make_rigid(moves[f])
         for n in range(last - first):
             turn_arm(moves[f], taught[n], own.points[n], own.arms[n], own.gaps[n])
         solve(own, taught, shown, belief, moves[f], covariances[f], verdicts[f])

@@ -1,17 +1,16 @@
-"""Movement of a body during an exposure, told from the streaks into which its stickers are drawn
-out.
+"""Movement of a body during an exposure, told from the streaks of its stickers.
 
-A disc that moves by d px while the shutter is open is drawn out: the second moments of its light
+A disc that moves by d px while the shutter is open is drawn out. The second moments of its light
 grow by d d' / 12, and those of an ellipse with matrix A are A A / 4. With the ellipse A_0 that the
-sticker would show at rest, its apparent one therefore fulfils
+sticker would show at rest, its apparent ellipse therefore fulfils
 
     A A = A_0 A_0 + d d' / 3.
 
 All stickers of a rigid body share one small movement w (6,), d = P w, which is found by least
-squares over both images. An ellipse is fitted to a streak only roughly, so the fit is repeated with
-the light of the ellipse moving by the d that was found, and what is then missing of A A is added to
-d d' / 3, until d settles. Streaks do not tell forth from back; the middle of the exposure, for
-which a pose stands, is the same for both.
+squares over both images. An ellipse fits a streak only roughly. The fit is therefore repeated with
+the light of the ellipse moving by the d that was found, and the rest of A A is added to d d' / 3,
+until d settles. Streaks do not tell forth from back. The middle of the exposure, for which a pose
+stands, is the same for both.
 """
 
 from collections.abc import Callable
@@ -29,24 +28,31 @@ from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.measuring.observation import LONGEST_SMEAR_PX, StickerWindows
 
-CHANCE = 1e-4  # of stickers at rest to be taken for streaks
-FEWEST = 8  # ellipses in both images together: four stickers
-# of one ellipse that counts: a partly hidden sticker is no streak
+# Probability that stickers at rest are taken for streaks.
+CHANCE = 1e-4
+# Ellipses in both images together: four stickers.
+FEWEST = 8
+# Largest squared misfit of one ellipse that counts: a partly hidden sticker is no streak.
 LARGEST_MISFIT = float(chi2.isf(CHANCE, 3))
-ROUNDS = 8  # at most
-SETTLED_PX = 0.05  # far below what moves a centre or shows in an ellipse
-REWEIGHTED = 5  # times that the start is found anew
+# Most rounds, and a change of d far below what moves a centre or shows in an ellipse.
+ROUNDS = 8
+SETTLED_PX = 0.05
+# Times that the start is found anew.
+REWEIGHTED = 5
 TINY_PX2 = 1e-6
-SMALLEST_SHARE = (
-    1e-2  # of the best determined combination of movements, below which the start leaves one out
-)
-UNIT = 1e-4  # m or rad, of the movements by which projections are differentiated
+# Share of the best determined combination of movements, below which the start leaves one out.
+SMALLEST_SHARE = 1e-2
+# Movements by which projections are differentiated, m or rad.
+UNIT = 1e-4
 
 
 @dataclass(frozen=True)
 class Streaks:
-    """swept: camera_from_body (4,4) at one and the other end of the exposure, in unknown order;
-    longest_px: of the stickers' movements in the images."""
+    """Movement told from streaks.
+
+    ``swept`` are camera_from_body (4, 4) at both ends of the exposure, in unknown order.
+    ``longest_px`` is the longest movement of a sticker in the images.
+    """
 
     swept: tuple[Array, Array]
     longest_px: float
@@ -54,11 +60,11 @@ class Streaks:
 
 @dataclass(frozen=True)
 class _Ellipses:
-    """Ellipses fitted while their light moves by ``smears`` (k,2) px: what movement and rest must
-    explain.
+    """Ellipses fitted while their light moves by ``smears`` (k, 2) px.
 
-    excess (k,3) px²: xx, xy, yy of A A - A_0 A_0 + d d' / 3; whiten (k,3,3) turns its noise into
-    unit matrices; bright (k,), and good (k,) where they lie wholly inside of their windows, too.
+    ``excess`` (k, 3) px² are xx, xy, yy of A A - A_0 A_0 + d d' / 3, and ``whiten`` (k, 3, 3) turns
+    their noise into unit matrices. ``good`` (k,) ellipses are bright and lie wholly inside their
+    windows.
     """
 
     smears: Array
@@ -69,10 +75,9 @@ class _Ellipses:
 
     @property
     def misfit(self) -> float:
-        """Sum of squared misfits with the smears, each as far as a sticker that is wholly seen
-        explains it.
+        """Sum of squared misfits with the smears, each limited to that of a whole sticker.
 
-        An ellipse that is not good counts like the worst, so that none is explained by being lost.
+        An ellipse that is not good counts like the worst, so that losing it explains nothing.
         """
         return float(
             np.where(
@@ -100,7 +105,8 @@ class _Ellipses:
 
 
 def find_streaks(read: StickerWindows) -> Streaks | None:
-    """The movement during the exposure of the body whose stickers were read; None where none shows.
+    """Find the movement during the exposure of the body whose stickers were read; None where none
+    shows.
 
     Raises LostError where the streaks are longer than can be measured.
     """
@@ -132,6 +138,7 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
     if found is None:
         _require_short(still)
         return None
+    # Six numbers of a movement must explain more than chance lets them.
     if still.misfit - found[1].misfit < chi2.isf(CHANCE, 6):
         return None
     movement, ellipses = found
@@ -142,17 +149,15 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
 
 
 def drawn_out(length_px: float) -> str:
-    """In words how long the streaks are, and how long they may be."""
+    """Say in words how long the streaks are, and how long they may be."""
     return (
-        f"the exposure draws stickers out over {length_px:.1f} px, at most "
-        f"{LONGEST_SMEAR_PX:.1f} px can be measured"
+        f"the exposure draws stickers out over {length_px:.1f} px, at most {LONGEST_SMEAR_PX:.1f} "
+        "px can be measured"
     )
 
 
 def _require_short(still: _Ellipses) -> None:
-    """Raise LostError where what is bright is drawn out beyond its windows, by what is seen of it
-    there.
-    """
+    """Raise LostError where bright spots are drawn out beyond their windows."""
     if np.count_nonzero(still.bright) < FEWEST:
         return
     squares = 3.0 * still.excess[still.bright][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -164,8 +169,11 @@ def _require_short(still: _Ellipses) -> None:
 def _movement_and_ellipses(
     still: _Ellipses, fit: Callable[[Array], _Ellipses], by_movement: Array
 ) -> tuple[Array, _Ellipses] | None:
-    """The movement (6,) about the stickers' middle that explains all ellipses, or else most, and
-    the ellipses fitted with it; None where too few are left."""
+    """Return the movement (6,) that explains all ellipses, or most, and the ellipses fitted with
+    it.
+
+    The movement is about the stickers' middle. The result is None where too few ellipses are left.
+    """
     best: tuple[Array, _Ellipses] | None = None
     for movement in _fitted_movements(still, by_movement, _starts(still, by_movement)):
         found = _settled(movement, fit, by_movement)
@@ -179,13 +187,14 @@ def _movement_and_ellipses(
 def _settled(
     movement: Array, fit: Callable[[Array], _Ellipses], by_movement: Array
 ) -> tuple[Array, _Ellipses] | None:
-    """A movement (6,) once fits of ellipses that move with it change it no more, and these
+    """Return a movement (6,) that fits of ellipses moving with it no longer change, and these
     ellipses.
 
-    None where too few are left. One that is longer than can be measured is given back as it is, one
-    far beyond cut.
+    The result is None where too few are left. A movement that is longer than can be measured is
+    returned as it is, one far beyond is shortened.
     """
     longest = float(np.linalg.norm(by_movement @ movement, axis=1).max())
+    # Far beyond the longest smear, no ellipse can be fitted.
     movement = movement * min(1.0, 2.0 * LONGEST_SMEAR_PX / max(longest, LONGEST_SMEAR_PX))
     ellipses = fit(by_movement @ movement)
     for _ in range(ROUNDS):
@@ -202,8 +211,8 @@ def _settled(
 
 
 def _moved(movement: Array, middle: Array) -> Array:
-    """Transform (4,4) of a movement (6,), shift and rotation vector, of a body about the point
-    ``middle`` (3,).
+    """Return the transform (4, 4) of a movement (6,), shift and rotation vector, about a point
+    (3,).
     """
     turn = rotation_exp(movement[3:])
     return rigid(turn, movement[:3] + middle - turn @ middle)
@@ -212,8 +221,9 @@ def _moved(movement: Array, middle: Array) -> Array:
 def _pixels_by_movement(
     rig: StereoRig, camera_from_body: Array, places: Array, middle: Array
 ) -> Array:
-    """Derivatives (2k, 2, 6) of the pixels of k stickers in both images by a movement about
-    ``middle`` (3,).
+    """Return derivatives (2k, 2, 6) of the pixels of k stickers in both images by a movement.
+
+    The movement is about the point ``middle`` (3,).
     """
     columns = [
         np.subtract(
@@ -229,7 +239,7 @@ def _pixels_by_movement(
 
 
 def _entries(matrices: Array) -> Array:
-    """The entries xx, xy, yy (..., 3) of symmetric matrices (..., 2, 2)."""
+    """Return the entries xx, xy, yy (..., 3) of symmetric matrices (..., 2, 2)."""
     return matrices[..., [0, 0, 1], [0, 1, 1]]
 
 
@@ -238,8 +248,9 @@ def _outer(smears: Array) -> Array:
 
 
 def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
-    """Entries (k,3) px² of A A and the matrices (k,3,3) that whiten them; ``systematic`` px² of A
-    that is not noise.
+    """Return the entries (k, 3) px² of A A, and the matrices (k, 3, 3) that whiten them.
+
+    ``systematic`` px² is the variance of A that is not noise.
     """
     xx, xy, yy = _entries(fits.shapes).T
     zero = np.zeros_like(xx)
@@ -255,10 +266,10 @@ def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
 
 
 def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:
-    """Movements (6,) from which to search: of any kind, without rotation, and without shift.
+    """Return movements (6,) from which to search: of any kind, without rotation, and without shift.
 
-    With wrong signs between stickers that all move along the same line, a search from one of them
-    alone may end beside the movement that explains all.
+    Signs may be wrong between stickers that all move along the same line, so that a search from a
+    single start may end beside the movement that explains all.
     """
     starts = []
     for free in (slice(0, 6), slice(0, 3), slice(3, 6)):
@@ -269,8 +280,7 @@ def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:
 
 
 def _linear_movement(by_movement: Array, excess: Array) -> Array:
-    """The movement w (m,) whose w w' is nearest to the symmetric matrix that explains (k,3) px²
-    best.
+    """Return the movement w (m,) whose w w' is nearest to the matrix that explains (k, 3) px² best.
 
     An ellipse that went astray on its streak is far from what the others say, and counts less each
     time.
@@ -300,8 +310,10 @@ def _linear_movement(by_movement: Array, excess: Array) -> Array:
 
 
 def _fitted_movements(ellipses: _Ellipses, by_movement: Array, starts: list[Array]) -> list[Array]:
-    """The movements (6,) found from each start that explain the good ellipses of whole stickers,
-    the best one first; partly hidden stickers count little."""
+    """Return the movements (6,) found from each start, the best first.
+
+    They explain the good ellipses of whole stickers; partly hidden stickers count little.
+    """
     by_movement, excess, whiten = (
         values[ellipses.good] for values in (by_movement, ellipses.excess, ellipses.whiten)
     )

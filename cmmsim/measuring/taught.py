@@ -1,9 +1,8 @@
-"""Result of teaching: the place of the base in the camera frame, and the stickers' places on the
-platform.
+"""Result of teaching: the place of the base in the camera frame, and of stickers on the platform.
 
-What of a sensor file a teaching holds for: the cameras, and where the planes and stickers of both
-bodies are. Noise, lens blur, timing, detector and renderer are no part of it: they change how well
-a pose is seen, not which one.
+A teaching holds for the cameras and the places of planes and stickers of both bodies in a sensor
+file. It does not depend on noise, lens blur, timing, detector and renderer: they change how well a
+pose is seen, not which one.
 """
 
 from __future__ import annotations
@@ -21,19 +20,44 @@ from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, pos
 from cmmsim.uncertainty.known_rig import KnownRig
 
 SHOWN_CHANGES = 3
-SHOWN_CHARACTERS = 40  # of what differs between two setups
+# Characters of a value that differs between two setups.
+SHOWN_CHARACTERS = 40
 
 
 @dataclass(frozen=True)
 class Taught:
-    """Result of teaching one sensor; plain arrays, so that it can be sent to another process.
+    """Result of teaching one sensor.
 
-    sensor_name; base_from_camera (4,4) and base_covariance (6,6) of its small error [dt, dphi];
-    platform_places (n,3) sticker coordinates in platform axes, m, and place_covariances (n,3,3);
-    platform_covariance (6,6): error of the platform frame itself, in platform axes; base_places
-    (k,3) sticker coordinates in base axes, m. setup: what of the sensor file this holds for, see
-    ``setup_of``; empty for one put together by hand. known: the rig that it was taught with, where
-    that is another than the file's.
+    It holds plain arrays, so that it can be sent to another process.
+
+    Attributes
+    ----------
+    sensor_name : str
+        Name of the sensor.
+    base_from_camera : ndarray, shape (4, 4)
+        Place of the cameras.
+    base_covariance : ndarray, shape (6, 6)
+        Covariance of its small error [dt, dphi].
+    platform_places, place_covariances : ndarray, shapes (n, 3) and (n, 3, 3)
+        Stickers in platform axes, m.
+    platform_covariance : ndarray, shape (6, 6)
+        Covariance of the error of the platform frame itself, in platform axes.
+    base_places : ndarray, shape (k, 3)
+        Stickers in base axes, m.
+    setup : str
+        Entries of the sensor file that it holds for, see ``setup_of``; empty if made by hand.
+    known : KnownRig or None
+        Rig that it was taught with, where it is not the file's.
+
+    Raises
+    ------
+    ShapeError
+        If an array has another shape.
+
+    Examples
+    --------
+    >>> Taught.without_error("mine", np.eye(4), np.zeros((3, 3)), np.zeros((0, 3)))
+    Taught('mine', 3 stickers of the platform, 0 of the base)
     """
 
     sensor_name: str
@@ -75,7 +99,17 @@ class Taught:
         base_places: Array,
         setup: str = "",
     ) -> Taught:
-        """Exact knowledge, as by a certificate: all covariances are zero."""
+        """Return exact knowledge, as by a certificate: all covariances are zero.
+
+        Parameters
+        ----------
+        sensor_name, base_from_camera, platform_places, base_places, setup
+            As of the class.
+
+        Returns
+        -------
+        Taught
+        """
         exact = np.zeros((6, 6))
         places = np.zeros((len(platform_places), 3, 3))
         return cls(
@@ -84,17 +118,26 @@ class Taught:
 
     def __repr__(self) -> str:
         stickers = (
-            f"{len(self.platform_places)} stickers of the platform, "
-            f"{len(self.base_places)} of the base"
+            f"{len(self.platform_places)} stickers of the platform, {len(self.base_places)} of the "
+            "base"
         )
         return f"Taught({self.sensor_name!r}, {stickers})"
 
     def calibration_covariance(self, pose: Array, method: str = "registration") -> Array:
-        """Covariance (6,6) of the part of the pose error that teaching left; the same in every
+        """Return the covariance of the part of the pose error that teaching left, the same in every
         frame.
 
-        ``method`` "planes": the platform's frame is found anew in every frame, and only the base's
-        was taught.
+        Parameters
+        ----------
+        pose : ndarray, shape (6,)
+            Pose of the platform.
+        method : {"registration", "planes"}
+            By "planes", the platform's frame is found anew in every image, and only the base's
+            was taught.
+
+        Returns
+        -------
+        ndarray, shape (6, 6)
         """
         base_from_platform = pose_to_transform(pose)
         lever = np.eye(6)
@@ -106,8 +149,9 @@ class Taught:
 
 
 def setup_of(file: SensorFile) -> str:
-    """JSON of the entries that teaching depends on, the same for the same entries."""
-    rig = file.rig.model_dump(exclude={"distance"})  # it has become part of the position
+    """Return the entries that teaching depends on as JSON, the same for the same entries."""
+    # The distance has become part of the position.
+    rig = file.rig.model_dump(exclude={"distance"})
     bodies = {
         name: {"planes": getattr(file, name).planes.model_dump()} for name in ("platform", "base")
     }
@@ -116,11 +160,10 @@ def setup_of(file: SensorFile) -> str:
 
 
 def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
-    """Raise TeachingError, naming what differs, unless ``taught`` holds for this file and its
-    ``stickers`` ones.
+    """Raise TeachingError, naming what differs, unless ``taught`` holds for a file and its
+    stickers.
 
-    One that was put together by hand states no setup: then the name of its sensor must be the
-    file's.
+    One that was made by hand states no setup: the name of its sensor must then be the file's.
     """
     if not taught.setup and taught.sensor_name != file.name:
         raise TeachingError(
@@ -139,7 +182,7 @@ def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
 
 
 def _changes(there: str, here: str) -> str:
-    """The first few entries in which two setups differ, with both values."""
+    """Describe the first few entries in which two setups differ, with both values."""
     then, now = (dotted(json.loads(text)) for text in (there, here))
     keys = [key for key in sorted({*then, *now}) if then.get(key) != now.get(key)]
     shown = [
@@ -151,6 +194,6 @@ def _changes(there: str, here: str) -> str:
 
 
 def _short(value: Any) -> str:
-    """A value on one line, cut where it is long."""
+    """Show a value on one line, shortened where it is long."""
     text = "nothing" if value is None else json.dumps(value)
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."

@@ -1,7 +1,7 @@
 """Camera noise after the linear model of EMVA 1288.
 
-Radiance (0 to 1) becomes electrons, shot noise, dark noise and what differs from pixel to pixel are
-added, the gain K turns electrons into grey values, which are clipped and rounded. Shot noise is
+Radiance (0 to 1) becomes electrons. Shot noise, dark noise and differences from pixel to pixel are
+added. The gain K turns electrons into grey values, which are clipped and rounded. Shot noise is
 drawn as a normal variable of the Poisson variance.
 """
 
@@ -15,17 +15,20 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 
 BIT_DEPTHS = (8, 10, 12)
-ROUNDING_TERMS = 50  # of a series, which leave 0.002 of 0.25 without noise
-NO_SWING = 1.5  # grey values squared: beyond, rounding_excess is 1 to 1e-11
-MANY_EXPOSURES = 30  # from here on their mean is drawn at once
+# Terms of a series, which leave 0.002 of 0.25 without noise.
+ROUNDING_TERMS = 50
+# Grey values squared: beyond, rounding_excess is 1 to 1e-11.
+NO_SWING = 1.5
+# From here on the mean of exposures is drawn at once.
+MANY_EXPOSURES = 30
 T = TypeVar("T", bound=np.generic)
 Singles = NDArray[np.float32]
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 def cut_windows(image: NDArray[T], corners: NDArray[np.int_], size: int) -> NDArray[T]:
-    """Windows (k, size, size) of an image (height, width) with first pixels ``corners`` (k, 2) as
-    (x, y).
+    """Return windows (k, size, size) of an image (height, width) with first pixels (k, 2) as (x,
+    y).
 
     Outside of the image they repeat its edge.
     """
@@ -40,15 +43,15 @@ class FixedPattern:
     """Differences from pixel to pixel of one camera, the same in every image (EMVA 1288: PRNU and
     DSNU).
 
-    sensitivity of each pixel relative to the mean, and its offset in the dark in e-; arrays of one
-    shape.
+    ``sensitivity`` is that of each pixel relative to the mean, and ``offset`` its signal in the
+    dark, e-. Both are arrays of one shape.
     """
 
     sensitivity: NDArray[np.float32]
     offset: NDArray[np.float32]
 
     def windows(self, corners: NDArray[np.int_], size: int) -> "FixedPattern":
-        """The pattern (k, size, size) in windows as of ``cut_windows``."""
+        """Return the pattern (k, size, size) in windows as of ``cut_windows``."""
         return FixedPattern(
             *(cut_windows(values, corners, size) for values in (self.sensitivity, self.offset))
         )
@@ -57,8 +60,9 @@ class FixedPattern:
 def draw_pattern(
     shape: tuple[int, int], prnu: float, dsnu: float, rng: np.random.Generator
 ) -> FixedPattern:
-    """Pattern of a camera with ``shape`` (height, width): white, normal, of relative std ``prnu``
-    and ``dsnu`` e-.
+    """Draw the pattern of a camera with ``shape`` (height, width).
+
+    It is white and normal, with relative standard deviation ``prnu``, and ``dsnu`` e-.
     """
     sensitivity = 1.0 + np.float32(prnu) * rng.standard_normal(shape, dtype=np.float32)
     offset = np.float32(dsnu) * rng.standard_normal(shape, dtype=np.float32)
@@ -71,14 +75,17 @@ def draw_pattern(
 class CameraNoise:
     """EMVA 1288 figures of one camera.
 
-    electrons_at_white   electrons at radiance 1 after one exposure, e- gain                 system
-    gain K, grey values per e- dark_noise           temporal noise in the dark, e- rms full_well
-    saturation capacity, e- black_level          grey value at no light enabled              False:
-    no noise at all; the mean grey value is still rounded bit_depth            of the grey values:
-    8, 10 or 12; images of more than 8 are uint16 prnu                 photo response
-    non-uniformity: std of the pixels' sensitivity, relative to its mean dsnu                 dark
-    signal non-uniformity: std of the pixels' offset, e- frames               exposures averaged in
-    each grey value, which divide the temporal noise but not the pattern
+    electrons_at_white  electrons at radiance 1 after one exposure, e-
+    gain                system gain K, grey values per e-
+    dark_noise          temporal noise in the dark, e- rms
+    full_well           saturation capacity, e-
+    black_level         grey value at no light
+    enabled             False: no noise at all; the mean grey value is still rounded
+    bit_depth           of the grey values: 8, 10 or 12; images of more than 8 are uint16
+    prnu                standard deviation of the pixels' sensitivity, relative to its mean
+    dsnu                standard deviation of the pixels' offset, e-
+    frames              exposures averaged in each grey value: they divide the temporal noise, but
+                        not the pattern
     """
 
     electrons_at_white: float
@@ -112,26 +119,27 @@ class CameraNoise:
         return np.dtype(np.uint8 if self.bit_depth == 8 else np.uint16)
 
     def mean_grey(self, radiance: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Expected grey values of radiance 0 to 1."""
+        """Return the expected grey values of radiance 0 to 1."""
         electrons = np.minimum(radiance * self.electrons_at_white, self.full_well)
         return self.black_level + self.gain * electrons
 
     def variance(self, mean_grey: Array) -> Array:
-        """Variance of a grey value with this mean: shot, dark and pattern noise, rounding (grey
-        values squared).
+        """Return the variance of a grey value with this mean: shot, dark, pattern and rounding
+        noise.
         """
         electrons = np.maximum((mean_grey - self.black_level) / self.gain, 0.0)
         constant, linear, quadratic = self.variance_coefficients
         return constant + electrons * (linear + electrons * quadratic)
 
     def rounding_excess(self, mean_grey: Array) -> Array:
-        """Largest variance of grey values with about this mean over their usual one, ``variance``:
-        1 with noise of a grey value, up to 3 with little, where it decides to which of two numbers
-        a mean half-way between is rounded.
+        """Return the largest variance of grey values with about this mean, over their usual one.
 
-        The variance of a rounded normal variable whose mean lies half-way between two numbers, from
-        the Fourier series of the rounding error: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s²
-        + 1 / (pi k)²). Over all means it is s² + 1/12, but the pixels of an even ground share
+        It is 1 with noise of a grey value, and up to 3 with little noise. Noise then decides to
+        which of two numbers a mean half-way between is rounded.
+
+        The variance of a rounded normal variable whose mean lies half-way between two numbers comes
+        from the Fourier series of the rounding error: s² + 1/12 + sum over k of exp(-2 pi² k² s²)
+        (4 s² + 1 / (pi k)²). Over all means it is s² + 1/12, but the pixels of an even ground share
         theirs.
         """
         usual = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
@@ -145,7 +153,9 @@ class CameraNoise:
     @property
     def variance_coefficients(self) -> tuple[float, float, float]:
         """Variance of a grey value as a polynomial in its electrons: constant, linear,
-        quadratic."""
+        quadratic.
+        """
+        # A mean over exposures divides the temporal noise; the pattern stays.
         temporal = self.gain**2 / self.frames
         pattern = self.gain**2
         return (
@@ -160,15 +170,15 @@ class CameraNoise:
         rng: np.random.Generator,
         pattern: FixedPattern | None = None,
     ) -> GreyImage:
-        """One exposure of a radiance image (float32, 0 to 1); ``pattern`` of the same shape, where
-        pixels differ.
+        """Take one exposure of a radiance image (float32, 0 to 1).
+
+        ``pattern`` has the same shape, where pixels differ.
         """
         if not self.enabled:
             grey = np.rint(np.clip(self.mean_grey(radiance), 0.0, float(self.white_level)))
             return np.asarray(grey.astype(self.image_type))
-        from cmmsim.radiometry.noise_kernels import (
-            expose_pixels,
-        )  # compiles, so it is loaded where it is first needed
+        # Late, as numba takes time to import.
+        from cmmsim.radiometry.noise_kernels import expose_pixels
 
         grey = np.empty(radiance.shape, dtype=self.image_type)
         expose_pixels(*self._lit(radiance, rng, pattern), grey.ravel())
@@ -181,14 +191,14 @@ class CameraNoise:
         frames: int,
         pattern: FixedPattern | None = None,
     ) -> Array:
-        """Mean grey values of ``frames`` independent exposures of a scene that stands still
-        (float64).
+        """Return the mean grey values (float64) of independent exposures of a scene that stands
+        still.
 
-        Without noise it is not rounded: the mean that noisy exposures approach, as their noise
-        dithers the rounding. The mean of 30 and more is drawn at once, one normal number a pixel
-        with the very mean and variance that the mean of rounded, clipped grey values has. What that
-        neglects is its shape: grey values are skewed only where they are clipped, and their mean
-        goes in steps of 1/frames, of which sums over a sticker's pixels show nothing.
+        Without noise the mean is not rounded: noisy exposures approach this mean, as their noise
+        dithers the rounding. The mean of 30 and more is drawn at once, as one normal number a pixel
+        with the mean and variance of the mean of rounded, clipped grey values. This neglects its
+        shape: grey values are skewed only where they are clipped, and their mean goes in steps of
+        1/frames, which do not show in sums over a sticker's pixels.
         """
         if not self.enabled:
             return np.clip(
@@ -205,8 +215,8 @@ class CameraNoise:
     def _lit(
         self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None
     ) -> tuple[Singles, Singles, Singles, Singles, Singles]:
-        """The light on each pixel, a standard normal number each and all else that
-        ``noise_kernels`` ask for.
+        """Return the light on each pixel, a standard normal number each, and all else for the
+        kernels.
         """
         normal = rng.standard_normal(radiance.shape, dtype=np.float32)
         none = np.empty(0, dtype=np.float32)

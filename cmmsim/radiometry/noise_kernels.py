@@ -1,6 +1,4 @@
-"""Compiled: from the light on each pixel to its grey value in one exposure and its mean in many,
-see ``noise``.
-"""
+"""Compiled: the grey value of each pixel in one exposure and its mean in many, see ``noise``."""
 
 from __future__ import annotations
 
@@ -10,10 +8,10 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-REACH = 6.0  # standard deviations within which noise is followed: 2e-9 of it lie beyond
-SMOOTH = (
-    1.0  # grey values: with as much noise rounding adds 1/12 to the variance and 1e-9 to the mean
-)
+# Standard deviations within which noise is followed: 2e-9 of it lie beyond.
+REACH = 6.0
+# Grey values: with as much noise, rounding adds 1/12 to the variance and 1e-9 to the mean.
+SMOOTH = 1.0
 SQRT_HALF = math.sqrt(0.5)
 
 
@@ -21,16 +19,17 @@ SQRT_HALF = math.sqrt(0.5)
 def expose_pixels(
     radiance: Array, normal: Array, figures: Array, sensitivity: Array, offset: Array, grey: Array
 ) -> None:
-    """Fill the grey values (n,) of pixels with this radiance (n,) and a standard normal number each
+    """Fill the grey values (n,) of pixels with radiance (n,) and a standard normal number each
     (n,).
 
-    All is float32, grey the camera's own type. figures (6,): electrons at white, full well,
-    variance in the dark (e-²), black level, gain, largest grey value; sensitivity and offset (n,)
-    where pixels differ, else empty.
+    All is float32, grey the camera's own type. ``figures`` (6,) are electrons at white, full well,
+    variance in the dark (e-²), black level, gain, and the largest grey value. ``sensitivity`` and
+    ``offset`` (n,) are empty unless pixels differ.
     """
     dark, black, gain, white = figures[2:]
     for k in range(len(radiance)):
         electrons = electrons_in(k, radiance, figures, sensitivity)
+        # Shot noise has the variance of its mean (Poisson); dark noise adds its own.
         noise = normal[k] * np.sqrt(electrons + dark)
         if len(offset):
             noise += offset[k]
@@ -48,9 +47,11 @@ def average_pixels(
     frames: int,
     grey: Array,
 ) -> None:
-    """Fill the means (n,), float64, of the grey values that ``expose_pixels`` gives in so many
-    exposures, taken for normal; parameters as there, but one standard normal number for all
-    exposures of a pixel."""
+    """Fill the means (n,), float64, of the grey values of ``expose_pixels`` in so many exposures.
+
+    They are taken as normal. Parameters are the same, but one standard normal number stands for all
+    exposures of a pixel.
+    """
     dark, black, gain, white = figures[2:]
     for k in range(len(radiance)):
         electrons = electrons_in(k, radiance, figures, sensitivity)
@@ -61,9 +62,7 @@ def average_pixels(
 
 @compiled
 def electrons_in(k: int, radiance: Array, figures: Array, sensitivity: Array) -> float:
-    """Mean electrons that light sets free in pixel k, at most the full well; parameters as of
-    ``expose_pixels``.
-    """
+    """Return the mean electrons that light sets free in pixel k, at most the full well."""
     light = radiance[k] * figures[0]
     if len(sensitivity):
         light *= sensitivity[k]
@@ -72,13 +71,15 @@ def electrons_in(k: int, radiance: Array, figures: Array, sensitivity: Array) ->
 
 @compiled
 def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[float, float]:
-    """Mean and variance of a normal number that is rounded and clipped to 0..white."""
+    """Return mean and variance of a normal number that is rounded and clipped to 0..white."""
     if deviation == 0.0 or mean - REACH * deviation > white or mean + REACH * deviation < 0.0:
         return min(max(np.rint(mean), 0.0), white), 0.0
     if deviation < SMOOTH:
+        # With little noise the steps of rounding show, and are added up one by one.
         low = max(math.floor(mean - REACH * deviation), 0.0)
         above, square = moments_above(low - mean, deviation, white - low)
         return low + above, max(square - above**2, 0.0)
+    # With more noise only clipping matters: what lies above white and below black is lost.
     over, over_square = moments_above(white - mean, deviation, np.inf)
     under, under_square = moments_above(mean, deviation, np.inf)
     lost = over_square + 2.0 * (white - mean) * over + under_square + 2.0 * mean * under
@@ -87,11 +88,11 @@ def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[flo
 
 @compiled
 def moments_above(height: float, deviation: float, most: float) -> tuple[float, float]:
-    """Mean and mean square of by how much, at most ``most``, a rounded normal number exceeds a
-    whole number that lies ``height`` above its mean.
+    """Return the mean and mean square excess of a rounded normal number over a whole number.
 
-    Each step from one number to the next is taken with the probability that the normal number lies
-    beyond its middle.
+    The whole number lies ``height`` above its mean, and the excess is at most ``most``. Each step
+    from one number to the next is taken with the probability that the normal number lies beyond its
+    middle.
     """
     steps = squares = 0.0
     for step in range(math.ceil(min(most, REACH * deviation - height))):

@@ -16,14 +16,30 @@ from cmmsim.radiometry.noise import GreyImage, cut_windows
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SHOWN_WIDTH_PX = 1600  # of the picture in a notebook
+# Width of the picture in a notebook.
+SHOWN_WIDTH_PX = 1600
 Windows = GreyImage | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class StereoFrame:
-    """left and right: grey images (height, width) taken at the same time, uint8, or uint16 of more
-    than 8 bit.
+    """Two grey images of the same size, taken at the same time.
+
+    Parameters
+    ----------
+    left, right : ndarray, shape (height, width)
+        Grey values, uint8, or uint16 for more than 8 bit.
+
+    Raises
+    ------
+    ShapeError
+        If an image has another shape or type.
+
+    Examples
+    --------
+    >>> image = np.zeros((30, 40), dtype=np.uint8)
+    >>> StereoFrame(image, image)
+    StereoFrame(two images of 40 x 30 px, uint8)
     """
 
     left: GreyImage
@@ -67,7 +83,8 @@ class StereoFrame:
 
             display(self)
             return None
-        from matplotlib import pyplot  # late, as it takes time to import
+        # Late, as numba takes time to import.
+        from matplotlib import pyplot
 
         figure, axes = pyplot.subplots(1, 2, figsize=(12.0, 5.0), layout="constrained")
         for axis, name, image in zip(axes, ("left", "right"), (self.left, self.right), strict=True):
@@ -80,7 +97,7 @@ class StereoFrame:
         return None
 
     def _repr_png_(self) -> bytes:
-        """Both images side by side as a PNG, made smaller where they are large."""
+        """Return both images side by side as a PNG, reduced where they are large."""
         import cv2  # late, as it takes time to import
 
         highest = max(self.left.max(), self.right.max(), 255)
@@ -103,10 +120,10 @@ class StereoImages(Protocol):
     """One exposure of two cameras that can be read whole or in parts."""
 
     def full(self) -> StereoFrame:
-        """Both whole images."""
+        """Return both whole images."""
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x,
+        """Return the grey values (2, n, size, size) of windows with first pixels (2, n, 2) as (x,
         y).
         """
 
@@ -118,11 +135,11 @@ class FrameImages:
         self._frame = frame
 
     def full(self) -> StereoFrame:
-        """Both whole images."""
+        """Return both whole images."""
         return self._frame
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x,
+        """Return the grey values (2, n, size, size) of windows with first pixels (2, n, 2) as (x,
         y).
         """
         sides = zip((self._frame.left, self._frame.right), corners, strict=True)
@@ -130,8 +147,8 @@ class FrameImages:
 
 
 def readable(images: StereoImages | StereoFrame) -> StereoImages:
-    """Images that can be read in parts, those of a whole frame too. Raises CmmError for anything
-    else.
+    """Return images that can be read in parts, also for a whole frame. Raises CmmError for
+    others.
     """
     if isinstance(images, StereoFrame):
         return FrameImages(images)

@@ -1,1 +1,1 @@
-"""Errors that all poses have in common: of the rig as it is known, of teaching, and of a drift."""
+"""Errors that all poses have in common: those of the known rig, of teaching, and of a drift."""

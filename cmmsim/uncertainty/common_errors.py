@@ -1,12 +1,13 @@
-"""Errors that all poses of a run have in common: what is not known exactly of cameras, taught
-frames and exposure.
+"""Errors that all poses of a run have in common: those of cameras, taught frames and exposure.
 
-A measured pose errs by noise, which is new in every frame, and by what the estimator takes for
-exact and is not: the rig (24 numbers), the taught frames of base and platform (12), and the instant
-at which the right camera exposes. Each is one draw that stays the same along a run. To first order
-they move a measured pose by J(pose) d, and J needs no images: centres are projected through a rig
-that is off, and measured with the known one. A rig that is off also teaches wrong frames and
-sticker places, and much of its error cancels there: only what differs from home and base is left.
+A measured pose errs by noise, which is new in every frame. It also errs because the estimator takes
+things for exact that are not: the rig (24 numbers), the taught frames of base and platform (12),
+and the instant at which the right camera exposes. Each is one draw that stays the same along a run.
+
+To first order they move a measured pose by J(pose) d, and J needs no images: centres are projected
+through a rig that is off, and measured with the known one. A rig that is off also teaches wrong
+frames and sticker places, and much of its error cancels there. Only what differs from home and base
+is left.
 """
 
 from __future__ import annotations
@@ -44,25 +45,25 @@ NAMES = (
     *(f"taught.{body}.{name}" for body in ("base", "platform") for name in PLACE_NAMES),
     "exposure.right_later_s",
 )
-"""Of all common errors; those of the rig are true minus known, those of what was taught known
+"""Names of all common errors. Those of the rig are true minus known, those of taught frames known
 against true, in the axes of base and platform."""
 
+# Poses of the teaching path: it is smooth, so that without noise few of its poses suffice.
 TEACHING_POSES = 8
-"""Of the teaching path: it is smooth, and without noise few of its poses show what all of them do.
-"""
 
+# Changes of the rig's parameters for central differences: ten times what a good calibration leaves.
 STEPS = np.diag(
     [*2 * (0.1, 0.1, 0.1, 0.1, 1e-4, 1e-4, 1e-5, 1e-5, 1e-4), *3 * (1e-5,), *3 * (1e-5,)]
 )
-"""Changes of the rig's parameters for central differences: some ten times what a good calibration
-leaves.
-"""
 
 
 @dataclass(frozen=True)
 class CommonErrors:
-    """Common errors by name, which ends with the unit; changes (N, 6, k) of the poses per unit of
-    each, m and rad; covariance (k, k) of the errors."""
+    """Common errors by name, which ends with the unit.
+
+    ``changes`` (N, 6, k) of the poses are per unit of each error, m and rad, and ``covariance`` (k,
+    k) belongs to the errors.
+    """
 
     names: tuple[str, ...]
     changes: Array
@@ -70,7 +71,7 @@ class CommonErrors:
 
     @property
     def pose_covariances(self) -> Array:
-        """Covariance (N, 6, 6) that they give each pose; the same draw in all of them."""
+        """Covariances (N, 6, 6) that the errors give each pose; the same draw in all of them."""
         return np.asarray(self.changes @ self.covariance @ self.changes.swapaxes(1, 2))
 
 
@@ -88,15 +89,18 @@ class MeasuringGeometry:
 
     @property
     def camera_from_base(self) -> Array:
-        """As it was taught (4,4)."""
+        """Place (4, 4) of the base as it was taught."""
         return invert(self.taught.base_from_camera)
 
     def pose_covariance(
         self, pose: Array, rig_covariance: Array, method: str = "registration"
     ) -> Array:
-        """Covariance (6, 6) of what a pose (6,), measured by registration, has in common with all
-        others: what is not known of rig, with a covariance (24, 24), and taught frames. NaN for
-        another method: of that it is not known."""
+        """Return the covariance (6, 6) that a pose (6,) measured by registration has in common with
+        others.
+
+        It comes from taught frames and a rig with a covariance (24, 24). It is NaN for another
+        method, where it is not known.
+        """
         if method != "registration":
             return np.full((6, 6), np.nan)
         return self.common_errors(pose[None], np.zeros((1, 6)), rig_covariance).pose_covariances[0]
@@ -104,12 +108,12 @@ class MeasuringGeometry:
     def common_errors(
         self, poses: Array, rates: Array, rig_covariance: Array, exposure_std: float = 0.0
     ) -> CommonErrors:
-        """Common errors of poses (N, 6) measured by registration in motion at rates (N, 6), m/s and
-        rad/s.
+        """Return the common errors of poses (N, 6) measured by registration.
 
-        rig_covariance (24, 24) of the rig's parameters; exposure_std: of the time by which the
-        right camera exposes later, s. What is known exactly is left out. Raises ShapeError for
-        anything but rows of six finite numbers.
+        They move at rates (N, 6), m/s and rad/s. ``rig_covariance`` (24, 24) belongs to the rig's
+        parameters, and ``exposure_std`` to the time by which the right camera exposes later, s.
+        Exact parameters are left out. Raises ShapeError for anything but rows of six finite
+        numbers.
         """
         poses = finite_array(poses, (len(poses), 6), "poses must be (N,6) and finite")
         rates = finite_array(
@@ -130,8 +134,9 @@ class MeasuringGeometry:
         return CommonErrors(tuple(NAMES[k] for k in kept), changes, covariance[np.ix_(kept, kept)])
 
     def _by_rig(self, view: _View) -> Array:
-        """Small errors (N, 6, 24) of base_from_platform by each parameter of the rig, through
-        teaching as well.
+        """Return small errors (N, 6, 24) of base_from_platform by each parameter of the rig.
+
+        The errors of teaching are included.
         """
         frames, places = self.taught_by_rig
         return (
@@ -141,8 +146,11 @@ class MeasuringGeometry:
 
     @cached_property
     def taught_by_rig(self) -> tuple[Array, Array]:
-        """Small error (6, 24) of base_from_camera as it was taught, and changes (24, n, 3) of the
-        places of the platform's stickers, by each parameter of the rig."""
+        """Errors of teaching by each parameter of the rig.
+
+        They are the small error (6, 24) of the taught base_from_camera, and changes (24, n, 3) of
+        the places of the platform's stickers.
+        """
         moved = [self.rig.moved(sign * step) for sign in (1.0, -1.0) for step in STEPS]
         frames, places = (
             values.reshape(2, len(STEPS), *values.shape[1:]) for values in self._teach(moved)
@@ -155,8 +163,10 @@ class MeasuringGeometry:
         return errors, (places[0] - places[1]) / twice[:, None, None]
 
     def _teach(self, true: Sequence[StereoRig]) -> tuple[Array, Array]:
-        """base_from_camera (r,4,4) and places (r,n,3) of the platform's stickers as the known rig
-        teaches them, without noise, where the cameras are those of other rigs: of each for itself.
+        """Return base_from_camera (r, 4, 4) and sticker places (r, n, 3) as the known rig teaches
+        them.
+
+        The cameras are those of r other rigs, each by itself, and there is no noise.
         """
         path = transforms_of(teaching_path(self.home, TEACHING_POSES))
         places = self.taught.platform_places
@@ -176,8 +186,9 @@ class MeasuringGeometry:
         )
 
     def _observed(self, true: Sequence[StereoRig], points: Array) -> tuple[Array, Array]:
-        """Points (r,n,3), and their covariances (r,n,3,3) per px² of noise, as triangulated with
-        the known rig, where points (n,3) in the camera frame are seen by the cameras of other rigs.
+        """Return points (r, n, 3), and covariances (r, n, 3, 3) per px² of noise, by the known rig.
+
+        Points (n, 3) in the camera frame are seen by the cameras of other rigs.
         """
         pixels = np.stack([rig.project(points)[0] for rig in true], axis=1).reshape(2, -1, 2)
         spread = np.broadcast_to(np.eye(2), (*pixels.shape[:2], 2, 2))
@@ -189,9 +200,12 @@ class MeasuringGeometry:
 
 @dataclass(frozen=True)
 class _View:
-    """Stickers seen at the poses of a run, by index (n,): base_from_platform (N,4,4); arms (N, n,
-    3) of the stickers about the platform's origin, in camera axes; changes of their pixels: slopes
-    (2, N, n, 2, 3) by their points, and by_rig (2, N, n, 2, 24) by the rig's parameters."""
+    """Stickers seen at the poses of a run, by index (n,).
+
+    ``frames`` (N, 4, 4) are base_from_platform. ``arms`` (N, n, 3) lead from the platform's origin
+    to the stickers, in camera axes. The changes of their pixels are ``slopes`` (2, N, n, 2, 3) by
+    their points, and ``by_rig`` (2, N, n, 2, 24) by the rig's parameters.
+    """
 
     camera_from_base: Array
     frames: Array
@@ -202,7 +216,7 @@ class _View:
 
     @property
     def levers(self) -> Array:
-        """Small error (N, 6, 6) of base_from_platform by that of base_from_camera, both in base
+        """Small errors (N, 6, 6) of base_from_platform by that of base_from_camera, both in base
         axes.
         """
         levers = np.tile(np.eye(6), (len(self.frames), 1, 1))
@@ -210,16 +224,15 @@ class _View:
         return levers
 
     def by_taught_frames(self) -> Array:
-        """Small errors (N, 6, 12) of base_from_platform by those of the taught frames of base and
-        platform.
-        """
+        """Return small errors (N, 6, 12) of base_from_platform by those of both taught frames."""
         turns = np.zeros((len(self.frames), 6, 6))
         turns[:, :3, :3] = turns[:, 3:, 3:] = self.frames[:, :3, :3]
         return np.concatenate([self.levers, turns], axis=2)
 
     def by_delay(self, poses: Array, rates: Array) -> Array:
-        """Small errors (N, 6, 1) of base_from_platform by a right camera that exposes later,
-        per s."""
+        """Return small errors (N, 6, 1) of base_from_platform, per s by which the right camera is
+        late.
+        """
         spin = np.einsum(
             "nij,nj->ni", np.stack([euler_rates_matrix(pose) for pose in poses]), rates[:, 3:]
         )
@@ -232,21 +245,24 @@ class _View:
         return self.registered(self._points(pixels))
 
     def points_by_rig(self) -> Array:
-        """Changes (N, n, 3, 24) of the triangulated points by each parameter of the rig behind the
-        pixels.
+        """Return changes (N, n, 3, 24) of the triangulated points by each parameter of the true
+        rig.
         """
         return self._points(self.by_rig)
 
     def points_by_places(self, places: Array) -> Array:
-        """Changes (N, n, 3, 24) of where stickers are expected by changes (24, n, 3) of their
-        taught places.
+        """Return changes (N, n, 3, 24) of expected stickers by changes (24, n, 3) of their taught
+        places.
         """
         turns = self.camera_from_base[:3, :3] @ self.frames[:, :3, :3]
         return np.einsum("nij,pmj->nmip", turns, places[:, self.seen])
 
     def registered(self, changes: Array) -> Array:
-        """Small errors (N, 6, p) of base_from_platform, in base axes, by changes (N, n, 3, p) of
-        the stickers' points in camera axes."""
+        """Return small errors (N, 6, p) of base_from_platform, in base axes, by changes of
+        stickers.
+
+        The changes (N, n, 3, p) of their points are in camera axes.
+        """
         rows = np.concatenate(
             [np.broadcast_to(np.eye(3), (*self.arms.shape[:2], 3, 3)), -skew(self.arms)], axis=3
         )
@@ -262,7 +278,7 @@ class _View:
         return np.einsum("cnmki,cnmkj->nmij", self.slopes, self.slopes)
 
     def _points(self, pixels: Array) -> Array:
-        """Changes (N, n, 3, p) of the triangulated points by changes (2, N, n, 2, p) of their
+        """Return changes (N, n, 3, p) of triangulated points by changes (2, N, n, 2, p) of their
         pixels.
         """
         return np.linalg.solve(
@@ -283,7 +299,7 @@ def _view(geometry: MeasuringGeometry, frames: Array) -> _View:
 
 
 def _seen_at_home(geometry: MeasuringGeometry) -> NDArray[np.int_]:
-    """Indices (n,) of the platform's stickers that both cameras see at home."""
+    """Return the indices (n,) of the platform's stickers that both cameras see at home."""
     camera_from_platform = geometry.camera_from_base @ pose_to_transform(geometry.home)
     seen = []
     for move in geometry.rig.from_camera:
@@ -294,8 +310,9 @@ def _seen_at_home(geometry: MeasuringGeometry) -> NDArray[np.int_]:
 
 
 def _small_error(moved: Array, other: Array) -> Array:
-    """[dt, dphi] (6,) with which points p of the output frame move by dt + dphi x p, from the other
-    to the first.
+    """Return [dt, dphi] (6,) by which points p of the output frame move: dt + dphi x p.
+
+    They move from the second transform to the first.
     """
     turn = moved[:3, :3] @ other[:3, :3].T
     return np.concatenate([moved[:3, 3] - turn @ other[:3, 3], rotation_log(turn)])

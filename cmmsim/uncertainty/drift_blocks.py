@@ -1,10 +1,11 @@
 """Residuals of the stickers' pixels in a few frames, and their changes by each error of the rig.
 
 A body's stickers are expected where their taught places and its measured pose put them. The pose
-itself is not known otherwise, so what six numbers explain is taken out: what is left is the
-pattern's misfit and the gaps of the rays. With n stickers, 4 n numbers, of unit variance in the 4 n
-- 6 directions that no pose explains, and zero in the others. The base stands still, and its pose
-was taught: of that nothing is taken out, and it shows how the whole rig stands against it as well.
+itself is not known otherwise, so the part that six numbers explain is taken out. The misfit of the
+pattern and the gaps of the rays are left. With n stickers these are 4 n numbers, of unit variance
+in the 4 n - 6 directions that no pose explains, and zero in the others. The base stands still, and
+its pose was taught: nothing is taken out of its residuals, which also show how the whole rig stands
+against it.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
 
 PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
-"""A movement of both cameras together: by so much points of the base move in the camera frame,
-about its origin.
+"""Names of a movement of both cameras together. Points of the base move by as much in the camera
+frame, about its origin.
 """
 
-SMALLEST_STD_PX = 5e-4  # of a centre: no detector is better, whatever it states
+# px of a centre: no detector is better, whatever it states.
+SMALLEST_STD_PX = 5e-4
 RIG = len(PARAMETER_NAMES)
 
 
@@ -33,10 +35,10 @@ RIG = len(PARAMETER_NAMES)
 class Rows:
     """Rows of b blocks of frames.
 
-    residuals (b, m) have unit variance or zero in any direction. Their derivatives are by a drift
-    since teaching (b, m, 30) of the rig's parameters and its place, by errors (b, m, 24) that the
-    rig had at teaching already, by the time (b, m, 1) [s] by which the right camera exposes later,
-    and by offsets (b, m, o) [px] of single centres.
+    ``residuals`` (b, m) have unit variance, or zero, in any direction. Their derivatives are
+    ``by_drift`` (b, m, 30) of the rig's parameters and its place since teaching, ``by_start`` (b,
+    m, 24) of errors that the rig had at teaching already, ``by_delay`` (b, m, 1) of the time [s] by
+    which the right camera exposes later, and ``by_offsets`` (b, m, o) [px] of single centres.
     """
 
     residuals: Array
@@ -48,9 +50,11 @@ class Rows:
 
 @dataclass
 class Sightings:
-    """The same stickers of a body in some frames, a block: index (k,) of them, their places (k, 3)
-    in body axes; camera_from_base (4,4); of each frame its time s, base_from_body as a pose (6,),
-    pixels (2, k, 2) and their variances (k,) px²."""
+    """Block of frames that show the same stickers of a body.
+
+    The stickers have an ``index`` (k,) and places (k, 3) in body axes. Each frame has its time in
+    s, base_from_body as a pose (6,), pixels (2, k, 2) and their variances (k,) px².
+    """
 
     index: NDArray[np.int_]
     places: Array
@@ -61,7 +65,7 @@ class Sightings:
     variances: list[Array] = field(default_factory=list)
 
     def add(self, time: float, pose: Array, pixels: tuple[Array, Array], variances: Array) -> None:
-        """One more frame."""
+        """Add one more frame."""
         self.times.append(time)
         self.poses.append(pose)
         self.pixels.append(np.array(pixels))
@@ -69,17 +73,17 @@ class Sightings:
 
     @cached_property
     def moves(self) -> Array:
-        """camera_from_body (f,4,4) of all frames, once there are no more."""
+        """Transforms camera_from_body (f, 4, 4) of all frames, once there are no more."""
         return np.asarray(self.camera_from_base @ transforms_of(np.array(self.poses)))
 
     @property
     def middle(self) -> Array:
-        """camera_from_body (4,4) half way."""
+        """Transform camera_from_body (4, 4) half way."""
         return np.asarray(self.moves[len(self.moves) // 2])
 
     @property
     def velocities(self) -> Array:
-        """Velocities of the stickers (k, 3) in the camera frame, m/s; zero where only one frame was
+        """Velocities of the stickers (k, 3) in the camera frame, m/s; zero if only one frame was
         seen.
         """
         span = self.times[-1] - self.times[0]
@@ -89,7 +93,9 @@ class Sightings:
 
 
 def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
-    """Rows of blocks of frames with the same stickers, in which the platform was measured."""
+    """Return the rows of blocks of frames with the same stickers, in which the platform was
+    measured.
+    """
     index = blocks[0].index
     moves = np.array([seen.middle for seen in blocks])
     arms = blocks[0].places @ moves[:, :3, :3].swapaxes(1, 2)
@@ -100,6 +106,7 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> R
         "bkij,bkj->bki", slopes[1], np.array([seen.velocities for seen in blocks])
     )
     residuals, roots = _whitened(geometry.rig, blocks)
+    # Orthonormal columns span the residuals that six numbers of a pose explain.
     by_pose = np.linalg.qr(_whiten(roots, slopes @ _small_movement(arms)))[0]
 
     def left(values: Array) -> Array:
@@ -117,9 +124,8 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> R
 
 
 def base_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
-    """Rows of blocks of frames with the same stickers, in which the base was looked at.
-
-    It stands still.
+    """Return the rows of blocks of frames with the same stickers of the base, which stands
+    still.
     """
     index = blocks[0].index
     move = geometry.camera_from_base
@@ -127,7 +133,7 @@ def base_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
     slopes, by_rig = geometry.rig.derivatives(arms + move[:3, 3])
     across = slopes.transpose(1, 0, 2, 3).reshape(len(arms), 4, 3)
     rig_first = by_rig.transpose(1, 0, 2, 3).reshape(len(arms), 4, RIG)
-    # where they were seen
+    # Changes of the places at which the stickers were taught.
     taught = np.linalg.solve(across.swapaxes(1, 2) @ across, across.swapaxes(1, 2) @ rig_first)
     by_drift = np.concatenate([by_rig, slopes @ _small_movement(arms)], axis=-1)
     residuals, roots = _whitened(geometry.rig, blocks)
@@ -141,8 +147,9 @@ def base_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
 
 
 def stacked(rows: list[Rows], centres: tuple[int, ...]) -> Rows:
-    """Rows of several bodies as one; the stickers of all bodies, so many each, have offsets of
-    their own.
+    """Join the rows of several bodies.
+
+    The stickers of all bodies, so many each, have offsets of their own.
     """
     sizes = [one.residuals.shape for one in rows]
     first = 0
@@ -162,16 +169,18 @@ NOT_OFFSETS = ("residuals", "by_drift", "by_start", "by_delay")
 
 
 def _derivatives(rig: StereoRig, points: Array) -> tuple[Array, Array]:
-    """Derivatives (2, b, k, 2, 3) of pixels by points (b, k, 3) in the camera frame; (2, b, k, 2,
-    24) by the rig.
+    """Return derivatives (2, b, k, 2, 3) of pixels by points (b, k, 3), and (2, b, k, 2, 24) by the
+    rig.
     """
     slopes, by_rig = rig.derivatives(points.reshape(-1, 3))
     return slopes.reshape(2, *points.shape[:2], 2, 3), by_rig.reshape(2, *points.shape[:2], 2, RIG)
 
 
 def _whitened(rig: StereoRig, blocks: Sequence[Sightings]) -> tuple[Array, Array]:
-    """Means (b, 4k) of pixels less those expected, in units of their standard deviations; and the
-    roots (b, k) of their weights."""
+    """Return means (b, 4k) of pixels less those expected, in units of their standard deviations.
+
+    The second result is the roots (b, k) of their weights.
+    """
     weights = 1.0 / (
         np.array([each for seen in blocks for each in seen.variances]) + SMALLEST_STD_PX**2
     )
@@ -185,16 +194,15 @@ def _whitened(rig: StereoRig, blocks: Sequence[Sightings]) -> tuple[Array, Array
 
 
 def _whiten(roots: Array, slopes: Array) -> Array:
-    """Derivatives (b, 4k, p) of whitened residuals from those of pixels (2, b, k, 2, p), or (2, 1,
-    k, 2, p).
-    """
+    """Return derivatives (b, 4k, p) of whitened residuals from those of pixels (2, b, k, 2, p)."""
     weighted = (roots[..., None, None] * slopes).swapaxes(0, 1)
     return weighted.reshape(len(roots), 4 * roots.shape[1], -1)
 
 
 def _small_movement(arms: Array) -> Array:
-    """Derivatives (..., 3, 6) of points, arms (..., 3) from their body's origin, by its small
-    movement [dt, dphi].
+    """Return derivatives (..., 3, 6) of points by the small movement [dt, dphi] of their body.
+
+    The points are arms (..., 3) from the body's origin.
     """
     return np.concatenate([np.broadcast_to(np.eye(3), (*arms.shape, 3)), -skew(arms)], axis=-1)
 
@@ -202,8 +210,9 @@ def _small_movement(arms: Array) -> Array:
 def _offsets(
     left: Callable[[Array], Array], roots: Array, index: NDArray[np.int_], count: int
 ) -> Array:
-    """Derivatives (b, 4k, 4 count) by the offsets of all centres of a body, of which an index (k,)
-    is seen.
+    """Return derivatives (b, 4k, 4 count) by the offsets of all centres of a body.
+
+    An index (k,) of them is seen.
     """
     blocks, k = roots.shape
     every = np.zeros((blocks, 4 * k, 2, count, 2))

@@ -1,31 +1,34 @@
-"""Sequential likelihood ratio for a rig that moves, from a row of residuals.
+"""Sequential likelihood ratio for a rig that moves, from rows of residuals, and its findings.
 
-That the rig is as it was calibrated and taught is one Gaussian model of all residuals: its errors
-are one draw of the calibration's covariance, the same in every frame. Others let it walk at random,
-at one of several rates, or be more wrong from the start than its covariance says. Each is a Kalman
-filter, and predicts the next residuals before it sees them. The mean over the others of their
-likelihoods over that of the first one is, while the first is true, a martingale with the mean one:
-it exceeds 1 / chance at any time of a run, however long, with at most that chance (Ville's
-inequality), so no correction for looking often is needed. Sources: J. Ville, Étude critique de la
-notion de collectif (1939); H. Robbins, Statistical methods related to the law of the iterated
-logarithm, Ann. Math. Statist. 41 (1970).
+One Gaussian model of all residuals says that the rig is as it was calibrated and taught: its errors
+are one draw of the calibration's covariance, the same in every frame. Other models let it walk at
+random, at one of several rates, or be more wrong from the start than its covariance says. Each is a
+Kalman filter, and predicts the next residuals before it sees them.
+
+The mean likelihood of the others over that of the first is, while the first is true, a martingale
+with the mean one. It exceeds 1 / chance at any time of a run, however long, with at most that
+probability (Ville's inequality), so that no correction for looking often is needed. Sources: J.
+Ville, Étude critique de la notion de collectif (1939); H. Robbins, Statistical methods related to
+the law of the iterated logarithm, Ann. Math. Statist. 41 (1970).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from cmmsim.geometry.pose import Array
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.uncertainty.drift_blocks import PLACES_OF_RIG, RIG, Rows
 
 SIZES = np.array(
     [*2 * (*4 * (0.1,), 1e-4, 1e-4, 1e-5, 1e-5, 1e-4), *6 * (2e-5,), *len(PLACES_OF_RIG) * (2e-5,)]
 )
-"""Of a drift that matters, of each parameter, px, m and rad: a tenth of a pixel, 20 um, 20 urad."""
+"""Sizes of a drift that matters, of each parameter: a tenth of a pixel, 20 um, 20 urad."""
 
 RATES = (0.05, 0.5, 5.0)
 """Standard deviations of random walks after WALK_FRAMES, in SIZES: a drift that comes in hours,
@@ -33,14 +36,20 @@ minutes, seconds.
 """
 
 WALK_FRAMES = 1000
+NAMES = (*PARAMETER_NAMES, *PLACES_OF_RIG)
+# Share of what residuals say of a drift at which no further parameter is named.
+EXPLAINED = 0.97
+MOST_NAMED = 3
+# Part of a direction, in SIZES, by which a parameter belongs to its name.
+LARGE_PART = 0.3
+ALWAYS_UNSEEN = ("scale of rig and taught places together",)
 
 
 class Filter:
-    """Kalman filter of unknowns (n,), of which the first w walk at random and are zero before the
-    first step: in its information form, since one product of the derivatives serves all models, and
-    few unknowns walk.
+    """Kalman filter of unknowns (n,), of which the first w walk at random and are zero at first.
 
-    What was seen makes the density of the unknowns x proportional to exp(constant + right x - x
+    It has the information form, since one product of the derivatives serves all models, and few
+    unknowns walk. The density of the unknowns x is proportional to exp(constant + right x - x
     precision x / 2). Source: B. D. O. Anderson and J. B. Moore, Optimal Filtering (1979), section
     6.3.
     """
@@ -53,7 +62,10 @@ class Filter:
 
     def step(self, gram: Array, right: Array, squared: float, frames: int) -> None:
         """See residuals r of unit variance with derivatives D (m, n), so many frames after those
-        before: D'D (n, n), D'r (n,) and r'r."""
+        before.
+
+        They are given as D'D (n, n), D'r (n,) and r'r.
+        """
         if len(self._walk):
             self._walk_on(frames)
         self.precision += gram
@@ -67,6 +79,7 @@ class Filter:
             self.precision[range(w), range(w)] = 1.0 / walked
             self._constant -= 0.5 * float(np.log(walked).sum())
             return
+        # The unknowns before the step are integrated out, and those after it take their place.
         both = np.column_stack([self.precision[:w], self.right[:w]])
         lower, part = _factored(self.precision[:w, :w] + np.diag(1.0 / walked), both)
         self.precision -= part[:, :-1].T @ part[:, :-1]
@@ -77,14 +90,16 @@ class Filter:
     @property
     def log_likelihood(self) -> float:
         """Log-likelihood of all residuals so far."""
-        if not self.precision[0, 0]:  # nothing was seen
+        # Nothing was seen yet.
+        if not self.precision[0, 0]:
             return 0.0
         lower, part = _factored(self.precision, self.right)
         return self._constant + 0.5 * float(part @ part) - float(np.log(np.diag(lower)).sum())
 
     def told_of(self, first: int) -> tuple[Array, Array]:
-        """Information (d, d) about the first d unknowns, and score (d,), whatever the others
-        are."""
+        """Return the information (d, d) about the first d unknowns, and score (d,), whatever others
+        are.
+        """
         others = np.linalg.solve(self.precision[first:, first:], self.precision[first:, :first])
         return (
             self.precision[:first, :first] - self.precision[:first, first:] @ others,
@@ -93,8 +108,10 @@ class Filter:
 
 
 def _factored(matrix: Array, right: Array) -> tuple[Array, Array]:
-    """Lower Cholesky factor L of a matrix (n, n), its upper part left as it was, and L^-1 right
-    (n,) or (n, p); plain LAPACK, whose callers in SciPy take longer than the work."""
+    """Return the lower Cholesky factor L of a matrix (n, n), and L^-1 right, (n,) or (n, p).
+
+    The upper part is left as it was. SciPy's own callers of LAPACK take longer than the work.
+    """
     lower, failed = dpotrf(matrix, lower=True, clean=False)
     if failed:
         raise np.linalg.LinAlgError(f"no positive definite matrix: minor {failed} of {len(matrix)}")
@@ -105,8 +122,8 @@ def _factored(matrix: Array, right: Array) -> tuple[Array, Array]:
 class Told:
     """Information on a drift in SIZES from residuals, apart from what was expected of it.
 
-    ``information`` (d, d), and ``score`` (d,), which is information times estimate. ``from_start``:
-    whether the rig was so at teaching already.
+    It is ``information`` (d, d), and ``score`` (d,), which is information times estimate.
+    ``from_start`` says that the rig was so at teaching already.
     """
 
     information: Array
@@ -115,11 +132,11 @@ class Told:
 
 
 class Evidence:
-    """The filters of all models.
+    """Filters of all models.
 
-    Parameters: calibration (24, r): what of SIZES the calibration leaves of the rig's parameters
-    for r independent numbers of unit variance; delay_std s; offset_std (o,) px of single centres;
-    whether the rig's place shows.
+    ``calibration`` (24, r) is the part of SIZES that the calibration leaves of the rig's
+    parameters, for r independent numbers of unit variance. ``delay_std`` is in s, and
+    ``offset_std`` (o,) in px of single centres. ``place_shows`` says that the rig's place shows.
     """
 
     def __init__(
@@ -138,16 +155,18 @@ class Evidence:
 
     @property
     def log_ratio(self) -> float:
-        """Logarithm of the likelihood of a rig that has moved, mean over the models of it, over
-        that of one that has not."""
+        """Logarithm of the likelihood of a rig that has moved, over that of one that has not.
+
+        The former is the mean over the models.
+        """
         others = np.array([one.log_likelihood for one in (*self._walking.values(), self._wrong)])
         return float(
             np.logaddexp.reduce(others) - np.log(len(others)) - self._fitting.log_likelihood
         )
 
     def products(self, rows: Rows) -> Array:
-        """Products (b, n, n) of the residuals and derivatives of b blocks with each other, as
-        ``step`` takes them.
+        """Return the products (b, n, n) of residuals and derivatives of b blocks, as ``step`` takes
+        them.
         """
         by_start = rows.by_start * SIZES[:RIG]
         known = [by_start @ self._calibration, self._delay_std * rows.by_delay, rows.by_offsets]
@@ -190,15 +209,143 @@ class Evidence:
         return Told(*_without_prior(walking, self._size, self._walked(rate)), from_start)
 
     def _walked(self, rate: float) -> float:
-        """Variance of a walk after all frames."""
+        """Return the variance of a walk after all frames."""
         return rate**2 * max(self._frames, 1) / WALK_FRAMES
 
 
 def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[Array, Array]:
-    """Information (d, d) and score (d,) that residuals gave about the first d unknowns, beyond that
-    of a prior.
+    """Return the information (d, d) and score (d,) of residuals about the first d unknowns.
+
+    Those of the prior are taken off.
     """
     information, score = filtered.told_of(size)
-    if not information.any():  # nothing has been seen, and nothing has walked
+    # Nothing has been seen, and nothing has walked.
+    if not information.any():
         return information, score
     return information - np.eye(size) / prior_variance, score
+
+
+@dataclass(frozen=True)
+class Movement:
+    """Movement of one parameter of the rig and its standard deviation, in the unit that ends its
+    name.
+    """
+
+    name: str
+    amount: float
+    std: float
+
+    def __str__(self) -> str:
+        own = self.name.rpartition(".")[2]
+        unit = own.rpartition("_")[2] if "_" in own else ""
+        return f"{self.name} by {self.amount:.3g} ± {self.std:.1g} {unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Statement on a rig from the residuals of a run.
+
+    Attributes
+    ----------
+    noticed_s, noticed_frame : float and int, or None
+        Time and frame at which the rig no longer fitted; None where it did all along.
+    evidence, limit : float
+        Largest logarithm of the likelihood ratio, and its limit.
+    chance : float
+        Probability with which a rig that fits exceeds the limit in a run, however long.
+    frames, judged_frames : int
+        All frames, and those in which enough stickers were seen.
+    movements : tuple of Movement
+        Fewest parameters that explain what is seen at the end of the run, the first one most. Other
+        parameters of nearly the same effect may be the true cause. Empty where nothing was noticed.
+    explained : float
+        Share that the movements explain.
+    from_start : bool
+        True if the rig was wrong at teaching already.
+    unseen : tuple of str
+        Directions in which a drift of a tenth of a pixel, 20 um or 20 urad would not show, named
+        by the parameters that move together.
+    """
+
+    noticed_s: float | None
+    noticed_frame: int | None
+    evidence: float
+    limit: float
+    chance: float
+    frames: int
+    judged_frames: int
+    movements: tuple[Movement, ...]
+    explained: float
+    from_start: bool
+    unseen: tuple[str, ...]
+
+    @property
+    def warning(self) -> str | None:
+        """Sentence that says what is wrong; None where nothing is."""
+        if self.noticed_s is None:
+            return None
+        moved = ", ".join(map(str, self.movements))
+        since, what = (
+            ("were wrong from the start", "an error")
+            if self.from_start
+            else ("moved", "a movement")
+        )
+        return (
+            f"the cameras {since}: noticed after {self.noticed_s:.2f} s; at the end of the run, "
+            f"{100 * self.explained:.0f} % of what the stickers show is explained by {what} of "
+            f"{moved} (a false alarm has a chance of {self.chance:g} a run)"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and texts."""
+        return asdict(self) | {"warning": self.warning, "unseen": list(self.unseen)}
+
+
+def movements(told: Told) -> tuple[tuple[Movement, ...], float]:
+    """Return the fewest parameters whose movement explains what residuals say, and their share.
+
+    They are found one after the other; each explains most of what those before leave.
+    """
+    information = told.information
+    score = told.score
+    whole = float(score @ np.linalg.pinv(information, hermitian=True) @ score)
+    chosen: list[int] = []
+    share = 0.0
+    while len(chosen) < MOST_NAMED and share < EXPLAINED:
+        gains = {
+            k: _gain(information, score, [*chosen, k]) for k in range(len(score)) if k not in chosen
+        }
+        best = max(gains, key=lambda k: gains[k])
+        chosen.append(best)
+        share = min(gains[best] / max(whole, gains[best], np.finfo(float).tiny), 1.0)
+    part = np.ix_(chosen, chosen)
+    amounts = np.linalg.solve(information[part], score[chosen])
+    spread = np.linalg.inv(information[part])
+    found = [
+        Movement(NAMES[k], float(amount * SIZES[k]), float(np.sqrt(variance) * SIZES[k]))
+        for k, amount, variance in zip(chosen, amounts, np.diag(spread), strict=True)
+    ]
+    return tuple(found), share
+
+
+def unseen_directions(information: Array) -> tuple[str, ...]:
+    """Return names of the directions of which residuals say less than one standard deviation of
+    SIZES.
+
+    The least seen comes first.
+    """
+    values, vectors = np.linalg.eigh(information)
+    named = [
+        " with ".join(NAMES[k] for k in np.argsort(-np.abs(vector)) if abs(vector[k]) >= LARGE_PART)
+        for value, vector in zip(values, vectors.T, strict=True)
+        if value < 1.0
+    ]
+    place = () if len(information) == len(NAMES) else ("place of the whole rig (base pose)",)
+    return (*ALWAYS_UNSEEN, *place, *named)
+
+
+def _gain(information: Array, score: Array, chosen: list[int]) -> float:
+    part = information[np.ix_(chosen, chosen)]
+    if np.linalg.eigvalsh(part)[0] <= 0.0:
+        return 0.0
+    return float(score[chosen] @ np.linalg.solve(part, score[chosen]))

@@ -1,4 +1,4 @@
-"""The watch itself: takes measurements frame after frame, and says what it has found."""
+"""Watch for a drift, which takes measurements frame after frame."""
 
 from __future__ import annotations
 
@@ -15,27 +15,51 @@ from cmmsim.measuring.observation import Observer, StickerObservation
 from cmmsim.radiometry.stereo_images import StereoImages
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
 from cmmsim.uncertainty.drift_blocks import RIG, Sightings, base_rows, platform_rows, stacked
-from cmmsim.uncertainty.drift_evidence import SIZES, Evidence
-from cmmsim.uncertainty.drift_finding import Finding, movements, unseen_directions
+from cmmsim.uncertainty.drift_evidence import SIZES, Evidence, Finding, movements, unseen_directions
 from cmmsim.uncertainty.known_rig import KnownRig
 
-CHANCE = 0.01  # of a false alarm in a run
-BLOCK = 6  # frames at most whose residuals are averaged before they count
-TOGETHER = (
-    64  # blocks that are counted at once, so that a long run takes no more memory than a short one
-)
-FEWEST = 4  # stickers of a frame that can say something
+# Probability of a false alarm in a run.
+CHANCE = 0.01
+# Most frames whose residuals are averaged before they count.
+BLOCK = 6
+# Blocks that are counted at once, so that a long run takes no more memory than a short one.
+TOGETHER = 64
+# Fewest stickers of a frame that can say something.
+FEWEST = 4
+# Error of a centre that teaching and the image of a sticker leave, the same while it stands still.
 TAUGHT_OFFSET_PX = 3e-4
-"""What teaching and the image of a sticker leave of a centre, the same while it stands still."""
 
 
 class DriftWatch:
-    """Tells from measurements whether the rig still is as it was calibrated and taught.
+    """Watch that tells whether the rig still is as it was calibrated and taught.
 
-    Parameters: geometry that is known; known: how well its rig is, None for exactly; frame_period
-    s; chance of a false alarm in a run, however long; offset_px: what a centre may be off for
-    reasons that are not noise; base: whether the base's stickers are given as well. Raises CmmError
-    for a chance that is none.
+    Parameters
+    ----------
+    geometry : MeasuringGeometry
+        Geometry that is known.
+    known : KnownRig, optional
+        Accuracy of its rig; exact unless given.
+    frame_period : float
+        Time from frame to frame, s.
+    chance : float
+        Probability of a false alarm in a run, however long.
+    offset_px : float
+        Error of a centre for reasons that are not noise.
+    base : bool
+        True if the base's stickers are given as well.
+
+    Raises
+    ------
+    CmmError
+        If ``chance`` is no probability.
+
+    Examples
+    --------
+    >>> sensor.start_run(1)
+    >>> watch = sensor.watch_drift()
+    >>> measured = sensor.measure(sensor.home)
+    >>> watch.finding.frames, watch.finding.warning
+    (1, None)
     """
 
     def __init__(
@@ -59,7 +83,7 @@ class DriftWatch:
         self.restart()
 
     def restart(self) -> None:
-        """A new run begins; what was found is forgotten."""
+        """Begin a new run, and forget what was found."""
         taught = self.geometry.taught
         known = self._known
         centres = len(taught.platform_places) + (
@@ -84,15 +108,17 @@ class DriftWatch:
         self._noticed: int | None = None
 
     def look(self, measurement: Measurement, images: StereoImages, observer: Observer) -> None:
-        """The next frame, as ``add``: the base's stickers are looked for in its images where they
-        are watched.
+        """Take the next frame, as ``add``; watched stickers of the base are looked for in its
+        images.
         """
         self.add(
             measurement, self._base_in(images, observer) if len(measurement.target_ids) else None
         )
 
     def _base_in(self, images: StereoImages, observer: Observer) -> StickerObservation | None:
-        """The base's stickers in a frame; None where nobody watches them, or too few agree."""
+        """Return the base's stickers in a frame; None where nobody watches them, or too few
+        agree.
+        """
         if not self.watches_base:
             return None
         body = self.geometry.base
@@ -105,8 +131,10 @@ class DriftWatch:
             return None
 
     def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
-        """The next frame; a lost one, or one without stickers, says nothing but that time passes.
-        base: what is seen of the base's stickers."""
+        """Take the next frame, in which ``base`` is what is seen of the base's stickers.
+
+        A lost frame only says that time passes.
+        """
         time = self._frames * self._period
         self._frames += 1
         if not measurement.ok or len(measurement.target_ids) < FEWEST:
@@ -155,7 +183,7 @@ class DriftWatch:
         return np.array_equal(self._base.index, seen)
 
     def _begin(self, measurement: Measurement, base: StickerObservation | None) -> None:
-        """Have frames with these stickers wait to be counted."""
+        """Let frames with these stickers wait to be counted."""
         taught = self.geometry.taught
         self._platform_ids = measurement.target_ids
         index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
@@ -166,7 +194,7 @@ class DriftWatch:
             self._base = Sightings(base.index, taught.base_places[base.index], camera_from_base)
 
     def _close(self, end: int) -> None:
-        """Have the frames that wait be a block, after so many frames of the run."""
+        """Make a block of the frames that wait, after so many frames of the run."""
         if self._platform is None:
             return
         self._blocks.append(_Block(self._platform, self._base, end))
@@ -175,8 +203,9 @@ class DriftWatch:
             self._count()
 
     def _count(self) -> None:
-        """Count the blocks. Matrices are small: a second thread of the BLAS takes ten times as
-        long.
+        """Count the blocks.
+
+        Matrices are small: a second thread of the BLAS takes ten times as long.
         """
         with self._threads.limit(limits=1, user_api="blas"):
             for block, products in zip(self._blocks, self._products(), strict=True):
@@ -189,8 +218,9 @@ class DriftWatch:
         self._blocks.clear()
 
     def _products(self) -> list[Array]:
-        """Products of each block, as the evidence takes them; those with the same stickers
-        together.
+        """Return the products of each block, as the evidence takes them.
+
+        Blocks with the same stickers are computed together.
         """
         alike: dict[tuple[bytes, bytes | None], list[int]] = {}
         for number, block in enumerate(self._blocks):
@@ -212,8 +242,10 @@ class DriftWatch:
 
 @dataclass(frozen=True)
 class _Block:
-    """Frames with the same stickers: what was seen of the platform, and of the base where somebody
-    watched it; end: how many frames of the run had passed."""
+    """Frames with the same stickers of the platform, and of the base where it is watched.
+
+    ``end`` is the number of frames of the run that had passed.
+    """
 
     platform: Sightings
     base: Sightings | None
@@ -221,7 +253,7 @@ class _Block:
 
     @property
     def stickers(self) -> tuple[bytes, bytes | None]:
-        """Says which they are."""
+        """Key of the stickers."""
         return (
             self.platform.index.tobytes(),
             None if self.base is None else self.base.index.tobytes(),

@@ -1,4 +1,4 @@
-"""A stereo rig as it is known: its parameters, and how well."""
+"""A stereo rig as it is known: its parameters, and their covariance."""
 
 from __future__ import annotations
 
@@ -13,24 +13,38 @@ from cmmsim.geometry.camera import INTRINSIC_NAMES
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 
-# of the largest: what rounding may leave of a covariance's negative eigenvalues, in units of its
-# std
+# Negative eigenvalues that rounding may leave of a covariance, over the largest, in units of its
+# standard deviations.
 ROUNDING = 1e-9
 
 PHOTOGRAPHED = (
     np.diag([*2 * (1.0, 1.0, 0.5, 0.5, 2e-3, 2e-3, 1e-4, 1e-4, 0.0), *3 * (5e-5,), *3 * (1e-4,)])
     ** 2
 )
-"""Covariance (24,24) of a rig as fifteen photographs of a board leave it: focal lengths to 1 px and
-principal points to 0.5 px, as was measured of real ones, and the rest to match."""
+"""Covariance (24, 24) of a rig that was calibrated by fifteen photographs of a board.
+
+Focal lengths to 1 px and principal points to 0.5 px were found with real ones; the rest matches."""
 
 
 @dataclass(frozen=True)
 class KnownRig:
-    """rig, and the covariance (24,24) of what is true minus what is known, in the order of
-    PARAMETER_NAMES; its rows of what is known exactly are zero. exposure_std: of the time by which
-    the right camera exposes later, s. Raises CmmError for what is no covariance, naming the first
-    parameter at fault."""
+    """Rig that is known with a covariance.
+
+    Parameters
+    ----------
+    rig : StereoRig
+        Rig as it is known.
+    covariance : ndarray, shape (24, 24)
+        Covariance of true minus known parameters, in the order of PARAMETER_NAMES. Rows of exact
+        parameters are zero.
+    exposure_std : float
+        Standard deviation of the time by which the right camera exposes later, s.
+
+    Raises
+    ------
+    CmmError
+        If this is no covariance; the message names the first parameter at fault.
+    """
 
     rig: StereoRig
     covariance: Array
@@ -63,15 +77,19 @@ class KnownRig:
     def drawn(
         cls, true: StereoRig, covariance: Array, rng: np.random.Generator, exposure_std: float = 0.0
     ) -> KnownRig:
-        """Draw what a calibration with this covariance (24,24) would have found of a true rig."""
+        """Draw what a calibration with this covariance (24, 24) would have found of a true rig."""
         std, unit = _standardised(cls(true, covariance).covariance)
         values, vectors = np.linalg.eigh(unit)
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+        # The covariance is that of true minus known.
         return cls(true.moved(-std * draw), covariance, exposure_std)
 
     def line_std(self, points: Array) -> float:
-        """Largest standard deviation [px] by which what is not known of the rig moves images of
-        points (n, 3), in the camera frame, off the epipolar lines of the known rig."""
+        """Return the largest standard deviation, px, of images of points off their epipolar lines.
+
+        The lines are those of the known rig, whose errors move images of points (n, 3) in the
+        camera frame.
+        """
         std = np.sqrt(np.diag(self.covariance))
         moved = []
         for k in np.flatnonzero(std):
@@ -89,8 +107,8 @@ class KnownRig:
         )
 
     def _off_lines(self, true: StereoRig, points: Array) -> Array:
-        """Signed distances (n,) px of the right images of points from the epipolar lines of their
-        left ones.
+        """Return signed distances (n,) px of right images of points from the epipolar lines of left
+        ones.
         """
         left, right = (
             np.column_stack([camera.undistort(pixels)[0], np.ones(len(points))])
@@ -101,25 +119,24 @@ class KnownRig:
 
 
 def _standardised(covariance: Array) -> tuple[Array, Array]:
-    """Standard deviations (24,), and what is left of a covariance (24,24) in their units."""
+    """Return standard deviations (24,), and a covariance (24, 24) in their units."""
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(std > 0.0, std, 1.0)
     return std, covariance / np.outer(scale, scale)
 
 
 def rig_changes(changes: Mapping[str, float]) -> Array:
-    """Changes (24,) of a rig's parameters from those that are named, in their units.
+    """Return changes (24,) of a rig's parameters from those that are named, in their units.
 
-    Raises CmmError for a name that is none of PARAMETER_NAMES, ShapeError for a number that is not
-    finite.
+    Raises CmmError for a name that is none of PARAMETER_NAMES, and ShapeError for a number that is
+    not finite.
     """
     values = np.zeros(len(PARAMETER_NAMES))
     for name, value in changes.items():
         if name not in PARAMETER_NAMES:
             raise CmmError(
                 f"a rig has no parameter {name!r}: it has left. and right. with "
-                f"{', '.join(INTRINSIC_NAMES)}, and "
-                f"right_from_left. with {', '.join(PLACE_NAMES)}"
+                f"{', '.join(INTRINSIC_NAMES)}, and right_from_left. with {', '.join(PLACE_NAMES)}"
             )
         values[PARAMETER_NAMES.index(name)] = finite_array(
             value, (), f"the change of {name} must be a finite number"

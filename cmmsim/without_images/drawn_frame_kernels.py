@@ -1,7 +1,7 @@
-"""Compiled: a pose from what two cameras find of the platform's stickers, frame after frame.
+"""Compiled: a pose from the stickers that two cameras find, frame after frame.
 
-What is found is compared with what is expected at the true pose: it differs by noise, by what
-teaching left and by what is not known of the rig.
+The stickers found are compared with those expected at the true pose. They differ by noise, by the
+errors of teaching, and by those of the rig.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compilation import Array, compiled
-from cmmsim.geometry.camera_kernels import Cameras, faces, length_of, light_at, project
+from cmmsim.geometry.camera_kernels import Cameras, faces, length_of, light_at, project, triangulate
 from cmmsim.geometry.disc_kernels import bent_root, disc_ellipse
 from cmmsim.geometry.matrix_kernels import from_entries
-from cmmsim.geometry.point_kernels import triangulate
 from cmmsim.geometry.transform_kernels import (
     carry,
     multiply,
@@ -24,17 +23,18 @@ from cmmsim.geometry.transform_kernels import (
     transform_pose,
 )
 from cmmsim.measuring.solver_kernels import MEASURED, STATE, Belief, Outlines, Seen, solve
-from cmmsim.without_images.centre_kernels import CentreNoise, holds, smeared, tabulated
+from cmmsim.without_images.drawn_fit_kernels import CentreNoise, holds, smeared, tabulated
 from cmmsim.without_images.hiding_kernels import Solids, hidden_stickers
 
-SETTLED = 2e-4  # m: last step of a triangulation; stickers are expected where they are
+# m: last step of a triangulation, which begins at the expected place.
+SETTLED = 2e-4
 
 
 class Frame(NamedTuple):
     """Stickers as two cameras find them in one frame.
 
-    ``stickers`` are those that are used, where they are triangulated. pixels (n,2,2) have
-    covariances ``spreads`` (n,2,2,2), px², and ``variances`` (n,) of a coordinate in the mean of
+    ``stickers`` are those used, with their triangulated places. ``pixels`` (n, 2, 2) have
+    covariances ``spreads`` (n, 2, 2, 2), px², and ``variances`` (n,) of a coordinate in the mean of
     both images. ``longest`` (1,) is the longest way of a sticker during the exposure, px.
     """
 
@@ -46,8 +46,8 @@ class Frame(NamedTuple):
 
 
 class Stickers(NamedTuple):
-    """True and taught places (n,3) of the platform's stickers, and their normals (n,3), in its
-    axes; radius m.
+    """True and taught places (n, 3) of the platform's stickers, normals (n, 3) in its axes, and
+    radius, m.
     """
 
     true: Array
@@ -75,10 +75,10 @@ class Limits(NamedTuple):
 
 
 class Eyes(NamedTuple):
-    """Cameras at their true and at their known places, and all that they look at: the platform's
-    stickers with their owner (n,), body 0, the solids that hide them, the noise of centres, the
-    limits for what is found and believed, and the taught base_from_camera and camera_from_base
-    (4,4).
+    """Cameras at their true and at their known places, and all that they look at.
+
+    The platform's stickers have owners (n,), body 0. The taught base_from_camera and
+    camera_from_base are (4, 4).
     """
 
     looking: Cameras
@@ -97,12 +97,11 @@ class Eyes(NamedTuple):
 def see(
     side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: Array, frame: Frame
 ) -> None:
-    """Fill one image's pixels and covariances of the stickers that are ``used`` so far, and take
-    out what is not seen.
+    """Fill one image's pixels and covariances of the used stickers, and take out those not seen.
 
-    moves (b,4,4) camera_from_body of all solids, the platform first; ends (2,4,4): of the platform
-    at the beginning and the end of the exposure, where it is ``moving``; noise (n,3) unit normal:
-    of the centres, and of how thin an ellipse may be.
+    ``moves`` (b, 4, 4) are camera_from_body of all solids, the platform first. ``ends`` (2, 4, 4)
+    are those of the platform at the beginning and the end of the exposure, where it is ``moving``.
+    ``noise`` (n, 3) is unit normal, for the centres and for the limit of thin ellipses.
     """
     count = len(frame.variances)
     used = frame.stickers.used
@@ -135,6 +134,7 @@ def see(
         u, v, a, b, c, d = project(camera, places[n, 0], places[n, 1], places[n, 2])
         x, y, xx, xy, yy = disc_ellipse(places[n], normals[n], stickers.radius, camera)
         xx, xy, yy = bent_root(xx, xy, yy, a, b, c, d)
+        # The centre of the ellipse lies beside the image of the disc's centre (eccentricity).
         middle_u = u + camera[0] * (x - places[n, 0] / places[n, 2])
         middle_v = v + camera[1] * (y - places[n, 1] / places[n, 2])
         smear_u = 0.0
@@ -164,7 +164,10 @@ def see(
         else:
             wide, tilt, high = tabulated(table, first_node, steps, by_light, xx, xy, yy, light)
         first = math.sqrt(wide)
+        # Cholesky's factor of the covariance shapes the unit noise.
         across = tilt / first
+        # The estimator takes the eccentricity off, so the noise is added to the sticker's own
+        # pixel.
         pixels[n, 0] = u + first * noise[n, 0]
         pixels[n, 1] = v + across * noise[n, 0] + math.sqrt(high - across * across) * noise[n, 1]
         spread = spreads[n]
@@ -177,11 +180,12 @@ def see(
 
 @compiled
 def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame) -> None:
-    """Fill what both cameras find: pixels and covariances, and which stickers are used.
+    """Fill the finds of both cameras: pixels and covariances, and the stickers that are used.
 
-    poses (6,6): in the middle, at the beginning and at the end of the left camera's exposure, then
-    of the right one's; bodies (b,4,4): base_from_body of all solids but the platform; noise (2,n,3)
-    unit normal; kept (n,) whether a sticker is not left out by chance.
+    ``poses`` (6, 6) are in the middle, at the beginning and at the end of the left camera's
+    exposure, then of the right one's. ``bodies`` (b, 4, 4) are base_from_body of all solids but the
+    platform. ``noise`` (2, n, 3) is unit normal, and ``kept`` (n,) says that a sticker is not left
+    out by chance.
     """
     moving = False
     apart = False
@@ -198,6 +202,7 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
         for end in range(2 if moving else 0):
             pose_transform(poses[3 * side + 1 + end], platform)
             multiply(eyes.looking.moves[side], platform, ends[end])
+        # Both cameras see the same pose unless the right one exposes later.
         if side == 0 or moving or apart:
             pose_transform(poses[3 * side], platform)
         multiply(eyes.looking.moves[side], platform, moves[0])
@@ -208,7 +213,7 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
 
 @compiled
 def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
-    """Take out stickers that nobody looks for with the platform at ``place`` (4,4).
+    """Take out stickers that nobody looks for with the platform at ``place`` (4, 4).
 
     The others are triangulated.
     """

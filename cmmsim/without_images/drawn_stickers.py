@@ -1,10 +1,12 @@
-"""One exposure of two cameras without images: what the fit of ellipses would find in windows of
-them.
+"""One exposure of two cameras without images: the results that fits of ellipses would have.
 
 A sticker that is seen whole in an image is found where the centre of its ellipse is, and with its
-shape, both with noise of the covariance that the fit states there: the inverse of its normal matrix
-at the true ellipse. What the noise does to the fit beyond the first order is left out; so is a
-sticker of which anything is hidden.
+shape, both with noise. The covariance of the noise is the one that the fit states there: the
+inverse of its normal matrix at the true ellipse. Effects of noise on the fit beyond the first order
+are left out, and so is a sticker of which anything is hidden.
+
+Exposures without images are proved to be like those with images under some conditions; others are
+refused.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,11 +17,12 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.allowed_plugins import RENDERERS
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR, RENDERERS
 from cmmsim.detection.detector import DetectedCentres
-from cmmsim.detection.ellipse_fit import SMALLEST_RADIUS_PX, EllipseFits, fit_settings
+from cmmsim.detection.ellipse_fit import RING_REACH, SMALLEST_RADIUS_PX, EllipseFits, fit_settings
 from cmmsim.errors import CmmError
-from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.files.schema import SensorFile
+from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.disc_image import bend_outlines, bending, project_discs
 from cmmsim.geometry.pose import IDENTITY, Array, frozen, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
@@ -27,21 +30,82 @@ from cmmsim.imaging.renderer import Renderer
 from cmmsim.imaging.scene_bodies import PlacedBodies
 from cmmsim.imaging.stereo_camera import Quality
 from cmmsim.measuring.observation import Observer
-from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.without_images.conditions import NAME, Light, require_short
+from cmmsim.radiometry.noise import NO_SWING, CameraNoise
 from cmmsim.without_images.sticker_scene import StickerScene
 
 if TYPE_CHECKING:
-    from cmmsim.without_images.drawn_window_kernels import Ellipses, Windows
+    from cmmsim.without_images.drawn_fit_kernels import Ellipses, Windows
 
+NAME = "statistical"
+WIDEST_PSF_PX = 1.0
+LONGEST_STREAK_PX = 4.0
+# Standard deviations of noise that must stay between black and white.
+CLIPPED = 3.0
 THIN_PX = 0.885
 """Half width of an ellipse at which half of the fits end at the smallest ellipse.
 
 It is measured in images. The errors of such fits are not of first order.
 """
-
 THIN_STD_PX = 0.055
 """Standard deviation of the half width at which fits begin to end there, also measured."""
+# base_from_body (4, 4) of a body without a place: far below.
+ABSENT = frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
+
+
+@dataclass(frozen=True)
+class Light:
+    """Radiance, 0 to 1, of stickers and of their rings, and the lens."""
+
+    sticker: float
+    ring: float
+    optics: Optics
+
+
+def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
+    """Raise CmmError, naming the key and its limit, for a sensor that the proof does not cover."""
+    ring, bright = (
+        float(noise.mean_grey(np.array(level))) for level in (light.ring, light.sticker)
+    )
+    low, high = (float(np.sqrt(noise.variance(np.array(grey)))) for grey in (ring, bright))
+    stickers = file.stickers
+    detector = file.detection.detector
+    wrong = [
+        (detector != DEFAULT_DETECTOR, f"detection.detector {detector!r}", DEFAULT_DETECTOR),
+        (not noise.enabled, "camera.noise false", "true: without noise, rounding alone decides"),
+        (noise.prnu > 0.0 or noise.dsnu > 0.0, f"camera.prnu {noise.prnu:g}, dsnu {noise.dsnu:g}",
+         "0: a pattern is the same in each frame"),
+        (low**2 < NO_SWING, f"noise of {low:.2g} grey values in the dark", "at least "
+                                                                           f"{NO_SWING**0.5:.2g}"),
+        (ring < CLIPPED * low or bright > noise.white_level - CLIPPED * high,
+         f"rings and stickers of {ring:.0f} and {bright:.0f} grey values",
+         f"{CLIPPED:g} standard deviations of noise within 0 to {noise.white_level}"),
+        (file.lens.psf_px > WIDEST_PSF_PX, f"lens.psf_px {file.lens.psf_px:g}", "at most "
+                                                                                f"{WIDEST_PSF_PX:g}"),
+        (stickers.ring_radius < RING_REACH * stickers.radius, "stickers.ring_radius "
+                                                              f"{stickers.ring_radius:g} m",
+         f"at least {RING_REACH:g} times radius {stickers.radius:g} m"),
+    ]  # fmt: skip
+    for refused, what, needed in wrong:
+        if refused:
+            raise CmmError(_not_proved(what, needed))
+
+
+def require_short(longest_px: float) -> None:
+    """Raise CmmError where an exposure draws stickers out farther than it was proved for."""
+    if longest_px > LONGEST_STREAK_PX:
+        raise CmmError(
+            _not_proved(
+                f"stickers drawn out over {longest_px:.1f} px by the exposure",
+                f"at most {LONGEST_STREAK_PX:g} px",
+            )
+        )
+
+
+def _not_proved(what: str, needed: str) -> str:
+    return (
+        f"renderer {NAME!r} is not proved for {what}, only for {needed}; take the renderer "
+        "analytic or pyrender"
+    )
 
 
 def refuse_images(*_: object, **__: object) -> NoReturn:
@@ -54,17 +118,15 @@ def refuse_images(*_: object, **__: object) -> NoReturn:
 
 
 STATISTICAL = Renderer(NAME, refuse_images)
-ABSENT = frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
-"""base_from_body (4,4) of a body without a place: far below."""
 
 
 @dataclass(frozen=True)
 class StatisticalStereoCamera:
-    """Two cameras that look at the true scene and say what a fit would find; as
-    `VirtualStereoCamera`, without images.
+    """Two cameras that look at the true scene and say what a fit would find.
 
-    rig and camera_from_base (4,4), the true ones; light; exposure and right_later in s;
-    obstacle_names: of the scene's solids after platform and base.
+    They are like `VirtualStereoCamera`, without images. ``rig`` and ``camera_from_base`` (4, 4) are
+    the true ones; ``exposure`` and ``right_later`` are in s. ``obstacle_names`` are those of the
+    scene's solids after platform and base.
     """
 
     rig: StereoRig
@@ -83,8 +145,9 @@ class StatisticalStereoCamera:
         quality: Quality | None = None,
         pose_rate: Array | None = None,
     ) -> "DrawnStickers":
-        """One exposure; parameters as of ``VirtualStereoCamera.look``. How many are averaged, the
-        observer knows.
+        """Take one exposure; parameters are those of ``VirtualStereoCamera.look``.
+
+        The observer's noise knows how many exposures are averaged.
         """
         rates = None if pose_rate is None else pose_rate[None]
         return DrawnStickers(
@@ -92,12 +155,15 @@ class StatisticalStereoCamera:
         )
 
     def moved(self, changes: Array) -> "StatisticalStereoCamera":
-        """The same cameras with changes (24,) of their rig's parameters."""
+        """Return the cameras with changes (24,) of their rig's parameters."""
         return replace(self, rig=self.rig.moved(changes))
 
     def exposed(self, poses: Array, rates: Array | None) -> Array:
-        """Poses (N,6,6) of the platform at poses (N,6) in motion at rates (N,6): in the middle, at
-        the beginning and at the end of the left camera's exposure, then of the right one's."""
+        """Return poses (N, 6, 6) of the platform at poses (N, 6) in motion at rates (N, 6).
+
+        They are in the middle, at the beginning and at the end of the left camera's exposure, then
+        of the right one's.
+        """
         if rates is None:
             return np.repeat(poses[:, None], 6, axis=1)
         half = 0.5 * self.exposure
@@ -106,20 +172,21 @@ class StatisticalStereoCamera:
         return np.asarray(poses[:, None] + later[:, None] * rates[:, None])
 
     def placed(self, obstacles: Mapping[str, Array]) -> Array:
-        """base_from_body (b,4,4) of the base and of all obstacles; those without a place lie far
-        below.
+        """Return base_from_body (b, 4, 4) of the base and of all obstacles.
+
+        Obstacles without a place lie far below.
         """
         if isinstance(obstacles, PlacedBodies) and obstacles.names == tuple(self.obstacle_names):
             return np.concatenate((IDENTITY[None], obstacles.together))
         return np.array([IDENTITY, *(obstacles.get(name, ABSENT) for name in self.obstacle_names)])
 
     def centre_error_px(self, quality: Quality) -> float:
-        """Error of a sticker's centre that drawing leaves: none, as nothing is drawn."""
+        """Return the error of a sticker's centre that drawing leaves: 0, as nothing is drawn."""
         return 0.0
 
     def greys(self, noise: CameraNoise, side: int, centres: Array) -> tuple[Array, Array]:
-        """Contrasts (k,) of stickers at centres (k,2) px of one image, and the grey values (k,) of
-        their grounds.
+        """Return contrasts (k,) of stickers at centres (k, 2) px of one image, and their grounds
+        (k,).
         """
         lit = self.light.optics.illumination(self.rig.cameras[side], centres)
         grounds = np.asarray(noise.mean_grey(self.light.ring * lit))
@@ -131,8 +198,9 @@ class StatisticalStereoCamera:
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     def side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Centres (m,2) and shapes (m,2,2) of ellipses that are fitted in one image, px, and which
-        are seen whole.
+        """Return centres (m, 2) and shapes (m, 2, 2) of ellipses in one image, px.
+
+        The third result says which are seen whole.
         """
         places, normals = self.scene.placed(moves)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
@@ -155,8 +223,8 @@ class StatisticalStereoCamera:
 class DrawnStickers:
     """Stickers as a fit would find them in one exposure, worked out as far as they are asked for.
 
-    camera; exposed (6,6) poses as of ``StatisticalStereoCamera.exposed``; bodies (b,4,4) as of its
-    ``placed``; rng of its noise.
+    ``exposed`` (6, 6) are poses as of ``StatisticalStereoCamera.exposed``, ``bodies`` (b, 4, 4)
+    those of its ``placed``, and ``rng`` is that of the noise.
     """
 
     full = windows = refuse_images
@@ -175,10 +243,11 @@ class DrawnStickers:
 
     @cached_property
     def _found(self) -> "Ellipses":
-        """The ellipses of all stickers; their grey values, which the observer's noise decides, are
-        not known yet.
+        """Ellipses of all stickers.
+
+        Their grey values, which the observer's noise decides, are not known yet.
         """
-        from cmmsim.without_images.drawn_window_kernels import Ellipses
+        from cmmsim.without_images.drawn_fit_kernels import Ellipses
 
         camera = self.camera
         centres: list[Array] = []
@@ -208,8 +277,8 @@ class DrawnStickers:
         return Ellipses(at, shape, smear, np.stack(seen), noise, np.zeros((2, 0)), np.zeros((2, 0)))
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
-        """See ``StickerExposure``: in each window the sticker nearest to its middle."""
-        from cmmsim.without_images.drawn_window_kernels import nearest_stickers
+        """Find in each window the sticker nearest to its middle, see ``StickerExposure``."""
+        from cmmsim.without_images.drawn_fit_kernels import nearest_stickers
 
         windows = _empty_windows(2 * corners.shape[1], observer)
         ellipses = self._found
@@ -219,7 +288,7 @@ class DrawnStickers:
         return self._fitted(windows, observer)
 
     def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
-        """See ``StickerExposure``."""
+        """Find the ellipses in both whole images, see ``StickerExposure``."""
         found = []
         for side, camera in enumerate(self.camera.rig.cameras):
             centres = self._found.centres[side]
@@ -237,8 +306,8 @@ class DrawnStickers:
         return found[0], found[1]
 
     def _fitted(self, windows: "Windows", observer: Observer) -> EllipseFits:
-        """Ellipses that are found in windows."""
-        from cmmsim.without_images.drawn_window_kernels import Fits, Smallest, fit_stickers
+        """Return the ellipses that are found in windows."""
+        from cmmsim.without_images.drawn_fit_kernels import Fits, Smallest, fit_stickers
 
         settings = observer.settings
         noise = observer.noise
@@ -277,10 +346,9 @@ class DrawnStickers:
 
 
 def _empty_windows(count: int, observer: Observer) -> "Windows":
-    """Room for windows."""
-    from cmmsim.without_images.drawn_window_kernels import (
-        Windows,
-    )  # compiles, so it is loaded where it is first needed
+    """Make room for windows."""
+    # Late, as numba takes time to import.
+    from cmmsim.without_images.drawn_fit_kernels import Windows
 
     whole = np.empty((2, count), dtype=int)
     found = np.empty(count, dtype=bool)

@@ -1,4 +1,4 @@
-"""Compiled: which stickers convex solids hide."""
+"""Compiled: the stickers that convex solids hide."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from cmmsim.geometry.disc_kernels import probe_discs
 from cmmsim.geometry.transform_kernels import carry
 from cmmsim.imaging.layer_kernels import enters
 
-PROBES = 12  # points about a sticker, asked with its middle whether a solid hides them
-TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
+# Points about a sticker that are probed, with its middle, for solids that hide them.
+PROBES = 12
+# Share of the way to a point in which meeting a solid counts as lying on it.
+TOUCHING = 1e-6
 
 
 class Solids(NamedTuple):
-    """Convex solids b, in their own axes: faces ``starts[b]`` to ``starts[b + 1]`` of normals
-    (f,3), outwards, and offsets (f,); the ball of ``radii[b]`` about ``middles[b]`` (3,) holds all
-    of it."""
+    """Convex solids in their own axes.
+
+    The faces of solid b are ``starts[b]`` to ``starts[b + 1]`` of outward normals (f, 3) and
+    offsets (f,). The ball of ``radii[b]`` about ``middles[b]`` (3,) holds all of it.
+    """
 
     starts: Array
     normals: Array
@@ -38,6 +42,7 @@ def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
     for i in range(3):
         along += (point[i] - eye[i]) * (middle[i] - eye[i])
         total += (point[i] - eye[i]) ** 2
+    # The point of the line of sight, between its ends, that is nearest to the middle.
     share = min(max(along / total, 0.0), 1.0)
     for i in range(3):
         gap += (eye[i] + share * (point[i] - eye[i]) - middle[i]) ** 2
@@ -46,7 +51,9 @@ def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
 
 @compiled
 def to_body(move: Array, point: Array, into: Array) -> None:
-    """Point (3,) in camera axes ``into`` axes of the body at camera_from_body ``move`` (4,4)."""
+    """Carry a point (3,) in camera axes into axes of the body at camera_from_body ``move`` (4,
+    4).
+    """
     for i in range(3):
         into[i] = 0.0
         for j in range(3):
@@ -65,11 +72,11 @@ def hidden_stickers(
     hidden: Array,
 ) -> None:
     """Fill ``hidden`` (n,): whether a solid stands before any point within ``clear`` m of a
-    sticker, in its plane.
+    sticker.
 
-    moves (b,4,4) camera_from_body of the solids; places and normals (n,3) of stickers in camera
-    axes; owners (n,) the solids that carry them, which do not hide them. Only stickers that are
-    ``asked`` (n,) are looked at.
+    The points lie in the sticker's plane. ``moves`` (b, 4, 4) are camera_from_body of the solids;
+    places and normals (n, 3) of stickers are in camera axes. The solids ``owners`` (n,) carry them
+    and do not hide them. Only stickers that are ``asked`` (n,) are looked at.
     """
     camera = np.zeros(3)
     eyes = np.empty((len(moves), 3))
@@ -88,6 +95,7 @@ def hidden_stickers(
         for b in range(len(moves)):
             if b == owners[n] or hidden[n]:
                 continue
+            # Two cheap tests first: most solids are far from the line of sight.
             if not reaches(camera, places[n], middles[b], solids.radii[b] + clear):
                 continue
             eye = eyes[b]

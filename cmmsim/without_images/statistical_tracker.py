@@ -1,33 +1,35 @@
 """Poses measured without images, one by one or many together.
 
-The stickers found are those of ``DrawnStickers``, but for a covariance from a table, and nothing is
+The stickers found are those of ``DrawnStickers``, except for a covariance from a table. Nothing is
 searched: each sticker is looked for where it is.
+
+The table holds the noise of a sticker's centre over its ellipse. The fit states a covariance at a
+centre, see `fit_covariances`. Its mean over all places of the centre within a pixel is inverted.
+The inverse grows with the rim: over the mean half axis m it changes little with m, and smoothly
+with the ovalness p = (A_xx - A_yy) / 2 m and q = A_xy / m of the ellipse's shape A.
 """
 
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.detection.ellipse_fit import SMALLEST_RADIUS_PX, fit_settings
 from cmmsim.errors import CmmError
 from cmmsim.geometry.camera_kernels import Cameras
 from cmmsim.geometry.pose import Array, invert
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.measuring.frame_solver import (
-    CHANCE,
-    belief_for,
-    lost_reason,
-)
-from cmmsim.measuring.measured_poses import MeasuredPoses
-from cmmsim.measuring.measurement import Measurement, lost_measurement
+from cmmsim.measuring.frame_solver import CHANCE, belief_for, lost_reason
+from cmmsim.measuring.measurement import MeasuredPoses, Measurement, lost_measurement
 from cmmsim.measuring.observation import GRAZING
 from cmmsim.measuring.pose_estimator import PoseEstimator
 from cmmsim.measuring.solver_kernels import COLUMNS, FIRST, LEFT, MEASURED, STATE, Seen
+from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoImages
-from cmmsim.without_images.centre_noise import centre_noise
-from cmmsim.without_images.conditions import require_short
+from cmmsim.without_images.drawn_fit_kernels import CentreNoise, fit_covariances
 from cmmsim.without_images.drawn_frame_kernels import (
     Eyes,
     Frame,
@@ -41,17 +43,98 @@ from cmmsim.without_images.drawn_stickers import (
     THIN_STD_PX,
     DrawnStickers,
     StatisticalStereoCamera,
+    require_short,
 )
 from cmmsim.without_images.sticker_scene import CLEAR
 
-OUTLINE_CHANCE = 2 * CHANCE  # of a good sticker to be left out for an outline in either image
-SETTLED = 1e-4  # rad: turn of the last step of a fit, which begins at the true pose
-BLOCK = 512  # frames that share a stream of noise and a thread's turn
+# Values of p and of q.
+OVAL = np.linspace(-0.78, 0.78, 14)
+# Mean half axes, up to half of the fitted part.
+RADII = 8
+MOST_OVAL = 0.85
+# Places within a pixel, along each axis.
+SHARP_PHASES = 5
+BLURRED_PHASES = 2
+# px by which a tabulated ellipse stays within the fitted part.
+EDGE_PX = 0.2
+# Shares of light at which its effect is followed.
+LIGHTS = np.array([0.4, 0.7, 1.0])
+# Probability that a good sticker is left out for an outline in either image.
+OUTLINE_CHANCE = 2 * CHANCE
+# rad: turn of the last step of a fit, which begins at the true pose.
+SETTLED = 1e-4
+# Frames that share a stream of noise and a thread's turn.
+BLOCK = 512
+
+
+@lru_cache(maxsize=16)
+def centre_noise(
+    noise: CameraNoise, psf_px: float, fit_size: int, sticker: float, ring: float
+) -> CentreNoise:
+    """Return the table for stickers and rings of these radiances, 0 to 1, in parts of ``fit_size``
+    px.
+    """
+    dark, bright, black = (
+        float(noise.mean_grey(np.array(level))) for level in (ring, sticker, 0.0)
+    )
+    settings = fit_settings(noise, psf_px)
+    phases = SHARP_PHASES if psf_px == 0.0 else BLURRED_PHASES
+    within = (np.arange(phases) + 0.5) / phases - 0.5
+
+    def covariances(shapes: Array, light: float) -> Array:
+        """Return mean covariances (n, 2, 2) of centres of ellipses with shapes (n, 2, 2)."""
+        found = np.empty((len(shapes), 5, 5))
+        total = np.zeros((len(shapes), 2, 2))
+        for phase in np.stack(np.meshgrid(within, within), axis=-1).reshape(-1, 2):
+            centres = np.tile(0.5 * (fit_size - 1) + phase, (len(shapes), 1))
+            contrasts = np.full(len(shapes), light * (bright - dark))
+            grounds = np.full(len(shapes), black + light * (dark - black))
+            still = np.zeros((len(shapes), 2))
+            fit_covariances(centres, shapes, still, contrasts, grounds, fit_size, settings, found)
+            total += found[:, :2, :2]
+        return total / phases**2
+
+    radii = np.linspace(SMALLEST_RADIUS_PX, 0.5 * fit_size, RADII)
+    m, p, q = np.meshgrid(radii, OVAL, OVAL, indexing="ij")
+    found = covariances(_shapes(m.ravel(), p.ravel(), q.ravel(), 0.5 * fit_size - EDGE_PX), 1.0)
+    known = np.linalg.inv(found)[:, [0, 0, 1], [0, 1, 1]] / m.reshape(-1, 1)
+    table = known.reshape(*m.shape, 3)
+    usual = _shapes(np.array([0.3 * fit_size]), np.array([0.25]), np.array([0.0]), 0.5 * fit_size)
+    growth = [float(np.trace(covariances(usual, light)[0])) for light in LIGHTS]
+    by_light = (
+        np.polynomial.Polynomial.fit(LIGHTS, LIGHTS**2 * np.array(growth) / growth[-1], 2)
+        .convert()
+        .coef
+    )
+    first = np.array([radii[0], OVAL[0], OVAL[0]])
+    steps = np.array([np.diff(radii)[0], *2 * [np.diff(OVAL)[0]]])
+    return CentreNoise(
+        table, first, steps, by_light, bright - dark, dark - black, black, fit_size, settings
+    )
+
+
+def _shapes(m: Array, p: Array, q: Array, largest: float) -> Array:
+    """Return shapes (n, 2, 2) of mean half axes m (n,) px and ovalness p, q (n,).
+
+    Their half axes are limited to those that can be fitted.
+    """
+    oval = np.minimum(np.hypot(p, q), MOST_OVAL)
+    angle = 0.5 * np.arctan2(q, p)
+    long, short = (
+        np.clip(m * (1.0 + sign * oval), SMALLEST_RADIUS_PX, largest) for sign in (1.0, -1.0)
+    )
+    mean = 0.5 * (long + short)
+    half = 0.5 * (long - short)
+    xx = mean + half * np.cos(2 * angle)
+    xy = half * np.sin(2 * angle)
+    yy = mean - half * np.cos(2 * angle)
+    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 
 class StatisticalTracker:
-    """Measures frame after frame as a `Tracker` does. Nothing is predicted: what is lost is found
-    again at once.
+    """Tracker that measures frame after frame as a `Tracker` does.
+
+    Nothing is predicted: a lost platform is found again at once.
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
@@ -61,13 +144,14 @@ class StatisticalTracker:
             )
         self._estimator = estimator
         self._camera: StatisticalStereoCamera | None = None
-        self._one = self._frame()  # what is found in a frame, overwritten by the next
+        # Finds of a frame, which the next one overwrites.
+        self._one = self._frame()
 
     def forget(self) -> None:
-        """There is nothing to be forgotten."""
+        """Do nothing: there is nothing to be forgotten."""
 
     def miss(self) -> None:
-        """A frame passed that nobody saw."""
+        """Pass a frame that nobody saw."""
 
     def measure(self, exposure: StereoImages) -> Measurement:
         """Measure one frame, such as ``sensor.look`` returns; raises CmmError for images."""
@@ -113,8 +197,10 @@ class StatisticalTracker:
         bodies: Array,
         rng: np.random.Generator,
     ) -> MeasuredPoses:
-        """Frames (N,6,6), as of ``StatisticalStereoCamera.exposed``, among bodies (b,4,4) that
-        stand still.
+        """Measure frames (N, 6, 6), as of ``StatisticalStereoCamera.exposed``, among bodies (b, 4,
+        4).
+
+        The bodies stand still.
         """
         count = len(exposed)
         eyes = self._eyes_of(camera)
@@ -132,12 +218,14 @@ class StatisticalTracker:
             require_short(measure_frames(eyes, poses, bodies, noise, kept, self._frame(), *filled))
             stickers[part] = np.where(verdicts[:, STATE] == MEASURED, verdicts[:, LEFT], 0)
 
+        # Kernels release the interpreter's lock. Each block has a stream of its own, so that
+        # threads change no numbers.
         with ThreadPoolExecutor(min(len(starts) or 1, os.cpu_count() or 1)) as pool:
             list(pool.map(block, starts, rng.spawn(len(starts))))
         return MeasuredPoses(found, spreads, stickers)
 
     def _eyes_of(self, camera: StatisticalStereoCamera) -> Eyes:
-        """Cameras and all that they look at.
+        """Return the cameras and all that they look at.
 
         Where a camera has only moved since the last frame, the rest stays.
         """
@@ -157,14 +245,18 @@ class StatisticalTracker:
         return Frame(stickers, pixels, np.empty((n, 2, 2, 2)), np.empty(n), np.empty(1))
 
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Unit normal noise (N,2,n,3) of centres and of how thin ellipses may be, and which
-        stickers (N,n) are not left out for their outlines."""
+        """Draw unit normal noise (N, 2, n, 3), and the stickers (N, n) that are not left out by
+        chance.
+
+        The noise is that of the centres and of the limit for thin ellipses. Outlines leave stickers
+        out.
+        """
         n = len(self._estimator.platform.sticker_ids)
         return rng.standard_normal((frames, 2, n, 3)), rng.random((frames, n)) >= OUTLINE_CHANCE
 
 
 def _eyes(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> Eyes:
-    """Cameras and all that they look at, as the kernels take them."""
+    """Return the cameras and all that they look at, as the kernels take them."""
     settings = estimator.settings
     taught = estimator.taught
     own = camera.scene.owners == 0

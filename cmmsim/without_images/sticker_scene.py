@@ -14,14 +14,17 @@ from cmmsim.imaging.scene_bodies import ConvexSolid, Mesh, SceneBody
 if TYPE_CHECKING:
     from cmmsim.without_images.hiding_kernels import Solids
 
-# radii of a sticker within which nothing may stand before it and its ring: about what is fitted
+# Radii of a sticker within which nothing may stand before it and its ring: about the fitted part.
 CLEAR = 1.75
 
 
 @dataclass(frozen=True)
 class StickerScene:
-    """m stickers of a radius, m, at places (m,3) with normals (m,3) in the axes of their owners
-    (m,), bodies 0 and 1; solids: of all bodies, those that carry no stickers last."""
+    """Stickers of one radius, m, and the solids of all bodies.
+
+    They are at places (m, 3) with normals (m, 3) in the axes of their owners (m,), bodies 0 and 1.
+    Solids that carry no stickers come last.
+    """
 
     places: Array
     normals: Array
@@ -31,7 +34,7 @@ class StickerScene:
 
     @classmethod
     def of(cls, bodies: Sequence[SceneBody], obstacles: Sequence[Mesh]) -> "StickerScene":
-        """The scene of bodies with stickers and of further solids."""
+        """Return the scene of bodies with stickers and of further solids."""
         discs = [
             (stack.discs[-1], owner) for owner, body in enumerate(bodies) for stack in body.stickers
         ]
@@ -47,27 +50,23 @@ class StickerScene:
         )
 
     def placed(self, moves: Array) -> tuple[Array, Array]:
-        """Places and normals (m,3) in the axes of a camera at which bodies stand by ``moves``
-        (b,4,4).
+        """Return places and normals (m, 3) in the axes of a camera, where bodies stand at (b, 4,
+        4).
         """
-        from cmmsim.geometry.disc_kernels import (
-            place_discs,
-        )  # compiles, so it is loaded where it is first needed
+        # Late, as numba takes time to import.
+        from cmmsim.geometry.disc_kernels import place_discs
 
         places = np.empty_like(self.places)
         normals = np.empty_like(self.normals)
         place_discs(moves, self.owners, self.places, self.normals, places, normals)
         return places, normals
 
-    def centres(self, moves: Array) -> Array:
-        """Places alone."""
-        return self.placed(moves)[0]
-
     def hidden(
         self, moves: Array, places: Array, normals: Array, asked: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Tell whether a solid stands before any part of the stickers (m,) with places and normals
-        (m,3) in camera axes; only those ``asked`` (m,) are looked at.
+        """Tell whether a solid stands before any part of stickers (m,).
+
+        They have places and normals (m, 3) in camera axes; only those ``asked`` (m,) are looked at.
         """
         from cmmsim.without_images.hiding_kernels import hidden_stickers
 
@@ -79,7 +78,7 @@ class StickerScene:
 
     @cached_property
     def hiding(self) -> "Solids":
-        """The solids as ``hidden_stickers`` takes them."""
+        """Solids as ``hidden_stickers`` takes them."""
         from cmmsim.without_images.hiding_kernels import Solids
 
         faces = [solid.faces for solid in self.solids]

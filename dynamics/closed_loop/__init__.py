@@ -30,12 +30,7 @@ from dynamics.closed_loop.loop_settings import (
     Sensor,
     ServoGains,
 )
-from dynamics.closed_loop.many_runs import (
-    prepare,
-    repeat_commands,
-    repeat_servo,
-    simulate_batch,
-)
+from dynamics.closed_loop.many_runs import prepare, repeat_commands, repeat_servo, simulate_batch
 from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
 from dynamics.closed_loop.simulate import (
     differentiate_commands,
@@ -44,10 +39,7 @@ from dynamics.closed_loop.simulate import (
     simulate_controller,
     simulate_servo,
 )
-from dynamics.closed_loop.start_state import (
-    StartState,
-    equilibrium,
-)
+from dynamics.closed_loop.start_state import StartState, equilibrium
 
 __all__ = [
     "IDEAL",

@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dynamics.closed_loop.problem import (
-    LoopProblem,
-)
+from dynamics.closed_loop.problem import LoopProblem
 
 Instant = tuple[int, float]
 """Frame, and time since that frame, s. Equal delays thus give equal spans in all frames."""
@@ -24,10 +22,10 @@ Instant = tuple[int, float]
 class CommandSchedule(NamedTuple):
     """Spans of time in which one command acts. No span is longer than to the end of its frame.
 
-    first: the spans of frame k are first[k] to first[k + 1]. Arrays with one entry a span: command,
-    number of the frame that issued the command, negative before the start; ramp, share of the way
-    from the command before that is done as the span begins, 1 for all of it; duration, s; steps,
-    number of integration steps.
+    The spans of frame k are first[k] to first[k + 1]. The other arrays have one entry a span.
+    `command` is the number of the frame that issued the command, negative before the start. `ramp`
+    is the share of the way from the command before that is done as the span begins, 1 for all of
+    it. `duration` is in s, and `steps` is the number of integration steps.
     """
 
     first: np.ndarray

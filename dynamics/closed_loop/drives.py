@@ -62,10 +62,10 @@ ABOVE_ZERO: Mapping[str, tuple[str, ...]] = {
 class JointLaw(NamedTuple):
     """Law of a joint with its gains.
 
-    lp, li, ld: gains, 0 where the law does not read them. lx and rate_weight (c): as in the
-    module's formula. lx_by (3,): derivatives of lx with respect to lp, li, ld. reads (3,): 1 for
-    each gain that the law reads, else 0. filter_time: time constant of the filter of the rate, s,
-    or 0.
+    The gains lp, li and ld are 0 where the law does not read them. `lx` and `rate_weight` (c) are
+    those of the module's formula, and `lx_by` (3,) the derivatives of lx with respect to lp, li,
+    ld. `reads` (3,) is 1 for each gain that the law reads, else 0. `filter_time` is the time
+    constant of the filter of the rate, s, or 0.
     """
 
     lp: float
@@ -90,7 +90,7 @@ class JointLaw(NamedTuple):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives (n, p) of command and integral of `held` with respect to all parameters.
 
-        by_dynamic: derivatives of the torque with respect to the dynamic parameters.
+        `by_dynamic` are derivatives of the torque with respect to the dynamic parameters.
         """
         command, integral = self.held(torque, angle)
         none = np.zeros((len(torque), len(JOINT_PID)))

@@ -1,7 +1,8 @@
 """Execution of a run: its problem is put into the memory of the kernels, which do its frames.
 
 The same lines run compiled and, as the oracle of that, as plain Python. Sensors and controllers of
-a user are Python, so that the kernels then do one frame at a time.
+a user are Python, so that the kernels then do one frame at a time. A run that ends early says what
+the kernels found to be the reason.
 """
 
 from dataclasses import replace
@@ -12,25 +13,20 @@ import numpy as np
 
 from dynamics.checks import floats
 from dynamics.closed_loop.command_schedule import command_schedule
-from dynamics.closed_loop.early_end import failure, stopped
 from dynamics.closed_loop.frame_kernels import measure_ideally, run_frames
 from dynamics.closed_loop.lane_kernels import run_lanes
-from dynamics.closed_loop.loop_settings import (
-    IDEAL,
-    EveryFrame,
-    IdealSensor,
-    RateSensor,
-)
+from dynamics.closed_loop.loop_settings import IDEAL, EveryFrame, IdealSensor, RateSensor
 from dynamics.closed_loop.motion_kernels import (
+    LEFT_REACH,
+    MEASURED_OUT_OF_REACH,
+    SINGULAR_MASS,
+    TOO_MANY_EVENTS,
     decide_modes,
     evaluate,
     evaluate_terms,
 )
-from dynamics.closed_loop.problem import (
-    LoopProblem,
-    Sizes,
-)
-from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
+from dynamics.closed_loop.problem import LoopProblem, Sizes
+from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure, saturated_frames
 from dynamics.closed_loop.run_memory import Memory, Plan, empty, empty_memory, empty_record
 from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent, whole_vectors
 from dynamics.closed_loop.stick_slip_kernels import stop_joints
@@ -47,6 +43,15 @@ MACHINE_CODE = (
 
 CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, stop_tangent)
 """Kernels that other kernels call by their addresses."""
+UNSTABLE = " (the loop is unstable)"
+FAILURES = {
+    LEFT_REACH: f"the robot left the reachable set{UNSTABLE}:",
+    SINGULAR_MASS: "the mass matrix is not positive definite: masses or inertias are zero or "
+    "overflow",
+    TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
+    MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; "
+    "there",
+}
 
 
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
@@ -365,3 +370,28 @@ def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
         line.__name__: address(kernel if compiled else line, *arguments)
         for kernel, line in lines.items()
     }
+
+
+def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any) -> LoopFailure:
+    """Error of a run that ended early, with the leg that is to blame for a pose out of reach."""
+    why = FAILURES[status]
+    if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
+        last = now.known.inputs[: problem.sizes.coordinates]
+        at = problem.robot.pose(last if status == LEFT_REACH else record.measured[frame])
+        margin = problem.robot.reach_margin(at)
+        leg = int(np.argmin(margin))
+        why += f" leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"
+    return stopped(problem, frame, record, why)
+
+
+def stopped(problem: LoopProblem, frame: int, record: Any, why: str) -> LoopFailure:
+    """Error of a run that ended early, with the frames at which actuators were at their limit."""
+    limit = problem.settings.drives.torque_limit
+    unit = problem.robot.layout.unit("joint1.coulomb")
+    saturated = saturated_frames(record.torque[:frame], limit)
+    when = f"t = {frame * problem.period:.3f} s"
+    # weak actuators make a robot leave the reach of a loop that is stable
+    if saturated:
+        why = why.replace(UNSTABLE, "")
+        when += f", saturated in {saturated} of {frame} frames, limit {limit:g} {unit}"
+    return LoopFailure(f"closed loop stopped at frame {frame} ({when}): {why}", frame, saturated)

@@ -15,16 +15,10 @@ from dynamics.closed_loop.loop_settings import (
     Reference,
     ServoGains,
 )
-from dynamics.closed_loop.problem import (
-    LoopProblem,
-    commands_problem,
-    servo_problem,
-)
+from dynamics.closed_loop.problem import LoopProblem, commands_problem, servo_problem
 from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
 from dynamics.closed_loop.simulate import differentiate_servo, simulate_servo
-from dynamics.closed_loop.start_state import (
-    StartState,
-)
+from dynamics.closed_loop.start_state import StartState
 from dynamics.errors import SimulationError
 from dynamics.robot import Robot
 

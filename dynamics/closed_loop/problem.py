@@ -33,9 +33,10 @@ from dynamics.robot import Robot
 class Sizes:
     """Sizes for which kernels are compiled.
 
-    joints, coordinates: of the robot. rigid: number of parameters of the rigid bodies. geometry:
-    room for geometric numbers, which are the last inputs of functions (see `Robot.moved`); it is
-    the same for most robots. filters: number of joints whose drives filter a rate.
+    `joints` and `coordinates` are those of the robot, and `rigid` is the number of parameters of
+    the rigid bodies. `geometry` is room for geometric numbers, which are the last inputs of
+    functions (see `Robot.moved`); it is the same for most robots. `filters` is the number of joints
+    whose drives filter a rate.
     """
 
     joints: int

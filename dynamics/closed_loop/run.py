@@ -5,12 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynamics.checks import whole
-from dynamics.closed_loop.loop_settings import (
-    MAX_DELAY_FRAMES,
-)
-from dynamics.closed_loop.start_state import (
-    StartState,
-)
+from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
+from dynamics.closed_loop.start_state import StartState
 from dynamics.errors import SimulationError
 
 
@@ -122,10 +118,9 @@ class ClosedLoopRun:
 
 
 class LoopFailure(SimulationError):
-    """Early end of a run.
+    """Early end of a run at a frame.
 
-    frame: number of the frame. saturated: number of frames before it at which an actuator gave its
-    largest torque.
+    `saturated` is the number of frames before it at which an actuator gave its largest torque.
     """
 
     def __init__(self, message: str, frame: int, saturated: int = 0) -> None:

@@ -18,13 +18,8 @@ import numpy as np
 
 from dynamics.closed_loop.command_schedule import CommandSchedule
 from dynamics.closed_loop.joints import FRICTION
-from dynamics.closed_loop.loop_settings import (
-    MAX_DELAY_FRAMES,
-)
-from dynamics.closed_loop.problem import (
-    LoopProblem,
-    Sizes,
-)
+from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
+from dynamics.closed_loop.problem import LoopProblem, Sizes
 from dynamics.parameters import LANES, room_for_derivatives
 
 LINE = 64
@@ -99,11 +94,11 @@ def empty_record(problem: LoopProblem, runs: int = 1) -> Record:
 class Memory(NamedTuple):
     """Records of one run.
 
-    task: what does not change during a run, such as the addresses of compiled functions, the laws,
-    parameters and gains. now: state of the integrator. evaluations (5,): everything known at the
+    `task` does not change during a run: addresses of compiled functions, laws, parameters and
+    gains. `now` is the state of the integrator. `evaluations` (5,) hold everything known at the
     stages of a step and at its end, where rows of stuck joints come in the order of `now.stuck`.
-    tangent: derivatives, with a row for each unknown, and columns for the parameters, for the start
-    state, and for the length of a step that an event cuts.
+    `tangent` holds derivatives, with a row for each unknown, and columns for the parameters, for
+    the start state, and for the length of a step that an event cuts.
     """
 
     task: Any

@@ -9,7 +9,6 @@ the step that follows is shorter by it. The impulse that stops joints is differe
 too.
 """
 
-from dynamics.closed_loop.drive_kernels import follows_law, winds_up
 from dynamics.closed_loop.linear_algebra_kernels import (
     add_product,
     clear,
@@ -23,8 +22,10 @@ from dynamics.closed_loop.motion_kernels import (
     count_stuck,
     dry_level,
     dry_slope,
+    follows_law,
     hold_compliance,
     mode_margin,
+    winds_up,
 )
 from dynamics.compiled.kernel import (
     Array,

@@ -27,9 +27,7 @@ from dynamics.closed_loop.problem import (
     with_derivatives,
 )
 from dynamics.closed_loop.run import ClosedLoopRun
-from dynamics.closed_loop.start_state import (
-    StartState,
-)
+from dynamics.closed_loop.start_state import StartState
 from dynamics.errors import SimulationError
 from dynamics.parameters import RigidGroups
 from dynamics.robot import Robot

@@ -18,15 +18,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from dynamics.closed_loop.drives import Drives, JointLaw
-from dynamics.closed_loop.loop_settings import (
-    FrameTiming,
-    LoopSettings,
-    ServoGains,
-)
-from dynamics.closed_loop.start_state import (
-    check_start_pose,
-    checked_loop_parameters,
-)
+from dynamics.closed_loop.loop_settings import FrameTiming, LoopSettings, ServoGains
+from dynamics.closed_loop.start_state import check_start_pose, checked_loop_parameters
 from dynamics.robot import Robot
 
 SLOWEST_HZ = 0.5
@@ -176,8 +169,8 @@ def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: 
 class _NearRest(NamedTuple):
     """Robot near rest, without the gains and the timing of the servo.
 
-    motion: see `_joint_loop`. jacobian (n, m): of the joints with respect to the coordinates.
-    turning (n, m): derivative of the Jacobian times the demand that holds the joints.
+    `motion` is that of `_joint_loop`. `jacobian` (n, m) is that of the joints with respect to the
+    coordinates, and `turning` (n, m) its derivative times the demand that holds the joints.
     """
 
     motion: np.ndarray

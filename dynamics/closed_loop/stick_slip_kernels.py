@@ -55,6 +55,7 @@ def set_stage(now: Record, at: Record, k: int) -> None:
     stage = at[k]
     h = now.length
     if k < END:
+        # Classical Runge-Kutta: a stage needs the slope of the one before it alone.
         before = at[k - 1]
         for i in range(now.unknowns):
             stage.state[i] = start.state[i] + FRACTION[k] * h * before.slope[i]
@@ -105,6 +106,7 @@ def crossing(now: Record, count: int) -> float:
     found = now.tried_crossing
     for i in range(count):
         found[i] = length[i]
+    # Neville's scheme, at a margin of zero.
     for order in range(1, count):
         for i in range(count - order):
             apart = margin[i] - margin[i + order]

@@ -85,9 +85,8 @@ class FunctionBody:
         return body + (_rows(self._name, *self._sizes) if self._beside == 1 else "")
 
     def _write(self, graph: Graph, parts: list[list[str]]) -> None:
-        """Write the values of a graph and its outputs.
-
-        parts: columns of what is known of the last input.
+        """Write the values of a graph and its outputs; `parts` are columns of what is known of the
+        last input.
         """
         values = GraphValues(self, graph, parts)
         for places, nodes in zip(self._outputs, graph.outputs, strict=True):

@@ -26,11 +26,11 @@ LEAVES = ("CONST", "INPUT")
 class PartedFunction:
     """Function that is given by its parts.
 
-    parts: (inputs, constants) -> a column for each part, all of the same length. end: (inputs,
-    columns of the parts) -> outputs, under the function's name. constants (c,): numbers, such as a
-    sign, that CasADi would simplify away, which would make parts unlike. side_by_side: number of
-    input sets that are computed at once; each entry of inputs and outputs is then a row of so many
-    numbers.
+    `parts` maps inputs and constants to a column for each part, all of the same length. `end` maps
+    inputs and the columns of the parts to outputs, under the function's name. `constants` (c,) are
+    numbers, such as a sign, that CasADi would simplify away, which would make parts unlike.
+    `side_by_side` is the number of input sets that are computed at once; each entry of inputs and
+    outputs is then a row of so many numbers.
     """
 
     parts: ca.Function
@@ -68,8 +68,8 @@ class ColumnFunction:
 
     The first `common` inputs are the same for all columns. The other inputs and the outputs have a
     row for each entry, with `room` for so many columns. `lanes` columns are computed at once, so
-    that memory behind the last column is overwritten up to a whole number of lanes. apart: distance
-    of the entries of the first inputs.
+    that memory behind the last column is overwritten up to a whole number of lanes. `apart` is the
+    distance of the entries of the first inputs.
     """
 
     function: ca.Function
@@ -86,7 +86,7 @@ class ColumnFunction:
 class Node(NamedTuple):
     """One value: the name of the operation that makes it, and the values that go into it.
 
-    value: number of a constant. entry: number of an input, and the place in it.
+    A constant has a `value`, and an input an `entry`: its number, and the place in it.
     """
 
     operation: str
@@ -99,7 +99,7 @@ class Node(NamedTuple):
 class Graph:
     """Values of an SX function, each after those that go into it.
 
-    outputs: places of the outputs among the values, by their entries.
+    `outputs` are the places of the outputs among the values, by their entries.
     """
 
     nodes: list[Node]
@@ -140,7 +140,7 @@ class Group(NamedTuple):
 def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Graph:
     """Values of an SX function, whose own instructions reuse places in memory.
 
-    constants: values of its last input.
+    `constants` are the values of its last input.
     """
     nodes: list[Node] = []
     held: dict[int, int] = {}

@@ -173,11 +173,13 @@ def _sine_and_cosine() -> ca.Function:
     x = ca.SX.sym("x")
     turns = ca.floor(x * (2 / np.pi) + 0.5)
     reduced = x
+    # One part after the other, so that the difference keeps its digits (Cody and Waite).
     for part in HALF_PI:
         reduced = reduced - turns * part
     square = reduced * reduced
     sine = reduced + reduced * square * _polynomial(SINE, square)
     cosine = 1 - 0.5 * square + square * square * _polynomial(COSINE, square)
+    # Of four quarter turns, the sine is negative in the last two, the cosine in the middle two.
     half = 0.5 * turns
     odd = 2 * (half - ca.floor(half))
     back = 2 * (0.5 * half - ca.floor(0.5 * half)) >= 1
@@ -201,6 +203,7 @@ def _arctangent() -> ca.Function:
     steep = height > width
     opposite = ca.if_else(steep, width, height)
     adjacent = ca.if_else(steep, height, width)
+    # tan(a - pi/4) = (y - x) / (y + x) brings large tangents close to zero.
     turned = opposite > LEAST_TURNED * adjacent
     tangent = ca.if_else(turned, opposite - adjacent, opposite) / ca.if_else(
         turned, opposite + adjacent, adjacent

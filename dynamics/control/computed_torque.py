@@ -23,13 +23,11 @@ import numpy as np
 from scipy.linalg import expm
 
 from dynamics.closed_loop.drives import Drives
-from dynamics.closed_loop.loop_settings import (
-    EveryFrame,
-)
+from dynamics.closed_loop.loop_settings import EveryFrame
 from dynamics.control.inverse_dynamics import Motion, spans
 from dynamics.control.law import Assignment, Feedback, LawInLoop
 from dynamics.control.observer import Estimate
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 
 INTEGRAL = 0.2
 """Factor of the gain Ki = INTEGRAL bandwidth^3 without an observer."""
@@ -54,8 +52,8 @@ def error_map(feedback: Feedback) -> np.ndarray:
 class WayBack:
     """Motion along which errors (m,) die out.
 
-    error, rate: errors and their rates at the time `begin`, s. beside: acceleration (m,) that is
-    added.
+    `error` and `rate` are errors and their rates at the time `begin`, s. `beside` is an
+    acceleration (m,) that is added.
     """
 
     desired: Motion
@@ -168,7 +166,7 @@ def _torque(
 ) -> np.ndarray:
     """Mean torque (n,) over the first frame of a way back, with the dry friction of a motion.
 
-    viscous (n,): friction that the model does not know.
+    `viscous` (n,) is friction that the model does not know.
     """
     along = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
     return np.asarray(

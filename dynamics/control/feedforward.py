@@ -18,10 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from dynamics.closed_loop.drives import PID, Drives
-from dynamics.closed_loop.loop_settings import (
-    EveryFrame,
-    FrameTiming,
-)
+from dynamics.closed_loop.loop_settings import EveryFrame, FrameTiming
 from dynamics.control.inverse_dynamics import Model, Motion, spans
 from dynamics.control.law import Assignment, LawInLoop
 from dynamics.control.observer import Estimate

@@ -14,10 +14,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq, minimize
 
 from dynamics.closed_loop import stability
-from dynamics.closed_loop.loop_settings import (
-    LoopSettings,
-    ServoGains,
-)
+from dynamics.closed_loop.loop_settings import LoopSettings, ServoGains
 from dynamics.control.computed_torque import INTEGRAL, error_map
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.law import Feedback
@@ -36,8 +33,8 @@ MET = 0.02
 class LoopFigures:
     """Figures of a loop near rest.
 
-    bandwidth, rad/s. damping, 1. radius: largest magnitude of an eigenvalue. gain_margin: factor by
-    which the gains may grow.
+    `bandwidth` is in rad/s, and `damping` has no unit. `radius` is the largest magnitude of an
+    eigenvalue, and `gain_margin` the factor by which the gains may grow.
     """
 
     bandwidth: float

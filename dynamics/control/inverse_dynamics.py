@@ -108,8 +108,8 @@ class Model:
     ) -> np.ndarray:
         """Actuator torques (N, n), N m or N, for pose rates and accelerations (N, 6) (eq. 17, 23).
 
-        dry_along (N, n): joint velocities whose signs dry friction has, instead of those of the
-        motion. Raises what `Robot.inverse_dynamics` raises.
+        Dry friction has the signs of the joint velocities `dry_along` (N, n), instead of those of
+        the motion. Raises what `Robot.inverse_dynamics` raises.
         """
         robot = self.robot
         parameters = self.dynamic.copy()
@@ -130,8 +130,9 @@ class Model:
 class Spans:
     """Joints and torques of a motion over spans of time of one length.
 
-    begin, end (N, n): joint coordinates at the ends. mean (N, n): their mean. mean_integral (N, n):
-    mean of their integral since the beginning. torque (N, n): mean torque.
+    `begin` and `end` (N, n) are joint coordinates at the ends, and `mean` (N, n) their mean.
+    `mean_integral` (N, n) is the mean of their integral since the beginning. `torque` (N, n) is the
+    mean torque.
     """
 
     begin: np.ndarray
@@ -146,7 +147,7 @@ def spans(
 ) -> Spans:
     """Joints and torques of a motion over the spans that begin at times (N,), s.
 
-    dry: motion whose joints have the signs of dry friction, if not this one. Raises what
+    The joints of the motion `dry`, if not of this one, have the signs of dry friction. Raises what
     `Robot.inverse_dynamics` raises.
     """
     share = (NODES + 1) / 2

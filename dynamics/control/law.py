@@ -6,11 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dynamics.closed_loop.drives import Drives
-from dynamics.closed_loop.loop_settings import (
-    Controller,
-    EveryFrame,
-    LoopSettings,
-)
+from dynamics.closed_loop.loop_settings import Controller, EveryFrame, LoopSettings
 from dynamics.control.inverse_dynamics import Model, Motion
 from dynamics.control.observer import Estimate, Observer
 

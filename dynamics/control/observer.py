@@ -16,9 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynamics.closed_loop.command_schedule import acting_times
-from dynamics.closed_loop.loop_settings import (
-    LoopSettings,
-)
+from dynamics.closed_loop.loop_settings import LoopSettings
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.prediction import Prediction
 from dynamics.errors import SimulationError
@@ -71,10 +69,10 @@ class Observer:
 
     At each frame, `see` takes the measured pose, `ahead` predicts, and `issue` notes the command.
 
-    model: robot as the law knows it. pose (6,): pose of rest at the start, held by the command
-    `holding` (n,). latencies (frames,): latency of each command, known as it is issued.
-    noise(frame): covariance (6, 6) of a measured pose. common (6, 6): covariance of what all
-    measured poses have in common.
+    `model` is the robot as the law knows it. `pose` (6,) is the pose of rest at the start, held by
+    the command `holding` (n,). `latencies` (frames,) are those of the commands, known as they are
+    issued. `noise(frame)` is the covariance (6, 6) of a measured pose, and `common` (6, 6) that of
+    what all measured poses have in common.
     """
 
     def __init__(

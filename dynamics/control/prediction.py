@@ -21,9 +21,7 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.special import ndtr
 
-from dynamics.closed_loop.loop_settings import (
-    LoopSettings,
-)
+from dynamics.closed_loop.loop_settings import LoopSettings
 from dynamics.control.inverse_dynamics import Model
 
 ROUNDS = 12
@@ -93,9 +91,9 @@ class Prediction:
     ) -> tuple[np.ndarray, np.ndarray]:
         """State after a time, s, in which a command (n,) and its rate act, and the map of errors.
 
-        covariance (size, size): that of the state, which says how well the velocities of joints are
-        known. A time in which a joint comes to rest or breaks away is halved until that changes its
-        velocity by less than is known of it.
+        The covariance (size, size) of the state says how well the velocities of joints are known. A
+        time in which a joint comes to rest or breaks away is halved until that changes its velocity
+        by less than is known of it.
         """
         after, errors, turns = self._once(state, covariance, command, command_rate, length)
         if not turns or length < SHORTEST:
@@ -230,11 +228,11 @@ def expected_dry_friction(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Expected dry friction (n,) over a step, and its gain on errors of each joint's velocity (n,).
 
-    velocity (n,): velocity after the step without dry friction, with normal errors of standard
-    deviations `width` (n,). turned (n, n): change of the velocities by a torque over the step.
-    largest (n,): largest torque. smooth: velocity over which the torque turns. The gain passes
-    errors on such that their variance is that after dry friction, which stops some of the drawn
-    joints. A line through the torque would give another variance.
+    `velocity` (n,) is the velocity after the step without dry friction, with normal errors of
+    standard deviations `width` (n,). `turned` (n, n) is the change of the velocities by a torque
+    over the step, and `largest` (n,) the largest torque. The torque turns over the velocity
+    `smooth`. The gain passes errors on such that their variance is that after dry friction, which
+    stops some of the drawn joints. A line through the torque would give another variance.
     """
     own = np.diag(turned)
     reach = np.maximum(own * largest + smooth, LEAST_REACH * width)

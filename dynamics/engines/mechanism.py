@@ -42,8 +42,9 @@ class Solid:
 class Freedom(NamedTuple):
     """Elementary joint between two bodies.
 
-    kind: "hinge", "slide" or "ball". It is at a point (3,), m, about or along an axis (3,), in the
-    axes of the base. coordinate: at home. friction: dry and viscous. actuator: its number, or None.
+    Its kind is "hinge", "slide" or "ball". It is at a point (3,), m, about or along an axis (3,),
+    in the axes of the base. `coordinate` is that at home, `friction` is dry and viscous, and
+    `actuator` its number, or None.
     """
 
     kind: str
@@ -84,8 +85,8 @@ class Connection:
 class Mechanism:
     """Bodies, with the base first, and their connections.
 
-    gravity (3,): m/s^2. ranges: of joints by name, where the file has them. gains: lp, li, ld (3,).
-    travel_limit: rad or m. notes: remarks on the file.
+    `gravity` (3,) is in m/s^2, and `travel_limit` in rad or m. `ranges` are those of joints by
+    name, where the file has them, `gains` are lp, li, ld (3,), and `notes` are remarks on the file.
     """
 
     name: str
@@ -156,7 +157,7 @@ def legs_of(
 ) -> Iterator[MechanismLeg]:
     """Legs of a simplified mechanism, each a chain from the base to the platform.
 
-    A chain may have two bars. from_platform (3, 4): platform axes and origin at home. Raises
+    A chain may have two bars. `from_platform` (3, 4) holds platform axes and origin at home. Raises
     RobotFileError, with leg and bodies, for any other mechanism.
     """
     left = [body for body in range(1, len(mechanism.solids)) if body != platform]
@@ -268,8 +269,8 @@ def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
     for one in freedoms:
         if one.actuator is None and any(one.friction):
             raise RobotFileError(
-                f"{one.name} has friction {max(one.friction):g}; joints without actuator have "
-                "none here"
+                f"{one.name} has friction {max(one.friction):g}; joints without actuator have none "
+                "here"
             )
     kinds = [one.kind for one in freedoms]
     axes = np.array([one.axis for one in freedoms] + [np.full(3, np.nan)])[:2]
@@ -289,8 +290,8 @@ def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
         lean = abs(float(directions[0] @ directions[1]))
         if lean > SAME:
             raise RobotFileError(
-                f"the hinges {names} are {np.degrees(np.arcsin(lean)):.3g} deg from normal to "
-                "each other"
+                f"the hinges {names} are {np.degrees(np.arcsin(lean)):.3g} deg from normal to each "
+                "other"
             )
         return "universal", point, axes
     if abs(np.linalg.det(directions)) < 1e-3:

@@ -40,8 +40,8 @@ NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 Integrator = Literal["implicitfast", "RK4"]
 
 CHANGED_INERTIAS = (
-    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments "
-    "that do no work in its",
+    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments that "
+    "do no work in its",
     "leg, as of a crank that turns about z alone and of a link that does not spin, do not alter "
     "the motion; others do.",
 )
@@ -51,13 +51,14 @@ CHANGED_INERTIAS = (
 class MjcfSolver:
     """Integration of the exported model by MuJoCo.
 
-    Its loops are springs, which are never exactly closed, so that they are made stiff. timestep_s:
-    time step. Stiff springs need short steps; at 0.25 ms the loops of rss6 stay closed to some
-    nanometres in the motions of `cmmsim verify-model`. time_constant_steps: time constant of the
-    spring of a loop, in steps, of which MuJoCo allows 2 or more. impedance: share of the force of a
-    loop that the solver enforces at once; the springs bring the rest. integrator: implicitfast
-    takes joint damping implicitly, which is stable for any viscous friction, at one evaluation a
-    step. RK4 is of fourth order, for comparisons with other engines, at four evaluations.
+    Its loops are springs, which are never exactly closed, so that they are made stiff. Stiff
+    springs need short steps `timestep_s`: at 0.25 ms the loops of rss6 stay closed to some
+    nanometres in the motions of `cmmsim verify-model`. `time_constant_steps` is the time constant
+    of the spring of a loop, in steps, of which MuJoCo allows 2 or more. `impedance` is the share of
+    the force of a loop that the solver enforces at once; the springs bring the rest. The integrator
+    implicitfast takes joint damping implicitly, which is stable for any viscous friction, at one
+    evaluation a step. RK4 is of fourth order, for comparisons with other engines, at four
+    evaluations.
     """
 
     timestep_s: float = 2.5e-4
@@ -86,10 +87,9 @@ def mjcf_text(
 ) -> str:
     """MJCF of a robot with dynamic parameters (p,), by default the nominal ones.
 
-    coulomb: write the dry friction; without it the joints only damp. source: text that says in the
-    file where the parameters come from. Raises ParameterError, and its subclass
-    UnphysicalInertiaError for a body that breaks Ix + Iy >= Iz where `allow_unphysical_inertia` is
-    False.
+    `coulomb` writes the dry friction; without it the joints only damp. `source` says in the file
+    where the parameters come from. Raises ParameterError, and its subclass UnphysicalInertiaError
+    for a body that breaks Ix + Iy >= Iz where `allow_unphysical_inertia` is False.
     """
     check_type("robot", robot, Robot, DynamicsError)
     check_type("source", source, str, DynamicsError)
@@ -169,10 +169,10 @@ def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source:
     """Add name and comments."""
     lines = [
         f"Parallel robot {robot.name}, {source}; exported by cmmsim. Units: m, kg, s, rad, N, N m.",
-        "Keyframe home, and as written: all actuated joints at their home coordinates, platform "
-        "at rest.",
-        "Links on ball joints may spin about their own axes; no force makes them as long as Ixx "
-        "= Iyy.",
+        "Keyframe home, and as written: all actuated joints at their home coordinates, platform at "
+        "rest.",
+        "Links on ball joints may spin about their own axes; no force makes them as long as Ixx = "
+        "Iyy.",
     ]
     if inertias.changes:
         lines += [*CHANGED_INERTIAS, *grouped(inertias.changes)]

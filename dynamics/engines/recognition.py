@@ -22,7 +22,7 @@ from dynamics.engines.mechanism import (
 from dynamics.errors import RobotFileError
 from dynamics.geometry import RobotGeometry
 from dynamics.inertia import MOMENTS
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from dynamics.legs.chain import SAME, leg_of
 from dynamics.legs.leg import Body, Leg, Placement
 from dynamics.parameters import parameter_layout
@@ -98,8 +98,8 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     gains = _gains(geometry, dynamic[layout.rigid]) if plain.gains is None else plain.gains
     if plain.gains is None:
         notes.append(
-            "the file has no joint PID: its gains are chosen for 3 Hz with the least that a "
-            "joint feels"
+            "the file has no joint PID: its gains are chosen for 3 Hz with the least that a joint "
+            "feels"
         )
     robot = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
     parsed_robot(robot_text(robot), "the robot")  # whose numbers must be those of a machine
@@ -125,8 +125,8 @@ def _inertia(
 ) -> list[float]:
     """Mass and moments of a body of a leg, in the axes of its kind. It may be equal bars.
 
-    ways (3, n): directions in which the platform can go. Along others, and in a body that does not
-    turn, masses may be anywhere. Raises RobotFileError for a centre of mass elsewhere, and for
+    `ways` (3, n) are directions in which the platform can go. Along others, and in a body that does
+    not turn, masses may be anywhere. Raises RobotFileError for a centre of mass elsewhere, and for
     products of inertia that would do work.
     """
     centre, axes = place
@@ -192,8 +192,8 @@ def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Char
             )
     if np.linalg.norm(axes[:2, 2]) > SAME:
         raise RobotFileError(
-            f"the platform's z is {np.round(axes[:, 2], 6).tolist()}; of planar robots it is "
-            "along z"
+            f"the platform's z is {np.round(axes[:, 2], 6).tolist()}; of planar robots it is along "
+            "z"
         )
     return Chart("planar", home)
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from dynamics.checks import row_text
 from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import ConvergenceError, ShapeError
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 
 # Smaller steps end the iteration. Smaller residuals, rad or m, count as solved.
 STEP_TOLERANCE = 1e-12

@@ -7,8 +7,7 @@ in this room and in robot files.
 
 from dynamics.legs.leg import Leg
 from dynamics.legs.pss import PssLeg, PusLeg
-from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg
-from dynamics.legs.rus import RusLeg
+from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg, RusLeg
 from dynamics.legs.ups import UpsLeg
 
 AnyLeg = RssLeg | RusLeg | UpsLeg | PssLeg | PusLeg | ParallelogramLeg | RrrLeg

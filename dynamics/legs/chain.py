@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from dynamics.errors import RobotFileError
 from dynamics.legs.leg import Leg
 from dynamics.legs.pss import PssLeg, PusLeg
-from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg
-from dynamics.legs.rus import RusLeg
+from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg, RusLeg
 from dynamics.legs.ups import UpsLeg
 
 SAME = 1e-6
@@ -22,12 +21,12 @@ SAME = 1e-6
 class Chain(NamedTuple):
     """Joints of a leg at home, in the axes of the base, m.
 
-    joints: their kinds (k), "hinge", "slide", "universal" or "ball", with * after the actuated one.
-    points (k, 3): their places. The last one is A, or the middle of two bars side by side. axes (k,
-    2, 3): the axis, and the second axis of a universal joint. coordinate: that of the actuated
-    joint. platform_joint: A in platform axes. across (3,): from the first of two bars to the
-    second, or zero. centres (k - 1, 3): centres of mass of the bodies. rods: length and radius that
-    are drawn of them, or None.
+    `joints` are their kinds (k), "hinge", "slide", "universal" or "ball", with * after the actuated
+    one. `points` (k, 3) are their places; the last one is A, or the middle of two bars side by
+    side. `axes` (k, 2, 3) hold the axis, and the second axis of a universal joint. `coordinate` is
+    that of the actuated joint. `platform_joint` is A in platform axes. `across` (3,) leads from the
+    first of two bars to the second, or is zero. `centres` (k - 1, 3) are centres of mass of the
+    bodies. `rods` are length and radius that are drawn of them, or None.
     """
 
     joints: tuple[str, ...]
@@ -75,8 +74,8 @@ def leg_of(chain: Chain) -> Leg:
     best = int(np.argmin(np.nan_to_num(np.abs(off), nan=np.inf)))
     if not abs(off[best]) < SAME:
         raise RobotFileError(
-            f"its coordinate at home, {chain.coordinate:g}, is {off[best]:.3g} from what it "
-            "should be"
+            f"its coordinate at home, {chain.coordinate:g}, is {off[best]:.3g} from what it should "
+            "be"
         )
     return branches[best]
 

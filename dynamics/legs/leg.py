@@ -22,11 +22,10 @@ import casadi as ca
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
-from dynamics.checks import shown
+from dynamics.checks import Length as Length
+from dynamics.checks import Place, shown, within
 from dynamics.errors import RobotFileError
 from dynamics.expressions import symmetric_from_lower
-from dynamics.quantities import Length as Length
-from dynamics.quantities import Place, within
 
 INERTIAL = ("mass", "Ixx", "Iyy", "Izz")
 """Inertial parameters of a body: kg, and kg m^2 about its own axes through its centre of mass."""
@@ -77,8 +76,8 @@ Direction = Annotated[np.ndarray, PlainValidator(_direction), WithJsonSchema(_NU
 class Body:
     """Kind of a body of a leg.
 
-    moments: those that do work as it moves. driven: inertial parameter of a body that an actuator
-    moves alone, in which the motor has a share, or None.
+    `moments` are those that do work as it moves. `driven` is the inertial parameter of a body that
+    an actuator moves alone, in which the motor has a share, or None.
     """
 
     name: str
@@ -98,14 +97,15 @@ class Placement(NamedTuple):
 class Segment(NamedTuple):
     """Body in the chain from the base to A, as other engines build it and as it is drawn.
 
-    joint: joint to the body before, or to the base: "hinge" about `axis`, "slide" along it,
-    "universal" about `axis` and then about x of this body, or "ball". axis (3,): in the axes of the
-    body before. origin (3,): place of the joint from the joint of the body before, in its axes. The
-    frame of the body is at its joint, with the axes of its `Placement`. In that frame are centre,
-    the centre of mass (3,); rod, the ends (2, 3) of what is drawn, m, with a radius; and end, which
-    is A for the last body. actuated: True where the coordinate of the leg is that of this joint.
-    copies: offsets (bars, 3) of the joints of several equal bars from `origin`, in the same axes.
-    The bars share the parameters of the body, and in the last body each of them ends as far from A.
+    `joint` leads to the body before, or to the base: "hinge" about `axis`, "slide" along it,
+    "universal" about `axis` and then about x of this body, or "ball". `axis` (3,) is in the axes of
+    the body before, and `origin` (3,) leads there from the joint of the body before to this joint.
+    The frame of the body is at its joint, with the axes of its `Placement`. In that frame are
+    `centre` (3,), the centre of mass; `rod` (2, 3), the ends of what is drawn, m, with a radius;
+    and `end`, which is A for the last body. `actuated` is True where the coordinate of the leg is
+    that of this joint. `copies` are offsets (bars, 3) of the joints of several equal bars from
+    `origin`, in the same axes. The bars share the parameters of the body, and in the last body each
+    of them ends as far from A.
     """
 
     joint: str
@@ -166,8 +166,8 @@ class Leg(BaseModel, ABC):
         margin = float(self.reach(ca.SX(joint)))
         if not margin > 0:
             raise RobotFileError(
-                f"leg {number} cannot reach the home pose: reach margin {margin:.3g}, must be > "
-                f"0; B to A {np.linalg.norm(joint - self.base_joint):.4g} m, {self.lengths()}"
+                f"leg {number} cannot reach the home pose: reach margin {margin:.3g}, must be > 0; "
+                f"B to A {np.linalg.norm(joint - self.base_joint):.4g} m, {self.lengths()}"
             )
         found = self
         if self.branch is None:
@@ -177,8 +177,8 @@ class Leg(BaseModel, ABC):
             if not turning < MOST_TURNING:
                 raise RobotFileError(
                     f"leg {number} is singular at the home pose: its {body.name} turns by "
-                    f"{turning:.3g} rad/m, limit {MOST_TURNING:.0e}; it lies along the axis of "
-                    "its universal joint or of its actuator"
+                    f"{turning:.3g} rad/m, limit {MOST_TURNING:.0e}; it lies along the axis of its "
+                    "universal joint or of its actuator"
                 )
         return found
 
@@ -273,7 +273,7 @@ class Leg(BaseModel, ABC):
     ) -> ca.SX:
         """Force at A (3,), N, that moves the bodies.
 
-        rigid (4 n,): inertial parameters of the bodies, one after the other.
+        `rigid` (4 n,) are the inertial parameters of the bodies, one after the other.
         """
         at, moving, gaining, own = (
             ca.SX.sym(name, n) for name, n in zip("pvai", (3, 3, 3, rigid.numel()), strict=True)

@@ -1,10 +1,15 @@
-"""RSS leg: a crank on the base (R), and a link between two spherical joints (S).
+"""Legs with a crank on the base: RSS, whose link has two spherical joints (S), and RUS.
 
 The inverse kinematics is in closed form (eq. 3 and 4). The dynamics uses the Jacobians of eq. 5-16.
 Their rates, Appendix A of the paper, are automatic derivatives, because eq. A5 and A6 are wrong as
 printed. The vector a from the platform origin to joint A is in the axes of the base: eq. 3 and 5
 need R a, though the text defines a in platform axes. Centres of mass are at mid-length. Forces are
 those of virtual work, as for any `Leg`, here in closed form, which is faster.
+
+The link of a RUS leg has a universal joint (U) at the tip of the crank, whose first axis is
+parallel to that of the crank. Both keep their direction in the axes of the base, and the link turns
+about that and about its own x. Its spin about its length follows, and all three of its moments do
+work.
 """
 
 from __future__ import annotations
@@ -27,6 +32,7 @@ from dynamics.legs.leg import (
     Placement,
     Segment,
     link_axes,
+    universal_spin,
 )
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -353,3 +359,28 @@ def _link_xy(leg: LegVectors) -> list[tuple[ca.SX, ca.SX]]:
     across = ca.cross(leg.axis, leg.link)
     weight = 1 / ca.dot(across, across)
     return [(across, weight), (ca.cross(leg.link, across), weight * (1 / leg.link_length**2))]
+
+
+class RusLeg(RssLeg):
+    """Crank that turns about an axis on the base, and a link on a universal joint at its tip T."""
+
+    bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Ixx", "Iyy", "Izz")))
+    link_joint: ClassVar[str] = "universal"
+    type: Literal["rus"] = "rus"  # type: ignore[assignment]
+
+    def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
+        leg = self.vectors(position)
+        rate = ca.dot(angle_gradient(leg), velocity)
+        link_rate = velocity - rate * ca.cross(leg.axis, leg.crank)
+        spin = universal_spin(leg.axis, leg.link / leg.link_length, link_rate / leg.link_length)
+        return [rate * leg.axis, spin]
+
+    # the closed forms of RSS are those of a link that does not spin
+
+    def force(
+        self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM
+    ) -> ca.SX:
+        return Leg.force(self, position, velocity, acceleration, rigid, gravity)
+
+    def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:
+        return Leg.mass(self, position, rigid)

@@ -2,7 +2,7 @@
 
 With J_a1 and J_a2 of eq. 7, diag(J_a1) theta_dot = J_a2 twist. Then J_ad = J_a1^-1 J_a2 (eq. 8),
 and J_theta = J_ad T maps pose rates (eq. 29). A pose has six entries also where the platform has
-fewer freedoms (see `kinematics.chart`).
+fewer freedoms (see `kinematics.platform.Chart`).
 """
 
 import casadi as ca

@@ -27,7 +27,7 @@ from dynamics.closed_loop import (
     equilibrium,
     simulate_commands,
 )
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import effective_command, running_integral

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynamics import Robot
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods

@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
 
 from dynamics import Robot
-from dynamics.kinematics.chart import Chart
-from dynamics.kinematics.platform import pose_rate_to_twist, twist_bias
+from dynamics.kinematics.platform import Chart, pose_rate_to_twist, twist_bias
 from dynamics.rigid_body.jacobians import freedoms, joint_jacobian
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array, agreed

@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot
 from dynamics.closed_loop import Reference, ServoGains
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.files.dataset import POSE, as_number, shown

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from dynamics.quantities import Gain, within
+from dynamics.checks import Gain, within
 from identify.own_parts import LAWS, check_choice
 from identify.scenario.section import Section, quantity
 

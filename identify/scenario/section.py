@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from dynamics.quantities import (
+from dynamics.checks import (
     Damping,
     Duration,
     Force,

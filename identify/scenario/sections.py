@@ -8,7 +8,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from dynamics.quantities import Within
+from dynamics.checks import Within
 from identify.own_parts import CRITERIA, LAWS, check_choice
 from identify.scenario.section import Section, quantity
 

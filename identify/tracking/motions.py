@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot, workspace
 from dynamics.errors import DynamicsError
-from dynamics.kinematics.chart import POSE_NAMES, Chart
+from dynamics.kinematics.platform import POSE_NAMES, Chart
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.design import Design, unseen_trajectories

@@ -24,7 +24,7 @@ from dynamics.closed_loop import LoopFailure, LoopSettings, Reference, simulate_
 from dynamics.closed_loop.start_state import (
     checked_loop_parameters,
 )
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
 from identify.estimation.covariance import repeated_experiments

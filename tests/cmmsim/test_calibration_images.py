@@ -16,9 +16,9 @@ from cmmsim.calibration import (
     CalibrationOptions,
     PairView,
     as_dict,
+    board_detection,
     board_poses,
     calibrate,
-    dot_search,
     find_board,
     render_pairs,
     rendered_boards,
@@ -157,8 +157,8 @@ def test_one_threshold_finds_the_dots_that_opencv_finds(rig):
         bright = 255 - picture if board.dark else picture
         for shown in (bright, np.ascontiguousarray(np.rot90(bright, 1 + k))):
             quick, thorough = (
-                dot_search.read_at_once(shown, board),
-                dot_search.found_by_opencv(shown, board, 1.0),
+                board_detection.read_at_once(shown, board),
+                board_detection.found_by_opencv(shown, board, 1.0),
             )
             # which OpenCV cannot tell
             mirrored = np.arange(len(quick)).reshape(board.rows, -1)[:, ::-1].ravel()
@@ -178,7 +178,7 @@ def test_one_threshold_finds_the_dots_that_opencv_finds(rig):
             -1,
         )
         assert all(
-            dot_search.read_at_once(changed, board) is None
+            board_detection.read_at_once(changed, board) is None
             for changed in (fewer, more, np.zeros_like(shown))
         )
 

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 import cmmsim
 from cmmsim.geometry.pose import apply
-from cmmsim.imaging.views import View
+from cmmsim.imaging.renderer import View
 from tests.cmmsim.sensors import (
     LENSES,
     NOISE_FREE,

@@ -18,10 +18,9 @@ from cmmsim.imaging.pyrender_meshes import (
     LaidSolids,
     disc_mesh,
 )
-from cmmsim.imaging.renderer import Drawable
+from cmmsim.imaging.renderer import NEAR, Drawable, View, Views
 from cmmsim.imaging.scene_bodies import Disc, DiscStack, rod, rod_transform, solid_mesh
 from cmmsim.imaging.stereo_camera import SUPERSAMPLING
-from cmmsim.imaging.views import NEAR, View, Views
 from cmmsim.imaging.window_kernels import mean_of_cells
 from cmmsim.loading import load_sensor
 

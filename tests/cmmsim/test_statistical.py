@@ -18,10 +18,9 @@ from cmmsim.geometry.pose import invert, pose_to_transform
 from cmmsim.measuring.observation import StickerObservation
 from cmmsim.measuring.solver_kernels import COLUMNS, LEFT, SEEN, STATE
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
-from cmmsim.without_images.centre_kernels import fit_covariances, tabulated
-from cmmsim.without_images.conditions import LONGEST_STREAK_PX
+from cmmsim.without_images.drawn_fit_kernels import fit_covariances, tabulated
 from cmmsim.without_images.drawn_frame_kernels import MEASURED, expect, look, measure_frame
-from cmmsim.without_images.drawn_stickers import THIN_PX, THIN_STD_PX
+from cmmsim.without_images.drawn_stickers import LONGEST_STREAK_PX, THIN_PX, THIN_STD_PX
 from cmmsim.without_images.statistical_tracker import StatisticalTracker
 from tests.cmmsim import plain
 from tests.cmmsim.sensors import (

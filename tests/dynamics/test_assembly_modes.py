@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics import forward_kinematics
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from dynamics.legs.ups import UpsLeg
 from dynamics.rigid_body.virtual_work import kinematic_functions
 

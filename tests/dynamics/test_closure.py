@@ -10,7 +10,7 @@ import dynamics
 from dynamics.closure import Closure
 from dynamics.errors import ConvergenceError
 from dynamics.geometry import RobotGeometry
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from dynamics.rigid_body.jacobians import joint_coordinates
 from tests.dynamics.conftest import SLOW_ROBOTS, derivative
 

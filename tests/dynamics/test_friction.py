@@ -27,7 +27,7 @@ from dynamics.closed_loop.problem import (
 from dynamics.compiled.lanes import PartedFunction
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.expressions import function
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from dynamics.rigid_body.accelerations import (
     STAGES,
     factored,

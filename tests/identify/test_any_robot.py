@@ -14,7 +14,7 @@ from dynamics.closed_loop import (
 )
 from dynamics.closed_loop.drives import joint_law
 from dynamics.geometry import RobotGeometry
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from dynamics.robot_file import ParameterSet, RobotDescription
 from identify.errors import ScenarioError, TrajectoryError
 from identify.estimation.base_parameters import (

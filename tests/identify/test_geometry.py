@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.measuring.measured_poses import MeasuredPoses
-from cmmsim.measuring.measurement import lost_measurement, measurement_without_stickers
+from cmmsim.measuring.measurement import (
+    MeasuredPoses,
+    lost_measurement,
+    measurement_without_stickers,
+)
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
 from dynamics import built_in_robots, load_robot
 from dynamics.errors import UnreachablePoseError

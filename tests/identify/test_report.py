@@ -13,7 +13,7 @@ import pytest
 from matplotlib.image import imread
 
 import identify
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from identify.errors import OutputFolderError, RecordError
 from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
 from identify.record.recording import build_model_run, read, write, write_model_runs

@@ -11,7 +11,7 @@ the next one arrives. Teaching is exact unless asked for otherwise.
 import numpy as np
 from pydantic import Field
 
-from dynamics.kinematics.chart import Chart
+from dynamics.kinematics.platform import Chart
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.excitation.design import drawn_trajectory

@@ -1,0 +1,380 @@
+"""An instrument: what a sensor is before it measures.
+
+It has its true cameras before the true scene, what is known of the cameras, and what it was taught.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from cmmsim.allowed_plugins import is_own, require_renderer
+from cmmsim.checks import checked_seed, require_kind
+from cmmsim.detection.detector import FitLimits, find_detector
+from cmmsim.errors import CmmError, UnknownOptionError
+from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, require_corner
+from cmmsim.files.schema import SensorFile, Timing
+from cmmsim.geometry.camera import Optics
+from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
+from cmmsim.imaging.renderer import choose_renderer
+from cmmsim.imaging.stereo_camera import Quality, VirtualStereoCamera
+from cmmsim.measuring.layout_search import SMALLEST_STEP
+from cmmsim.measuring.observation import DetectionSettings, Observer
+from cmmsim.measuring.pose_estimator import METHODS, PoseEstimator
+from cmmsim.measuring.taught import Taught, require_taught_for, setup_of
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.teaching import (
+    Progress,
+    Teacher,
+    WindowSizes,
+    exactly_taught,
+    largest_radius,
+    radius_at,
+    window_sizes,
+)
+from cmmsim.true_cameras import TrueCameras
+from cmmsim.uncertainty.common_errors import CommonErrors, MeasuringGeometry
+from cmmsim.uncertainty.known_rig import KnownRig
+from cmmsim.without_images.drawn_stickers import StatisticalStereoCamera
+
+TEACHING_STREAM = 0
+
+
+class Instrument:
+    """The part of a `Sensor` that does not change from run to run."""
+
+    def __init__(
+        self,
+        file: SensorFile,
+        seed: int = 0,
+        method: str = "registration",
+        taught: Taught | None = None,
+        progress: Progress | None = None,
+        renderer: str | None = None,
+        known: KnownRig | None = None,
+    ) -> None:
+        require_kind(
+            file, SensorFile, "a sensor is made of a SensorFile; load_sensor takes a name or a path"
+        )
+        if method not in METHODS:
+            raise UnknownOptionError("method", method, METHODS)
+        find_detector(file.detection.detector)
+        self._asked_renderer = require_renderer(file.renderer if renderer is None else renderer)
+        # A user's own renderer is imported at once, so that an error names it before work begins.
+        if is_own(self._asked_renderer):
+            choose_renderer(self._asked_renderer)
+        if progress is not None and not callable(progress):
+            raise CmmError(
+                f"progress must be a function of the steps done and their number, got {progress!r}"
+            )
+        self._file = file
+        self._seed = checked_seed(seed)
+        self._progress = progress
+        self.method = method
+        self._known = taught.known if isinstance(taught, Taught) else known
+        figures = file.camera.model_dump(exclude={"pattern_seed"})
+        self.noise = CameraNoise(
+            **{("enabled" if k == "noise" else k): v for k, v in figures.items()}
+        )
+        self.optics = Optics(**file.lens.model_dump())
+        self.platform = marked_body("platform", file.platform)
+        self.base = marked_body("base", file.base)
+        if taught is not None:
+            require_kind(taught, Taught, "taught must be what another sensor's teach() returned")
+            require_taught_for(taught, file, len(self.platform.nominal))
+        bodies = self.platform, self.base
+        self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
+        self.rig = self.true_cameras.rig if self._known is None else self._known.rig
+        self._taught = taught
+
+    def __repr__(self) -> str:
+        state = "not yet taught" if self._taught is None else "taught"
+        how = f"method {self.method!r}, renderer {self._asked_renderer!r}"
+        return f"Sensor({self.name!r}, {how}, {state})"
+
+    @property
+    def name(self) -> str:
+        """Name of the sensor file."""
+        return self._file.name
+
+    @property
+    def renderer(self) -> str:
+        """Name of the renderer that draws; "auto" is decided on first use."""
+        return self.true_cameras.renderer.name
+
+    @cached_property
+    def _view(self) -> StickerView:
+        """Stickers as the known rig should see them."""
+        place = self.true_cameras.camera_from_base
+        return StickerView(
+            self._file, self.platform, self.base, self.rig, self._known, place, self.optics
+        )
+
+    @cached_property
+    def settings(self) -> DetectionSettings:
+        """Settings of the search for stickers in windows."""
+        return self._view.settings(self.noise, self.camera.centre_error_px(Quality()))
+
+    @property
+    def timing(self) -> Timing:
+        """Frame rate, exposure, latency with its jitter, and dropout, as the file states them."""
+        return self._file.timing
+
+    @property
+    def note(self) -> str:
+        """Warning about the file's figures, such as that they are assumed; empty if there is
+        none.
+        """
+        return self._file.note
+
+    @property
+    def home(self) -> Array:
+        """Pose (6,) of the platform at teaching, m and rad."""
+        return np.array(self._file.platform.home)
+
+    @property
+    def taught(self) -> Taught:
+        """Result of teaching; teaches on first use."""
+        return self.teach()
+
+    @property
+    def truth(self) -> Taught:
+        """True places of rig and stickers, for studies of the observation noise alone.
+
+        No part of the measurement knows them.
+        """
+        return exactly_taught(self._file)
+
+    @property
+    def estimator(self) -> PoseEstimator:
+        """Part that turns images into poses, also images from elsewhere."""
+        common = None
+        if self._known is not None:
+            known = self._known.covariance
+            common = partial(
+                self._geometry.pose_covariance, rig_covariance=known, method=self.method
+            )
+        return PoseEstimator(
+            self.rig, self.noise, self.settings, self.platform, self.taught, self.method, common
+        )
+
+    @cached_property
+    def _geometry(self) -> MeasuringGeometry:
+        """Set-up as it is known once it is taught."""
+        return MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
+
+    @property
+    def observer(self) -> Observer:
+        """Part that finds stickers in images, which needs no teaching."""
+        return Observer(self.rig, self.noise, self.settings)
+
+    @property
+    def camera(self) -> VirtualStereoCamera | StatisticalStereoCamera:
+        """Both cameras before the true scene, as they are at teaching."""
+        return self.true_cameras.at_rest
+
+    def teach(self, progress: Progress | None = None) -> Taught:
+        """Teach the frames of base and platform, unless that has been done.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with the number of steps done and their total.
+
+        Returns
+        -------
+        Taught
+            Frames, which other sensors with the same cameras and bodies may take over.
+
+        Raises
+        ------
+        TeachingError
+            If a sticker cannot be seen, or the planes of a body meet in no point.
+
+        Examples
+        --------
+        >>> sensor.teach().sensor_name
+        'ctrack780'
+        """
+        if self._taught is None:
+            for body in (self.platform, self.base):
+                require_corner(body)
+            teacher = Teacher(
+                self.camera, self.observer, self.platform, self.base, self._view.sizes.plan()
+            )
+            rng = np.random.default_rng([self._seed, TEACHING_STREAM])
+            found = teacher.teach(self.name, self.home, rng, progress or self._progress)
+            self._taught = replace(found, setup=setup_of(self._file), known=self._known)
+        return self._taught
+
+    def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
+        """Register further rigid bodies that may hide stickers.
+
+        They are drawn where ``obstacles`` of `Sensor.look` says.
+
+        Parameters
+        ----------
+        meshes : mapping of str to trimesh.Trimesh
+            Bodies by name, in m.
+
+        Raises
+        ------
+        CmmError
+            If ``meshes`` are not meshes by name.
+
+        Examples
+        --------
+        >>> import cmmsim
+        >>> sensor.add_bodies({"leg": cmmsim.rod(0.3, 0.01)})
+        """
+        self.true_cameras.add_bodies(meshes)
+
+    def move_rig(self, changes: Mapping[str, float], right_later: float = 0.0) -> None:
+        """Change the true rig; the estimator is not told.
+
+        Parameters
+        ----------
+        changes : mapping of str to float
+            Amounts by the names of ``stereo_rig.PARAMETER_NAMES``, as ``{"right.cx_px": 0.1}``.
+        right_later : float
+            Time by which the right camera exposes later, s.
+
+        Raises
+        ------
+        CmmError
+            If a rig has no such name.
+        ShapeError
+            If an amount is not a finite number.
+
+        Examples
+        --------
+        >>> sensor.move_rig({"right.cx_px": 0.1})
+        >>> sensor.move_rig({"right.cx_px": -0.1})
+        """
+        self.true_cameras.move(changes, right_later)
+
+    def drift_rig(self, changes: Mapping[str, float], frames: int) -> None:
+        """Change the true rig evenly in each run from now on; the estimator is not told.
+
+        Parameters
+        ----------
+        changes : mapping of str to float
+            Amounts by name, as of `move_rig`. Without any, the rig does not drift.
+        frames : int
+            Number of frames from the first to the last change.
+
+        Raises
+        ------
+        CmmError
+            If a rig has no such name, there are fewer than two frames, or the stickers leave an
+            image.
+        ShapeError
+            If an amount is not a finite number.
+
+        Examples
+        --------
+        >>> sensor.drift_rig({"right.cx_px": 0.1}, frames=100)
+        >>> sensor.drift_rig({}, frames=100)
+        """
+        self.true_cameras.drift(changes, frames)
+
+    def common_errors(self, poses: ArrayLike, rates: ArrayLike) -> CommonErrors:
+        """Return the errors of rig and taught frames that all poses have in common.
+
+        Parameters
+        ----------
+        poses, rates : array_like, shape (N, 6)
+            Poses in m and rad, and their time derivatives.
+
+        Returns
+        -------
+        CommonErrors
+            Errors, and how they move these poses.
+
+        Raises
+        ------
+        CmmError
+            If the method is "planes".
+        ShapeError
+            If poses or rates are not rows of six finite numbers.
+
+        Examples
+        --------
+        >>> poses = np.array([sensor.home])
+        >>> sensor.common_errors(poses, 0.0 * poses).changes.shape[:2]
+        (1, 6)
+        """
+        self._require_registration("common errors are known of")
+        known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
+        at = np.asarray(poses, dtype=float)
+        along = np.asarray(rates, dtype=float)
+        return self._geometry.common_errors(at, along, known.covariance, known.exposure_std)
+
+    def _require_registration(self, what: str) -> None:
+        """Raise CmmError unless poses come from registration; ``what`` begins the message."""
+        if self.method != "registration":
+            raise CmmError(f"{what} poses by registration only, not by {self.method}")
+
+
+@dataclass(frozen=True)
+class StickerView:
+    """Stickers of both bodies as a rig sees them, with the platform at home.
+
+    ``known`` says how well the rig is known; None means exactly. ``camera_from_base`` (4, 4) is the
+    place that the file states.
+    """
+
+    file: SensorFile
+    platform: MarkedBody
+    base: MarkedBody
+    rig: StereoRig
+    known: KnownRig | None
+    camera_from_base: Array
+    optics: Optics
+
+    @cached_property
+    def sizes(self) -> WindowSizes:
+        """Sizes of windows: large and blurred stickers need a wider view."""
+        radius = self.file.stickers.radius
+        place = self.camera_from_base
+        at_target = radius_at(self.rig, place, np.array(self.file.rig.target), radius)
+        at_teaching = max(
+            largest_radius(self.rig, place, self.base, radius),
+            largest_radius(self.rig, self._camera_from_platform, self.platform, radius),
+        )
+        blurred = self.optics.psf_px > 0.0 or self.file.timing.exposure > 0.0
+        return window_sizes(at_target, at_teaching, self.optics.psf_px, blurred)
+
+    def settings(self, noise: CameraNoise, centre_error_px: float) -> DetectionSettings:
+        """Settings of the search for stickers in windows.
+
+        ``centre_error_px`` is what drawing leaves in a centre.
+        """
+        timing = self.file.timing
+        return DetectionSettings(
+            self.sizes.window,
+            self.sizes.fit,
+            radius=self.file.stickers.radius,
+            detector=self.file.detection.detector,
+            limits=FitLimits(smallest_contrast=SMALLEST_STEP * noise.white_level),
+            optics=self.optics,
+            centre_error_px=centre_error_px,
+            exposed_share=timing.exposure * timing.frame_rate,
+            line_error_px=0.0 if self.known is None else self.known.line_std(self._stickers),
+        )
+
+    @property
+    def _camera_from_platform(self) -> Array:
+        return self.camera_from_base @ pose_to_transform(np.array(self.file.platform.home))
+
+    @property
+    def _stickers(self) -> Array:
+        """Nominal places (n,3) of all stickers in the camera frame."""
+        places = (self._camera_from_platform, self.platform), (self.camera_from_base, self.base)
+        return np.concatenate([apply(move, body.nominal) for move, body in places])

@@ -1,0 +1,329 @@
+"""Compiled: results that the fit of ellipses would have for stickers that nobody draws.
+
+They are the covariance of an ellipse's centre, and the finds in windows of both images.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cmmsim.compilation import Array, compiled
+from cmmsim.detection.fit_kernels import (
+    UNKNOWNS,
+    FitSettings,
+    accumulate,
+    light_of_moving,
+    mask_ring,
+)
+from cmmsim.geometry.camera_kernels import length_of
+from cmmsim.geometry.matrix_kernels import factor, invert_factored
+
+
+class CentreNoise(NamedTuple):
+    """Table of the inverse covariance of a centre.
+
+    ``table`` (a, b, c, 3) holds xx, xy, yy of the inverse covariance over the ellipse's mean half
+    axis m, by m and its ovalness p and q, from ``first`` (3,) on in ``steps`` (3,). ``by_light``
+    (3,) are factors of 1 / light², 1 / light and 1, whose sum is the growth of the covariance at a
+    share of light. ``contrast``, ``ring`` and ``black`` are grey values of full light.
+    """
+
+    table: Array
+    first: Array
+    steps: Array
+    by_light: Array
+    contrast: float
+    ring: float
+    black: float
+    fit_size: int
+    settings: FitSettings
+
+
+@compiled
+def fit_covariances(
+    centres: Array,
+    shapes: Array,
+    smears: Array,
+    contrasts: Array,
+    grounds: Array,
+    size: int,
+    settings: FitSettings,
+    covariances: Array,
+) -> None:
+    """Fill covariances (n, m, m) of the first m parameters that ``fit_window`` would state.
+
+    The n ellipses are as its model says. They have centres (n, 2) in px of parts of ``size`` px,
+    shapes (n, 2, 2), smears (n, 2) px, contrasts and grounds (n,).
+    """
+    mask = np.empty((size, size), np.bool_)
+    window = np.empty((size, size))
+    shares = np.empty((size, size))
+    derivatives = np.empty((size, size, 5))
+    normal = np.empty((UNKNOWNS, UNKNOWNS))
+    right = np.empty(UNKNOWNS)
+    parameters = np.empty(UNKNOWNS)
+    for n in range(len(centres)):
+        parameters[0] = centres[n, 0]
+        parameters[1] = centres[n, 1]
+        mask_ring(parameters, shapes[n], settings.ring_reach, mask)
+        light_of_moving(parameters, shapes[n], smears[n], settings, shares, derivatives)
+        for i in range(size):
+            for j in range(size):
+                window[i, j] = grounds[n] + contrasts[n] * shares[i, j]
+        accumulate(
+            window, mask, shares, derivatives, contrasts[n], grounds[n], settings, normal, right
+        )
+        for k in range(UNKNOWNS):
+            normal[k, k] += 1e-9  # as in fit_window
+        factor(normal)
+        invert_factored(normal, covariances[n])
+
+
+@compiled
+def tabulated(
+    table: Array,
+    first: Array,
+    steps: Array,
+    by_light: Array,
+    xx: float,
+    xy: float,
+    yy: float,
+    light: float,
+) -> tuple:
+    """Return the covariance xx, xy, yy px² of the centre of an ellipse with a given shape.
+
+    It is linear between the table's entries; the first four parameters are those of
+    ``CentreNoise``.
+    """
+    mean = 0.5 * (xx + yy)
+    a = (mean - first[0]) / steps[0]
+    b = (0.5 * (xx - yy) / mean - first[1]) / steps[1]
+    c = (xy / mean - first[2]) / steps[2]
+    i = min(max(math.floor(a), 0), table.shape[0] - 2)
+    j = min(max(math.floor(b), 0), table.shape[1] - 2)
+    k = min(max(math.floor(c), 0), table.shape[2] - 2)
+    a = min(max(a - i, 0.0), 1.0)
+    b = min(max(b - j, 0.0), 1.0)
+    c = min(max(c - k, 0.0), 1.0)
+    found_xx = 0.0
+    found_xy = 0.0
+    found_yy = 0.0
+    for up in range(2):
+        for across in range(2):
+            entries = table[i + up, j + across]
+            weight = (a if up else 1.0 - a) * (b if across else 1.0 - b)
+            near = weight * (1.0 - c)
+            far = weight * c
+            found_xx += near * entries[k, 0] + far * entries[k + 1, 0]
+            found_xy += near * entries[k, 1] + far * entries[k + 1, 1]
+            found_yy += near * entries[k, 2] + far * entries[k + 1, 2]
+    scale = by_light[0] / (light * light) + by_light[1] / light + by_light[2]
+    scale /= mean * (found_xx * found_yy - found_xy * found_xy)
+    return scale * found_yy, -scale * found_xy, scale * found_xx
+
+
+@compiled
+def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear: tuple) -> tuple:
+    """Return the covariance xx, xy, yy px² of the centre of an ellipse that moves by ``smear`` px.
+
+    It is computed at the ellipse's own place.
+    """
+    local = np.empty((1, 2))
+    found = np.empty((1, 5, 5))
+    size = noise.fit_size
+    one = np.empty((1, 2, 2))
+    moved = np.empty((1, 2))
+    greys = np.empty((2, 1))
+    for i in range(2):
+        local[0, i] = centre[i] - np.rint(centre[i] - 0.5 * (size - 1))
+        moved[0, i] = smear[i]
+        for j in range(2):
+            one[0, i, j] = shape[i + j]
+    greys[0, 0] = noise.contrast * light
+    greys[1, 0] = noise.black + noise.ring * light
+    fit_covariances(local, one, moved, greys[0], greys[1], size, noise.settings, found)
+    return found[0, 0, 0], found[0, 0, 1], found[0, 1, 1]
+
+
+@compiled
+def holds(centre: float, reach: float, size: int) -> bool:
+    """Tell whether the part of ``size`` px fitted about ``centre`` holds what reaches so far about
+    it.
+
+    All are px along one axis.
+    """
+    local = centre - np.rint(centre - 0.5 * (size - 1))
+    return local - reach > -0.5 and local + reach < size - 0.5
+
+
+class Ellipses(NamedTuple):
+    """Ellipses of m stickers in both images.
+
+    They have centres (2, m, 2), shapes (2, m, 2, 2) and smears (2, m, 2), px, and a mask ``seen``
+    (2, m) of those seen whole. ``noise`` (2, m, 6) is unit normal, for centres, shapes, and the
+    limit of thin ellipses. Contrasts and grounds (2, m) are grey values.
+    """
+
+    centres: Array
+    shapes: Array
+    smears: Array
+    seen: Array
+    noise: Array
+    contrasts: Array
+    grounds: Array
+
+
+class Windows(NamedTuple):
+    """Parts of ``size`` px that are fitted.
+
+    They have sides (k,), the numbers of their stickers (k,), first pixels ``corners`` (k, 2), and
+    ``found`` (k,), which says whether there is a sticker.
+    """
+
+    sides: Array
+    stickers: Array
+    corners: Array
+    found: Array
+    size: int
+
+
+class Fits(NamedTuple):
+    """Results of k fits.
+
+    They are ``good`` (k,), with centres (k, 2) and shapes (k, 2, 2), px, and the covariances (k, 5,
+    5) of both; contrasts and grounds (k,) are grey values.
+    """
+
+    good: Array
+    centres: Array
+    shapes: Array
+    covariances: Array
+    contrasts: Array
+    grounds: Array
+
+
+class Smallest(NamedTuple):
+    """Limits for an ellipse.
+
+    They are half of its width in px, the half width at which half of the fits end for being too
+    thin, the softness of that limit, and the contrast in grey values.
+    """
+
+    radius: float
+    thin_px: float
+    thin_std_px: float
+    contrast: float
+
+
+@compiled
+def nearest_stickers(
+    seen: Array, centres: Array, corners: Array, side_px: int, windows: Windows
+) -> None:
+    """Fill the parts that are fitted in windows of ``side_px`` px with first pixels (2, k, 2).
+
+    They lie about the sticker nearest to the middle of each, as far as the window goes.
+    """
+    at = 0
+    slack = side_px - windows.size
+    middle = 0.5 * (side_px - 1)
+    half = 0.5 * (windows.size - 1)
+    for side in range(2):
+        for k in range(corners.shape[1]):
+            least = np.inf
+            corner = corners[side, k]
+            windows.stickers[at] = 0
+            for n in range(seen.shape[1]):
+                x = centres[side, n, 0] - corner[0] - middle
+                y = centres[side, n, 1] - corner[1] - middle
+                # Windows are square, so the farther axis decides.
+                gap = max(abs(x), abs(y))
+                if seen[side, n] and gap < least:
+                    least = gap
+                    windows.stickers[at] = n
+            windows.sides[at] = side
+            windows.found[at] = least < np.inf
+            for i in range(2):
+                first = int(np.rint(centres[side, windows.stickers[at], i] - half))
+                windows.corners[at, i] = min(max(first, corner[i]), corner[i] + slack)
+            at += 1
+
+
+@compiled
+def fit_stickers(
+    ellipses: Ellipses, windows: Windows, smallest: Smallest, settings: FitSettings, fits: Fits
+) -> None:
+    """Fill what is found in windows; results that are not good have unit covariances and mean
+    nothing.
+    """
+    count = len(windows.stickers)
+    size = windows.size
+    local = np.empty((count, 2))
+    shapes = np.empty((count, 2, 2))
+    smears = np.empty((count, 2))
+    greys = np.empty((2, count))
+    known = np.empty((count, 5, 5))
+    chosen = 0
+    for k in range(count):
+        side = windows.sides[k]
+        n = windows.stickers[k]
+        shape = ellipses.shapes[side, n]
+        width = 0.5 * (shape[0, 0] + shape[1, 1]) - length_of(
+            0.5 * (shape[0, 0] - shape[1, 1]), shape[0, 1]
+        )
+        good = windows.found[k] and ellipses.contrasts[side, n] >= smallest.contrast
+        good = good and width > smallest.radius
+        good = good and width > smallest.thin_px + smallest.thin_std_px * ellipses.noise[side, n, 5]
+        for i in range(2):
+            reach = length_of(shape[i, 0], shape[i, 1])
+            local[chosen, i] = ellipses.centres[side, n, i] - windows.corners[k, i]
+            good = (
+                good and local[chosen, i] - reach > -0.5 and local[chosen, i] + reach < size - 0.5
+            )
+        fits.contrasts[k] = ellipses.contrasts[side, n]
+        fits.grounds[k] = ellipses.grounds[side, n]
+        fits.good[k] = good
+        if not good:
+            continue
+        greys[0, chosen] = fits.contrasts[k]
+        greys[1, chosen] = fits.grounds[k]
+        for i in range(2):
+            smears[chosen, i] = ellipses.smears[side, n, i]
+            for j in range(2):
+                shapes[chosen, i, j] = shape[i, j]
+        chosen += 1
+    fit_covariances(
+        local[:chosen],
+        shapes[:chosen],
+        smears[:chosen],
+        greys[0, :chosen],
+        greys[1, :chosen],
+        size,
+        settings,
+        known[:chosen],
+    )
+    root = np.empty((5, 5))
+    off = np.empty(5)
+    chosen = 0
+    for k in range(count):
+        side = windows.sides[k]
+        n = windows.stickers[k]
+        for i in range(5):
+            for j in range(5):
+                fits.covariances[k, i, j] = (
+                    known[chosen, i, j] if fits.good[k] else 1.0 if i == j else 0.0
+                )
+                root[i, j] = fits.covariances[k, i, j]
+        chosen += fits.good[k]
+        # The root of the covariance turns unit noise into that of the fit.
+        factor(root)
+        for i in range(5):
+            off[i] = 0.0
+            for j in range(i + 1):
+                off[i] += root[i, j] * ellipses.noise[side, n, j]
+        for i in range(2):
+            fits.centres[k, i] = ellipses.centres[side, n, i] + off[i]
+            for j in range(2):
+                fits.shapes[k, i, j] = ellipses.shapes[side, n, i, j] + off[2 + i + j]
