@@ -188,7 +188,13 @@ class Within:
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         least = min(self.least, 0.0) if self.zero else self.least
-        return {**handler(schema), "minimum": least, "maximum": self.most}
+        # A field may have narrower limits of its own, which hold as well.
+        shown = handler(schema)
+        return {
+            **shown,
+            "minimum": max(least, shown.get("minimum", least)),
+            "maximum": min(self.most, shown.get("maximum", self.most)),
+        }
 
 
 def within(quantity: Any) -> Within:

@@ -64,7 +64,13 @@ class Within:
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         least = min(self.least, 0.0) if self.zero else self.least
-        return {**handler(schema), "minimum": least, "maximum": self.most}
+        # A field may have narrower limits of its own, which hold as well.
+        shown = handler(schema)
+        return {
+            **shown,
+            "minimum": max(least, shown.get("minimum", least)),
+            "maximum": min(self.most, shown.get("maximum", self.most)),
+        }
 
 
 Length = Annotated[float, Within(1e-6, 1e3, "m")]

@@ -30,15 +30,18 @@ PAGES: dict[str, Callable[[], str]] = {
     "api_identify.md": lambda: api_pages.package("identify"),
 }
 SHARES = {
-    "position_share_percent": "position over that of `pid`, %",
-    "orientation_share_percent": "orientation over that of `pid`, %",
+    "position_share_percent": "position error over that of `pid`, %",
+    "orientation_share_percent": "orientation error over that of `pid`, %",
 }
-FOLLOWED = {"position_rms_um": "position, µm", "orientation_rms_urad": "orientation, µrad"} | SHARES
+FOLLOWED = {
+    "position_rms_um": "position error, µm",
+    "orientation_rms_urad": "orientation error, µrad",
+} | SHARES
 """Figures of a motion that is followed."""
 
 COMPARED = SHARES | {
-    "true_position_ratio": "position over that with the true model",
-    "true_orientation_ratio": "orientation over that with the true model",
+    "true_position_ratio": "position error over that with the true model",
+    "true_orientation_ratio": "orientation error over that with the true model",
     "starting_position_excess_um": "initial model worse by, µm",
     "starting_orientation_excess_urad": "initial model worse by, µrad",
 }
@@ -87,7 +90,7 @@ ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
         {
             "identified_groups": "identified groups",
             "group_std_percent": "their standard deviation, %",
-            "coulomb_std_percent": "Coulomb friction, %",
+            "coulomb_std_percent": "standard deviation of Coulomb friction, %",
             "unseen_position_rms_um": "position error in validation, µm",
         },
     ),
@@ -139,7 +142,7 @@ FIGURES: dict[str, Callable[[Path], str]] = {
         at_both_rates("observer"),
         TIMING,
         {"scenario.robot": "robot", "options.law": "law"},
-        {"observer_normalised_error": "mean squared error of the observer over the stated one"},
+        {"observer_normalised_error": "mean squared error over the stated variance"},
     ),
 }
 

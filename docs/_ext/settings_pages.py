@@ -14,8 +14,6 @@ from identify.studies.labels import factor_unit
 from identify.studies.rows import KINDS
 from identify.studies.study_file import study_schema
 
-LIMITS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-
 
 def scenario() -> str:
     """Scenario files."""
@@ -208,10 +206,26 @@ def _plural(kind: str) -> str:
 
 
 def _limits(value: dict[str, Any]) -> str:
+    """Narrowest of the lower and of the upper limits of a property, in words."""
     parts = [value, *(one for one in value.get("anyOf", []) if isinstance(one, dict))]
-    return " and ".join(
-        f"{sign} {part[name]:g}" for part in parts for name, sign in LIMITS.items() if name in part
-    )
+    lower = [
+        (part[name], sign)
+        for part in parts
+        for name, sign in (("minimum", "≥"), ("exclusiveMinimum", ">"))
+        if name in part
+    ]
+    upper = [
+        (part[name], sign)
+        for part in parts
+        for name, sign in (("maximum", "≤"), ("exclusiveMaximum", "<"))
+        if name in part
+    ]
+    # Of equal numbers the limit that excludes the number is the narrower one.
+    narrowest = [
+        *sorted(lower, key=lambda limit: (-limit[0], limit[1] == "≥"))[:1],
+        *sorted(upper, key=lambda limit: (limit[0], limit[1] == "≤"))[:1],
+    ]
+    return " and ".join(f"{sign} {number:g}" for number, sign in narrowest)
 
 
 def _sentence(text: str) -> str:

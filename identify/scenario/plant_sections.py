@@ -72,29 +72,28 @@ class Control(Section):
     """Law by which `cmmsim track` makes the robot follow a motion.
 
     All other runs have the law pid, except the excitation, which has a key of its own. The torque
-    limit holds in all runs, and the model knows it.
+    limit holds in all runs, and the model includes it.
     """
 
-    law: str = Field("pid", description=f"{', '.join(LAWS)}, or module:function")
+    law: str = Field("pid", description=f"control law: {', '.join(LAWS)}, or module:function")
     observer: bool = Field(
         True,
-        description="whether a law that knows a model predicts the pose over latency, jitter and "
-        "lost frames",
+        description="whether an observer predicts the pose for laws that know a model",
     )
     torque_access: bool = Field(
-        True, description="whether the drives take torques, or joint commands only"
+        True, description="whether the drives take torques; otherwise only joint commands"
     )
     torque_limit_N_m: float | None = quantity(None, "N m", "largest torque of an actuator", gt=0)
     torque_limit_N: float | None = quantity(None, "N", "the same, where actuators slide", gt=0)
     bandwidth_rad_s: float | None = quantity(
         None,
         "rad/s",
-        "of the loop of computed_torque; by default as fast as frame rate and latency allow",
+        "bandwidth of the law computed_torque; by default as fast as frame rate and latency allow",
         gt=0,
     )
-    damping: float = quantity(1.0, "1", "of that loop", gt=0, le=10)
+    damping: float = quantity(1.0, "1", "damping of the law computed_torque", gt=0, le=10)
     servo_bandwidth_rad_s: float | None = quantity(
-        None, "rad/s", "for which `cmmsim check` designs gains of the visual servo", gt=0
+        None, "rad/s", "bandwidth for which `cmmsim check` designs gains of the visual servo", gt=0
     )
     servo_damping: float = quantity(0.1, "1", "least damping of that design", ge=0, lt=1)
 
@@ -108,16 +107,16 @@ class Control(Section):
 class _Friction(Section):
     friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
     smoothing_velocity_rad_s: float | None = quantity(
-        None, "rad/s", "v_s of the law smoothed", gt=0
+        None, "rad/s", "velocity v_s over which the law smoothed smooths the sign", gt=0
     )
     smoothing_velocity_m_s: float | None = quantity(
         None, "m/s", "the same, where actuators slide", gt=0
     )
     static_ratio: float | None = quantity(
-        None, "1", "breakaway over Coulomb torque of the law stribeck", ge=1, le=1e3
+        None, "1", "ratio of breakaway to Coulomb torque of the law stribeck", ge=1, le=1e3
     )
     stribeck_velocity_rad_s: float | None = quantity(
-        None, "rad/s", "velocity at which the excess fades", gt=0
+        None, "rad/s", "velocity over which the breakaway torque falls to the Coulomb torque", gt=0
     )
     stribeck_velocity_m_s: float | None = quantity(
         None, "m/s", "the same, where actuators slide", gt=0
@@ -150,48 +149,48 @@ class Plant(_Friction):
     """
 
     parameters: str = Field(
-        "identified", description="named parameter set of the robot file, the truth"
+        "identified", description="parameter set of the robot file that is the truth"
     )
     drive: DriveName = Field(
-        "pid", description="law of the drives: the paper's PID, PD, PI, P-PI, or a filtered PID"
+        "pid", description="law of the drives; pid is the paper's, cascade is P-PI"
     )
     derivative_filter_s: float | None = quantity(
         None, "s", "time constant of the drive pid_filtered", gt=0, le=1
     )
     drive_gains: dict[str, float] = Field(
         {},
-        description="of the drives, instead of the set's: { lp = 10.5, li = 30.0, ld = 0.3 }, in "
-        "the units of these",
+        description="gains of the drives, instead of those of the parameter set, in the same "
+        "units; { lp = 10.5, li = 30.0, ld = 0.3 }",
     )
     steps_per_frame: int = quantity(
-        16, "1", "integration steps a frame; elastic joints take more", ge=1, le=10_000
+        16, "1", "integration steps per frame; elastic joints take more", ge=1, le=10_000
     )
     geometry_error_m: float = quantity(
         0.0,
         "m",
-        "standard deviation of each coordinate of the joint centres from the robot file's",
+        "standard deviation of each coordinate of the joint centres from the robot file",
         ge=0,
         le=1e-3,
     )
     length_error_m: float = quantity(
         0.0,
         "m",
-        "standard deviation of each length of the legs, as of cranks, from the robot file's",
+        "standard deviation of each length of the legs from the robot file",
         ge=0,
         le=1e-3,
     )
     axis_error_rad: float = quantity(
         0.0,
         "rad",
-        "standard deviation of each turn of an axis of the legs, of which there are two",
+        "standard deviation of both angles by which an axis of a leg is turned",
         ge=0,
         le=1e-2,
     )
-    geometry_seed: int = quantity(0, "1", "which of the robots with such errors", ge=0)
+    geometry_seed: int = quantity(0, "1", "seed of these errors", ge=0)
     joint_stiffness_N_m_rad: float | None = quantity(
         None,
         "N m/rad",
-        "of a spring between motor and driven body, makes the joints elastic",
+        "stiffness of a spring between motor and driven body, which makes the joint elastic",
         gt=0,
         le=1e6,
     )
@@ -201,9 +200,11 @@ class Plant(_Friction):
     joint_damping_N_m_s_rad: float = quantity(0.05, "N m s/rad", "damping of that spring", ge=0)
     joint_damping_N_s_m: float = quantity(50.0, "N s/m", "the same, where actuators slide", ge=0)
     motor_inertia_kg_m2: float = quantity(
-        3e-4, "kg m2", "share of a driven body's inertia before that spring", gt=0
+        3e-4, "kg m2", "part of the driven body's inertia on the motor's side of that spring", gt=0
     )
-    motor_mass_kg: float = quantity(0.3, "kg", "share of its mass, where actuators slide", gt=0)
+    motor_mass_kg: float = quantity(
+        0.3, "kg", "part of the driven body's mass on the motor's side, where actuators slide", gt=0
+    )
 
     @property
     def drive_law(self) -> DriveName:
@@ -231,19 +232,19 @@ class Model(_Friction):
     """Estimator's model of the robot."""
 
     start_parameters: str = Field(
-        "initial", description="named parameter set of the robot file, the starting guess"
+        "initial", description="parameter set of the robot file that is the initial guess"
     )
     drive: Literal["pid", "pd", "pi", "cascade", "pid_filtered", "auto"] = Field(
-        "pid", description="law of the drives; auto: that for which the record speaks"
+        "pid", description="law of the drives; auto takes the most probable one of the record"
     )
     derivative_filter_s: float | None = quantity(
         None,
         "s",
-        "time constant of the drive pid_filtered, which auto considers where it is stated",
+        "time constant of the drive pid_filtered; auto considers this drive only if it is stated",
         gt=0,
         le=1,
     )
-    steps_per_frame: int = quantity(4, "1", "integration steps a frame", ge=1, le=10_000)
+    steps_per_frame: int = quantity(4, "1", "integration steps per frame", ge=1, le=10_000)
 
     @property
     def drive_law(self) -> DriveName:

@@ -52,19 +52,20 @@ class Scenario(Section):
     name: Name = Field(description="short name, used for folders")
     description: str = ""
     robot: str = Field(
-        "rss6", description="built-in robot, or path of a robot file from this file on"
+        "rss6", description="built-in robot, or path of a robot file relative to this file"
     )
     sensor: str = Field(
-        "ctrack780", description="built-in sensor, or path of a sensor file from this file on"
+        "ctrack780", description="built-in sensor, or path of a sensor file relative to this file"
     )
-    sensor_note: str = Field("", description="what the sensor's file says about its own figures")
+    sensor_note: str = Field("", description="note of the sensor file about its figures")
     sensor_changes: dict[str, Any] = Field(
-        {}, description="entries that hold instead of the sensor file's"
+        {}, description="entries that replace those of the sensor file"
     )
     renderer: str = Field(
         "auto",
-        description="what draws the images: pyrender, analytic, auto: pyrender where OpenGL "
-        "works, or module:name; statistical: nothing, it says what would be found in them",
+        description="renderer of the images; pyrender; analytic; auto, which is pyrender where "
+        "OpenGL works; module:function; or statistical, which draws errors of sticker centres "
+        "instead",
     )
     pose_method: Literal["registration", "planes"] = "registration"
     rig: Rig = Rig()

@@ -60,17 +60,19 @@ class Excitation(Section):
     candidates: int = quantity(
         64,
         "1",
-        "random trajectories: the best is chosen, is where a search begins, or they evolve",
+        "number of random trajectories, from which the method starts",
         ge=1,
         le=100_000,
     )
     method: Literal["random", "evolutionary", "gradient"] = Field(
         "random",
-        description="best random trajectory, differential evolution (the paper's kind), or IPOPT",
+        description="search: random, evolutionary (differential evolution, as in the paper) or "
+        "gradient (IPOPT)",
     )
     criterion: str = Field(
         "observability",
-        description="eq. 39, D-optimality of the output error's information, or module:function",
+        description="observability (eq. 39), information (D-optimality of the output error), or "
+        "module:function",
     )
     max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a joint", gt=0)
     max_joint_velocity_m_s: float = quantity(0.2, "m/s", "the same, where actuators slide", gt=0)
@@ -78,15 +80,19 @@ class Excitation(Section):
         0.05, "1", "least leverage of an actuator on its leg (J_a1)", ge=0, lt=1
     )
     most_condition: float = quantity(
-        20.0, "1", "largest condition number of J_a2 without unit, of the 2-norm", ge=1, le=1e9
+        20.0, "1", "largest condition number (2-norm) of the dimensionless J_a2", ge=1, le=1e9
     )
     law: str = Field(
         "pid",
-        description=f"law of the run, which knows the starting model: {', '.join(LAWS)}, or "
-        "module:function; under another than pid the model gets the logged commands",
+        description=f"control law of the run, which uses the initial model: {', '.join(LAWS)}, or "
+        "module:function; with any law but pid the model gets the logged commands",
     )
     generations: int = quantity(
-        324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000
+        324,
+        "1",
+        "number of generations of the evolutionary method; the paper has 324",
+        ge=1,
+        le=100_000,
     )
 
     @property
@@ -118,7 +124,7 @@ class PriorValue(Section):
     """Prior knowledge of a parameter before the experiment, in its SI unit."""
 
     value: float = quantity(..., "SI", "expected value", ge=0, le=1e12)
-    std: float = quantity(..., "SI", "its standard deviation", ge=1e-24, le=1e12)
+    std: float = quantity(..., "SI", "standard deviation of the value", ge=1e-24, le=1e12)
 
 
 CAMERA_CHANGE = Within(-1e3, 1e3, "in the unit of the parameter")
@@ -136,36 +142,42 @@ class Rig(Section):
 
     known: str = Field(
         "exact",
-        description="exact; calibrated: from pictures of a board that the run takes first; "
-        "photographs: as fifteen photographs of a board leave it; or a calibration.json, whose "
-        "covariance says how well",
+        description="how well the cameras are known; exact; calibrated, from pictures of a board "
+        "that the run takes first; photographs, with the covariance that fifteen photographs of a "
+        "board leave; or the path of a calibration.json, with its covariance",
     )
-    pairs: int = quantity(20, "1", "pairs of pictures of the board, where calibrated", ge=3, le=500)
+    pairs: int = quantity(
+        20, "1", "number of pairs of pictures of the board for calibrated", ge=3, le=500
+    )
     errors: dict[str, float] = Field(
         {},
-        description='true minus known, of which no covariance knows: { "left.cx_px" = 0.1 }, px, '
-        "m or rad",
+        description="true minus known camera parameters, which no covariance includes; "
+        '{ "left.cx_px" = 0.1 }, in px, m or rad',
     )
     right_later_s: float | None = quantity(
         None,
         "s",
-        "by how much the right camera truly exposes later; left out: drawn",
+        "true delay of the right camera's exposure; drawn if left out",
         ge=-0.1,
         le=0.1,
     )
     right_later_std_s: float = quantity(
-        0.0, "s", "how well that is known to be nothing", ge=0, le=0.1
+        0.0,
+        "s",
+        "standard deviation of the delay of the right camera, which is taken as zero",
+        ge=0,
+        le=0.1,
     )
     drift: dict[str, float] = Field(
         {},
-        description="how far the true cameras move, evenly from the first to the last frame of "
-        "each run, and the "
-        'estimator is not told: { "right.cx_px" = 0.1 }, px, m or rad',
+        description="change of the true camera parameters from the first to the last frame of each "
+        "run, without the estimator's knowledge; "
+        '{ "right.cx_px" = 0.1 }, in px, m or rad',
     )
     watch: Literal["platform", "both", "none"] = Field(
         "platform",
-        description="whose stickers tell a run whether the cameras still are as they were; both: "
-        "the base's, too, in twice the time",
+        description="stickers that the drift watch uses; both are those of platform and base, "
+        "which takes twice the time",
     )
 
     @field_validator("errors", "drift")
@@ -193,11 +205,13 @@ class Identification(Section):
 
     method: Literal["closed_loop", "command_driven"] = Field(
         "closed_loop",
-        description="the model closes its own loop (the paper), or gets the logged commands",
+        description="closed_loop (the model closes its own loop, as in the paper) or "
+        "command_driven (the model gets the logged commands)",
     )
     scale_anchor: Literal["platform_mass", "joint_gain", "payload", "prior"] = Field(
         "platform_mass",
-        description="what fixes the overall scale of the parameters; payload records a second run",
+        description="quantity that fixes the common factor of all parameters; payload records a "
+        "second run",
     )
     anchor_std: float | None = quantity(
         None, "unit of the anchor", "standard deviation of the anchor", gt=0
@@ -205,24 +219,26 @@ class Identification(Section):
     start_std: float = quantity(
         1.0,
         "1",
-        "standard deviation of the starting guess, relative to each value",
+        "standard deviation of the initial guess, relative to each value",
         ge=1e-9,
         le=1e9,
     )
     prior: dict[str, PriorValue] = Field(
-        {}, description="parameters known better than the starting guess: { name = { value, std } }"
+        {},
+        description="parameters that are known better than the initial guess: { name = { value, "
+        "std } }",
     )
     nuisances: list[Literal["rig", "teaching", "exposure", "latency", "geometry"]] = Field(
         ["rig", "teaching", "exposure", "latency", "geometry"],
-        description="of what all poses of a record have in common, what is estimated beside the "
+        description="errors common to all poses of a record that are estimated beside the "
         "parameters",
     )
     physical_consistency: bool = Field(
         False,
-        description="only masses and moments of inertia that a rigid body can have (the paper's "
-        "have others)",
+        description="whether only masses and moments of inertia of rigid bodies are admitted; "
+        "some of the paper's are not",
     )
-    max_iterations: int = quantity(30, "1", "iterations at most", ge=1, le=1000)
+    max_iterations: int = quantity(30, "1", "largest number of iterations", ge=1, le=1000)
     cost_tolerance: float = quantity(
         1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1
     )
@@ -259,7 +275,7 @@ class Payload(Section):
     """
 
     mass_kg: float = quantity(
-        8.0, "kg", "mass, its centre in the origin of the platform frame", gt=0
+        8.0, "kg", "mass; its centre is in the origin of the platform frame", gt=0
     )
     Ixx_kg_m2: float = quantity(
         0.02, "kg m2", "moment of inertia about the platform's x axis", ge=0
@@ -271,7 +287,7 @@ class Payload(Section):
         0.04, "kg m2", "moment of inertia about the platform's z axis", ge=0
     )
     mass_std_kg: float = quantity(
-        0.0, "kg", "standard deviation of the mass, as weighed; 0: exactly known", ge=0
+        0.0, "kg", "standard deviation of the mass; 0 means exactly known", ge=0
     )
     Ixx_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Ixx_kg_m2", ge=0)
     Iyy_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Iyy_kg_m2", ge=0)
@@ -296,10 +312,10 @@ class Payload(Section):
 
 
 class Validation(Section):
-    """Unseen trajectories on which the identified model is judged."""
+    """Validation: unseen trajectories on which the identified model is judged."""
 
-    count: int = quantity(10, "1", "number of unseen trajectories", ge=1, le=1000)
-    duration_s: float = quantity(10.0, "s", "length of each", gt=0, le=3600)
+    count: int = quantity(10, "1", "number of validation trajectories", ge=1, le=1000)
+    duration_s: float = quantity(10.0, "s", "length of each validation trajectory", gt=0, le=3600)
 
 
 class Geometry(Section):
@@ -310,52 +326,59 @@ class Geometry(Section):
 
     known: str = Field(
         "exact",
-        description="exact: the robot file's; calibrated: by static poses, which the run measures "
-        "first; or the robot.toml of a calibration, with its covariance beside it",
+        description="how well the geometry is known; exact, as in the robot file; calibrated, by "
+        "static poses that the run measures first; or the path of the robot.toml of a calibration, "
+        "with its covariance beside it",
     )
     poses: int = quantity(60, "1", "number of poses that are measured", ge=1, le=10_000)
-    frames_per_pose: int = quantity(20, "1", "frames whose mean counts as a pose", ge=1, le=10_000)
+    frames_per_pose: int = quantity(
+        20, "1", "number of frames whose mean is a measured pose", ge=1, le=10_000
+    )
     selection: Literal["random", "greedy", "gradient"] = Field(
         "gradient",
-        description="random poses, the best of the candidates, or those moved along the index's "
-        "gradient",
+        description="choice of the poses: random, greedy (the best of the candidates) or gradient "
+        "(moved along the gradient of the index)",
     )
     criterion: Literal["prediction", "determinant", "noise_amplification"] = Field(
         "prediction",
-        description="index: mean error of other poses, determinant of the information, or Nahvi "
-        "and Hollerbach's",
+        description="index of the choice: prediction (mean error of other poses), determinant (of "
+        "the information) or noise_amplification (Nahvi and Hollerbach)",
     )
     candidates: int = quantity(
-        400, "1", "random poses within the travel to choose from", ge=1, le=100_000
+        400, "1", "number of random poses within the travel to choose from", ge=1, le=100_000
     )
     measurement: Literal["images", "drawn"] = Field(
-        "images", description="poses through images, or drawn with the noise that the sensor states"
+        "images", description="images, or poses drawn with the noise that the sensor states"
     )
     frames: Literal["taught", "unknown"] = Field(
         "taught",
-        description="base and platform frame as well as the sensor's teaching says, or not known "
-        "at all",
+        description="knowledge of the base and platform frames: taught, with the covariance of "
+        "teaching, or unknown",
     )
     tolerance_m: float = quantity(
-        1e-3, "m", "standard deviation of places and lengths about the drawing's", gt=0
+        1e-3, "m", "standard deviation of positions and lengths from the drawing", gt=0
     )
     tolerance_rad: float = quantity(
-        1e-2, "rad", "standard deviation of axes and zero angles about it", gt=0
+        1e-2, "rad", "standard deviation of axes and zero angles from the drawing", gt=0
     )
     encoder_noise_rad: float = quantity(
         1e-5, "rad", "standard deviation of one reading of an encoder", ge=0
     )
     encoder_noise_m: float = quantity(1e-6, "m", "the same, where actuators slide", ge=0)
     encoder_resolution_rad: float = quantity(
-        4.8e-5, "rad", "its step, here of 17 bits; 0: none", ge=0
+        4.8e-5, "rad", "step of an encoder, here of 17 bits; 0 means no steps", ge=0
     )
     encoder_resolution_m: float = quantity(1e-6, "m", "the same, where actuators slide", ge=0)
     encoder_offset_rad: float = quantity(
-        0.0, "rad", "standard deviation of what each reads at zero", ge=0, le=0.05
+        0.0, "rad", "standard deviation of the reading of an encoder at zero", ge=0, le=0.05
     )
     encoder_offset_m: float = quantity(0.0, "m", "the same, where actuators slide", ge=0, le=0.01)
     unseen: int = quantity(
-        200, "1", "poses that are not measured and judge the result", ge=1, le=100_000
+        200,
+        "1",
+        "number of poses that are not measured, on which the result is judged",
+        ge=1,
+        le=100_000,
     )
 
     @model_validator(mode="after")

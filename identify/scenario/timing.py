@@ -40,21 +40,19 @@ class Timing(Section):
     """
 
     frame_rate_hz: float = quantity(
-        60.0, "Hz", "stereo frames a second; the servo acts once a frame", gt=0, le=2000
+        60.0, "Hz", "stereo frames per second; the servo acts once per frame", gt=0, le=2000
     )
-    exposure_s: float = quantity(
-        0.0, "s", "time in which a picture gathers light; 0 is an instant", ge=0, le=1
-    )
+    exposure_s: float = quantity(0.0, "s", "exposure time; 0 is an instant", ge=0, le=1)
     latency_s: float = quantity(
-        0.0, "s", "mean delay from the middle of the exposure to the command", ge=0, le=1
+        0.0, "s", "mean latency from the middle of the exposure to the command", ge=0, le=1
     )
     latency_jitter_s: float = quantity(
         0.0, "s", "standard deviation of the latency between frames", ge=0, le=1
     )
     latency_std_s: float = quantity(
-        0.0, "s", "how well the mean latency is known, standard deviation", ge=0, le=0.1
+        0.0, "s", "standard deviation of the stated mean latency", ge=0, le=0.1
     )
-    dropout: float = quantity(0.0, "1", "probability that a frame is lost on its way", ge=0, le=1)
+    dropout: float = quantity(0.0, "1", "probability that a frame is lost", ge=0, le=1)
     hold: Literal["zero", "linear"] = Field("zero", description="joint command between two frames")
 
     @property

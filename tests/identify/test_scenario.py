@@ -21,7 +21,7 @@ from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector
 from identify.reporting.settings import changed_settings
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
-from identify.scenario.scenario import ESTIMATOR_SECTIONS
+from identify.scenario.scenario import ESTIMATOR_SECTIONS, scenario_schema
 from identify.setup import Setup
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import NAMES, SHORT, changed_robot_file, rss6
@@ -291,6 +291,18 @@ def test_every_number_has_a_unit():
         for name, entry in section.model_fields.items():
             if entry.annotation in (int, float, float | None) and name != "count":
                 assert entry.json_schema_extra["unit"], f"{section.__name__}.{name}"
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "name"),
+    [("timing", "frame_rate_hz", "Timing"), ("plant", "geometry_error_m", "Plant")],
+)
+def test_the_largest_value_of_the_schema_is_taken_and_a_larger_one_is_refused(section, key, name):
+    """The limit of the field holds, which is narrower than the range of its unit."""
+    most = scenario_schema()["$defs"][name]["properties"][key]["maximum"]
+    load_scenario("quick").with_overrides({f"{section}.{key}": float(most)})
+    with pytest.raises(ScenarioError, match=f"{section}.{key}"):
+        load_scenario("quick").with_overrides({f"{section}.{key}": 1.001 * most})
 
 
 CHANGES = {"camera.dark_noise": 52.0, "lens.psf_px": 0.6, "rig.baseline": 0.8}
