@@ -29,12 +29,12 @@ def run(
     """
     began = time.perf_counter()
     run_folder = RunFolder(folder)
-    scenario = with_renderer(scenario)
+    planned = Setup(with_renderer(scenario), seed)
     seconds: dict[str, float] = {}
     setup = None
     taught = None
-    if not is_begun(scenario, seed, folder):
-        setup, seconds = begin(Setup(scenario, seed), folder, progress)
+    if not is_begun(planned, folder):
+        setup, seconds = begin(planned, folder, progress)
     names = record_files(scenario.identification)
     if not all((folder / name).is_file() for name in names):
         taught = record(folder, progress, workers, setup)
@@ -56,12 +56,12 @@ def record(
 
     setup: that of the run where it is at hand, its sensor taught.
     """
-    run_folder, scenario, trajectories, known = open_run(folder)
+    run_folder, opened, trajectories = open_run(folder, progress)
     began = time.perf_counter()
-    seed = trajectories.seed
     if setup is None:
-        setup = Setup(scenario, seed, calibrated=known, progress=progress)
+        setup = opened
         teach(setup.sensor, progress)
+    scenario = setup.scenario
     names = record_files(scenario.identification)
     with progress.stage("record", setup.sensor_plan.frames * len(names)) as advance:
         for name in names:
@@ -70,7 +70,7 @@ def record(
                 setup.sensor,
                 trajectories.excitation,
                 scenario.excitation,
-                seed,
+                setup.seed,
                 advance,
                 scenario.payload if name == run_folder.payload.name else None,
             )

@@ -39,7 +39,7 @@ from identify.experiment.sensor_in_loop import SensorPlan, teach
 from identify.files.atomic import write_bytes
 from identify.files.dataset import POSE, netcdf
 from identify.loop_parameters import loop_settings
-from identify.model.from_record import model_side
+from identify.model.from_record import ModelSide, model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import integer_seed
 from identify.record import recording
@@ -116,6 +116,11 @@ class Setup:
         return self.known.robot
 
     @cached_property
+    def side(self) -> ModelSide:
+        """The robot and its loop as the estimator knows them."""
+        return model_side(self.robot, self.scenario)
+
+    @cached_property
     def plant(self) -> Plant:
         """The true robot in its loop, which no estimator sees."""
         scenario = self.scenario
@@ -131,8 +136,7 @@ class Setup:
             parameters=true_parameters(self.nominal, switches),
             switches=switches,
             loop=KnownLoop(
-                settings=model_side(self.nominal, scenario).settings,
-                start=scenario.model,
+                side=self.side,
                 prior=identification.prior,
                 filter_time=scenario.model.derivative_filter_s or switches.derivative_filter_s,
                 control=control,

@@ -20,10 +20,11 @@ from identify.commands.options import (
 from identify.files.lock import working_in
 from identify.files.run_folder import RunFolder, save_files
 from identify.progress import Progress, print_table, terminal_progress
-from identify.scenario import Scenario, load_scenario
+from identify.scenario import load_scenario
 
 if TYPE_CHECKING:
     from identify.excitation.comparison import Comparison, Entry
+    from identify.setup import Setup
     from identify.validation.estimator_comparison import Score
 
 ESTIMATORS_HEADER = (
@@ -287,16 +288,18 @@ def variation(
 
 
 def compare_excitation(
-    scenario: Scenario, seed: int, folder: Path, progress: Progress, json: Path | None, quiet: bool
+    setup: "Setup", folder: Path, progress: Progress, json: Path | None, quiet: bool
 ) -> None:
     """Search with every method, and write comparison.json and comparison.png into `folder`."""
     from identify.excitation.comparison import compare_methods, comparison_figure
     from identify.excitation.information import knowledge
-    from identify.setup import Setup
 
-    setup = Setup(scenario, seed)
+    scenario = setup.scenario
     design = setup.design
-    found = compare_methods(design, knowledge(design.robot, scenario), seed, progress)
+    times = scenario.timing.frame_times(design.settings.duration_s)
+    covariance = setup.sensor_plan.covariance(setup.robot.home_pose)
+    known = knowledge(setup.side, scenario.identification, times, covariance)
+    found = compare_methods(design, known, setup.seed, progress)
     figures = {**asdict(found), "scenario": scenario.name}
     figure = comparison_figure(design.robot, design.settings, found)
     save_files(folder, {"comparison.json": figures, "comparison.png": figure})

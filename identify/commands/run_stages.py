@@ -71,10 +71,12 @@ def run(
                                               joints off by 0.1 mm: the model
                                               is wrong, and the residuals tell
     """
+    from identify.setup import Setup, with_renderer
+
     chosen = chosen_scenario(scenario, settings, robot)
     path = out or Path("runs") / f"{chosen.name}-{seed}"
     # An experiment that was begun in this folder goes on, so its files may be there.
-    begun = _pipeline().is_begun(chosen, seed, path)
+    begun = _pipeline().is_begun(Setup(with_renderer(chosen), seed), path)
     folder = context.with_resource(new_run_folder(path, BEGUN if begun else UNFINISHED))
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
     result = _warned(folder)
@@ -150,12 +152,12 @@ def excite(
     # What an interrupted search has left may be replaced.
     may_hold = () if compare else UNFINISHED
     folder = context.with_resource(new_run_folder(out or Path("runs") / name, may_hold))
-    if compare:
-        compare_excitation(chosen, seed, folder.path, terminal_progress(quiet), json, quiet)
-        return
     from identify.setup import Setup, with_renderer
 
     setup = Setup(with_renderer(chosen), seed)
+    if compare:
+        compare_excitation(setup, folder.path, terminal_progress(quiet), json, quiet)
+        return
     _pipeline().excite(setup, folder.path, terminal_progress(quiet))
     tell(load_result(folder.trajectories), json, quiet, lambda: None)
 

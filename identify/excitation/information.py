@@ -59,8 +59,9 @@ from identify.excitation.motion import (
     sample_times,
     tracked_motion,
 )
-from identify.model.from_record import model_side
+from identify.model.from_record import ModelSide, model_side
 from identify.scenario import Scenario
+from identify.scenario.sections import Identification
 from identify.trajectory import FourierTrajectory
 
 
@@ -69,7 +70,11 @@ def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: A
 
     Searches use D of the linearised loop. Their results are judged by that of the simulated loop.
     """
-    known = knowledge(robot, scenario)
+    covariance = expected_covariance(
+        scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes
+    )
+    times = scenario.timing.frame_times(scenario.excitation.duration_s)
+    known = knowledge(model_side(robot, scenario), scenario.identification, times, covariance)
     value, smooth = (
         log_linear_information(robot, unknowns, known, v) for v in (None, smoothing_of(robot))
     )
@@ -104,23 +109,24 @@ class Knowledge:
     scaled_prior: Array
 
 
-def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
-    """Return the scenario's starting guess with its prior, scale anchor, loop and sensor."""
-    settings = scenario.identification
-    guess = model_guess(robot, scenario.model, settings)
-    prior = np.eye(len(robot.layout.names))
+def knowledge(
+    side: ModelSide, settings: Identification, times: Array, covariance: Array
+) -> Knowledge:
+    """Return what is known before a run: the model's starting guess, its prior and the anchor.
+
+    The run has frames at times (N,) [s], and poses have the covariance (6, 6).
+    """
+    layout = side.robot.layout
+    guess = model_guess(side.robot, side.model, settings)
+    prior = np.eye(len(layout.names))
     anchor = settings.scale_anchor
     if anchor in MEASURED_PARAMETER:
-        place = robot.layout.names.index(MEASURED_PARAMETER[anchor])
-        std = settings.anchor_std or default_std(anchor, robot.layout)
+        place = layout.names.index(MEASURED_PARAMETER[anchor])
+        std = settings.anchor_std or default_std(anchor, layout)
         # In units of the prior's deviation, as all of this matrix.
         prior[place, place] += (guess.std[place] / std) ** 2
-    covariance = expected_covariance(
-        scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes
-    )
-    times = scenario.timing.frame_times(scenario.excitation.duration_s)
-    start = scenario.model.start_parameters
-    return Knowledge(start, guess, model_side(robot, scenario).settings, times, covariance, prior)
+    start = side.model.start_parameters
+    return Knowledge(start, guess, side.settings, times, covariance, prior)
 
 
 def log_information(robot: Robot, known: Knowledge, trajectory: FourierTrajectory) -> float:

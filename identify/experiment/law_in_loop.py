@@ -131,7 +131,7 @@ def prepared(
         check_motion(robot, desired, times, **plant.runs.limits)
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
-    settings = loop.settings
+    settings = loop.side.settings
     if known.drive is not None:
         filter_time = loop.filter_time if known.drive == FILTERED else None
         settings = replace(

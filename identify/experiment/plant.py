@@ -32,12 +32,13 @@ from identify.errors import ScenarioError
 from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import of_actuators
+from identify.model.from_record import ModelSide
 from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
 from identify.record.known_geometry import KnownGeometry
 from identify.record.payload import payload_vector
 from identify.record.pose_covariance import factor
-from identify.scenario import Model, PriorValue, Timing
 from identify.scenario import Plant as PlantSwitches
+from identify.scenario import PriorValue, Timing
 from identify.scenario.plant_sections import Control
 from identify.scenario.sections import Geometry, Payload, Rig
 
@@ -48,10 +49,8 @@ class KnownLoop:
 
     Attributes
     ----------
-    settings : LoopSettings
-        Loop of the model.
-    start : Model
-        Section of the scenario with the starting parameters and the law of the drives.
+    side : ModelSide
+        Nominal robot and the loop around its model.
     prior : mapping of str to PriorValue
         Parameters that are known better, by name.
     filter_time : float or None
@@ -60,8 +59,7 @@ class KnownLoop:
         What is asked of control laws, and what the drives take.
     """
 
-    settings: LoopSettings
-    start: Model
+    side: ModelSide
     prior: Mapping[str, PriorValue]
     filter_time: float | None
     control: Control
@@ -217,12 +215,12 @@ class Plant:
         timing = self.runs.timing.model_copy(update=dict.fromkeys(none, 0.0))
         settings, known = (
             replace(loop, timing=replace(loop.timing, latency_s=0.0))
-            for loop in (self.settings, self.loop.settings)
+            for loop in (self.settings, self.loop.side.settings)
         )
         return replace(
             self,
             settings=settings,
-            loop=replace(self.loop, settings=known),
+            loop=replace(self.loop, side=replace(self.loop.side, settings=known, timing=timing)),
             runs=replace(self.runs, timing=timing),
         )
 

@@ -143,7 +143,7 @@ def run_plant(
     in_loop = None
     if law != SERVO:
         motion = NamedMotion("the trajectory", trajectory, duration_s)
-        start = plant.loop.start
+        start = plant.loop.side.model
         # The law knows no more than an experimenter: starting model and stated load.
         guess = starting_guess(
             plant.nominal, start.start_parameters, 1.0, plant.loop.prior, start.drive_law

@@ -48,8 +48,9 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
         planned = load_scenario(run_folder.whole_scenario)
         seed = None
     else:
-        _, planned, trajectories, _ = open_run(folder)
-        seed = trajectories.seed
+        _, setup, trajectories = open_run(folder)
+        planned = setup.scenario
+        seed = setup.seed
     scenario = planned.with_estimator_settings(settings or {})
     files = RunFiles(run_folder)
     names = record_files(scenario.identification)
@@ -57,7 +58,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     records = {name: files.content(name) for name in names}
     if seed is not None:
         for name, one in records.items():
-            check_planned(run_folder.path / name, one, scenario, trajectories)
+            check_planned(run_folder.path / name, one, setup, trajectories)
     found = _identified_files(run_folder, records, scenario, seed, progress)
     changed = {} if scenario == planned else scenario_file(run_folder, scenario.to_toml())
     write_files(changed | found)

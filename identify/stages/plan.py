@@ -24,22 +24,22 @@ from identify.progress import Progress
 from identify.record.checks import check_length, check_trajectory, fewest_frames
 from identify.record.known_geometry import FOLDER, KnownGeometry, known_geometry
 from identify.record.provenance import RECORDS
-from identify.scenario import Scenario, load_scenario
+from identify.scenario import load_scenario
 from identify.scenario.sections import Identification
-from identify.setup import Setup, with_renderer
+from identify.setup import Setup
 from identify.trajectory import TrajectorySet, check_travel, load_trajectories, trajectories_json
 
 
-def is_begun(scenario: Scenario, seed: int, folder: Path) -> bool:
+def is_begun(setup: Setup, folder: Path) -> bool:
     """Tell whether a folder has the plan of this run, and no report yet."""
     run_folder = RunFolder(folder)
     if not (run_folder.scenario.is_file() and run_folder.trajectories.is_file()):
         return False
     if run_folder.report.exists():
         return False
-    text = sealed_toml(with_renderer(scenario).to_toml())
+    text = sealed_toml(setup.scenario.to_toml())
     same = run_folder.scenario.read_text(encoding="utf-8", errors="replace") == text
-    return same and load_trajectories(run_folder.trajectories).seed == seed
+    return same and load_trajectories(run_folder.trajectories).seed == setup.seed
 
 
 def begin(setup: Setup, folder: Path, progress: Progress) -> tuple[Setup, dict[str, float]]:
@@ -72,16 +72,16 @@ def excite(setup: Setup, folder: Path, progress: Progress) -> None:
     _write_plan(folder, setup, _designed(setup, progress), calibration)
 
 
-def open_run(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, KnownGeometry]:
-    """Read the plan of a run folder and the geometry that its estimator knows."""
+def open_run(
+    folder: Path, progress: Progress | None = None
+) -> tuple[RunFolder, Setup, TrajectorySet]:
+    """Read the plan of a run folder, and resolve it with the geometry that its estimator knows."""
     run_folder = RunFolder(folder)
     scenario = load_scenario(run_folder.whole_scenario)
-    return (
-        run_folder,
-        scenario,
-        load_trajectories(run_folder.trajectories),
-        known_geometry(load_robot(scenario.robot), scenario.geometry, folder),
-    )
+    trajectories = load_trajectories(run_folder.trajectories)
+    robot = load_robot(scenario.robot)
+    known = known_geometry(robot, scenario.geometry, folder)
+    return run_folder, Setup(scenario, trajectories.seed, robot, known, progress), trajectories
 
 
 def _calibrated(setup: Setup, progress: Progress) -> tuple[GeometryOutcome | None, Setup]:
@@ -97,9 +97,10 @@ def _calibrated(setup: Setup, progress: Progress) -> tuple[GeometryOutcome | Non
 
 
 def check_planned(
-    file: Path, record: xr.Dataset, scenario: Scenario, trajectories: TrajectorySet
+    file: Path, record: xr.Dataset, setup: Setup, trajectories: TrajectorySet
 ) -> None:
     """Raise EstimationError if a file's record does not follow the planned trajectory."""
+    scenario = setup.scenario
     try:
         duration_s = scenario.excitation.duration_s
         check_trajectory(record, trajectories.excitation, scenario.timing, duration_s)

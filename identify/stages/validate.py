@@ -1,6 +1,7 @@
 """Stage that runs the identified model and the plant on unseen trajectories and opens the truth."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from identify.files.run_folder import (
     result_json,
 )
 from identify.loop_parameters import settled_drive
-from identify.model.from_record import model_side
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
@@ -30,7 +30,6 @@ from identify.reporting.run_result import (
     sensor_entry,
     validation_entry,
 )
-from identify.setup import Setup
 from identify.stages.plan import check_planned, open_run
 from identify.validation.unseen import model_on_record, predicted_runs, run_unseen
 
@@ -53,23 +52,23 @@ def validate(
             f"{folder} holds a record of your own: no plant is there that could run unseen "
             f"trajectories; go on with: cmmsim report --out {folder}"
         )
-    run_folder, scenario, trajectories, known = open_run(folder)
+    run_folder, setup, trajectories = open_run(folder)
     began = time.perf_counter()
-    robot = known.robot
+    robot = setup.robot
     run_folder.require("covariance.nc")
     files = RunFiles(run_folder)
     result = load_result(run_folder.result)
     check_robot(files.experiment, robot)
-    check_planned(run_folder.experiment, files.experiment, scenario, trajectories)
+    check_planned(run_folder.experiment, files.experiment, setup, trajectories)
     excitation_truth = read_truth(run_folder.experiment)
     check_entries(run_folder.result, result, "identify")
     files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
     covariance = files.covariance_of(robot)
     models = _identified_models(robot, run_folder, result)
-    scenario = scenario.with_drive(settled_drive(result["identification"]))
-    side = model_side(robot, scenario)
-    seed = trajectories.seed
-    setup = Setup(scenario, seed, calibrated=known)
+    scenario = setup.scenario.with_drive(settled_drive(result["identification"]))
+    setup = replace(setup, scenario=scenario)
+    seed = setup.seed
+    side = setup.side
     plan = setup.sensor_plan
     taught = taught or plan.taught(robot, seed, progress).taught
     duration_s = scenario.validation.duration_s

@@ -128,7 +128,7 @@ def known_model(plant: Plant, model: str) -> KnownModel:
     """Return the "initial" or the "true" model of a plant."""
     if model == "true":
         return KnownModel(plant.parameters, plant.switches.drive, FITTED)
-    start = plant.loop.start
+    start = plant.loop.side.model
     law = start.drive_law
     guess = starting_guess(plant.nominal, start.start_parameters, 1.0, drive=law)
     return KnownModel(guess.values, law)

@@ -369,7 +369,7 @@ def errors_of_model(parameters: ArrayLike, plant: Plant, design: Design, seed: i
     range. Raises TrajectoryError if no unseen trajectory keeps the robot's limits.
     """
     robot = plant.nominal
-    settings = plant.loop.settings
+    settings = plant.loop.side.settings
     values = checked_loop_parameters(robot, parameters, settings.drives.law)
     times = plant.runs.timing.frame_times(design.unseen.duration_s)
     references = [path.reference(times) for path in unseen_trajectories(design, seed)]

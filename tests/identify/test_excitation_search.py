@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from cmmsim.visibility import expected_covariance
 from dynamics.closed_loop import (
     differentiate_servo,
 )
@@ -48,9 +49,18 @@ SMALL = QUICK.with_overrides(
 TINY = {"excitation.position_amplitude_m": 1e-4, "excitation.orientation_amplitude_rad": 4e-4}
 
 
+def known_of(scenario):
+    """What is known before the run of a scenario."""
+    times = scenario.timing.frame_times(scenario.excitation.duration_s)
+    covariance = expected_covariance(
+        scenario.sensor, rss6().home_pose, scenario.pose_method, changes=scenario.sensor_changes
+    )
+    return knowledge(side_of(scenario), scenario.identification, times, covariance)
+
+
 @pytest.fixture(scope="module")
 def known(robot):
-    return knowledge(robot, QUICK)
+    return known_of(QUICK)
 
 
 def a_motion(robot, seed, scenario=QUICK):
@@ -191,20 +201,20 @@ def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
         name: {"value": value, "std": deviation} for name, (value, deviation) in prior.items()
     }
     scenario = QUICK.with_overrides({"identification.prior": entries})
-    found = log_information(robot, knowledge(robot, scenario), trajectory)
+    found = log_information(robot, known_of(scenario), trajectory)
     assert found == pytest.approx(expected, rel=1e-6)
 
 
 def test_longer_runs_inform_more_and_an_unstable_starting_model_is_named(robot, known):
     _, _, trajectory = a_motion(robot, 10)
     longer = QUICK.with_overrides({"excitation.duration_s": 20.0})
-    once, twice = (log_information(robot, knowledge(robot, s), trajectory) for s in (QUICK, longer))
+    once, twice = (log_information(robot, known_of(s), trajectory) for s in (QUICK, longer))
     assert 0.0 < twice - once < np.log(2) / 2 + 0.05
     late = QUICK.with_overrides({"timing.frame_rate_hz": 30.0, "timing.latency_s": 0.05})
     with pytest.raises(
         TrajectoryError, match=r"no D-criterion: .*model\.start_parameters = 'initial' is unstable"
     ):
-        log_information(robot, knowledge(robot, late), trajectory)
+        log_information(robot, known_of(late), trajectory)
 
 
 @pytest.fixture
@@ -341,7 +351,7 @@ def test_gradient_method_wins_in_value(criterion, generations):
     overrides = {"excitation.criterion": criterion, "excitation.generations": generations}
     scenario = load_scenario("paper").with_overrides(overrides)
     design = design_of(scenario)
-    known = knowledge(rss6(), scenario)
+    known = known_of(scenario)
     random, evolutionary, gradient = compare_methods(design, known, 0, SilentProgress()).entries
     assert gradient.value > 1.02 * evolutionary.value > 1.02 * random.value
     for entry in (evolutionary, gradient):

@@ -22,6 +22,7 @@ from importlib import import_module, resources
 from importlib.util import module_from_spec, spec_from_file_location
 from multiprocessing import get_context
 from pathlib import Path
+from pkgutil import resolve_name
 from types import SimpleNamespace
 
 import numpy as np
@@ -272,9 +273,9 @@ def computed_once(case, name):
 
 
 def owner_of(name):
-    """Module and name of a function."""
-    module, _, function = name.rpartition(".")
-    return import_module(module), function
+    """Module or class of a function, and its name."""
+    owner, _, function = name.rpartition(".")
+    return resolve_name(owner), function
 
 
 @cache

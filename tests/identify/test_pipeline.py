@@ -18,6 +18,7 @@ from identify.progress import SilentProgress
 from identify.record.recording import read, read_runs
 from identify.reporting.goals import check_goals
 from identify.scenario import load_scenario
+from identify.setup import Setup, with_renderer
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import quick, recorded_run_folder, run_plant
 
@@ -69,7 +70,8 @@ def test_a_quick_run_meets_every_goal_and_the_model_is_twenty_times_closer_than_
 def test_the_papers_experiment_gives_the_figures_that_are_quoted(tmp_path):
     """To the last digit that the README quotes; the report, which changes none, is the quick
     run's."""
-    pipeline.excite(load_scenario("paper"), 0, tmp_path, SilentProgress())
+    setup = Setup(with_renderer(load_scenario("paper")))
+    pipeline.excite(setup, tmp_path, SilentProgress())
     taught = pipeline.record(tmp_path, SilentProgress())
     pipeline.identify(tmp_path, SilentProgress())
     pipeline.validate(tmp_path, SilentProgress(), taught=taught)
