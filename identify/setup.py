@@ -138,6 +138,7 @@ class Setup:
             loop=KnownLoop(
                 side=self.side,
                 prior=identification.prior,
+                # Whichever side states it, the filter is that of the same drives.
                 filter_time=scenario.model.derivative_filter_s or switches.derivative_filter_s,
                 control=control,
             ),
@@ -236,6 +237,7 @@ class Setup:
         if path is not None:
             write_bytes(path, content, parents=True)
             return done.record.assign_attrs(path=str(path))
+        # `record.truth` reads the truth from a file, so that every record needs one.
         kept = Path(platformdirs.user_cache_dir("cmmsim")) / "records"
         suffix = "-payload" if payload else ""
         target = kept / f"{self.scenario.name}-{self.seed}{suffix}.nc"

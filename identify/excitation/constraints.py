@@ -114,7 +114,9 @@ def within_sight(sight: SightLines, stickers: list[int], home: Array, box: Array
         nearest = seen[:, 2] - shifts
         if (nearest <= 0).any():
             return False
+        # A sticker that shifts is seen from another side, as if it had turned.
         turned = turn + np.arcsin(np.minimum(1.0, shifts / np.linalg.norm(seen, axis=1)))
+        # From the share used at home back to the angle of incidence.
         angle = np.arccos(1 - use[:, 0] * (1 - GRAZING)) + turned
         moved = (
             (shifts / nearest)[:, None]
@@ -267,6 +269,7 @@ class MotionConstraints:
             Limit(CONDITIONING, condition_number(link_rows) / most, (most,), "", ("",)),
         ]
         self._box_units = chart.units
+        # Many rows, which a search need not evaluate where no pose of the box can break them.
         if not self.always_in_sight:
             names = [
                 f"sticker {sight.platform.sticker_ids[k]}, {side} camera, {what}"

@@ -178,6 +178,7 @@ def evolve(
             init=np.array([filling.member(z) for z in candidates[:MOST_MEMBERS]]),
             maxiter=generations,
             tol=STALLED,
+            # The polish of SciPy follows gradients, and this cost jumps at every limit.
             polish=False,
             recombination=RECOMBINATION,
             rng=np.random.default_rng(seed),

@@ -160,6 +160,7 @@ def prepared(
             f"law {law} sets torques, which the drives of {robot.name} do not take: "
             "control.torque_access = false; feedforward needs joint commands only"
         )
+    # The feedback of this law goes through the model, and a wrong one can make it unstable.
     if law == "computed_torque":
         check_torque_gains(model, settings, desired[0], asked)
     if isinstance(found.controller, EveryFrame):

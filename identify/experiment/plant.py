@@ -190,6 +190,7 @@ class Plant:
         settings = self._settings_at(parameters, reference.poses[0])
         known = None if self.robot is self.nominal else self.nominal
         law = law or LawInLoop()
+        # Whether commands are torques is the law's choice, and all else of the drives the plant's.
         settings = replace(settings, drives=replace(settings.drives, torques=law.drives.torques))
         given = (self.robot, parameters, reference, settings)
         try:
@@ -277,6 +278,7 @@ def with_springs(settings: LoopSettings, nominal: Robot, switches: PlantSwitches
 
 def true_parameters(nominal: Robot, switches: PlantSwitches) -> Array:
     """Return the true parameters (p,): those of a named set, with the drive gains of the plant."""
+    # Of this guess only the values count, whatever its spread.
     values = starting_guess(nominal, switches.parameters, 1.0, drive=switches.drive).values
     layout = nominal.layout
     for name, gain in switches.drive_gains.items():
@@ -326,6 +328,7 @@ def true_deviations(
 
 def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:
     """Return the robot with the geometric errors that a scenario's plant states."""
+    # A seed of its own, so that runs with other noise are of the same robot.
     rng = np.random.default_rng(plant.geometry_seed)
     geometry = nominal.geometry.with_errors(
         plant.geometry_error_m, rng, plant.length_error_m, plant.axis_error_rad

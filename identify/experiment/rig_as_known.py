@@ -53,6 +53,7 @@ def known_rig(
     if section.exact:
         return None
     exposure = section.right_later_std_s
+    # The cameras are known, and only when the right one exposes is not.
     if section.known == "exact":
         return KnownRig(rig, np.zeros((len(PARAMETER_NAMES),) * 2), exposure)
     if section.known == "calibrated":

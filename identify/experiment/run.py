@@ -133,6 +133,7 @@ def run_plant(
     """
     runs = plant.runs
     times = runs.timing.frame_times(duration_s)
+    # Refused here and not at the frame itself, as images take minutes.
     check_travel(plant.nominal, trajectory, times, **runs.limits)
     reference = trajectory.reference(times)
     part_exposures(sensor, runs.rig, seed)

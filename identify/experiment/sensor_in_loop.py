@@ -142,6 +142,7 @@ class SensorPlan:
         sensor = cmmsim.Sensor(
             self.file, seed, self.method, taught, renderer=self.renderer, known=known
         )
+        # These move the true cameras alone; the estimator keeps those that it was given.
         sensor.move_rig(self.rig.errors, self.rig.right_later_s or 0.0)
         sensor.drift_rig(self.rig.drift, self.frames)
         sensor.add_bodies(robot_meshes(robot))
@@ -267,6 +268,7 @@ class SensorInLoop:
 
         The rate blurs the picture of an exposure that is not instantaneous.
         """
+        # The places of the legs are not counted as time of the sensor.
         bodies = robot_transforms(self._robot, pose) if self._sees_bodies else None
         began = time.perf_counter()
         measured = self._sensor.measure(pose, bodies, rate)

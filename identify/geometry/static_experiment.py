@@ -130,6 +130,7 @@ def measured(
     with progress.stage("measure poses", len(poses) * frames) as advance:
         for row, pose in enumerate(poses):
             bodies = robot_transforms(robot, pose)
+            # A stream for each pose, so that a lost frame does not shift the noise of the others.
             sensor.start_run(stream_seed(seed, NOISE, FIRST_POSE_RUN + row))
             values, covariances = _frames_at(sensor, pose, bodies, frames)
             advance(frames)
@@ -188,6 +189,7 @@ def drawn(
     """
     taught = sensor.taught
     known = FrameKnowledge(taught.base_covariance, taught.platform_covariance)
+    # One draw: what teaching got wrong is wrong in the same way at all poses.
     offset = known.root @ rng.standard_normal(12)
     covariances = np.full((len(poses), 6, 6), np.nan)
     seen = np.zeros(len(poses), dtype=bool)

@@ -125,6 +125,7 @@ def _designed(setup: Setup, progress: Progress) -> TrajectorySet:
         "excitation.duration_s gives",
     )
     check_parameter_set(robot, scenario.model.start_parameters)
+    # What is cheap to refuse was refused by now: compiling takes seconds, and the search minutes.
     compile_robots((robot, plant.robot), progress)
     plant.check()
     trajectories = design_trajectories(setup.design, setup.seed, progress)

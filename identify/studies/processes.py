@@ -103,6 +103,7 @@ class ProcessExecutor:
         for worker in ready:
             if not worker.cases:
                 worker.give(setup, batches.take(self._count))
+        # Nothing else runs beside a suspect, so that a second death is its own fault.
         if ready and not any(worker.cases for worker in ready):
             ready[0].give(setup, suspects.take())
         return not ready or any(worker.cases for worker in ready)

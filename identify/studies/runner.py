@@ -148,6 +148,7 @@ def _now_and_then(show: Callable[[], object]) -> Callable[[], None]:
             return
         show()
         took = time.perf_counter() - began
+        # A table of many rows takes long, and may take no more than its share of the study.
         next_time = began + took + max(SO_FAR_S, took / SO_FAR_SHARE)
 
     return perhaps
@@ -206,6 +207,7 @@ class Batches:
     def learn(self, finished: list[Finished]) -> None:
         """Take from a finished batch how long rows take."""
         mean = sum(row.seconds for row in finished) / len(finished)
+        # Half of the old value stays, so that one slow batch does not make all others small.
         self._row_seconds = max(0.5 * (self._row_seconds + mean), 1e-6)
 
 
@@ -238,6 +240,7 @@ def compute(setup: Setup, cases: list[Case]) -> list[Finished]:
 
     The only part of a study that runs on other processes and machines.
     """
+    # The user allowed these modules to the command, and another process has not heard of it.
     allow_plugin(*setup.plugins)
     return [_compute(setup, case) for case in cases]
 

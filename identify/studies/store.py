@@ -158,6 +158,7 @@ def resolved(study: Study, setup: Setup) -> dict[str, Any]:
         "scenario": scenario.model_dump(mode="json"),
         "sensor": sensor.model_dump(mode="json"),
     }
+    # Through JSON and back, as tuples become lists in the file with which this is compared.
     return dict(json.loads(json.dumps(entry)))
 
 

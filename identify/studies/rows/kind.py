@@ -167,8 +167,9 @@ frame rate, because a change of that may need one of these.
 def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) -> None:
     """Refuse factors, changes and options that rows never read, or that have no effect in any row.
 
-    This relies on what each kind states of itself, which costs nothing. To see that a factor
-    changes no figure, a row would have to be computed once more for each factor and each change.
+    This relies on what each kind states of itself, which costs nothing. What a row reads is known
+    only when it has been computed, in minutes, and a key that is read may still have no effect. To
+    see that, a row would have to be computed once more for each factor and each change.
 
     Parameters
     ----------
