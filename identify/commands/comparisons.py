@@ -1,7 +1,7 @@
 """Commands that compare estimators on one record, estimates of several runs, or excitations."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -293,8 +293,11 @@ def compare_excitation(
     """Search with every method, and write comparison.json and comparison.png into `folder`."""
     from identify.excitation.comparison import compare_methods, comparison_figure
     from identify.excitation.information import knowledge
+    from identify.record.known_geometry import KnownGeometry
 
     scenario = setup.scenario
+    # The methods are compared on the robot of the file, which no run has to calibrate for it.
+    setup = replace(setup, calibrated=KnownGeometry(setup.nominal))
     design = setup.design
     times = scenario.timing.frame_times(design.settings.duration_s)
     covariance = setup.sensor_plan.covariance(setup.robot.home_pose)
