@@ -14,7 +14,7 @@ from rich.console import Console
 
 from cmmsim.errors import OpenGLMissingError
 from dynamics.errors import RobotFileError
-from identify.commands import experiment as command_line
+from identify.commands import run_stages as command_line
 from identify.commands.options import parse_settings
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import RunFolder, load_result, save_result
