@@ -48,6 +48,7 @@ myst_heading_anchors = 4
 myst_substitutions = kept_figures.substitutions(DOCS.parent / ".readme")
 smartquotes = False  # two dashes begin an option
 default_role = "literal"  # single backquotes in docstrings are code
+napoleon_use_ivar = True  # Attributes of a docstring may also be members, which autodoc documents
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
