@@ -24,7 +24,7 @@ FREQUENCY = 2 * np.pi * np.array([0.6, 0.8, 1.0, 0.7, 0.9, 0.5])  # rad/s
 
 
 class ProportionalController:
-    """(frame, time, measured pose, desired pose, desired rate) -> joint command (6,) [rad]."""
+    """Map (frame, time, measured pose, desired pose, desired rate) to a joint command (6,) [rad]."""
 
     def __init__(self, robot: dynamics.Robot, gain: float) -> None:
         self.robot, self.gain = robot, gain

@@ -15,13 +15,13 @@ import dynamics
 import identify
 
 WINDOW, DEGREE = 25, 4  # frames and degree of the polynomials that smooth and differentiate
-TORQUE_STD = 0.1  # N m: how well one equation is believed to hold
-SLIPPING = 0.02  # rad/s: below it dry friction may be anything up to its limit
-UNSEEN_FRICTION = 1.0  # N m and N m s/rad, where the starting guess has none
+TORQUE_STD = 0.1  # N m: assumed standard deviation of one equation
+SLIPPING = 0.02  # rad/s: below it dry friction has any value up to its limit
+UNSEEN_FRICTION = 1.0  # N m and N m s/rad, where the initial guess has none
 
 
 def least_squares(record: xr.Dataset, robot: dynamics.Robot) -> np.ndarray:
-    """Record of an experiment -> the 64 dynamic parameters, then lp, li, ld."""
+    """Map the record of an experiment to the 64 dynamic parameters, followed by lp, li, ld."""
     period = 1.0 / record.attrs["frame_rate_hz"]
     measured = np.hstack([record["measured_position"], record["measured_orientation"]])
     pose, pose_rate, acceleration = (smooth(measured, order, period) for order in range(3))
@@ -30,8 +30,8 @@ def least_squares(record: xr.Dataset, robot: dynamics.Robot) -> np.ndarray:
     to_joints = np.linalg.inv(jacobian).transpose(0, 2, 1)
     angle, velocity = robot.inverse_kinematics(pose), np.einsum("nij,nj->ni", jacobian, twist)
 
-    # A command is held for a frame, so on the average it acts half a frame late; its rate, a
-    # difference, a whole one.
+    # A command is held for a frame, so that on average it acts half a frame late. Its rate is a
+    # difference and acts a whole frame late.
     command, command_rate = (smooth(record["command"].values, order, period) for order in range(2))
     lag = command - 0.5 * period * command_rate - angle
     lag_rate = command_rate - period * smooth(record["command"].values, 2, period) - velocity
@@ -59,7 +59,7 @@ def solve(balance: np.ndarray, robot: dynamics.Robot, platform_mass: float) -> n
     guess = robot.parameter_sets["initial"].vector
     spread = np.where(guess > 0, 0.5 * guess, UNSEEN_FRICTION)
     weighed = np.zeros(73)
-    weighed[0] = 1000.0  # 1/kg: the balance shows grams
+    weighed[0] = 1000.0  # 1/kg: the scale shows grams
     rows = np.vstack([balance, np.eye(67, 73) / spread[:, None], weighed])
     right = np.concatenate([np.zeros(len(balance)), guess / spread, [weighed[0] * platform_mass]])
     scale = np.append(spread, np.ones(6))

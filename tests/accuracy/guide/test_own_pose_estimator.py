@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 import cmmsim
 
 REACH = np.array([0.005, 0.005, 0.005, 0.02, 0.02, 0.02])  # m and rad around home
-FARTHEST_PX = 20.0  # that this moves the image of a sticker
-BRIGHT, GROUND = 100, 40  # grey values: what is inside of a blob, and what does not count beside it
+FARTHEST_PX = 20.0  # largest motion of a sticker's image within this reach
+BRIGHT, GROUND = 100, 40  # grey values inside of a blob, and of the background
 AREA_PX = (15, 400)
 
 
 class BlobEstimator:
-    """Stereo frame -> pose (6,) [m, rad] of the platform in the base frame."""
+    """Map a stereo frame to the pose (6,) [m, rad] of the platform in the base frame."""
 
     def __init__(self, rig: cmmsim.StereoRig, taught: cmmsim.Taught, home: np.ndarray) -> None:
         self.rig, self.taught = rig, taught
