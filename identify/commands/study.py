@@ -172,10 +172,10 @@ def study(
     from identify.studies.table import rows_beside
 
     count = cores() if workers is None else workers
-    setup = prepare(chosen)
+    shared = prepare(chosen)
     # The memory of other machines is not known here.
     if scheduler is None:
-        check_memory(chosen, setup, max(count, 1))
+        check_memory(chosen, shared, max(count, 1))
     others = rows_beside(chosen, beside or ())
     folder = out or Path("runs") / f"study-{chosen.name}"
     try:
@@ -183,7 +183,7 @@ def study(
         # Figures are drawn at the end only, because drawing takes seconds.
         so_far = partial(_summary, chosen, folder, figures=False)
         workers_there = _workers(scheduler, count, insecure)
-        outcome = run_study(chosen, folder, progress, workers_there, so_far, setup)
+        outcome = run_study(chosen, folder, progress, workers_there, so_far, shared)
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(STOPPED) from None

@@ -136,7 +136,7 @@ def run_plant(
     # Refused here and not at the frame itself, as images take minutes.
     check_travel(plant.nominal, trajectory, times, **runs.limits)
     reference = trajectory.reference(times)
-    part_exposures(sensor, runs.rig, seed)
+    delay_right_camera(sensor, runs.rig, seed)
     watch = _watched(sensor, runs.rig, len(times))
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
     latencies = drawn_latencies(runs.timing, len(times), seed, run)
@@ -175,7 +175,7 @@ def run_plant(
     return Experiment(record, truth)
 
 
-def part_exposures(sensor: PoseSensor, rig: Rig, seed: int) -> None:
+def delay_right_camera(sensor: PoseSensor, rig: Rig, seed: int) -> None:
     """Delay the right camera's exposure by a random draw from its stated uncertainty.
 
     All runs of a seed have the same delay.

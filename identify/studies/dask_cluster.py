@@ -30,7 +30,7 @@ from distributed.security import Security
 from identify.errors import StudyError
 from identify.files.versions import product_version, require_product, same_versions, versions
 from identify.studies.runner import Batches, Suspects, compute
-from identify.studies.study_design import Case, Finished, Setup
+from identify.studies.study_design import Case, Finished, Shared
 
 WORKERLESS_SECONDS = 180
 """Longest time that a cluster may be without workers, s. On a busy machine they start slowly."""
@@ -61,7 +61,7 @@ class DaskExecutor:
         self._asked = -math.inf
         self._seen = time.monotonic()
 
-    def __call__(self, setup: Setup, batches: Batches) -> Iterator[list[Finished]]:
+    def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches as they are done.
 
         Raises
@@ -70,7 +70,7 @@ class DaskExecutor:
             The scheduler or all workers are gone, or workers cannot run this program.
         """
         try:
-            while self._send_more(setup, batches):
+            while self._send_more(shared, batches):
                 finished = self._next()
                 if finished:
                     batches.learn(finished)
@@ -78,21 +78,21 @@ class DaskExecutor:
         except OSError as error:
             raise gone(error) from error
 
-    def _send_more(self, setup: Setup, batches: Batches) -> bool:
+    def _send_more(self, shared: Shared, batches: Batches) -> bool:
         """Keep all workers busy. Return False at the end.
 
         Rows that may kill their workers come last, one at a time.
         """
         workers = self._count_workers()
         while len(self._open) < BATCHES_A_WORKER * workers and (cases := batches.take(workers)):
-            self._send(setup, cases)
+            self._send(shared, cases)
         if not self._open and (cases := self._suspects.take()):
-            self._send(setup, cases)
+            self._send(shared, cases)
         return bool(self._open)
 
-    def _send(self, setup: Setup, cases: list[Case]) -> None:
+    def _send(self, shared: Shared, cases: list[Case]) -> None:
         # With pure=True, Dask would answer a second try with the failure of the first.
-        future = self._client.submit(_compute_alike, product_version(), setup, cases, pure=False)
+        future = self._client.submit(_compute_alike, product_version(), shared, cases, pure=False)
         self._open[future.key] = (future, cases)
         future.add_done_callback(self._done.put)
 
@@ -156,13 +156,13 @@ class DaskExecutor:
             )
 
 
-def _compute_alike(version: str, setup: Setup, cases: list[Case]) -> list[Finished]:
+def _compute_alike(version: str, shared: Shared, cases: list[Case]) -> list[Finished]:
     """Compute rows on a worker, which may have come after the others were checked.
 
     Raises StudyError if the worker has another version of cmmsim than the study.
     """
     require_product(f"worker {get_worker().address}", product_version(), version, REMEDY)
-    return compute(setup, cases)
+    return compute(shared, cases)
 
 
 def gone(error: OSError) -> StudyError:

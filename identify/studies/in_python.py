@@ -104,13 +104,15 @@ class Study:
         named = StudyFile(name=scenario.name, kind=self.kind, scenario=scenario.name)
         settings = {"seed": self.seed, "repeats": self.repeats}
         study = named.with_settings({**self.changes, **self.vary, **settings})
-        setup = prepare(study, scenario)
+        shared = prepare(study, scenario)
         count = cores() if workers is None else workers
-        check_memory(study, setup, max(count, 1))
+        check_memory(study, shared, max(count, 1))
         computing = partial(local_processes, count) if count else in_this_process
         with tempfile.TemporaryDirectory(prefix="cmmsim-study-") as temporary:
             place = Path(temporary) / "study" if folder is None else Path(folder)
-            outcome = run_study(study, place, progress or SilentProgress(), computing, setup=setup)
+            outcome = run_study(
+                study, place, progress or SilentProgress(), computing, shared=shared
+            )
         if outcome.failures:
             raise StudyError(
                 f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}"

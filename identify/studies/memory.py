@@ -3,9 +3,9 @@
 import psutil
 
 from identify.errors import StudyError
-from identify.setup import Setup as Experiment
+from identify.setup import Setup
 from identify.studies.rows import find_kind
-from identify.studies.study_design import Case, Setup
+from identify.studies.study_design import Case, Shared
 from identify.studies.study_file import Range, Study
 
 LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
@@ -17,7 +17,7 @@ PROCESS = 0.5e9
 GB = 1e9
 
 
-def check_memory(study: Study, shared: Setup, workers: int) -> None:
+def check_memory(study: Study, shared: Shared, workers: int) -> None:
     """Refuse a study whose longest rows, one a worker, need more memory than this machine has.
 
     Raises StudyError with both numbers.
@@ -28,7 +28,7 @@ def check_memory(study: Study, shared: Setup, workers: int) -> None:
     longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
     case = Case(0, 0, longest)
     options = kind.checked(shared.row_options(case))
-    needed = PROCESS + kind.memory(Experiment(shared.row_scenario(case)), options)
+    needed = PROCESS + kind.memory(Setup(shared.row_scenario(case)), options)
     there = psutil.virtual_memory().total
     if workers * needed > there:
         fit = int(there // needed)

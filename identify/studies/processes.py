@@ -22,7 +22,7 @@ from identify.errors import StudyError
 from identify.runtime import deaf_offspring, end_with_parent, held
 from identify.studies.memory import GB
 from identify.studies.runner import Batches, Suspects, compute
-from identify.studies.study_design import Case, Finished, Setup
+from identify.studies.study_design import Case, Finished, Shared
 
 SPAWN = get_context("spawn")
 """Way to start processes anew, so that they inherit neither threads nor the locks these hold."""
@@ -55,7 +55,7 @@ class ProcessExecutor:
         self._stillborn = 0
         self._looked = time.monotonic()
 
-    def __call__(self, setup: Setup, batches: Batches) -> Iterator[list[Finished]]:
+    def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches as they are done.
 
         Raises
@@ -66,7 +66,7 @@ class ProcessExecutor:
         suspects = Suspects()
         try:
             self._start_missing()
-            while self._hand_out(setup, batches, suspects):
+            while self._hand_out(shared, batches, suspects):
                 for worker in self._heard():
                     if finished := self._take(worker, batches, suspects):
                         yield finished
@@ -94,7 +94,7 @@ class ProcessExecutor:
                 f"{error.strerror}; name fewer with --workers"
             ) from error
 
-    def _hand_out(self, setup: Setup, batches: Batches, suspects: Suspects) -> bool:
+    def _hand_out(self, shared: Shared, batches: Batches, suspects: Suspects) -> bool:
         """Give each idle process a batch, and suspects last, one at a time.
 
         Returns False at the end.
@@ -102,10 +102,10 @@ class ProcessExecutor:
         ready = [worker for worker in self._workers if worker.ready]
         for worker in ready:
             if not worker.cases:
-                worker.give(setup, batches.take(self._count))
+                worker.give(shared, batches.take(self._count))
         # Nothing else runs beside a suspect, so that a second death is its own fault.
         if ready and not any(worker.cases for worker in ready):
-            ready[0].give(setup, suspects.take())
+            ready[0].give(shared, suspects.take())
         return not ready or any(worker.cases for worker in ready)
 
     def _heard(self) -> list["_Worker"]:
@@ -175,13 +175,13 @@ class _Worker:
             self._process.start()
         theirs.close()
 
-    def give(self, setup: Setup, cases: list[Case]) -> None:
+    def give(self, shared: Shared, cases: list[Case]) -> None:
         """Hand over rows to compute. An empty list is no work."""
         self.cases = cases
         if cases:
             # OSError means that it has died, which is seen when it is heard.
             with suppress(OSError):
-                self.pipe.send((setup, cases))
+                self.pipe.send((shared, cases))
 
     def receive(self) -> list[Finished]:
         """Return the rows found, or none when the process becomes ready.

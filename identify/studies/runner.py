@@ -20,7 +20,7 @@ from identify.progress import Progress
 from identify.runtime import honoured, raise_noted
 from identify.studies.rows import find_kind
 from identify.studies.store import VIEW, Journal, open_folder, resolved
-from identify.studies.study_design import Case, Design, Finished, Setup, prepare
+from identify.studies.study_design import Case, Design, Finished, Shared, prepare
 from identify.studies.study_file import Study
 from identify.studies.table import FIRST, LAST, TABLE, tidy_table, write_table, write_view
 
@@ -48,7 +48,7 @@ class Outcome:
         return [f"row {row}: {error}" for row, error in zip(bad["row"], bad["error"], strict=True)]
 
 
-Executor = Callable[[Setup, "Batches"], Iterator[list[Finished]]]
+Executor = Callable[[Shared, "Batches"], Iterator[list[Finished]]]
 """Computes batches until there are none left, and yields them as they are done, in any order."""
 
 Workers = Callable[[], AbstractContextManager[Executor]]
@@ -61,9 +61,9 @@ def in_this_process() -> Iterator[Executor]:
     yield _serial
 
 
-def _serial(setup: Setup, batches: "Batches") -> Iterator[list[Finished]]:
+def _serial(shared: Shared, batches: "Batches") -> Iterator[list[Finished]]:
     while cases := batches.take(workers=1):
-        finished = compute(setup, cases)
+        finished = compute(shared, cases)
         batches.learn(finished)
         yield finished
 
@@ -81,7 +81,7 @@ def run_study(
     progress: Progress,
     workers: Workers = in_this_process,
     so_far: SoFar = lambda frame: None,
-    setup: Setup | None = None,
+    shared: Shared | None = None,
 ) -> Outcome:
     """Run a study in its folder, or go on with it there.
 
@@ -100,7 +100,7 @@ def run_study(
         Starts what computes the rows.
     so_far : callable
         Gets the table of what is done now and then while the study runs.
-    setup : Setup, optional
+    shared : Shared, optional
         What the rows share, from `prepare`. The default prepares the study as its file has it.
 
     Returns
@@ -117,15 +117,15 @@ def run_study(
     StudyInterrupted
         Ctrl-C ended it.
     """
-    setup = setup or prepare(study)
-    entry = resolved(study, setup)
+    shared = shared or prepare(study)
+    entry = resolved(study, shared)
     design = Design(study)
     with open_folder(folder, entry, len(design)) as journal:
         found = int(journal.finished.sum())
         try:
             with honoured():
                 shown = _now_and_then(lambda: so_far(tidy_table(study, journal.rows())))
-                _compute_pending(study.name, setup, design, journal, progress, workers, shown)
+                _compute_pending(study.name, shared, design, journal, progress, workers, shown)
         except KeyboardInterrupt:
             done = sum(1 for _ in journal.rows())  # it may have come while some were being noted
             raise StudyInterrupted(
@@ -156,7 +156,7 @@ def _now_and_then(show: Callable[[], object]) -> Callable[[], None]:
 
 def _compute_pending(
     name: str,
-    setup: Setup,
+    shared: Shared,
     design: Design,
     journal: Journal,
     progress: Progress,
@@ -169,7 +169,7 @@ def _compute_pending(
     batches = Batches((design.case(number) for number in journal.pending()), left)
     raise_noted()
     with workers() as execute, progress.stage(f"rows of {name}", left) as advance:
-        for finished in execute(setup, batches):
+        for finished in execute(shared, batches):
             journal.append(finished)
             advance(len(finished))
             shown()
@@ -234,23 +234,23 @@ class Suspects:
         return []
 
 
-def compute(setup: Setup, cases: list[Case]) -> list[Finished]:
+def compute(shared: Shared, cases: list[Case]) -> list[Finished]:
     """Compute rows one after the other; what goes wrong in one is noted there, and the others go
     on.
 
     The only part of a study that runs on other processes and machines.
     """
     # The user allowed these modules to the command, and another process has not heard of it.
-    allow_plugin(*setup.plugins)
-    return [_compute(setup, case) for case in cases]
+    allow_plugin(*shared.plugins)
+    return [_compute(shared, case) for case in cases]
 
 
-def _compute(setup: Setup, case: Case) -> Finished:
+def _compute(shared: Shared, case: Case) -> Finished:
     start = time.perf_counter()
     try:
-        kind = find_kind(setup.kind)
-        options = kind.checked(setup.row_options(case))
-        row = kind.compute(setup.row_scenario(case), setup.row_seed(case.number), options)
+        kind = find_kind(shared.kind)
+        options = kind.checked(shared.row_options(case))
+        row = kind.compute(shared.row_scenario(case), shared.row_seed(case.number), options)
         figures = _plain(row, {*FIRST, *case.factors, *LAST})
     except KeyboardInterrupt:
         raise

@@ -28,7 +28,7 @@ from identify.errors import StudyError, StudyInterrupted
 from identify.files.atomic import make_folder, take_back, write_text
 from identify.files.lock import LOCK, locked
 from identify.files.versions import same_versions, versions
-from identify.studies.study_design import Finished, Setup
+from identify.studies.study_design import Finished, Shared
 from identify.studies.study_file import Study
 from identify.studies.table import TABLE, study_in, written
 
@@ -146,12 +146,12 @@ class Journal:
                     ) from error
 
 
-def resolved(study: Study, setup: Setup) -> dict[str, Any]:
+def resolved(study: Study, shared: Shared) -> dict[str, Any]:
     """Return everything that decides the rows of a study, as JSON has it.
 
     It is the study's file, and the scenario and sensor that it names.
     """
-    scenario = setup.scenario
+    scenario = shared.scenario
     sensor = read_sensor_file(scenario.sensor, scenario.sensor_changes)
     entry = {
         "study": study.model_dump(mode="json"),

@@ -26,8 +26,7 @@ from identify.errors import ScenarioError, StudyError
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import numbers_by_name
-from identify.setup import Setup as Experiment
-from identify.setup import with_renderer
+from identify.setup import Setup, with_renderer
 from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.kind import Kind, check_read
 from identify.studies.study_file import Law, Range, Study
@@ -88,7 +87,7 @@ class Finished:
 
 
 @dataclass(frozen=True)
-class Setup:
+class Shared:
     """Everything that the rows of a study share.
 
     Attributes
@@ -188,7 +187,7 @@ def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def prepare(study: Study, given: Scenario | None = None) -> Setup:
+def prepare(study: Study, given: Scenario | None = None) -> Shared:
     """Check a study's keys, values, kind and laws, and load what its rows share.
 
     The first row is checked as a whole. Values that contradict each other only in other rows become
@@ -220,14 +219,14 @@ def prepare(study: Study, given: Scenario | None = None) -> Setup:
         )
     except ScenarioError as error:
         raise StudyError(f"scenario of the study: {error}") from error
-    setup = Setup(study.kind, scenario, study.options, study.seed)
+    shared = Shared(study.kind, scenario, study.options, study.seed)
     first = Design(study).case(0)
-    row_scenario = setup.row_scenario(first)
-    row_options = kind.checked(setup.row_options(first))
+    row_scenario = shared.row_scenario(first)
+    row_options = kind.checked(shared.row_options(first))
     if kind.reads is not None:
         check_read(study, kind.reads, row_scenario, row_options)
     if getattr(row_options, "sensor", "images") == "images":
-        plan = Experiment(row_scenario).sensor_plan
+        plan = Setup(row_scenario).sensor_plan
         try:
             # The statistical renderer was proved for some sensors, and their cameras refuse it for
             # others, when they are first asked for.
@@ -245,7 +244,7 @@ def prepare(study: Study, given: Scenario | None = None) -> Setup:
             _check_law(law, study, list(kind.columns))
         except StudyError as error:
             raise StudyError(f"[[theory]] {place}: {error}") from error
-    return setup
+    return shared
 
 
 def _check_keys(study: Study, kind: Kind) -> None:

@@ -23,7 +23,7 @@ from identify.estimation.result import IdentificationResult
 from identify.excitation.design import design_trajectories
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, Seen, by_images, prepared
 from identify.experiment.plant import Plant
-from identify.experiment.run import Latencies, drawn_latencies, excitation_run, part_exposures
+from identify.experiment.run import Latencies, delay_right_camera, drawn_latencies, excitation_run
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, teach
 from identify.files.run_folder import RunFolder, load_result, rms_figures
 from identify.files.versions import versions
@@ -198,7 +198,7 @@ def follow_by_images(
     delay between the exposures depend on the seed alone. The second value is what the loop saw.
     Raises as `follow`.
     """
-    part_exposures(sensor, plant.runs.rig, seed)
+    delay_right_camera(sensor, plant.runs.rig, seed)
     seen = by_images(
         SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, FIRST_RUN + number), advance)
     )
