@@ -95,7 +95,7 @@ def own_part(option: str, name: str) -> Any:
         )
     try:
         return getattr(importlib.import_module(module), attribute)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise CmmError(
             f"{option} {name!r} is no importable module:name: {error}; its folder must be on "
             "PYTHONPATH"
@@ -126,7 +126,7 @@ class Telling:
             return found
         except self.known:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a part does not end the program
             # The first entry is the call above; the second, where there is one, is in the user's
             # file.
             at = traceback.extract_tb(error.__traceback__)[:2][-1]

@@ -217,5 +217,7 @@ Acceleration = Annotated[float, Within(-1e3, 1e3, "m/s^2")]
 Force = Annotated[float, Within(1e-12, 1e9, "N m or N", zero=True)]
 Damping = Annotated[float, Within(1e-12, 1e9, "N m s/rad or N s/m", zero=True)]
 Gain = Annotated[float, Within(1e-9, 1e12, "", zero=True)]
+Ratio = Annotated[float, Within(1e-16, 1e12, "", zero=True)]
+"""Number without a unit: a share, a tolerance or a count."""
 Frequency = Annotated[float, Within(1e-6, 1e6, "Hz or rad/s")]
 Duration = Annotated[float, Within(1e-9, 1e6, "s", zero=True)]

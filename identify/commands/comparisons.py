@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.commands.options import (
+    MOST_WORKERS,
     JsonFile,
     Plugins,
     Quiet,
@@ -211,7 +212,11 @@ def variation(
     workers: Annotated[
         int | None,
         typer.Option(
-            "--workers", min=1, help="Processes that design and render.", show_default="one a core"
+            "--workers",
+            min=1,
+            max=MOST_WORKERS,
+            help="Processes that design and render.",
+            show_default="one a core",
         ),
     ] = None,
     json: JsonFile = None,

@@ -1,10 +1,12 @@
 """Command ``import``: robots from files of other programs."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dynamics.errors import RobotFileError
 from identify.commands.help import Command, Commands
 from identify.commands.options import Quiet
 from identify.errors import OutputFolderError
@@ -49,7 +51,7 @@ def mjcf(
     """
     from dynamics.engines.mjcf_import import robot_of_mjcf
 
-    _write(*robot_of_mjcf(file), f"From {file.name}, imported by cmmsim.", out, quiet)
+    _write(*_read(robot_of_mjcf, file), f"From {file.name}, imported by cmmsim.", out, quiet)
 
 
 @imports.command(cls=Command)
@@ -75,11 +77,22 @@ def urdf(
     from dynamics.engines.urdf_import import robot_of_urdf
 
     _write(
-        *robot_of_urdf(file, closures),
+        *_read(robot_of_urdf, file, closures),
         f"From {file.name} with {closures.name}, imported by cmmsim.",
         out,
         quiet,
     )
+
+
+def _read(read: Callable[..., Any], *files: Path) -> tuple["RobotDescription", list[str]]:
+    """Read a robot from files that may be anybody's, within limits of time and memory."""
+    from identify.files.limited_process import StrangerError, within_limits
+
+    try:
+        found: tuple[RobotDescription, list[str]] = within_limits(read, *files)
+    except StrangerError as error:
+        raise RobotFileError(f"{files[0]}: {error}") from None
+    return found
 
 
 def _write(

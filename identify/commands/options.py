@@ -122,9 +122,18 @@ EstimatorSettings = Annotated[
         "identification.method=command_driven; repeatable. The record was made with the rest.",
     ),
 ]
+MOST_WORKERS = 1000
+"""Largest number of processes that a command starts."""
+
 Workers = Annotated[
     int | None,
-    typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core"),
+    typer.Option(
+        "--workers",
+        min=1,
+        max=MOST_WORKERS,
+        help="Processes that render.",
+        show_default="one a core",
+    ),
 ]
 Quiet = Annotated[
     bool, typer.Option("--quiet", help="No progress bars and no tables; warnings stay.")

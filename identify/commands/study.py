@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.commands.help import BEYOND_LIMIT, ROWS_FAILED
-from identify.commands.options import JsonFile, Plugins, completion, parse_settings, tell
+from identify.commands.options import (
+    MOST_WORKERS,
+    JsonFile,
+    Plugins,
+    completion,
+    parse_settings,
+    tell,
+)
 from identify.errors import StudyError, StudyInterrupted
 from identify.progress import print_table, terminal_progress
 from identify.runtime import STOPPED
@@ -69,6 +76,7 @@ def study(
         int | None,
         typer.Option(
             min=0,
+            max=MOST_WORKERS,
             help="Processes on this machine; 0: none but this one.",
             show_default="one a core",
         ),

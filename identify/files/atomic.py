@@ -7,6 +7,7 @@ full. The content is then written beside its place, flushed to the disk, and ren
 import errno
 import io
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -168,19 +169,27 @@ def atomic_contents(folder: Path) -> Iterator[Path]:
                 for path in sorted(Path(name).iterdir()):
                     moved.append(folder / path.name)
                     path.rename(moved[-1])
-    except BaseException:  # Ctrl-C as well
+    except BaseException as error:  # Ctrl-C as well
         for path in moved:
             shutil.rmtree(path, ignore_errors=True)
             path.unlink(missing_ok=True)
         take_back(folders)
+        if isinstance(error, WriteError):  # which names a file of the temporary folder
+            raise WriteError(re.sub(rf"/{re.escape(TEMPORARY)}[^/]*", "", str(error))) from None
         raise
 
 
 def _write_beside(path: Path, content: bytes) -> None:
-    with path.open("xb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with path.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:
+        # The message says how much is free, and what was written so far is.
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        raise
 
 
 def _needed(path: Path, size: int) -> str:

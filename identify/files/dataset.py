@@ -17,8 +17,9 @@ from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.atomic import write_bytes
+from identify.files.limited_process import StrangerError
 from identify.files.seal import is_sealed, sealed
-from identify.files.stranger import ENGINE, Content, StrangerError, load, load_elsewhere
+from identify.files.stranger import ENGINE, Content, load, load_elsewhere
 
 
 def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:

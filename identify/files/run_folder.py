@@ -12,10 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from dynamics.files import read_bytes
 from identify.errors import OutputFolderError, RecordError
 from identify.files.atomic import figure_bytes, write_bytes, write_files
 from identify.files.lock import LOCK, working_in
 from identify.files.seal import check_toml, opened_json, sealed_json
+
+LARGEST_JSON = 100_000_000
+"""Largest number of bytes of a result, or of poses at which a robot stood."""
 
 WRITTEN_BY = {
     "scenario.toml": "excite",
@@ -150,9 +154,7 @@ def load_result(path: Path | str) -> dict[str, Any]:
     Raises RecordError if there is no such file, or if it is damaged or holds no JSON object.
     """
     try:
-        result = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordError(f"cannot read result: {error}") from error
+        result = json.loads(read_bytes(path, f"result {path}", RecordError, LARGEST_JSON))
     except (ValueError, RecursionError) as error:
         raise RecordError(f"{path} is truncated or not JSON: {error}") from error
     if not isinstance(result, dict):

@@ -13,6 +13,7 @@ from dynamics.checks import (
     Inertia,
     Margin,
     Mass,
+    Ratio,
     Speed,
     within,
 )
@@ -49,6 +50,7 @@ RANGES = {
     "N m s/rad": within(Damping),
     "N s/m": within(Damping),
     "1/s": within(Gain),
+    "1": within(Ratio),
 }
 """Ranges of quantities by their unit."""
 

@@ -14,13 +14,21 @@ from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot, workspace
 from dynamics.errors import DynamicsError
+<<<<<<< HEAD
 from dynamics.kinematics.platform import POSE_NAMES, Chart
+=======
+from dynamics.files import read_bytes
+from dynamics.kinematics.chart import POSE_NAMES, Chart
+>>>>>>> f73c19e (Read robots of other programs within limits of time and memory, and close what a walk found open: devices as files, tiny numbers, parts that end the program, free room in messages)
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.design import Design, unseen_trajectories
 from identify.experiment.law_in_loop import NamedMotion
 from identify.loop_parameters import of_actuators
 from identify.trajectory import box_of
+
+LARGEST_MOTION = 100_000_000
+"""Largest number of bytes of a file of poses: an hour at 200 Hz."""
 
 COLUMNS = ("t", *POSE_NAMES)
 
@@ -176,12 +184,11 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
     """
     try:
         # Spreadsheets write a byte order mark, which utf-8-sig skips.
-        text = path.read_text(encoding="utf-8-sig")
+        content = read_bytes(path, f"the motion {path}", TrajectoryError, LARGEST_MOTION)
+        text = content.decode("utf-8-sig")
         lines = [line.split(",") for line in text.splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(
-            f"cannot read the motion {path}: {getattr(error, 'strerror', None) or error}"
-        ) from None
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"cannot read the motion {path}: {error}") from None
     header = [name.strip() for name in lines[0]] if lines else []
     if len(header) == 1 and ";" in header[0]:
         raise TrajectoryError(f"{path}: cells are separated by commas, and these by semicolons")

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from identify.errors import OutputFolderError, RecordError
-from identify.files import stranger
+from identify.files import limited_process
 from identify.files.dataset import read_group
 from identify.files.lock import LOCK, locked, working_in
 from identify.files.run_folder import RunFolder, load_result
@@ -58,19 +58,21 @@ def test_what_hangs_kills_or_fills_the_reader_of_a_strangers_file_is_one_line(
     data.to_netcdf(path, engine="h5netcdf")
     xr.testing.assert_identical(read_group(path), data.load())
     assert "has no group 'b'" in refusal(RecordError, read_group, path, "b")
-    monkeypatch.setattr(stranger, "LIMIT_S", 1)
+    monkeypatch.setattr(limited_process, "LIMIT_S", 1)
     for does, says in (
         ("import time; time.sleep(100)", "cannot be read within"),
         ("import os; os.abort()", "ends with status -6"),
         ("bytearray(3 * 10**9)", "MemoryError"),
         ("raise ValueError('odd\\nbytes')", "odd bytes"),
     ):
-        monkeypatch.setattr(stranger, "CODE", f"{PATCHED}\n    {does}\n{SERVED}")
+        monkeypatch.setattr(limited_process, "CODE", f"{PATCHED}\n    {does}\n{SERVED}")
         assert says in refusal(RecordError, read_group, path)
 
 
-PATCHED = "from identify.files import stranger\nstranger.LIMIT_S = 1\ndef load(*_):"
-SERVED = "stranger.load = load\nstranger.serve()"
+PATCHED = """from identify.files import limited_process, stranger
+limited_process.LIMIT_S = 1
+def load(*_):"""
+SERVED = "stranger.load = load\nlimited_process.serve()"
 
 
 def test_a_folder_is_for_one_process_and_a_lock_that_was_left_or_is_anothers_holds_nobody_up(

@@ -1,6 +1,7 @@
 """Parts of a user's own run only where their module is allowed; what they do wrongly is one line."""
 
 import pickle
+import sys
 from dataclasses import replace
 
 import casadi as ca
@@ -70,6 +71,11 @@ def test_a_module_is_allowed_by_name_with_what_is_within_it_and_nothing_else(mon
     allow_plugin("os")
     assert allowed_plugins() == ("json", "xml", "os")
     assert "no name of a module" in refusal(cmmsim.CmmError, allow_plugin, "my-module")
+
+
+def test_a_part_that_ends_the_program_is_one_line():
+    part = Telling("law 'own:law'", lambda: sys.exit(0), cmmsim.CmmError)
+    assert "law 'own:law' raised SystemExit: 0" in refusal(cmmsim.CmmError, part)
 
 
 def test_rows_of_a_study_run_where_its_command_allowed_their_kind(stranger, monkeypatch):

@@ -478,6 +478,28 @@ def test_two_hundred_changed_mechanisms_are_read_or_refused_in_a_line(tmp_path):
     assert check_imports(200, tmp_path) > 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("inside", "said"),
+    [
+        ('<sensor><user dim="2000000000"/></sensor>', "Could not allocate memory"),
+        ('<size nuser_body="2000000000"/>', "unknown exception"),
+        (f"<worldbody>{'<site/>' * 100_000}</worldbody>", "cannot be read within 8 s"),
+    ],
+)
+def test_a_small_file_of_which_mujoco_makes_a_huge_model_is_one_line(
+    inside, said, tmp_path, capsys
+):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "x.xml"
+    path.write_text(f"<mujoco>{inside}</mujoco>", encoding="utf-8")
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    assert command("import", "mjcf", path, "--out", tmp_path / "x.toml") == 1
+    assert said in one_line(capsys.readouterr().err)
+    assert [one.name for one in tmp_path.iterdir()] == ["x.xml"]
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < max(before, 1_500_000)  # kB
+
+
 def replaced(text, old, new, path):
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
@@ -493,6 +515,7 @@ def replaced(text, old, new, path):
         (read_robot_file, robot_texts, "lp = 30.0", "lp = 1e-300", "0 or 1e-09"),
         (read_robot_file, robot_texts, "coulomb = 0.0", "coulomb = 1e25", "to 1e+09 N m or N"),
         (load_scenario, lambda: ['name = "x"\n[servo]\nkd = 1\n'], "1", "1e-300", "1e-09 to 1e+06"),
+        (load_scenario, lambda: ['name = "x"\n[servo]\nkp = 1\n'], "1", "1e-300", "1e-16 to 1e+12"),
         (load_scenario, lambda: ['name = "x"\n[filter]\ncutoff_hz = 9\n'], "9", "1e25", "Hz"),
         (read_board, lambda: [BOARD], "0.03", "1e25", "less than or equal to 100"),
     ],

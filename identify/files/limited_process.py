@@ -1,0 +1,88 @@
+"""Calls of functions in another process, within limits of time and memory.
+
+A library can hang, crash, or ask for all memory on a file that somebody else made or that is
+damaged. The process that reads such a file is ended if it exceeds the limits.
+"""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from dynamics.errors import DynamicsError
+
+LIMIT_S = 8
+"""Seconds that the reading may take."""
+START_S = 60
+"""Additional seconds for the process to start on a busy machine."""
+LIMIT_MEMORY = 1_000_000_000
+"""Largest number of bytes that the reading may allocate, if the system can limit them."""
+
+CODE = "from identify.files.limited_process import serve; serve()"
+TOO_LONG = f"it cannot be read within {LIMIT_S} s"
+
+
+class StrangerError(Exception):
+    """Reason, in one line, why a file cannot be read."""
+
+
+def within_limits(read: Callable[..., Any], *given: object) -> Any:
+    """Call a function of a module in another process, within the limits, and return its result.
+
+    Raises StrangerError with the reason if a limit is exceeded, if the process dies, or if the
+    function raises an error. Errors of `dynamics` are raised as they are.
+    """
+    limited = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", CODE],
+            input=pickle.dumps((read, given)),
+            capture_output=True,
+            timeout=START_S + LIMIT_S,
+            env=limited,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise StrangerError(TOO_LONG) from None
+    if _ended_by_alarm(done.returncode):
+        raise StrangerError(TOO_LONG)
+    if done.returncode:
+        raise StrangerError(f"the library that reads it ends with status {done.returncode}")
+    found = pickle.loads(done.stdout)
+    if isinstance(found, Exception):
+        raise found
+    return found
+
+
+def _ended_by_alarm(status: int) -> bool:
+    return hasattr(signal, "SIGALRM") and status == -signal.SIGALRM
+
+
+def serve() -> None:
+    """Do the call that is pickled on standard input, and write a pickle of its result or error."""
+    # Whatever the library prints must not get among the bytes of the pickle.
+    out = sys.stdout
+    sys.stdout = sys.stderr
+    # Functions are pickled by name, so that this imports their modules, which is not limited.
+    read, given = pickle.loads(sys.stdin.buffer.read())
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_MEMORY, LIMIT_MEMORY))
+    if hasattr(signal, "alarm"):  # elsewhere the other process alone watches the time
+        signal.alarm(LIMIT_S)
+    try:
+        found = read(*given)
+    except DynamicsError as error:
+        found = error
+    except Exception as error:  # whatever the library makes of such a file
+        found = StrangerError(" ".join(str(error).split()) or type(error).__name__)
+    out.buffer.write(pickle.dumps(found))
