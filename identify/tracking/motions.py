@@ -14,12 +14,8 @@ from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot, workspace
 from dynamics.errors import DynamicsError
-<<<<<<< HEAD
-from dynamics.kinematics.platform import POSE_NAMES, Chart
-=======
 from dynamics.files import read_bytes
-from dynamics.kinematics.chart import POSE_NAMES, Chart
->>>>>>> f73c19e (Read robots of other programs within limits of time and memory, and close what a walk found open: devices as files, tiny numbers, parts that end the program, free room in messages)
+from dynamics.kinematics.platform import POSE_NAMES, Chart
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.design import Design, unseen_trajectories
