@@ -277,6 +277,7 @@ def _round(
     bounds = _bounds(scene, condition.psf_px, centres, shapes, fit_size + 2)
     scores = []
     for detector in detectors:
+        # The same windows with noise and without: their errors are noise and bias.
         found, without_noise = (
             detector.detect(
                 SpotWindows(

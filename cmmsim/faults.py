@@ -25,7 +25,7 @@ from cmmsim.errors import UnknownOptionError
 from cmmsim.fault_images import DiscMark, Fault, FillMark, GlintMark, Mark, PlateMark
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, checked_pose, invert, pose_to_transform
-from cmmsim.measuring.pose_estimator import PoseEstimator
+from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator
 
 # Sides of the boxes that hide stickers, m.
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)
@@ -88,11 +88,7 @@ class FaultGenerator:
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
-        require_kind(
-            estimator,
-            PoseEstimator,
-            "an estimator must be a PoseEstimator, such as sensor.estimator",
-        )
+        require_estimator(estimator)
         self._rig = estimator.rig
         self._platform = estimator.platform
         self._taught = estimator.taught

@@ -119,6 +119,7 @@ class Teacher:
                 for body in (self.base, self.platform)
             ]
             report(1, steps)
+            # The error of this one view stays in every pose, so it is averaged longest.
             base = self._look_at(
                 self.base,
                 start[0],

@@ -5,11 +5,10 @@ The place to look next comes from the last measurements, never from the true pos
 
 from __future__ import annotations
 
-from cmmsim.checks import require_kind
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, invert, rigid, rotation_exp, rotation_log
 from cmmsim.measuring.measurement import Measurement, lost_measurement
-from cmmsim.measuring.pose_estimator import PoseEstimator, require_fitting
+from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator, require_fitting
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 
 # A tracked frame that shows less than this share of the stickers seen before is searched as a whole
@@ -43,11 +42,7 @@ class Tracker:
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
-        require_kind(
-            estimator,
-            PoseEstimator,
-            "an estimator must be a PoseEstimator, such as sensor.estimator",
-        )
+        require_estimator(estimator)
         self._estimator = estimator
         self.forget()
 

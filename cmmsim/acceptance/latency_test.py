@@ -149,6 +149,7 @@ def latency_test(
     def motion(times: Array) -> Array:
         return apply(volume.base_from_volume, _circle(times))
 
+    # A body that is not found at all is told before any frame is tracked.
     locate(estimator, sensor.look(pose(0.0)))
     tracker = Tracker(estimator)
     taken = np.arange(frames) / sensor.timing.frame_rate

@@ -224,6 +224,7 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
     """Measure the bar at ``times`` (n,) s of a path; it stands still before time 0."""
     estimators = [estimator_of(sensor, end) for end in bar_ends(sensor.platform)]
     for estimator in estimators:
+        # An end that is not found at all is told before any frame is tracked.
         locate(estimator, sensor.look(path.pose(0.0)))
     trackers = [Tracker(estimator) for estimator in estimators]
     rows = []

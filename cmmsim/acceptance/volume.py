@@ -242,6 +242,7 @@ def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> No
                 "nearer to a cube"
             )
         for point in (line.start, line.end):
+            # Rounding may put an end a little outside.
             if np.any(np.abs(point) > 0.5 * volume.size + 1e-9):
                 raise AcceptanceError(
                     f"line {line.name} leaves the volume at {np.round(1e3 * point)} mm"

@@ -276,6 +276,7 @@ def _normal_equations(
         computed, by_common, by_board = _predict(points, seen, state, side, free)
         error = seen.pixels - computed
         residuals.append(error)
+        # Sightings are sorted by view, so that each view is a slice.
         edges = np.searchsorted(seen.view, np.arange(views + 1))
         for v, (first, last) in enumerate(pairwise(edges)):
             jc = by_common[first:last].reshape(-1, common)

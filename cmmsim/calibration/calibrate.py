@@ -156,6 +156,7 @@ def _without_misfits(
                 f"{usual:.2f} px"
             )
             judged[seen[k]] = judged[seen[k]].without(int(side), reason)
+        # The next round starts where this one ended.
         start = solved.state
         boards[seen] = solved.state.left_from_boards
     return judged, [judged[k] for k in seen], solved, sightings

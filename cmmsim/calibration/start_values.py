@@ -65,6 +65,7 @@ def _one_camera(
             f"the {SIDES[side]} camera sees the board in {len(views)} images, {FEWEST_VIEWS} needed"
         )
     _require_variety(list(views.values()), board.symmetries, SIDES[side])
+    # Two radial terms are enough for a start; the adjustment frees the others.
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= 0 if bend else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     flags |= cv2.CALIB_FIX_ASPECT_RATIO if fix_aspect else 0

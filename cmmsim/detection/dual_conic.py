@@ -51,6 +51,7 @@ def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
     )
     normal = np.einsum("inyx,jnyx->nij", basis, basis)
     determined = np.linalg.cond(normal) < 1.0 / SMALLEST_CONDITION
+    # Any regular matrix will do, as these windows are not good.
     normal[~determined] = np.eye(5)
     dual = np.linalg.solve(normal, -np.einsum("inyx,nyx->ni", basis, lines.c**2)[..., None])[..., 0]
     centres = 0.5 * dual[:, 3:] * lines.unit_px[:, None] + spots.centroids

@@ -96,6 +96,7 @@ def fit_ellipses(
     covariances = np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
     settings = fit_settings(noise, psf_px, iterations)
     moved = np.zeros((n, 2)) if smears is None else np.ascontiguousarray(smears, dtype=float)
+    # Kernels are compiled for floats in C order.
     pixels = np.ascontiguousarray(windows, dtype=float)
 
     def fit(part: slice) -> None:

@@ -279,6 +279,7 @@ def exposed_windows(
     there is no vignetting. Supersampling and sub_pixels are as of ``ImageFormation.windows``.
     """
     reached = formation.reached(camera, moments, corners, size, sub_pixels)
+    # Bodies move if their transforms change from moment to moment.
     moves = np.ptp(np.stack(moments), axis=0).any(axis=(1, 2))[formation.drawable.body_index]
     drawn_often = np.asarray(reached[:, :, moves].any(axis=(0, 2)))
     drawn_once = np.asarray(reached.any(axis=(0, 2))) & ~drawn_often

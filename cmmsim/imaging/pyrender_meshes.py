@@ -192,6 +192,7 @@ class LaidSolids:
         self._ring_centres = np.array(
             [np.zeros(3) if ring is None else ring.centre for ring in lowest]
         )
+        # The inner circle of the polygon that bounds a band.
         inside = BAND_REACH * np.cos(np.pi / GROUND_SIDES)
         self._ring_reach = np.array(
             [0.0 if ring is None else inside * ring.radius for ring in lowest]
@@ -222,6 +223,7 @@ class LaidSolids:
         laid = Laid(
             np.full(len(views), -1), np.zeros(len(views), dtype=bool), np.full(len(views), -1)
         )
+        # One solid, and one stack of discs on it at most.
         few = reaching.sum(axis=1) <= 2
         bounds = views.bounds
         for shown in views.exposures:

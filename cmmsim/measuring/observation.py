@@ -186,6 +186,7 @@ class Observer:
         turned = [(normals @ move[..., :3, :3].swapaxes(-1, -2)).reshape(-1, 3) for move in moves]
         pixels, valid = self.rig.project(apply_each(camera_from_body, places).reshape(-1, 3))
         facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
+        # One ray makes no point: both cameras must see a sticker.
         index = np.flatnonzero(np.all(valid & facing, axis=0))
         exposures = index // len(places)
         size = self.settings.window_size + 2 * self.detector.margin_px

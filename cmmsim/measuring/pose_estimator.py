@@ -305,9 +305,7 @@ def measure_frame(
     True
     """
     require_kind(frame, StereoFrame, "a frame must be a StereoFrame(left, right)")
-    require_kind(
-        estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator"
-    )
+    require_estimator(estimator)
     require_fitting(frame, estimator)
     if expected is not None:
         expected = finite_array(
@@ -320,6 +318,12 @@ def measure_frame(
         )[0]
     except LostError as error:
         return lost_measurement(str(error))
+
+
+def require_estimator(estimator: object) -> None:
+    """Raise CmmError for anything but a PoseEstimator."""
+    wanted = "an estimator must be a PoseEstimator, such as sensor.estimator"
+    require_kind(estimator, PoseEstimator, wanted)
 
 
 def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:

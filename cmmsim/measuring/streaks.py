@@ -285,6 +285,7 @@ def _linear_movement(by_movement: Array, excess: Array) -> Array:
     An ellipse that went astray on its streak is far from what the others say, and counts less each
     time.
     """
+    # By the pixels that they move, metres and radians become comparable.
     scale = np.sqrt((by_movement**2).sum(axis=(0, 1)))
     scaled = by_movement / scale
     rows, columns = np.triu_indices(len(scale))

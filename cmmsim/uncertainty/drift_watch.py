@@ -95,6 +95,7 @@ class DriftWatch:
             else known.covariance / np.outer(SIZES[:RIG], SIZES[:RIG])
         )
         values, vectors = np.linalg.eigh(covariance)
+        # Parameters that are known exactly leave directions without variance.
         kept = values > 1e-12 * max(float(values[-1]), 1e-300)
         delay_std = 0.0 if known is None else known.exposure_std
         offsets = np.full(4 * centres, self._offset_std)

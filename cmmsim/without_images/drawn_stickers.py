@@ -266,6 +266,7 @@ class DrawnStickers:
             centres.append(at)
             shapes.append(shape)
             seen.append(whole)
+            # A body at rest smears nothing.
             if np.array_equal(first, last):
                 smears.append(np.zeros(at.shape))
                 continue

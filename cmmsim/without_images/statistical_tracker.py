@@ -99,6 +99,7 @@ def centre_noise(
     found = covariances(_shapes(m.ravel(), p.ravel(), q.ravel(), 0.5 * fit_size - EDGE_PX), 1.0)
     known = np.linalg.inv(found)[:, [0, 0, 1], [0, 1, 1]] / m.reshape(-1, 1)
     table = known.reshape(*m.shape, 3)
+    # The growth with less light hardly depends on the shape: one usual ellipse tells it.
     usual = _shapes(np.array([0.3 * fit_size]), np.array([0.25]), np.array([0.0]), 0.5 * fit_size)
     growth = [float(np.trace(covariances(usual, light)[0])) for light in LIGHTS]
     by_light = (

@@ -62,13 +62,8 @@ def repeat_servo(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from dynamics import closed_loop, load_robot
-    >>> from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains
-    >>> robot = load_robot("rss6")
-    >>> still = Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
-    >>> settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector
+    With robot, parameters, still and settings of the example of `simulate_servo`:
+
     >>> noises = 1e-5 * np.random.default_rng(0).standard_normal((5, 3, 6))
     >>> len(closed_loop.repeat_servo(robot, parameters, still, settings, noises))
     5
@@ -117,13 +112,8 @@ def repeat_commands(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from dynamics import closed_loop, load_robot
-    >>> from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains
-    >>> robot = load_robot("rss6")
-    >>> still = Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
-    >>> settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector
+    With robot, parameters, still and settings of the example of `simulate_servo`:
+
     >>> given = robot, parameters, still, settings, np.zeros((3, 6))
     >>> len(closed_loop.repeat_commands(*given, np.zeros((5, 3, 6))))
     5
@@ -182,14 +172,11 @@ def simulate_batch(
 
     Examples
     --------
-    >>> import numpy as np
+    With robot, parameters, still and settings of the example of `simulate_servo`:
+
     >>> import dynamics
-    >>> from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains
-    >>> robot = dynamics.load_robot("rss6")
-    >>> still = Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
-    >>> settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector * [[1.0], [1.01]]
-    >>> len(dynamics.simulate_batch(robot, parameters, still, settings))
+    >>> both = parameters * [[1.0], [1.01]]
+    >>> len(dynamics.simulate_batch(robot, both, still, settings))
     2
     """
     threads = _cores() if workers is None else whole("workers", workers, SimulationError, least=1)

@@ -137,13 +137,8 @@ def simulate_commands(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from dynamics import closed_loop, load_robot
-    >>> from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains
-    >>> robot = load_robot("rss6")
-    >>> still = Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
-    >>> settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector
+    With robot, parameters, still and settings of the example of `simulate_servo`:
+
     >>> closed_loop.simulate_commands(robot, parameters, still, settings, np.zeros((3, 6)))
     ClosedLoopRun(3 frames to 0.03333 s, 0 lost, 0 events)
     """
@@ -190,13 +185,8 @@ def simulate_controller(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from dynamics import closed_loop, load_robot
-    >>> from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains
-    >>> robot = load_robot("rss6")
-    >>> still = Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
-    >>> settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector
+    With robot, parameters, still and settings of the example of `simulate_servo`:
+
     >>> def follow(frame, time, measured, desired, desired_rate):
     ...     return robot.inverse_kinematics(desired)
     >>> closed_loop.simulate_controller(robot, parameters, still, settings, follow)
@@ -251,13 +241,8 @@ def differentiate_servo(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from dynamics import closed_loop, load_robot
-    >>> from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains
-    >>> robot = load_robot("rss6")
-    >>> still = Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
-    >>> settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector
+    With robot, parameters, still and settings of the example of `simulate_servo`:
+
     >>> run = closed_loop.differentiate_servo(robot, parameters, still, settings)
     >>> run.pose_sensitivity.shape
     (3, 6, 67)
@@ -304,13 +289,8 @@ def differentiate_commands(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from dynamics import closed_loop, load_robot
-    >>> from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains
-    >>> robot = load_robot("rss6")
-    >>> still = Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
-    >>> settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector
+    With robot, parameters, still and settings of the example of `simulate_servo`:
+
     >>> commands = np.zeros((3, 6))
     >>> run = closed_loop.differentiate_commands(robot, parameters, still, settings, commands)
     >>> run.pose_sensitivity.shape

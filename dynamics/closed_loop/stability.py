@@ -144,6 +144,7 @@ def lowest_frame_rate(
         timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
         return _radius(near, replace(settings, timing=timing))
 
+    # The map holds the commands of all frames of the latency, of which fifty are enough.
     fastest = min(
         100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf
     )
@@ -299,6 +300,7 @@ def last_stable(
             low = value
             high = following
             for _ in range(30):
+                # Bisection of the logarithm.
                 middle = (low * high) ** 0.5
                 low, high = (middle, high) if (radius(middle) < 1) == stable else (low, middle)
             return (low * high) ** 0.5

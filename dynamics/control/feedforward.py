@@ -47,6 +47,7 @@ def joint_commands(
         moved = along.end[k] - along.begin[k]
         mean = along.mean[k]
         by_before = ld * (c * before + moved) / period
+        # The drive's torque, solved for the command: its mean over a held one, its end of a ramp.
         if held:
             left = (
                 along.torque[k]

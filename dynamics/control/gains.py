@@ -208,6 +208,7 @@ def _torque_map(
         inverse @ (factor * (map_[1] @ along) * one - along[0] * stiff - along[1] * damp)
         for along in mean.T
     )
+    # Held torques are part of the state, so that one exponential has their exact effect.
     inner = np.zeros((2 * size + joints, 2 * size + joints))
     inner[: 2 * size, : 2 * size] = motion
     inner[size : 2 * size, 2 * size :] = push
@@ -242,6 +243,8 @@ def _torque_map(
 
 def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float:
     """Lowest frequency, rad/s, at which the error passes `HALF_POWER`, at most that of Nyquist."""
+    # The error need not rise everywhere: a grid finds the first crossing, Brent's method its
+    # digits.
     places = np.geomspace(1e-2, np.pi * rate_hz, 60)
     beyond = [_error_share(response(w)) > HALF_POWER for w in places]
     first = int(np.argmax(beyond))
@@ -264,6 +267,7 @@ def _error_share(response: np.ndarray) -> float:
 def _damping(map_: np.ndarray) -> float:
     """Least damping ratio of the eigenvalues of a map."""
     values = np.linalg.eigvals(map_).astype(complex)
+    # Poles in units of the frame rate. States with an eigenvalue of about zero settle at once.
     poles = np.log(values[np.abs(values) > AT_ONCE])
     # a state that stands still has no damping
     return float(np.min(-poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)))

@@ -121,6 +121,7 @@ class Observer:
         self._walk = np.diag(walk**2)
         jacobian = robot.coordinate_jacobian(pose)
         mass = free.T @ robot.mass_matrix(pose, self._model.dynamic) @ free
+        # Inertia that each joint feels while the others are free.
         felt = 1 / np.diag(jacobian @ np.linalg.solve(mass, jacobian.T))
         doubt[at.coordinates] = PLACE_DOUBT
         doubt[at.rates] = RATE_DOUBT
@@ -129,6 +130,7 @@ class Observer:
         self._covariance = np.diag(doubt**2)
         self._covariance[at.offset, at.offset] = free.T @ common @ free
         self._seen = np.zeros((len(mass), at.size))
+        # The offset of the sensor is in every measured pose.
         self._seen[:, at.coordinates] = self._seen[:, at.offset] = np.eye(len(mass))
         self._by_scale = np.zeros((2, at.size, at.size))
         self._scale = np.zeros(2)
@@ -176,6 +178,7 @@ class Observer:
         """Note the command (n,) of a frame."""
         self._arrivals.append(self.arrival(frame))
         self._commands.append(np.array(command))
+        # Commands that act no more are dropped, so that a long run takes no more time for a frame.
         del self._arrivals[: -self._kept()], self._commands[: -self._kept()]
 
     def _kept(self) -> int:

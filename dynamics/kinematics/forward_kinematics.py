@@ -44,9 +44,9 @@ coordinates of the platform.
 class ForwardSolution:
     """Result of a search.
 
-    pose (6,) or (N, 6): pose that the search ended with. iterations () or (N,): Newton steps.
-    residual (n,) or (N, n): wanted joint coordinates less those of the pose, rad or m; NaN where a
-    leg cannot reach.
+    `pose` (6,) or (N, 6) is the pose that the search ended with, after `iterations` () or (N,) of
+    Newton's method. `residual` (n,) or (N, n) is the difference of wanted joint coordinates from
+    those of the pose, rad or m, and NaN where a leg cannot reach.
     """
 
     pose: np.ndarray
@@ -182,7 +182,8 @@ def _damped(
 def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solutions (N, 6, 1) of linear systems.
 
-    The shortest one of least squares for a singular matrix, NaN for one that has overflowed.
+    A singular matrix gives the shortest solution of least squares, and one that has overflowed
+    gives NaN.
     """
     try:
         return np.linalg.solve(matrices, right)

@@ -29,6 +29,16 @@ def _public():
 PUBLIC = _public()
 
 
+def _loop(robot):
+    """Arguments of a run, as the example of `simulate_servo` makes them."""
+    gains = closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4)
+    return {
+        "parameters": robot.parameter_sets["identified"].vector,
+        "still": closed_loop.Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6))),
+        "settings": closed_loop.LoopSettings(gains, closed_loop.FrameTiming(60.0)),
+    }
+
+
 @pytest.mark.parametrize("name", PUBLIC)
 def test_a_public_name_says_what_it_takes_and_gives_and_its_example_runs(robot, name):
     value = PUBLIC[name]
@@ -41,7 +51,8 @@ def test_a_public_name_says_what_it_takes_and_gives_and_its_example_runs(robot, 
         assert "Raises\n---" in text
     if inspect.isclass(value) and issubclass(value, Exception):
         return
-    names = {"np": np, "robot": robot, "closed_loop": closed_loop} | vars(inspect.getmodule(value))
+    names = {"np": np, "robot": robot, "closed_loop": closed_loop} | _loop(robot)
+    names |= vars(inspect.getmodule(value))
     tests = doctest.DocTestFinder(recurse=False).find(value, name, globs=names)
     examples = [example for one in tests for example in one.examples]
     assert examples, f"{name} has no example"
