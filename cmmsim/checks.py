@@ -40,7 +40,7 @@ _TEXTS = re.compile(
     """,
     re.DOTALL | re.VERBOSE,
 )
-"""Texts and comments of TOML, each found to its end: a search takes linear time."""
+"""Pattern of strings and comments of TOML. It never backtracks, so a search takes linear time."""
 
 
 def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDArray[np.float64]:
@@ -158,8 +158,8 @@ def _parsed(text: str) -> dict[str, Any]:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         raise
-    except ValueError:  # of int(), beyond some thousand digits
-        raise ValueError("an integer beyond 64 bits, or a date that is none") from None
+    except ValueError:  # int() refuses numbers of some thousand digits
+        raise ValueError("an integer beyond 64 bits, or an impossible date") from None
     if found := _fault(content):
         raise ValueError(found)
     return content
@@ -182,7 +182,7 @@ def _fault(content: dict[str, Any]) -> str:
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             return "an integer beyond 64 bits"
         elif not isinstance(value, (str, int, float)):
-            return f"a date or time, {value}, which none needs"
+            return f"a date or time, {value}, which no such file needs"
     return ""
 
 
@@ -194,7 +194,7 @@ def _explain(error: Any, model: type[BaseModel]) -> str:
             f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1], model))}"
         )
     if error["type"] == "missing":
-        return f"{where}: {error['msg']}"  # what was got instead is the whole section
+        return f"{where}: {error['msg']}"  # the input is the whole section
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
     return f"{where}: {error['msg']} (got {_shown(repr(error['input']))})"

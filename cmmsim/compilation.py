@@ -15,6 +15,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numba
 import numpy as np
 from numba import njit
 
@@ -54,7 +55,11 @@ def compiled(function: F) -> Dispatcher[F]:
     )
     # numba asks only whether the function's own file has changed, but kernels call kernels of
     # other files
-    kernel._cache._cache_file._source_stamp = _stamp()
+    file = kernel._cache._cache_file
+    file._source_stamp = _stamp()
+    # numba unpickles an index of its own version only, and one of older kernels may name modules
+    # that are gone
+    file._version = f"{numba.__version__} {_stamp()}"
     return kernel
 
 

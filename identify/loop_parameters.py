@@ -30,7 +30,8 @@ def loop_settings(
     The latency is the mean one. Friction law, drive law and integration steps are those of the
     plant or the model, and only the torque limit is taken from `control`.
 
-    Raises ScenarioError for a constant of the other kind of actuators.
+    Raises ScenarioError if only the constant of sliding actuators is set and the robot's actuators
+    turn, or the reverse.
     """
     smoothing = of_actuators(robot, side, "smoothing_velocity")
     stribeck = of_actuators(robot, side, "stribeck_velocity")

@@ -2,8 +2,9 @@
 
 The bar moves along two rasters in three orientations, after standing still where each begins. One
 raster goes to and fro along the volume's x axis while it advances along y; the other exchanges
-these axes. Flat stickers cannot be seen along the line of sight, so the bar is turned by
-``TOWARDS_DEPTH`` from the image plane instead. In addition it turns smoothly about all its axes.
+these axes. A bar that points at the cameras hides its flat stickers. The third orientation
+therefore leans only ``TOWARDS_DEPTH`` out of the image plane. In addition the bar turns smoothly
+about all its axes.
 
 The sensor measures the poses of the clusters at both ends in the same exposure. Their certified
 relative pose is compared with the measured one, for the standing and for the moving bar. Frames are
@@ -103,8 +104,8 @@ class BarPath:
 
     @property
     def reach(self) -> Array:
-        """Largest distance (3,) of the bar's middle from the volume's, m, at which the bar stays
-        inside.
+        """Distances (3,), m, by which the bar's middle may move from the middle of the volume with
+        the whole bar still inside.
         """
         return 0.5 * self.volume.size - room_of_bar(self.along)
 
@@ -140,7 +141,7 @@ class BarRun:
     ``time`` (n,) s are the measured frames. ``errors`` (n, 6) are those of the relative pose,
     [shift, turn] in axes of the first end, m and rad. ``distance_errors`` (n,) are those of the
     ends' distance, m. ``variance_ratios`` (n,) are squared errors in units of the stated
-    covariance, over six dimensions. ``lost`` counts frames in which an end was not measured.
+    covariance, divided by 6. ``lost`` counts frames in which an end was not measured.
     ``given_up`` says why the run ended after GIVEN_UP of them in a row; its other frames count as
     lost.
     """
@@ -190,7 +191,10 @@ class BarTest:
 
     @property
     def variance_ratio(self) -> float:
-        """Mean squared error in units of the stated covariance, which is right at 1."""
+        """Mean squared error in units of the stated covariance.
+
+        1 means that the covariance is right.
+        """
         return float(np.concatenate([run.variance_ratios for run in self.runs]).mean())
 
 
@@ -260,7 +264,7 @@ def relative_error(first: Measurement, second: Measurement) -> tuple[Array, floa
     """Return the error (6,) of the second end's pose relative to the first, in axes of the first.
 
     The other results are the error of the ends' distance, and the squared error in units of the
-    stated covariance, over six.
+    stated covariance, divided by 6.
     """
     measured = invert(pose_to_transform(first.pose)) @ pose_to_transform(second.pose)
     turn = rotation_log(measured[:3, :3] @ END_FROM_END[:3, :3].T)

@@ -56,7 +56,7 @@ class FrictionLaw:
         static_ratio times the Coulomb torque. When the joint slips, the excess fades as
         exp(-(theta_dot / stribeck_velocity)^2).
     smoothing_velocity : float, optional
-        Velocity over which the smoothed law turns, rad/s.
+        Velocity over which the smoothed law changes its sign, rad/s.
     static_ratio : float, optional
         Static torque over the Coulomb torque, at least 1.
     stribeck_velocity : float, optional
@@ -178,7 +178,8 @@ class JointElasticity:
             body = layout.kinds[row[0]]
             if body.driven is None:
                 raise SimulationError(
-                    f"joints cannot be elastic: the actuator of leg {leg + 1} drives no body alone"
+                    f"joints cannot be elastic: the actuator of leg {leg + 1} does not drive just "
+                    "one body"
                 )
             layout.bodies_of(carried)[row[0], INERTIAL.index(body.driven)] -= self.motor_inertia
         return carried
@@ -191,7 +192,7 @@ class JointElasticity:
         frame_period: float,
         friction: FrictionLaw,
     ) -> int:
-        """Number of integration steps a frame that follow the fastest motion near a pose (6,).
+        """Integration steps per frame that follow the fastest motion near a pose (6,).
 
         The fastest motion is that of the largest eigenvalue of joints and motors under joint PID
         and friction, linearised at rest. Raises SimulationError where a motor has more inertia than
@@ -234,7 +235,7 @@ class JointElasticity:
             unit = "kg" if layout.prismatic else "kg m^2"
             raise SimulationError(
                 f"motor inertia is {self.motor_inertia:g} {unit}, must be below the "
-                f"{driven[least]:.3g} {unit} of {name} about its axis, which it is a part of"
+                f"{driven[least]:.3g} {unit} of {name} about its axis, which contains it"
             )
 
 

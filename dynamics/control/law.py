@@ -1,4 +1,8 @@
-"""Interface of the control laws: the assignment that a law takes, and what it returns for a run."""
+"""Interface of the control laws: the assignment that a law takes, and what it returns for a run.
+
+These laws move the platform. The law of a joint's drive, the paper's PID among them, stands in
+`dynamics.closed_loop.drives`.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,8 @@
 """Robot of a mechanism from another program, where its legs are of known kinds.
 
-The frame of the platform is at its centre of mass. It has the axes of the file where the inertia of
-the platform is diagonal in them and a pose can describe them, else principal axes.
+The frame of the platform is at its centre of mass. Its axes are those of the file if the inertia of
+the platform is diagonal in them, else principal axes. If these tilt too far for the angles of a
+pose, they are renamed to lie nearest those of the base.
 """
 
 from collections import Counter
@@ -37,7 +38,8 @@ DIAGONAL = 1e-9
 MOST_TILT = 0.9
 """Largest sin(beta) at home.
 
-Near 1 angles say nothing. A platform beyond it gets the axes nearest to those of the base.
+Near 1 the angles are singular: alpha and gamma turn about the same axis. A platform beyond it
+gets the axes nearest to those of the base.
 """
 
 OWN_RATE = 2 * np.pi * 3
@@ -98,11 +100,11 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     gains = _gains(geometry, dynamic[layout.rigid]) if plain.gains is None else plain.gains
     if plain.gains is None:
         notes.append(
-            "the file has no joint PID: its gains are chosen for 3 Hz with the least that a joint "
-            "feels"
+            "the file has no joint PID: its gains are chosen for 3 Hz at the joint that feels "
+            "the least inertia"
         )
     robot = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
-    parsed_robot(robot_text(robot), "the robot")  # whose numbers must be those of a machine
+    parsed_robot(robot_text(robot), "the robot")  # raises if a number is out of range
     return robot, notes
 
 
@@ -116,17 +118,18 @@ def _leg(one: MechanismLeg, number: int) -> Leg:
 
 
 def _numbers(place: Placement) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers as text."""
+    """Centre and axes of a body as arrays of numbers."""
     return np.array(ca.evalf(place.centre)).ravel(), np.array(ca.evalf(place.axes))
 
 
 def _inertia(
     body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid], ways: np.ndarray
 ) -> list[float]:
-    """Mass and moments of a body of a leg, in the axes of its kind. It may be equal bars.
+    """Mass and moments of a body of a leg, in the axes of its kind.
 
-    `ways` (3, n) are directions in which the platform can go. Along others, and in a body that does
-    not turn, masses may be anywhere. Raises RobotFileError for a centre of mass elsewhere, and for
+    The body may consist of several equal bars. Its centre of mass is checked only along `ways`
+    (3, n), the directions in which the platform can move, and only if the body turns: elsewhere it
+    has no effect. Raises RobotFileError for a centre of mass elsewhere, and for
     products of inertia that would do work.
     """
     centre, axes = place
@@ -201,7 +204,7 @@ def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Char
 def _travel(
     plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes: list[str]
 ) -> float:
-    """Travel limit from the ranges of the file, else some way about home."""
+    """Travel limit from the ranges of the file, else a chosen distance about home."""
     limits = []
     for one in found:
         at_home = one.actuated.coordinate
@@ -222,7 +225,7 @@ def _travel(
 
 
 def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:
-    """Gains lp, li, ld for what the joint that feels least feels at home."""
+    """Gains lp, li, ld for the smallest inertia that any joint feels at home."""
     home = ca.SX(geometry.home_pose)
     free = geometry.chart.basis
     jacobian = np.array(ca.evalf(joint_jacobian(geometry, home))) @ free

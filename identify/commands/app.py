@@ -83,10 +83,10 @@ def _printing() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # All other files are written in blocks that name them, see `identify.files.atomic`.
+        # All other files are written inside `identify.files.atomic.writing`; its error names them.
         if error.filename is not None or error.errno not in NO_ROOM:
             raise
-        # Python would else write the rest at its end, and fail once more.
+        # Otherwise Python writes the rest when it exits, and fails again.
         with suppress(OSError):
             sys.stdout.close()
         raise WriteError(f"cannot write standard output: {error.strerror}") from None

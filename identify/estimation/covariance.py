@@ -1,5 +1,7 @@
 """Covariance of an output-error estimate, from all that is not known exactly in the experiment.
 
+`identify.estimation.bounds` makes the intervals from it.
+
 Sensor noise enters twice: in the measured poses, and through the servo in the plant's motion. A
 model that closes its own loop cannot follow the latter. Its residuals are coloured, and stick-slip
 makes the response nonlinear. So the experiment is repeated on the identified model with drawn

@@ -1,10 +1,11 @@
 """Unknowns of a smooth-start trajectory (eq. 37), with its motion and regressors in CasADi.
 
-The conditions of a smooth start leave 2 (n - 1) free directions a coordinate: n - 1 combinations of
-the sines with sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. With dimensionless Z
-(m, 2 (n - 1)) and a box (m,) the m coordinates q are
+The conditions of a smooth start leave 2 (n - 1) free directions for each coordinate: n - 1
+combinations of the sines with sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. For
+the m coordinates q, with a dimensionless matrix Z of shape (m, 2 (n - 1)) and the diagonal matrix D
+of their amplitudes,
 
-    q(t) = home + box Z B_0(t)^T,    q_dot(t) = box Z B_1(t)^T,    q_ddot(t) = box Z B_2(t)^T.
+    q(t) = home + D Z B_0(t)^T,    q_dot(t) = D Z B_1(t)^T,    q_ddot(t) = D Z B_2(t)^T.
 
 Every trajectory that starts smoothly at home is thus one vector z of 2 m (n - 1) numbers, and each
 z is one trajectory.
@@ -52,7 +53,7 @@ class Unknowns:
 
     @property
     def columns(self) -> int:
-        """Number of free directions a coordinate, 2 (n - 1)."""
+        """Number of free directions of a coordinate, 2 (n - 1)."""
         return 2 * (self.harmonics - 1)
 
     @property
@@ -166,7 +167,8 @@ def tracked_motion(
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
     """Return the steady-state motion, as `motion`, of a robot that follows z with a lag.
 
-    It follows harmonic k with `tracking` (harmonics, m, m), and the mean exactly.
+    `tracking` (harmonics, m, m) is the complex gain of the loop at each harmonic. The mean is
+    followed exactly.
     """
     speeds = 2j * np.pi * unknowns.fundamental_hz * np.arange(1, unknowns.harmonics + 1)
     period = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
@@ -194,7 +196,8 @@ def regressor(
     """Return the function (pose, rate, acceleration) (6,) -> transposed regressor (p, m) or (p, n).
 
     It is the regressor of the wrench (eq. 25) along the m coordinates, or of the n actuators'
-    torques. The former is J_ad^T times the latter, projected on the chart. The sign of Coulomb
+    torques. With J the Jacobian of the joints along the m coordinates, the former is J^T times the
+    latter. The sign of Coulomb
     friction has no derivative: `smoothing` replaces it by tanh(theta_dot / v_s) with v_s in rad/s,
     or m/s where actuators slide. None keeps the sign.
     """

@@ -36,7 +36,7 @@ from identify.model.from_record import ModelSide
 from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
 from identify.record.known_geometry import KnownGeometry
 from identify.record.payload import payload_vector
-from identify.record.pose_covariance import factor
+from identify.record.run_error_covariance import factor
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import PriorValue, Timing
 from identify.scenario.plant_sections import Control

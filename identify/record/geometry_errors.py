@@ -21,7 +21,7 @@ from dynamics import Robot
 from dynamics.closure import Closure
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.record.pose_covariance import covariance_fault, factor, noticed_directions
+from identify.record.run_error_covariance import covariance_fault, factor, noticed_directions
 from identify.runtime import cores
 
 COVARIANCE = "geometry_covariance"

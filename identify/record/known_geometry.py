@@ -10,7 +10,7 @@ from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.dataset import read_covariance
 from identify.files.seal import check_toml
-from identify.record.pose_covariance import covariance_fault
+from identify.record.run_error_covariance import covariance_fault
 from identify.scenario.sections import Geometry
 
 FOLDER = "geometry"

@@ -1,8 +1,8 @@
 """Records of one's own, from netCDF or CSV, with all that an identification needs to know of them.
 
 A netCDF record states its scenario and its scale anchor itself. A CSV table has a TOML file of the
-same name beside it. That file is a scenario, of which robot, timing, servo, model, filter,
-identification and payload count. Its table `[record]` holds what was measured beside the poses.
+same name beside it. That file is a scenario; only its sections robot, timing, servo, model, filter,
+identification and payload are used. Its table `[record]` holds what was measured beside the poses.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ from identify.scenario.sections import LOAD_UNITS, Identification, Payload
 from identify.scenario.settings_file import one_line
 
 DESCRIPTION = "record"
-"""Table of the file beside a CSV record that is not the scenario's."""
+"""The one table of that file that is not part of a scenario."""
 
 
 class Measured(Section):
@@ -81,7 +81,7 @@ def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
 
 
 def description_file(path: Path) -> Path:
-    """Return the path of the file that says what a CSV table is a record of."""
+    """Return the path of the TOML file that describes a CSV record."""
     return path.with_suffix(".toml")
 
 
@@ -103,7 +103,7 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
         time=table.groups["time"][:, 0] - start,
         reference_pose=table.groups["reference"],
         reference_rate=_rates(table, scenario.timing.frame_period_s),
-        # a pose in a row that says it was lost is not taken
+        # the pose of a row that is marked as lost is ignored
         measured_pose=np.where(ok[:, None], poses, np.nan),
         measured_covariance=_covariances(table, measured, ok),
         measured_ok=ok,
@@ -122,7 +122,7 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
 
 
 def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
-    """Read what a CSV table is a record of: the scenario, and what was measured beside the poses.
+    """Read the description of a CSV record: its scenario, and what was measured beside the poses.
 
     Raises RecordError or ScenarioError if there is no such file, it is no TOML, or its content is
     not valid.

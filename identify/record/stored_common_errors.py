@@ -26,7 +26,7 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
 from identify.record.geometry_errors import GeometryErrors
-from identify.record.pose_covariance import covariance_fault, factor, noticed_directions
+from identify.record.run_error_covariance import covariance_fault, factor, noticed_directions
 
 CHANGES = "common_error"
 COVARIANCE = "common_error_covariance"

@@ -1,4 +1,4 @@
-"""Sections of the report after its first look: text, pictures, tables and folded parts."""
+"""Sections of the report after its opening summary: text, pictures, tables and folded parts."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -58,8 +58,10 @@ def sensor_section(data: RunData) -> Section:
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
     if data.cameras_acquitted:
         common_errors = data.result["identification"].get("nuisances")
-        beside = ", beside what is wrong in all frames alike" if common_errors else ""
-        said.append(f"Its errors are the noise that it states, new in every frame{beside}.")
+        beside = ", plus errors that all frames share" if common_errors else ""
+        said.append(
+            f"Its errors are the noise that it states, independent from frame to frame{beside}."
+        )
     elif data.cameras_acquitted is not None:
         said.append(
             "Its errors are larger than the noise that it states, or depend on those of the "
@@ -68,8 +70,8 @@ def sensor_section(data: RunData) -> Section:
     watch = data.result.get("drift_watch")
     if watch and watch.get("noticed_s") is None:
         said.append(
-            "By the stickers' pattern and the gaps of the rays, the cameras stayed as they were "
-            "calibrated."
+            "Judged by the pattern of the stickers, and by how closely the two rays to each of "
+            "them meet, the cameras kept their calibration."
         )
     # An empty table is left out.
     common = [table for table in (tables.common_error_table(data.result),) if table.rows]
@@ -104,8 +106,8 @@ def parameter_section(data: RunData) -> Section:
     counted = f", and {known_sums} of {len(sums)} sums of several" if sums else ""
     text = [
         f"The record identifies {len(known)} of {len(parameters)} parameters{counted}. Identified "
-        "means that it at least halves what the starting value left open, and leaves less than "
-        "half of the quantity in doubt.",
+        "means that it at least halves the standard deviation of the starting value, and brings it "
+        "below half of the quantity's size.",
         parameter_tables.scale_sentence(found),
         *filter(None, [parameter_tables.drive_sentence(found)]),
         *_prior_text(found),
@@ -194,9 +196,9 @@ def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
     directions = conditioning["directions"]
     unshown = conditioning["unshown"]
     return [
-        f"Poses can show {directions} independent quantities of this robot and its controller, but "
-        f"for one common factor of all of them. This record shows {directions - unshown} of them "
-        "better than the starting values do."
+        f"Poses determine {directions} independent quantities of this robot and its controller, up "
+        "to one factor that is common to all of them. This record shows "
+        f"{directions - unshown} of them better than the starting values do."
     ]
 
 
@@ -224,7 +226,7 @@ def _paper_text(data: RunData) -> tuple[str, ...]:
         return ()
     return (
         "This run repeats the paper's experiment on a simulated robot of the same kind, with its "
-        "masses, gains and motion frequencies; where it filters and how it searches for its "
-        "trajectory are its own (scenario.toml). The paper's own figures stand beside. They are of "
+        "masses, gains and motion frequencies; its filter and its search for a trajectory differ "
+        "from the paper's (scenario.toml). The paper's own figures stand beside. They are of "
         "a real robot whose truth nobody knows.",
     )

@@ -112,9 +112,9 @@ class Workcell:
 
     @cached_property
     def bodies(self) -> tuple[Solid, ...]:
-        """Platform in its own frame, and body with stickers on the base, in the base frame.
+        """The platform, in its own frame.
 
-        The latter is the sensor's; without a sensor there is only the platform.
+        With a sensor also the body that carries the stickers of the base, in the base frame.
         """
         if self.sensor is None:
             assert self.robot is not None
