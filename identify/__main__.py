@@ -4,15 +4,15 @@ libraries are loaded.
 
 import sys
 
-from identify.runtime import STOPPED, honoured
+from identify.runtime import STOPPED, honoured, loading
 
 
 def main() -> None:
     """Run the command; exit status and one line on standard error where Ctrl-C ends it."""
     try:
         with honoured():
-            from identify.commands import app as command_line
-
+            with loading():
+                from identify.commands import app as command_line
             command_line.main()
     except KeyboardInterrupt:
         sys.stderr.write("aborted\n")

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -93,6 +94,29 @@ def raise_noted() -> None:
 
 
 @contextmanager
+def loading() -> Iterator[None]:
+    """Raise KeyboardInterrupt at each import of the block once Ctrl-C came in a `noted` block.
+
+    Libraries swallow the exception while they look for optional ones. All the others would then be
+    loaded before the command ends, which takes a minute on a busy machine. Clean-up that imports
+    does not belong in the block.
+    """
+    reminder = _Reminder()
+    sys.meta_path.insert(0, reminder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(reminder)
+
+
+class _Reminder:
+    """Finder of modules that finds none and reminds of Ctrl-C."""
+
+    def find_spec(self, *_: object) -> None:
+        raise_noted()
+
+
+@contextmanager
 def honoured() -> Iterator[None]:
     """Leave the block with KeyboardInterrupt after Ctrl-C, even if foreign code swallowed it.
 
@@ -163,7 +187,8 @@ def _end_after(parent: BaseProcess | None) -> None:
 def _is_ours() -> bool:
     """Tell whether Ctrl-C may be handled here.
 
-    It may in the main thread, unless something such as nohup has turned it off.
+    It may in the main thread, unless something has turned it off, as nohup does, and the shell of a
+    script for a command in the background.
     """
     in_main = threading.current_thread() is threading.main_thread()
     return in_main and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None)

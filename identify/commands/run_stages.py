@@ -31,6 +31,7 @@ from identify.files.run_folder import (
     new_run_folder,
 )
 from identify.progress import print_warnings, terminal_progress
+from identify.runtime import loading
 
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
 """Files that the first two stages leave."""
@@ -71,7 +72,8 @@ def run(
                                               joints off by 0.1 mm: the model
                                               is wrong, and the residuals tell
     """
-    from identify.setup import Setup, with_renderer
+    with loading():
+        from identify.setup import Setup, with_renderer
 
     chosen = chosen_scenario(scenario, settings, robot)
     path = out or Path("runs") / f"{chosen.name}-{seed}"
@@ -107,9 +109,10 @@ def warm_up(
       cmmsim warm-up
       cmmsim warm-up quick --robot mine.toml
     """
-    from dynamics import built_in_robots
-    from identify.experiment.warm_up import warm_up
-    from identify.setup import Setup, with_renderer
+    with loading():
+        from dynamics import built_in_robots
+        from identify.experiment.warm_up import warm_up
+        from identify.setup import Setup, with_renderer
 
     chosen = with_renderer(chosen_scenario(scenario, settings, robot))
     setup = Setup(chosen)
@@ -152,7 +155,8 @@ def excite(
     # What an interrupted search has left may be replaced.
     may_hold = () if compare else UNFINISHED
     folder = context.with_resource(new_run_folder(out or Path("runs") / name, may_hold))
-    from identify.setup import Setup, with_renderer
+    with loading():
+        from identify.setup import Setup, with_renderer
 
     setup = Setup(with_renderer(chosen), seed)
     if compare:
@@ -322,6 +326,7 @@ def _summary() -> Any:
 
 def _pipeline() -> Any:
     """Import the stages late: ``cmmsim --help`` must not wait for CasADi and OpenGL."""
-    from identify import pipeline
+    with loading():
+        from identify import pipeline
 
     return pipeline

@@ -17,7 +17,7 @@ from identify.commands.options import (
 )
 from identify.errors import StudyError, StudyInterrupted
 from identify.progress import print_table, terminal_progress
-from identify.runtime import STOPPED
+from identify.runtime import STOPPED, cores, loading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -173,11 +173,11 @@ def study(
             f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say "
             "--yes"
         )
-    from identify.runtime import cores
-    from identify.studies.memory import check_memory
-    from identify.studies.runner import run_study
-    from identify.studies.study_design import prepare
-    from identify.studies.table import rows_beside
+    with loading():
+        from identify.studies.memory import check_memory
+        from identify.studies.runner import run_study
+        from identify.studies.study_design import prepare
+        from identify.studies.table import rows_beside
 
     count = cores() if workers is None else workers
     shared = prepare(chosen)

@@ -2,13 +2,14 @@
 
 import signal
 import sys
+from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
 
 from identify.errors import StudyInterrupted
 from identify.progress import SilentProgress
-from identify.runtime import held, honoured, noted, raise_noted
+from identify.runtime import held, honoured, loading, noted, raise_noted
 from identify.studies.runner import run_study
 from tests.identify.commands import command
 from tests.identify.study_rows import DARK, journal, small_study
@@ -59,6 +60,20 @@ def test_noted_ctrl_c_is_raised_again_where_it_was_swallowed_and_an_inner_blocks
             assert outer.came
     with pytest.raises(ImportError, match="no library"), honoured():
         raise ImportError("no library")
+
+
+def test_ctrl_c_that_an_import_swallowed_is_raised_at_the_next_one():
+    before = list(sys.meta_path)
+    with noted(), loading():
+        with pytest.raises(ModuleNotFoundError):
+            import_module("no_such_library")
+        swallowed()
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                import_module("no_such_library")
+    assert sys.meta_path == before
+    with pytest.raises(ModuleNotFoundError):
+        import_module("no_such_library")
 
 
 def test_ctrl_c_in_a_row_is_no_error_of_it_whatever_became_of_it_and_one_that_was_swallowed_begins_no_row(
