@@ -25,6 +25,7 @@ from identify.files.seal import check_toml, is_sealed, opened_json
 from identify.pipeline import excite, identify, record, validate
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
+from identify.setup import Setup
 from identify.studies.runner import run_study
 from identify.studies.store import JOURNAL
 from identify.studies.table import TABLE, read_table
@@ -428,7 +429,7 @@ def test_a_run_a_stage_and_a_study_killed_by_two_signals_each_go_on_to_the_same_
 ):
     scenario = load_scenario("quick").with_overrides(SHORT | ONE)
     whole, progress = tmp_path / "whole", SilentProgress()
-    excite(scenario, 0, whole, progress)
+    excite(Setup(scenario), whole, progress)
     taught = record(whole, progress)
     identify(whole, progress)
     identified = copied(whole, IDENTIFIED, tmp_path / "identified")
