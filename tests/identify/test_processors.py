@@ -62,11 +62,12 @@ from tempfile import TemporaryDirectory
 from identify import load_scenario, pipeline
 from identify.files.run_folder import load_result
 from identify.progress import SilentProgress
+from identify.setup import Setup
 
-scenario, progress = load_scenario("quick", renderer="statistical"), SilentProgress()
+setup, progress = Setup(load_scenario("quick", renderer="statistical")), SilentProgress()
 with TemporaryDirectory() as name:
     folder = Path(name)
-    pipeline.excite(scenario, 0, folder, progress)
+    pipeline.excite(setup, folder, progress)
     taught = pipeline.record(folder, progress)
     pipeline.identify(folder, progress)
     pipeline.validate(folder, progress, taught=taught)
