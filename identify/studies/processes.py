@@ -14,15 +14,16 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, resource_tracker
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 
 import psutil
 
 from identify.errors import StudyError
-from identify.runtime import deaf_offspring, end_with_parent, held
+from identify.runtime import deaf_offspring, held
 from identify.studies.memory import GB
-from identify.studies.runner import Batches, Suspects, compute
+from identify.studies.runner import Batches, Suspects
 from identify.studies.study_design import Case, Finished, Shared
+from identify.studies.worker import work
 
 SPAWN = get_context("spawn")
 """Way to start processes anew, so that they inherit neither threads nor the locks these hold."""
@@ -168,7 +169,7 @@ class _Worker:
         self.cases: list[Case] = []
         self.fate = "died"
         self.pipe, theirs = SPAWN.Pipe()
-        self._process = SPAWN.Process(target=_work, args=(theirs,), daemon=True)
+        self._process = SPAWN.Process(target=work, args=(theirs,), daemon=True)
         # The tracker is started outside the block, where it would unblock Ctrl-C.
         resource_tracker.ensure_running()
         with _one_thread_each(), deaf_offspring():
@@ -228,15 +229,3 @@ def _one_thread_each() -> Iterator[None]:
         for name in THREADS:
             del os.environ[name]
         os.environ.update(before)
-
-
-def _work(pipe: Connection) -> None:
-    """Compute batches in a process of its own until the pipe closes."""
-    end_with_parent()
-    import cv2
-
-    cv2.setNumThreads(1)  # OpenCV does not read the variables of THREADS
-    with suppress(EOFError, OSError, KeyboardInterrupt):
-        pipe.send([])  # no rows: the libraries are loaded, and the process is ready
-        while True:
-            pipe.send(compute(*pipe.recv()))

@@ -4,6 +4,8 @@ middle, and no door for anybody else.
 
 import os
 import signal
+import subprocess
+import sys
 from collections import Counter
 from contextlib import suppress
 from functools import partial
@@ -87,7 +89,7 @@ def test_processes_that_die_before_they_are_ready_or_cannot_be_started_end_the_s
     tmp_path, monkeypatch
 ):
     workers = partial(local_processes, 2)
-    monkeypatch.setattr(processes, "_work", os.abort)
+    monkeypatch.setattr(processes, "work", os.abort)
     with pytest.raises(StudyError, match=r"^3 processes died before .* --workers 0 [^\n]*$"):
         run_study(many_rows(), tmp_path / "a", SilentProgress(), workers)
     none = SimpleNamespace(Pipe=lambda: (_ for _ in ()).throw(OSError(11, "Resource unavailable")))
@@ -210,3 +212,10 @@ def test_command_interrupted_while_its_workers_start_ends_with_one_line(command)
     """
     running, folder, _ = command(workers=1, until=starts_workers)
     assert interrupted(running, folder) == []
+
+
+def test_a_worker_watches_its_parent_before_it_loads_libraries():
+    """That takes a minute on a busy machine, in which a killed command's pipes would stay open."""
+    code = "import sys, identify.studies.worker; print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
