@@ -36,11 +36,11 @@ from identify.errors import IdentifyError as IdentifyError
 
 if TYPE_CHECKING:
     from identify.estimation.identification import identify as identify
+    from identify.estimation.prior import ScaleAnchor as ScaleAnchor
+    from identify.estimation.prior import store_anchor as store_anchor
     from identify.estimation.result import IdentificationResult as IdentificationResult
-    from identify.estimation.scale_anchor import ScaleAnchor as ScaleAnchor
-    from identify.estimation.scale_anchor import store_anchor as store_anchor
-    from identify.record.payload import payload_vector as payload_vector
-    from identify.record.payload import store_payload as store_payload
+    from identify.record.conditions import payload_vector as payload_vector
+    from identify.record.conditions import store_payload as store_payload
     from identify.record.recording import build_record as build_record
     from identify.reporting.pictures import run_figures as run_figures
     from identify.scenario import Scenario as Scenario
@@ -56,10 +56,10 @@ _HOME = {
     **dict.fromkeys(("run_experiment", "set_up", "unseen_errors"), "identify.setup"),
     "Study": "identify.studies.in_python",
     "build_record": "identify.record.recording",
-    "ScaleAnchor": "identify.estimation.scale_anchor",
-    "store_anchor": "identify.estimation.scale_anchor",
-    "payload_vector": "identify.record.payload",
-    "store_payload": "identify.record.payload",
+    "ScaleAnchor": "identify.estimation.prior",
+    "store_anchor": "identify.estimation.prior",
+    "payload_vector": "identify.record.conditions",
+    "store_payload": "identify.record.conditions",
     "IdentificationResult": "identify.estimation.result",
     "identify": "identify.estimation.identification",
     "run_figures": "identify.reporting.pictures",

@@ -5,7 +5,7 @@ from typing import Any
 
 from cmmsim.files.sensor_file import sensor_schema
 from dynamics.robot_file import FAMILIES, robot_schema
-from identify.record.command_times import OPTIONAL
+from identify.record.conditions import OPTIONAL
 from identify.record.csv_record import RULES
 from identify.record.own_record import record_schema
 from identify.record.recording import VARIABLES

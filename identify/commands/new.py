@@ -159,8 +159,13 @@ def record(
       cmmsim identify --record mine.csv
     """
     from dynamics import load_robot
-    from identify.record.own_record import description_file, read_own_records
-    from identify.record.starting import SCHEMA, description_text, table_text
+    from identify.record.own_record import (
+        SCHEMA,
+        description_file,
+        description_text,
+        read_own_records,
+        table_text,
+    )
 
     if file.suffix != ".csv":
         raise OutputFolderError(f"cannot write {file}: the name of a record's table ends in .csv")

@@ -31,7 +31,7 @@ Conditioning says how unevenly a record tells the parameters apart. The informat
 units of the starting guess: an eigenvalue of one is a direction that the record shows as well as
 the guess knows it. With the guess, the information is that of all parameters. Without it, most of
 them would have none. The poses alone are therefore asked for the base parameters and the gains,
-with their common factor held, which poses never show (`scale_anchor`).
+with their common factor held, which poses never show (`prior`).
 """
 
 from dataclasses import dataclass
@@ -54,8 +54,7 @@ from identify.estimation.bounds import bounded_estimate, combined_std
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.prior import StartingGuess, friction, holding_torque
-from identify.estimation.scale_anchor import ScaleAnchor
+from identify.estimation.prior import ScaleAnchor, StartingGuess, friction, holding_torque
 
 IDENTIFIABLE_SHARE = 0.5
 """Share of the guess's standard deviation, and of the size, that may be left in doubt.

@@ -23,18 +23,15 @@ from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
-from identify.estimation.prior import model_guess
+from identify.estimation.prior import model_guess, read_anchor
 from identify.estimation.result import IdentificationResult
-from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
 from identify.model.from_record import ModelSide, identified_model, model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
-from identify.record.command_times import command_time_warnings
-from identify.record.drift import drift_warnings
+from identify.record.conditions import SERVO, command_time_warnings, drift_warnings, recorded_law
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import recorded_scenario, recorded_seed
-from identify.record.recorded_law import SERVO, recorded_law
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 from identify.scenario.sections import Identification

@@ -20,7 +20,7 @@ A common error of the poses of a run, or of a geometry that is known only so wel
 for each standard deviation. An error of the latency moves U by the way that it makes in that time.
 In the equation these errors stand with lp and with li. They are errors of the rows that go on along
 a run, lp0 e and li0 integral(e) with the gains of the starting guess, and they are marginalised
-(`record.common_errors`).
+(`record.stored_common_errors`).
 """
 
 import numpy as np
@@ -35,8 +35,7 @@ from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array, triangular_factor
 from identify.estimation.bounds import SMALLEST_SHARE
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.prior import StartingGuess
-from identify.estimation.scale_anchor import ScaleAnchor
+from identify.estimation.prior import ScaleAnchor, StartingGuess
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import Marginal

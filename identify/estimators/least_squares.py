@@ -26,8 +26,7 @@ from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.prior import StartingGuess
-from identify.estimation.scale_anchor import ScaleAnchor
+from identify.estimation.prior import ScaleAnchor, StartingGuess
 from identify.estimation.warm_start import REWEIGHTINGS, bounded_fit, joint_balance
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter

@@ -48,8 +48,7 @@ from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, LoopSettings, differentiate_servo
 from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
-from identify.estimation.prior import StartingGuess, model_guess
-from identify.estimation.scale_anchor import MEASURED_PARAMETER, default_std
+from identify.estimation.prior import MEASURED_PARAMETER, StartingGuess, default_std, model_guess
 from identify.excitation.criteria import Criterion, smoothing_of
 from identify.excitation.motion import (
     RESPONSE_BITS,

@@ -34,8 +34,8 @@ from identify.experiment.truth import build_truth
 from identify.loop_parameters import of_actuators
 from identify.model.from_record import ModelSide
 from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
+from identify.record.conditions import payload_vector
 from identify.record.known_geometry import KnownGeometry
-from identify.record.payload import payload_vector
 from identify.record.run_error_covariance import factor
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import PriorValue, Timing

@@ -13,8 +13,7 @@ from cmmsim.uncertainty.drift_watch import DriftWatch
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from dynamics.closed_loop.command_schedule import acting_times
 from identify.arrays import Array
-from identify.estimation.prior import starting_guess
-from identify.estimation.scale_anchor import measured_anchor, store_anchor
+from identify.estimation.prior import measured_anchor, starting_guess, store_anchor
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, by_images, prepared
 from identify.experiment.plant import Plant, PlatformLoad, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop
@@ -30,11 +29,9 @@ from identify.random_streams import (
     stream_seed,
 )
 from identify.record import recording
-from identify.record.drift import store_finding
+from identify.record.conditions import SERVO, store_finding, store_law, store_payload
 from identify.record.geometry_errors import store_geometry_covariance
-from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
-from identify.record.recorded_law import SERVO, store_law
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.scenario import Excitation, Timing
 from identify.scenario.sections import Payload, Rig

@@ -18,16 +18,18 @@ from identify.record.checks import (
     check_good_share,
     check_length,
     check_origin,
+    check_plausible,
     check_reference,
     checked_covariance,
     fewest_frames,
 )
-from identify.record.command_times import logged_latencies
-from identify.record.drift import drift_warnings
+from identify.record.conditions import (
+    drift_warnings,
+    logged_latencies,
+    recorded_payload,
+    takes_torques,
+)
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
-from identify.record.payload import recorded_payload
-from identify.record.plausibility import check_plausible
-from identify.record.recorded_law import takes_torques
 from identify.record.recording import poses, recorded_reference
 from identify.record.stored_common_errors import CommonErrors, read_common_errors
 from identify.scenario import Filter, Model, Scenario, Timing

@@ -3,10 +3,13 @@
 A netCDF record states its scenario and its scale anchor itself. A CSV table has a TOML file of the
 same name beside it. That file is a scenario; only its sections robot, timing, servo, model, filter,
 identification and payload are used. Its table `[record]` holds what was measured beside the poses.
+
+Files to fill in for a record of one's own are an empty table, and what goes with it.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -15,21 +18,21 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.interpolate import make_interp_spline
 
-from dynamics import load_robot
+from dynamics import Robot, load_robot
 from dynamics.files import is_file, is_name, parse_toml, read_text
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
-from identify.record.csv_record import Table, read_table
-from identify.record.payload import payload_vector, store_payload
+from identify.record.conditions import payload_vector, store_payload
+from identify.record.csv_record import RULES, Table, columns_of, read_table
 from identify.record.provenance import recorded_scenario
 from identify.record.recording import build_record, read
 from identify.scenario import Scenario
 from identify.scenario.scenario import SCENARIOS, scenario_schema
 from identify.scenario.section import Section, quantity
 from identify.scenario.sections import LOAD_UNITS, Identification, Payload
-from identify.scenario.settings_file import one_line
+from identify.scenario.settings_file import one_line, starting_toml
 
 DESCRIPTION = "record"
 """The one table of that file that is not part of a scenario."""
@@ -231,3 +234,71 @@ def _state_payload(record: xr.Dataset, layout: ParameterLayout, payload: Payload
         mass, *moments = (load[f"{figure}{std}_{unit}"] for figure, unit in LOAD_UNITS.items())
         vectors.append(payload_vector(layout, mass, (moments[0], moments[1], moments[2])))
     store_payload(record, layout, *vectors)
+
+
+SCHEMA = Path(__file__).parent / "record.schema.json"
+
+SHOWN_ROWS = 2
+WIDTH = 96
+SECTIONS = ("robot", "timing", "servo", "model", "filter", "identification", "payload")
+"""Parts of a scenario that a record is made with, or that an identification reads."""
+
+# values of a starting file, for the user to replace
+FRAME_RATE_HZ = 60.0
+POSITION_STD_M = 5e-6
+ORIENTATION_STD_RAD = 2e-5
+
+
+def table_text(robot: Robot) -> str:
+    """Return a table with comments, the columns of a robot, and rows at rest at its home pose."""
+    groups = columns_of(robot)
+    comments = [*wrap(RULES, WIDTH), ""]
+    for group in groups.values():
+        shown = ", ".join(
+            group.names if len(group.names) <= 6 else (*group.names[:3], "...", group.names[-1])
+        )
+        comments += wrap(f"{'Optional: ' if group.optional else ''}{group.meaning}: {shown}", WIDTH)
+    comments += [
+        "",
+        f"Replace the {SHOWN_ROWS} rows, in which {robot.name} stands still at its home pose.",
+    ]
+    written = {name: groups[name] for name in ("time", "reference", "measured", "command")}
+    pose = [f"{value:.9g}" for value in robot.home_pose]
+    command = [f"{value:.9g}" for value in robot.inverse_kinematics(robot.home_pose)]
+    rows = [[f"{row / FRAME_RATE_HZ:.6f}", *pose, *pose, *command] for row in range(SHOWN_ROWS)]
+    header = [column for group in written.values() for column in group.names]
+    lines = [f"# {line}".rstrip() for line in comments] + [
+        ",".join(cells) for cells in [header, *rows]
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def description_text(robot: Robot, name_or_path: str, table: str) -> str:
+    """Return what goes with a table: robot, timing, servo and scale.
+
+    The user replaces them by those of the record.
+    """
+    mass = float(robot.parameter_sets["initial"].vector[robot.layout.names.index("platform.mass")])
+    made_with = Scenario.model_validate(
+        {
+            "name": "record",
+            "robot": name_or_path,
+            "timing": {"frame_rate_hz": FRAME_RATE_HZ, "latency_s": 0.0, "hold": "zero"},
+            "servo": {
+                name: getattr(Scenario.model_fields["servo"].default, name)
+                for name in ("kp", "kd", "ki")
+            },
+            "identification": {"scale_anchor": "platform_mass", "anchor_std": 0.005},
+        }
+    )
+    measured = Measured(
+        anchor_value=mass, position_std_m=POSITION_STD_M, orientation_std_rad=ORIENTATION_STD_RAD
+    )
+    head = [
+        f"# What {table} is a record of. Entries that are commented out have the value that holds "
+        "without them; those",
+        "# that are not, replace by what your machine and its controller have.",
+    ]
+    own = starting_toml(measured).rstrip("\n").split("\n")
+    sections = starting_toml(made_with, SECTIONS)
+    return "\n".join([*head, sections, f"[{DESCRIPTION}]", *own]) + "\n"

@@ -31,7 +31,7 @@ from identify.files.dataset import (
     write_groups,
 )
 from identify.files.versions import versions
-from identify.record.command_times import COMMAND_TIME, OPTIONAL, check_command_times
+from identify.record.conditions import COMMAND_TIME, OPTIONAL, check_command_times
 
 TRUTH_GROUP = "truth"
 
@@ -107,7 +107,7 @@ def build_record(
         Commands of the n joints, each from its frame on: rad, or m where they are prismatic.
     command_time : array_like, shape (N,), optional
         Times at which the commands were written to the drives, s, from which on they act. See
-        `identify.record.command_times`.
+        `identify.record.conditions`.
     scenario_toml : str
         Timing and servo of the run, as `Scenario.to_toml` gives them.
     robot : str

@@ -20,7 +20,7 @@ from identify.files.versions import versions
 from identify.model.from_record import model_side
 from identify.progress import Progress
 from identify.record import recording
-from identify.record.drift import DRIFT, read_finding
+from identify.record.conditions import DRIFT, read_finding
 from identify.record.geometry_errors import COVARIANCE as GEOMETRY_COVARIANCE
 from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.known_geometry import known_geometry

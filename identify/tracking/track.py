@@ -30,7 +30,7 @@ from identify.files.versions import versions
 from identify.loop_parameters import parameter_column, settled_drive
 from identify.progress import Advance, Progress
 from identify.random_streams import NOISE, TRACKED, child, stream_seed
-from identify.record.recorded_law import SERVO
+from identify.record.conditions import SERVO
 from identify.scenario import load_scenario
 from identify.setup import Setup
 from identify.tracking.following import Followed, by_drawing, follow

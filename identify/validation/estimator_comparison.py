@@ -39,10 +39,9 @@ from identify.loop_parameters import settled_drive
 from identify.model.from_record import ModelSide, model_side
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, mixed_generator
-from identify.record.command_times import logged_latencies
+from identify.record.conditions import logged_latencies, takes_torques
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RunFiles
-from identify.record.recorded_law import takes_torques
 from identify.scenario import Timing, load_scenario
 from identify.scenario.plant_sections import AUTO
 from identify.scenario.sections import Identification

@@ -37,8 +37,7 @@ from identify.model.loop_model import LoopModel
 from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
-from identify.record.command_times import logged_latencies
-from identify.record.recorded_law import SERVO, recorded_law
+from identify.record.conditions import SERVO, logged_latencies, recorded_law
 from identify.record.recording import recorded_reference
 from identify.runtime import cores
 from identify.trajectory import FourierTrajectory

@@ -12,7 +12,7 @@ from identify.estimation.multiple_shooting import segments
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.model.from_record import identified_model
-from identify.record.command_times import logged_latencies
+from identify.record.conditions import logged_latencies
 from identify.record.recording import check_record
 from identify.studies.rows.row_sensor import DrawnSensor
 from identify.validation.unseen import model_on_record

@@ -9,7 +9,7 @@ from cmmsim.teaching import exactly_taught
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify
 from identify.experiment.run import excitation_run
-from identify.record.drift import DRIFT, drift_warnings, read_finding, store_finding
+from identify.record.conditions import DRIFT, drift_warnings, read_finding, store_finding
 from identify.setup import Setup
 from tests.identify.synthetic import quick, rss6, run_plant, trajectory
 

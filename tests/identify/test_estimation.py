@@ -19,13 +19,13 @@ from identify.estimation.base_parameters import structure
 from identify.estimation.covariance import correlation_matrix, estimate_uncertainty
 from identify.estimation.identifiability import POOR
 from identify.estimation.identification import identify
-from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
+from identify.estimation.prior import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import joint_balance
 from identify.experiment.plant import drawn_load
 from identify.loop_parameters import choose_parameters
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
-from identify.record.payload import store_payload
+from identify.record.conditions import store_payload
 from identify.reporting.run_result import prediction_entry
 from identify.scenario import load_scenario
 from identify.validation.unseen import PosePrediction, predict_poses, predicted_runs

@@ -10,7 +10,7 @@ from identify.estimation.identification import identify
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.model.from_record import identified_model
-from identify.record.recorded_law import recorded_law, takes_torques
+from identify.record.conditions import recorded_law, takes_torques
 from identify.studies.rows.row_sensor import DrawnSensor
 from identify.validation.unseen import model_on_record
 from tests.identify.synthetic import (

@@ -14,9 +14,8 @@ from identify.commands.help import NOT_DONE
 from identify.errors import EstimationError
 from identify.files.run_folder import load_result
 from identify.model.from_record import identified_model
-from identify.record.command_times import OPTIONAL
+from identify.record.conditions import OPTIONAL, recorded_payload
 from identify.record.own_record import read_own_records
-from identify.record.payload import recorded_payload
 from identify.record.recording import VARIABLES, poses, read
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import (

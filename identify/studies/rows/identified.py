@@ -26,7 +26,7 @@ from identify.experiment.truth import true_poses
 from identify.model.from_record import ModelSide, model_side
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
-from identify.record.command_times import logged_latencies
+from identify.record.conditions import logged_latencies
 from identify.record.recording import recorded_reference
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario, scenario_from_toml

@@ -1,0 +1,261 @@
+"""Conditions of a run that its record states beside the frames.
+
+Law. A model can close its own loop around the visual servo only. Of another control law the record
+states the name, and what its commands are: joint commands or, if the drives took them, torques. A
+record that states nothing was made under the servo.
+
+Times of commands. A command acts from the instant at which it is written to the drives. With a
+latency that jitters, every command acts after another time, and a model that takes the mean for all
+of them describes another loop. If a record holds no such times, the model's commands have the
+latency of the timing. The log is that of a clock. It does not show how far the mean latency is from
+the stated one (`timing.latency_std_s`).
+
+Load. A known load on the platform shows the scale of all parameters, where the same motion is made
+with and without it. It is a rigid body whose centre lies in the origin of the platform frame. It
+adds its mass and its principal moments of inertia to those of the platform. A record holds these
+figures as the experimenter knows them, each with its standard deviation, which says how well it was
+weighed or computed. Records that state the same figures carry the same load.
+
+Drift. A watch over the cameras may have found that they drifted during the run.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dynamics.closed_loop import Drives
+from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
+from dynamics.parameters import ParameterLayout
+from identify.arrays import Array
+from identify.errors import EstimationError, RecordError
+from identify.files.dataset import Variables, as_number, check_variables, shown
+from identify.scenario.sections import check_load_std, check_moments
+from identify.scenario.timing import Timing
+
+SERVO = "pid"
+"""Name of the visual servo's law."""
+
+TORQUE_UNITS = {"rad": "N m", "m": "N"}
+"""Unit of commands that are torques, by that of joint commands."""
+
+
+def store_law(record: xr.Dataset, law: str, drives: Drives) -> None:
+    """Store with a record the law under which it was made, and what the drives took."""
+    record.attrs |= {"law": law, "torque_commands": np.int8(drives.torques)}
+    said = record["command"].attrs
+    units = TORQUE_UNITS[said["units"]] if drives.torques else said["units"]
+    what = "torque" if drives.torques else "joint command"
+    said |= {"units": units, "long_name": f"{what} of the law {law} from this frame on"}
+
+
+def recorded_law(record: xr.Dataset) -> str:
+    """Return the name of a record's law. Raises RecordError if the attribute is no name."""
+    law = record.attrs.get("law", SERVO)
+    if not isinstance(law, str) or not law:
+        raise RecordError(
+            f"the record's attribute law is {law!r}, must be the name of the law, or absent for "
+            "the servo"
+        )
+    return law
+
+
+def takes_torques(record: xr.Dataset) -> bool:
+    """Tell whether a record's commands are torques. Raises RecordError if it says neither."""
+    said = record.attrs.get("torque_commands", 0)
+    if said not in (0, 1):
+        raise RecordError(f"the record's attribute torque_commands is {said!r}, must be 0 or 1")
+    return bool(said)
+
+
+COMMAND_TIME = "command_time"
+
+OPTIONAL: Variables = {
+    COMMAND_TIME: (
+        ("time",),
+        "s",
+        "time at which the command of this frame acted; NaN where the frame was lost and nothing "
+        "was written. Without this variable all commands have the latency of the timing",
+    )
+}
+"""Variables that a record may hold beside the others."""
+
+CLOCK_S = 1e-6
+"""Difference, s, that two clock readings of the same instant may have."""
+
+SAME_S = 1e-9
+"""Difference, s, below which latencies are the same."""
+
+
+def check_command_times(record: xr.Dataset, source: str) -> None:
+    """Refuse times of commands that are impossible.
+
+    Raises RecordError with the first frame of that kind.
+    """
+    if COMMAND_TIME not in record:
+        return
+    check_variables(record, OPTIONAL, source)
+    acted = record[COMMAND_TIME].values
+    lost = record["measured_ok"].values == 0
+    time = record["time"].values
+    unsaid = np.flatnonzero(~(np.isfinite(acted) | np.isnan(acted) & lost))
+    early = np.flatnonzero(acted < time - CLOCK_S)
+    # lost frames have written nothing, and stand between those that have
+    written = np.flatnonzero(~np.isnan(acted))
+    back = written[1:][np.diff(acted[written]) < -CLOCK_S]
+    overtaken = (
+        "is before that of an earlier frame: a command that was overtaken acts with the one that "
+        "overtook it"
+    )
+    for frames, what in (
+        (unsaid, "is not finite, and that frame was measured"),
+        (early, "is before the frame itself, which its command answers"),
+        (back, overtaken),
+    ):
+        if len(frames):
+            more = f"; so in {len(frames)} frames" if len(frames) > 1 else ""
+            raise RecordError(
+                f"{source}: {COMMAND_TIME} of frame {frames[0]} (t = {time[frames[0]]:.6g} s) is "
+                f"{acted[frames[0]]:.6g} s; it {what}{more}"
+            )
+
+
+def command_time_warnings(records: Sequence[xr.Dataset], timing: Timing) -> tuple[str, ...]:
+    """Return a warning if the latency jitters and a record lacks the times of its commands."""
+    if not timing.latency_jitter_s or all(COMMAND_TIME in record for record in records):
+        return ()
+    return (
+        f"the latency varies by {1e3 * timing.latency_jitter_s:.3g} ms from frame to frame, and a "
+        f"record does not say when its commands acted ({COMMAND_TIME}): the model takes the mean "
+        "for all, and is another loop",
+    )
+
+
+def logged_latencies(record: xr.Dataset, timing: Timing) -> Array | None:
+    """Return the logged latency of each frame's command (N,) in s.
+
+    None if all have that of the timing. Raises EstimationError for one that is longer than a loop
+    can have.
+    """
+    if COMMAND_TIME not in record:
+        return None
+    found = record[COMMAND_TIME].values - record["time"].values
+    # lost frames have written nothing, and get the latency of the timing
+    latencies: Array = np.where(np.isnan(found), timing.latency_s, np.maximum(found, 0.0))
+    in_frames = latencies * timing.frame_rate_hz
+    if (in_frames > MAX_DELAY_FRAMES).any():
+        first = int(np.argmax(in_frames > MAX_DELAY_FRAMES))
+        raise EstimationError(
+            f"the command of frame {first} acted {latencies[first]:.4g} s after it, "
+            f"{in_frames[first]:.1f} frames of {timing.frame_rate_hz:g} Hz; at most "
+            f"{MAX_DELAY_FRAMES} frames are possible"
+        )
+    return None if np.abs(latencies - timing.latency_s).max() <= SAME_S else latencies
+
+
+ADDED = {
+    "payload_mass": ("platform.mass", "kg"),
+    "payload_Ixx": ("platform.Ixx", "kg m2"),
+    "payload_Iyy": ("platform.Iyy", "kg m2"),
+    "payload_Izz": ("platform.Izz", "kg m2"),
+}
+"""Attributes of a record, with the parameter to which each adds, and its unit.
+
+The standard deviation of `payload_mass` is `payload_mass_std`, and so for the others.
+"""
+
+
+def payload_vector(
+    layout: ParameterLayout, mass_kg: float, inertia_kg_m2: tuple[float, float, float]
+) -> Array:
+    """Return what a load adds to a robot's parameters (p,).
+
+    Given the standard deviations of its figures, it is the standard deviations of that.
+    """
+    added = np.zeros(len(layout.names))
+    for (parameter, _), value in zip(ADDED.values(), (mass_kg, *inertia_kg_m2), strict=True):
+        added[layout.names.index(parameter)] = value
+    return added
+
+
+def store_payload(
+    record: xr.Dataset, layout: ParameterLayout, payload: Array, std: Array | None = None
+) -> None:
+    """Store a load (p,) with the record made under it.
+
+    std (p,): standard deviations of the load. None: it is known exactly.
+    """
+    deviations = np.zeros(len(layout.names)) if std is None else std
+    for name, (parameter, _) in ADDED.items():
+        place = layout.names.index(parameter)
+        record.attrs |= {name: float(payload[place]), f"{name}_std": float(deviations[place])}
+
+
+def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array, Array]:
+    """Return the load (p,) of a record and its standard deviations (p,), zero if it states none.
+
+    Raises RecordError if a figure is missing, a figure or its standard deviation is no finite
+    number >= 0, the moments are of no body, or a standard deviation exceeds its figure.
+    """
+    load = np.zeros(len(layout.names))
+    std = np.zeros(len(layout.names))
+    stated = record.attrs
+    # a record that states one figure must state all
+    if not any(name in stated or f"{name}_std" in stated for name in ADDED):
+        return load, std
+    try:
+        for name, (parameter, unit) in ADDED.items():
+            place = layout.names.index(parameter)
+            load[place] = _not_negative(name, stated.get(name), unit)
+            std[place] = _not_negative(f"{name}_std", stated.get(f"{name}_std", 0.0), unit)
+            check_load_std(f"{name}_std", std[place], name, load[place], unit)
+        check_moments({name: float(stated[name]) for name in ADDED if name != "payload_mass"})
+    except ValueError as error:
+        raise RecordError(f"the record's attribute {error}") from None
+    return load, std
+
+
+def _not_negative(name: str, value: object, unit: str) -> float:
+    """Return an attribute's value, which must be a finite number >= 0."""
+    number = as_number(value)
+    if not 0 <= number < 1e6:
+        raise RecordError(
+            f"the record's attribute {name} is {shown(value)}, must be a number >= 0 in {unit}"
+        )
+    return number
+
+
+DRIFT = "drift_watch"
+"""Name of the attribute of a record, and of the entry of `result.json`."""
+
+
+def store_finding(record: xr.Dataset, finding: Mapping[str, Any]) -> None:
+    """Store a finding of the sensor's drift watch with a record."""
+    record.attrs[DRIFT] = json.dumps(dict(finding))
+
+
+def read_finding(record: xr.Dataset) -> dict[str, Any] | None:
+    """Return the finding that a record holds, or None if nobody watched.
+
+    Raises RecordError if the attribute is no finding.
+    """
+    if DRIFT not in record.attrs:
+        return None
+    try:
+        finding = json.loads(record.attrs[DRIFT])
+        _ = finding["warning"]
+    except (TypeError, ValueError, KeyError) as error:
+        raise RecordError(
+            f"{DRIFT} of the record is no finding: {type(error).__name__} {error}"
+        ) from None
+    return dict(finding)
+
+
+def drift_warnings(records: Sequence[xr.Dataset]) -> tuple[str, ...]:
+    """Return the warnings in the findings of records. Raises RecordError as `read_finding`."""
+    findings = [read_finding(record) for record in records]
+    return tuple(
+        found["warning"] for found in findings if found is not None and found["warning"] is not None
+    )
