@@ -330,7 +330,7 @@ def test_a_long_loss_is_flagged(scenario):
 def loaded(scenario, seed):
     """A record of the bare robot, and one with the scenario's known load on the platform."""
     load, duration = (
-        drawn_load(LAYOUT, scenario, np.random.default_rng(0)).stated,
+        drawn_load(LAYOUT, scenario.payload, np.random.default_rng(0)).stated,
         scenario.excitation.duration_s,
     )
     bare, _ = run_plant(scenario, seed=seed, duration_s=duration)
