@@ -196,8 +196,6 @@ class IdentificationResult:
         return np.array([float(truth[name]) for name in self.names])
 
     def _repr_html_(self) -> str:
-        from identify.estimation.result import result_html  # draws, which takes time to import
-
         return result_html(self)
 
     @property
@@ -302,10 +300,6 @@ class IdentificationResult:
             "rests_on_prior": bool(groups.rests_on_prior[k]),
             "prior_share": groups.prior_share[k],
         }
-
-
-if TYPE_CHECKING:
-    from identify.estimation.result import IdentificationResult
 
 
 def result_html(result: IdentificationResult) -> str:
