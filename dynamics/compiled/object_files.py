@@ -59,12 +59,14 @@ def save_object(name: str, content: bytes) -> None:
 
     The file is built beside its place and then renamed. A process that breaks off, or another one
     that compiles the same, thus never leaves half a file. Gives one warning where nothing can be
-    written.
+    written. Files that no process used for two months are removed.
     """
     path = cache_folder() / name
-    missing = [folder for folder in path.parents if not folder.exists()]
+    missing: list[Path] = []
     beside = None
     try:
+        # in a folder that may not be looked into this is an error, too
+        missing = [folder for folder in path.parents if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         # readable and writable by its owner alone
         descriptor, beside = tempfile.mkstemp(dir=path.parent, suffix=".half")

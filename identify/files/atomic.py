@@ -7,7 +7,6 @@ full. The content is then written beside its place, flushed to the disk, and ren
 import errno
 import io
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -41,7 +40,9 @@ def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
     else:
         return
     needed = "" if size is None else _needed(Path(path), size)
-    raise WriteError(f"cannot write {path}: {reason}{needed}; name another place")
+    # A file of `atomic_contents` is named by the place that it would have had.
+    place = Path(*(part for part in Path(path).parts if not part.startswith(TEMPORARY)))
+    raise WriteError(f"cannot write {place}: {reason}{needed}; name another place")
 
 
 def write_bytes(path: Path | str, content: bytes, *, parents: bool = False) -> None:
@@ -169,13 +170,11 @@ def atomic_contents(folder: Path) -> Iterator[Path]:
                 for path in sorted(Path(name).iterdir()):
                     moved.append(folder / path.name)
                     path.rename(moved[-1])
-    except BaseException as error:  # Ctrl-C as well
+    except BaseException:  # Ctrl-C as well
         for path in moved:
             shutil.rmtree(path, ignore_errors=True)
             path.unlink(missing_ok=True)
         take_back(folders)
-        if isinstance(error, WriteError):  # which names a file of the temporary folder
-            raise WriteError(re.sub(rf"/{re.escape(TEMPORARY)}[^/]*", "", str(error))) from None
         raise
 
 
