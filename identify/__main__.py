@@ -17,6 +17,10 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.stderr.write("aborted\n")
         raise SystemExit(STOPPED) from None
+    finally:
+        # If Ctrl-C came in code that Python compiled from a string, Python would end itself by the
+        # signal and ignore the exit status. Running another string makes it forget that.
+        exec("")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from identify.progress import SilentProgress
 from identify.runtime import held, honoured, loading, noted, raise_noted
 from identify.studies.runner import run_study
 from tests.identify.commands import command
-from tests.identify.study_rows import DARK, journal, small_study
+from tests.identify.study_rows import DARK, PATIENCE, journal, process, small_study
 
 
 def ctrl_c():
@@ -74,6 +74,19 @@ def test_ctrl_c_that_an_import_swallowed_is_raised_at_the_next_one():
     assert sys.meta_path == before
     with pytest.raises(ModuleNotFoundError):
         import_module("no_such_library")
+
+
+def test_ctrl_c_in_code_from_a_string_does_not_change_the_exit_status(tmp_path):
+    """Python remembers such a Ctrl-C, and ends itself by the signal where it would exit."""
+    (tmp_path / "interrupted.py").write_text(
+        "from identify.commands import app\n"
+        "from identify.__main__ import main\n"
+        "app.main = lambda: exec('raise KeyboardInterrupt')\n"
+        "main()\n"
+    )
+    running = process("interrupted", before=tmp_path)
+    _, error = running.communicate(timeout=PATIENCE)
+    assert (running.returncode, error) == (130, "aborted\n")
 
 
 def test_ctrl_c_in_a_row_is_no_error_of_it_whatever_became_of_it_and_one_that_was_swallowed_begins_no_row(
