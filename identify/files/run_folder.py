@@ -16,7 +16,7 @@ from dynamics.files import read_bytes
 from identify.errors import OutputFolderError, RecordError
 from identify.files.atomic import figure_bytes, write_bytes, write_files
 from identify.files.lock import LOCK, working_in
-from identify.files.seal import check_toml, opened_json, sealed_json
+from identify.files.seal import check_netcdf, check_toml, opened_json, sealed_json
 
 LARGEST_JSON = 100_000_000
 """Largest number of bytes of a result, or of poses at which a robot stood."""
@@ -71,9 +71,16 @@ class RunFolder:
         return self.experiment.is_file() and not self.trajectories.exists()
 
     def require(self, *names: str) -> None:
-        """Raise OutputFolderError if a file of an earlier stage is missing.
+        """Check that files of earlier stages are there, and netCDF files undamaged.
 
-        The message names the first missing file and the stage that writes it.
+        Their digests are compared before a library opens any of them.
+
+        Raises
+        ------
+        OutputFolderError
+            A file is missing. The message names the first one and the stage that writes it.
+        RecordError
+            A netCDF file cannot be read, or does not have the digest that it carries.
         """
         if not self.path.is_dir():
             raise OutputFolderError(
@@ -85,6 +92,8 @@ class RunFolder:
                 raise OutputFolderError(
                     f"{self.path} has no {name}; write it with: cmmsim {stage} --out {self.path}"
                 )
+        for path in (self.path / name for name in names if name.endswith(".nc")):
+            check_netcdf(path)
 
 
 @contextmanager

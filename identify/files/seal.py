@@ -41,6 +41,14 @@ def is_sealed(path: Path | str, content: bytes) -> bool:
     return True
 
 
+def check_netcdf(path: Path) -> None:
+    """Check that a netCDF file carries the right digest or none, without opening it.
+
+    Raises RecordError if the digest is wrong or the file cannot be read.
+    """
+    is_sealed(path, _content(path))
+
+
 def sealed_json(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a JSON file with its digest as the first entry."""
     return {KEY: _of_json(entry), **entry}
@@ -67,10 +75,7 @@ def check_toml(path: Path) -> Path:
 
     Raises RecordError if the digest is wrong or there is no such file.
     """
-    try:
-        first, _, text = path.read_bytes().partition(b"\n")
-    except OSError as error:
-        raise RecordError(f"cannot read {path}: {error.strerror or error}") from None
+    first, _, text = _content(path).partition(b"\n")
     comment = _COMMENT.encode()
     if first.startswith(comment) and first[len(comment) :][:_HEX] != _hex(text):
         raise RecordError(
@@ -81,6 +86,13 @@ def check_toml(path: Path) -> Path:
 
 
 _DIFFERS = "it does not have the digest that it carries"
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RecordError(f"cannot read {path}: {error.strerror or error}") from None
 
 
 def _hex(content: bytes) -> bytes:
