@@ -9,6 +9,7 @@ Experiment
 
 Identification
     identify(record) -> IdentificationResult    `result.table(truth=record.truth)`, `result.robot`
+    diagnose(record, result) -> Diagnosis       causes for which the model misses the record
     setup.unseen_errors(result) -> UnseenErrors model against plant on trajectories it never saw
     unseen_errors(parameters, robot, scenario, seed) -> ndarray   the same for any parameters
 
@@ -35,6 +36,7 @@ from typing import TYPE_CHECKING, Any
 from identify.errors import IdentifyError as IdentifyError
 
 if TYPE_CHECKING:
+    from identify.diagnosis.diagnose import diagnose as diagnose
     from identify.estimation.identification import identify as identify
     from identify.estimation.prior import ScaleAnchor as ScaleAnchor
     from identify.estimation.prior import store_anchor as store_anchor
@@ -62,6 +64,7 @@ _HOME = {
     "store_payload": "identify.record.conditions",
     "IdentificationResult": "identify.estimation.result",
     "identify": "identify.estimation.identification",
+    "diagnose": "identify.diagnosis.diagnose",
     "run_figures": "identify.reporting.pictures",
 }
 

@@ -6,7 +6,7 @@ sees the sensor, the plant's settings or the truth.
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import xarray as xr
 
@@ -85,19 +85,14 @@ def identify(
     """
     progress = progress or SilentProgress()
     began = time.perf_counter()
-    records = [record] if isinstance(record, xr.Dataset) else list(record)
-    if not records:
-        raise EstimationError("no record to identify from")
-    scenario = recorded_scenario(records[0]) if scenario is None else scenario
-    _check_type(scenario, Scenario, "identify.load_scenario")
-    if robot is None:
-        robot = known_geometry(load_robot(scenario.robot), scenario.geometry).robot
-    _check_type(robot, Robot, "dynamics.load_robot")
-    settings = scenario.identification
+    asked = asked_of(record, robot, scenario)
+    records = asked.records
+    side = asked.side
+    robot = side.robot
+    settings = asked.settings
     # the model can close the loop of the servo, and under any other law gets the logged commands
     by_servo = all(recorded_law(record) == SERVO for record in records)
     closed_loop = by_servo and settings.method == "closed_loop"
-    side = model_side(robot, scenario)
 
     def problem_under(law: DriveName) -> OutputErrorProblem:
         return output_error_problem(records, side.with_drive(law), settings)
@@ -147,6 +142,8 @@ def identify(
         expected_noise_ratio=explained.misfit.expected,
         noise_ratio_std=explained.misfit.std,
         whiteness=explained.whiteness,
+        driven_estimate=by_commands.solution.parameters,
+        driven_misfit=explained.driven_misfit,
         seconds={
             "drive": chosen - began,
             "warm_start": warmed - chosen,
@@ -155,6 +152,30 @@ def identify(
         },
         **vars(judgement) | {"warnings": (*told, *drive.warnings(), *judgement.warnings)},
     )
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Records of an identification, and what the estimator knows beside them."""
+
+    records: list[xr.Dataset]
+    side: ModelSide
+    settings: Identification
+
+
+def asked_of(
+    record: xr.Dataset | Sequence[xr.Dataset], robot: Robot | None, scenario: Scenario | None
+) -> Asked:
+    """Return what `identify` is asked with, for the same arguments and with the same errors."""
+    records = [record] if isinstance(record, xr.Dataset) else list(record)
+    if not records:
+        raise EstimationError("no record to identify from")
+    scenario = recorded_scenario(records[0]) if scenario is None else scenario
+    _check_type(scenario, Scenario, "identify.load_scenario")
+    if robot is None:
+        robot = known_geometry(load_robot(scenario.robot), scenario.geometry).robot
+    _check_type(robot, Robot, "dynamics.load_robot")
+    return Asked(records, model_side(robot, scenario), scenario.identification)
 
 
 def _check_type(given: object, kind: type, loader: str) -> None:

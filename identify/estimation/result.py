@@ -79,6 +79,10 @@ class IdentificationResult:
         standard deviation of that.
     whiteness : Whiteness
         Test of the residuals of the model that the logged commands drive.
+    driven_estimate : ndarray, shape (p,)
+        Estimate by that model, which is the final one if it was the last to be searched.
+    driven_misfit : Misfit
+        Its misfit.
     """
 
     layout: ParameterLayout
@@ -109,6 +113,8 @@ class IdentificationResult:
     expected_noise_ratio: float
     noise_ratio_std: float
     whiteness: Whiteness
+    driven_estimate: Array
+    driven_misfit: Misfit
     warnings: tuple[str, ...]
     seconds: dict[str, float]
 
@@ -131,6 +137,12 @@ class IdentificationResult:
     def misfit(self) -> Misfit:
         """Comparison of the residual with what noise alone would leave."""
         return Misfit(self.noise_ratio, self.expected_noise_ratio, self.noise_ratio_std)
+
+    @property
+    def explained(self) -> bool:
+        """True if noise explains all that the model leaves of the record."""
+        missed = self.misfit.significant or self.driven_misfit.significant
+        return not (missed or self.whiteness.suspicious)
 
     def __repr__(self) -> str:
         return (

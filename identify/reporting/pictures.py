@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import RunFolder
 from identify.record.recording import poses
-from identify.reporting.figures import estimates, fit, overview, paths
+from identify.reporting.figures import diagnosis, estimates, fit, overview, paths
 from identify.reporting.figures.style import drawn, moving
 from identify.reporting.run_data import RunData, read_run
 
@@ -63,6 +63,7 @@ def pictures(data: RunData) -> dict[str, Picture]:
         "fit_excitation": Picture(
             lambda: fit.fit_figure(data.excitation_fit), FIT.format("exciting trajectory")
         ),
+        **_of_the_diagnosis(data.result),
         "parameters": Picture(
             lambda: estimates.parameter_figure(names), _parameters_caption(names)
         ),
@@ -90,6 +91,19 @@ CORRELATION = (
     "How the errors of identified parameters go together: the area of a dot is the size of their "
     "correlation, an open one is negative."
 )
+
+
+def _of_the_diagnosis(result: dict[str, Any]) -> dict[str, Picture]:
+    """Show what the causes explain; nothing where noise explains the record."""
+    entry = result.get("diagnosis")
+    if entry is None:
+        return {}
+    text = (
+        "Causes for which the model may miss the record: what of the misfit each alone explains "
+        "beside the parameters (left), and what is left of it as those that were found are fitted "
+        "(right)."
+    )
+    return {"diagnosis": Picture(lambda: diagnosis.diagnosis_figure(entry), text)}
 
 
 def _errors(data: RunData) -> Picture:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from identify.reporting import paper, parameter_tables, tables
+from identify.reporting.diagnosis_text import diagnosis_table, diagnosis_text
 from identify.reporting.number_format import number, spelled
 from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
@@ -92,7 +93,13 @@ def fit_section(data: RunData) -> Section:
         f"{spelled(found['stop_reason'])}."
     )
     table = tables.excitation_error_table(data.result, data.beside_paper)
-    return Section("Fit", (text, *_paper_text(data)), ("fit_excitation",), tables=(table,))
+    causes = diagnosis_table(data.result)
+    return Section(
+        "Fit",
+        (text, *_paper_text(data), *diagnosis_text(data.result)),
+        ("fit_excitation", "diagnosis"),
+        tables=(table, *([causes] if causes.rows else [])),
+    )
 
 
 def parameter_section(data: RunData) -> Section:

@@ -8,6 +8,7 @@ from typing import Any
 import xarray as xr
 
 from dynamics import load_robot
+from identify.diagnosis.diagnose import diagnose
 from identify.estimation import identification
 from identify.files.atomic import write_files
 from identify.files.dataset import covariance_netcdf, netcdf, parameter_units
@@ -28,6 +29,8 @@ from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, digest
 from identify.record.recording import build_model_run, model_groups
 from identify.scenario import Scenario, load_scenario
+from identify.stages.diagnose import ENTRY as DIAGNOSIS
+from identify.stages.diagnose import with_diagnosis
 from identify.stages.plan import check_planned, open_run, record_files, scenario_file
 from identify.validation.unseen import model_on_record
 
@@ -104,6 +107,12 @@ def _identified_files(
     nominal = load_robot(scenario.robot)
     robot = known_geometry(nominal, scenario.geometry, run_folder.path).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
+    diagnosis = None
+    # drives that took torques have no commands whose causes could be asked
+    if result.drive.in_loop and not result.explained:
+        with progress.stage("diagnosis", 1) as advance:
+            diagnosis = diagnose(list(records.values()), result, robot, scenario)
+            advance()
     seen = next(iter(records.values()))
     # The models run with the drive law that was identified.
     side = model_side(robot, scenario).with_drive(result.drive.law)
@@ -126,23 +135,25 @@ def _identified_files(
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     units = parameter_units(result.layout, result.common_errors.names)
     files[run_folder.covariance] = covariance_netcdf(units, covariance)
-    files[run_folder.result] = result_json(
-        {
-            "scenario": scenario.name,
-            "seed": seed,
-            "settings": scenario.estimator_settings(),
-            "date": str(seen.attrs.get("created", ""))[:10] or None,
-            "versions": versions(),
-            ENTRY: made_of,
-            "seconds": {
-                "record": seen.attrs.get("record_seconds"),
-                "identify": ended - began,
-                **seconds,
-            },
-            DRIFT: read_finding(seen),
-            "identification": result.to_dict(),
-            "before": rms_figures(before - measured, ok),
-            "after": rms_figures(after - measured, ok),
+    entries: dict[str, Any] = {
+        "scenario": scenario.name,
+        "seed": seed,
+        "settings": scenario.estimator_settings(),
+        "date": str(seen.attrs.get("created", ""))[:10] or None,
+        "versions": versions(),
+        ENTRY: made_of,
+        "seconds": {
+            "record": seen.attrs.get("record_seconds"),
+            "identify": ended - began,
+            **seconds,
         },
-    )
+        DRIFT: read_finding(seen),
+        "identification": result.to_dict(),
+        "before": rms_figures(before - measured, ok),
+        "after": rms_figures(after - measured, ok),
+        DIAGNOSIS: None,
+    }
+    if diagnosis is not None:
+        entries = with_diagnosis(entries, diagnosis)
+    files[run_folder.result] = result_json(entries)
     return files

@@ -1,0 +1,109 @@
+"""Diagnosis of records: from what was identified of them to the causes that explain the rest."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.diagnosis.catalogue import catalogue
+from identify.diagnosis.cause import Cause
+from identify.diagnosis.diagnosis import Diagnosis, diagnosis_of
+from identify.diagnosis.fit import Point, linearised
+from identify.diagnosis.own_cause import check_columns
+from identify.diagnosis.score import cause_columns
+from identify.diagnosis.selection import Rows, select
+from identify.errors import EstimationError
+from identify.estimation.identification import asked_of, identify, output_error_problem
+from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_search import search_with_common_errors
+from identify.estimation.result import IdentificationResult
+from identify.runtime import one_thread
+from identify.scenario import Scenario
+
+
+def diagnose(
+    record: xr.Dataset | Sequence[xr.Dataset],
+    result: IdentificationResult | None = None,
+    robot: Robot | None = None,
+    scenario: Scenario | None = None,
+    causes: Sequence[Cause] = (),
+) -> Diagnosis:
+    """Name the causes for which the model of a robot misses its records, with their sizes.
+
+    Parameters
+    ----------
+    record : xarray.Dataset or sequence of them
+        One or several records of the same robot.
+    result : IdentificationResult, optional
+        What was identified from them. The default is to identify it.
+    robot : Robot, optional
+        Robot as it is known. The default is the robot of the scenario.
+    scenario : Scenario, optional
+        Settings of the estimator. The default is the scenario that the first record carries.
+    causes : sequence of Cause, optional
+        Causes of one's own, beside those of the catalogue.
+
+    Returns
+    -------
+    Diagnosis
+        Causes by their share of the misfit. A right model is accused of nothing.
+
+    Raises
+    ------
+    RecordError, EstimationError, ScenarioError, dynamics.DynamicsError
+        As `identify.identify`. An EstimationError also tells that a cause of one's own changes no
+        pose, or that the drives took torques.
+
+    Examples
+    --------
+    >>> import identify
+    >>> record = identify.run_experiment(identify.load_scenario("quick", renderer="statistical"))
+    >>> identify.diagnose(record).findings
+    ()
+    """
+    if result is None:
+        result = identify(record, robot, scenario)
+    began = time.perf_counter()
+    asked = asked_of(record, robot, scenario)
+    side = asked.side.with_drive(result.drive.law)
+    problem = output_error_problem(asked.records, side, asked.settings)
+    found = diagnosis_from(problem, result.driven_estimate, causes)
+    return replace(found, seconds=time.perf_counter() - began)
+
+
+@one_thread
+def diagnosis_from(
+    problem: OutputErrorProblem, start: Array, own: Sequence[Cause] = ()
+) -> Diagnosis:
+    """Return the diagnosis of a problem, from parameters (p,) near its optimum.
+
+    The joints are driven by the logged commands, since the residuals of a right model are white
+    only then. own: causes beside those of the catalogue.
+
+    Raises EstimationError for a cause of one's own that has no column and for drives that took
+    torques, and LoopFailure if the model is unstable.
+    """
+    began = time.perf_counter()
+    if any(run.settings.drives.torques for run in problem.runs):
+        raise EstimationError(
+            "the drives took torques: a record is diagnosed only where they took joint commands"
+        )
+    problem, point = _optimum(problem.driven_by_commands(), start)
+    causes = (*catalogue(problem), *own)
+    columns = cause_columns(problem, point.parameters, causes, np.zeros(len(causes)))
+    check_columns(tuple(own), columns[:, len(causes) - len(own) :])
+    found = select(problem, replace(point, columns=columns), causes)
+    rows = Rows.of(problem, point.residual)
+    return diagnosis_of(found, causes, rows, time.perf_counter() - began)
+
+
+def _optimum(problem: OutputErrorProblem, start: Array) -> tuple[OutputErrorProblem, Point]:
+    """Return a problem with the modes of its common errors at its optimum, and the optimum."""
+    found = search_with_common_errors(problem, [start], lambda n=1: None)
+    there = found.linearised()
+    solution = found.solution
+    return there, linearised(there, solution.parameters, solution.at_bound, (), np.zeros(0))

@@ -1,0 +1,238 @@
+"""Diagnosis of a record: the causes that explain what its model leaves, with their sizes."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from identify.diagnosis.cause import Cause
+from identify.diagnosis.selection import Ranked, Rows, Selected, Selection
+from identify.estimation.explanation import Misfit
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_OF_IT = 0.5
+"""Share of the misfit that the causes must explain for it to count as explained."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """Size of a cause with its standard deviation, in its unit."""
+
+    name: str
+    unit: str
+    value: float
+    std: float
+
+    def __str__(self) -> str:
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{self.value:.4g} ± {self.std:.2g}{unit}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Cause, or group of causes, that explains what a model leaves of its record.
+
+    Attributes
+    ----------
+    name : str
+        Name in plain words.
+    sizes : tuple of Size
+        Size of each cause, fitted beside the parameters and all other findings.
+    share : float
+        Share of the misfit that it explains after the findings before it.
+    statistic, freedoms : float, int
+        Score statistic and its degrees of freedom.
+    chance : float
+        Probability that a right model is accused of any cause so strongly.
+    alike : tuple of str
+        Causes that the record cannot tell from this one.
+    remedies : tuple of str
+        Line to type, or sentence of what to measure or mend, for each cause.
+    """
+
+    name: str
+    sizes: tuple[Size, ...]
+    share: float
+    statistic: float
+    freedoms: int
+    chance: float
+    alike: tuple[str, ...]
+    remedies: tuple[str, ...]
+
+    def __str__(self) -> str:
+        sizes = "; ".join(
+            str(one) if len(self.sizes) == 1 else f"{one.name}: {one}" for one in self.sizes
+        )
+        alike = f" (or {', or '.join(self.alike)}: they cannot be told apart)" if self.alike else ""
+        return f"{self.name}{alike}, {sizes}, explains {100 * self.share:.3g} % of the misfit"
+
+
+@dataclass(frozen=True)
+class CandidateRow:
+    """Candidate as it was ranked before any cause was fitted.
+
+    share: of the misfit that it alone explains. value and std: size of a single cause, to first
+    order, with its standard deviation by noise, or None for a group, and where nothing shows it.
+    """
+
+    name: str
+    unit: str
+    share: float
+    statistic: float
+    freedoms: int
+    chance: float
+    value: float | None
+    std: float | None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Causes for which a model misses its record, the one that explains most first.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        Causes that chance does not explain. Empty if the model is accused of nothing.
+    candidates : tuple of CandidateRow
+        All causes and groups that were asked, as they were ranked at first.
+    misfit, left : Misfit
+        Misfit of the model that the logged commands drive, without and with the findings.
+    seconds : float
+        Time that the diagnosis took, s.
+    """
+
+    findings: tuple[Finding, ...]
+    candidates: tuple[CandidateRow, ...]
+    misfit: Misfit
+    left: Misfit
+    seconds: float
+
+    @property
+    def explained(self) -> float:
+        """Share of the misfit that all findings explain together."""
+        return sum(one.share for one in self.findings)
+
+    @property
+    def none_of_these(self) -> bool:
+        """True if the model misses the record, and the findings explain less than half of that."""
+        return self.misfit.significant and self.explained < MOST_OF_IT
+
+    def __str__(self) -> str:
+        asked = f"{len(self.candidates)} causes and groups were asked"
+        if self.none_of_these:
+            best = f"; the most is {self.findings[0]}" if self.findings else ""
+            return f"none of these explains what the model leaves of the record: {asked}{best}"
+        if not self.findings:
+            return f"no cause is accused: {asked}"
+        return "; then ".join(str(one) for one in self.findings)
+
+    def __repr__(self) -> str:
+        return f"<Diagnosis: {self}>"
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return a warning that names the first cause, if there is any."""
+        if not self.findings and not self.none_of_these:
+            return ()
+        if self.none_of_these:
+            return (f"diagnosis: {self}",)
+        first = self.findings[0]
+        return (f"diagnosis: {first}; {first.remedies[0]}",)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the diagnosis for JSON."""
+        return {
+            "says": str(self),
+            "none_of_these": self.none_of_these,
+            "explained": self.explained,
+            "misfit": asdict(self.misfit),
+            "left": asdict(self.left),
+            "findings": [asdict(one) for one in self.findings],
+            "candidates": [asdict(one) for one in self.candidates],
+            "warnings": list(self.warnings()),
+            "seconds": self.seconds,
+        }
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Table of all candidates as they were ranked, with the share that each alone explains."""
+        import pandas as pd
+
+        return pd.DataFrame([asdict(one) for one in self.candidates]).set_index("name")
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<li>{html.escape(str(one))}<br>{html.escape(' '.join(one.remedies))}</li>"
+            for one in self.findings
+        )
+        shown = self.to_dataframe().head(10).to_html(float_format="%.4g")
+        return f"<p>{html.escape(str(self))}</p><ol>{rows}</ol>{shown}"
+
+
+def diagnosis_of(
+    selection: Selection, causes: Sequence[Cause], rows: Rows, seconds: float
+) -> Diagnosis:
+    """Return what a selection among causes says. rows: places of the problem's residuals."""
+    count = len(rows.of_poses(selection.point.residual))
+    excess = count * (selection.before.found - selection.before.expected)
+    gains = sum(one.gain for one in selection.selected)
+    # a misfit that chance can make has no shares; then it is what the causes explain
+    whole = max(excess, gains)
+    sizes = dict(zip(selection.places, _sizes(selection, causes, rows), strict=True))
+    findings = tuple(_finding(one, causes, sizes, whole) for one in selection.selected)
+    candidates = tuple(_row(one, causes, whole) for one in selection.ranking)
+    return Diagnosis(findings, candidates, selection.before, selection.after, seconds)
+
+
+def _sizes(selection: Selection, causes: Sequence[Cause], rows: Rows) -> list[Size]:
+    """Return the fitted sizes, with the spread that noise and what is left of the misfit make."""
+    point = selection.point
+    if not len(point.sizes):
+        return []
+    there = point.score()
+    # what is left of the misfit lasts from frame to frame, and spreads the sizes further
+    model = selection.after.share_of_model * rows.spread(point.residual, there.directions)
+    std = np.sqrt(np.diag(there.covariance(model)))
+    return [
+        Size(causes[place].name, causes[place].unit, float(value), float(err))
+        for place, value, err in zip(selection.places, point.sizes, std, strict=True)
+    ]
+
+
+def _finding(
+    one: Selected, causes: Sequence[Cause], sizes: dict[int, Size], whole: float
+) -> Finding:
+    own = [sizes[place] for place in one.places]
+    # a group of which one member is left is that member
+    name = own[0].name if len(own) == 1 else one.ranked.candidate.name
+    return Finding(
+        name=name,
+        sizes=tuple(own),
+        share=one.gain / whole,
+        statistic=one.ranked.score.statistic,
+        freedoms=one.ranked.score.freedoms,
+        chance=one.ranked.chance,
+        alike=one.alike,
+        remedies=tuple(
+            causes[place].remedy(size.value) for place, size in zip(one.places, own, strict=True)
+        ),
+    )
+
+
+def _row(one: Ranked, causes: Sequence[Cause], whole: float) -> CandidateRow:
+    candidate = one.candidate
+    alone = len(candidate.places) == 1 and one.score.freedoms == 1
+    return CandidateRow(
+        name=candidate.name,
+        unit=causes[candidate.places[0]].unit,
+        share=one.score.statistic / whole if whole > 0 else 0.0,
+        statistic=one.score.statistic,
+        freedoms=one.score.freedoms,
+        chance=one.chance,
+        value=float(one.score.sizes[0]) if alone else None,
+        std=float(np.sqrt(one.score.covariance()[0, 0])) if alone else None,
+    )

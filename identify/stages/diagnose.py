@@ -1,0 +1,54 @@
+"""Stage that names the causes for which the identified model misses its record."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from dynamics import load_robot
+from identify.diagnosis.cause import Cause
+from identify.diagnosis.diagnose import diagnosis_from
+from identify.diagnosis.diagnosis import Diagnosis
+from identify.estimation.identification import output_error_problem
+from identify.files.run_folder import RunFolder, check_entries, load_result, save_result
+from identify.loop_parameters import settled_drive
+from identify.model.from_record import model_side
+from identify.record.known_geometry import known_geometry
+from identify.record.provenance import RECORDS, RunFiles
+from identify.reporting.run_result import parameter_vector
+from identify.scenario import load_scenario
+from identify.stages.plan import record_files
+
+ENTRY = "diagnosis"
+"""Name of the entry of result.json."""
+
+
+def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
+    """Diagnose the identified model of a run folder, and store the diagnosis in result.json.
+
+    Raises RecordError if the result is incomplete or was made of another record, and the errors of
+    `identify.diagnose`.
+    """
+    run_folder = RunFolder(folder)
+    run_folder.require("scenario.toml", "experiment.nc", "result.json")
+    files = RunFiles(run_folder)
+    result = load_result(run_folder.result)
+    check_entries(run_folder.result, result, "identify")
+    files.check_made_of(*RECORDS, result=result)
+    scenario = load_scenario(run_folder.whole_scenario)
+    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, folder).robot
+    identification = result["identification"]
+    side = model_side(robot, scenario).with_drive(settled_drive(identification))
+    records = [files.content(name) for name in record_files(scenario.identification)]
+    problem = output_error_problem(records, side, scenario.identification)
+    found = diagnosis_from(problem, parameter_vector(robot, identification, "estimate"), own)
+    save_result(run_folder.result, with_diagnosis(result, found))
+    return found
+
+
+def with_diagnosis(result: dict[str, Any], found: Diagnosis) -> dict[str, Any]:
+    """Return a result with a diagnosis, and its warning in place of an earlier one's."""
+    identification = result["identification"]
+    earlier = (result.get(ENTRY) or {}).get("warnings", [])
+    kept = [text for text in identification["warnings"] if text not in earlier]
+    warned = identification | {"warnings": [*kept, *found.warnings()]}
+    return result | {"identification": warned, ENTRY: found.to_dict()}

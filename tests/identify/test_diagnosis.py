@@ -1,0 +1,267 @@
+"""Diagnosis: the cause that was put into the plant or the record is named, with its size; a right
+model is accused of nothing.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+import identify
+from dynamics.geometry import RobotGeometry
+from identify.diagnosis.cause import Cause, in_each_run
+from identify.diagnosis.diagnose import diagnosis_from
+from identify.diagnosis.own_cause import own_cause
+from identify.diagnosis.score import Beside, score
+from identify.diagnosis.selection import CHANCE
+from identify.errors import EstimationError
+from identify.files.run_folder import load_result
+from tests.identify import synthetic
+from tests.identify.commands import command, one_line, refusal
+from tests.identify.synthetic import (
+    problem_of,
+    quick,
+    recorded_run_folder,
+    rss6,
+    run_plant,
+    truth,
+)
+
+
+def record_of(seed, monkeypatch=None, plant=None, scenario=None, **given):
+    """A record, of a plant that is changed by a function."""
+    if plant is not None:
+        made = synthetic.build_plant
+        monkeypatch.setattr(synthetic, "build_plant", lambda *own: plant(made(*own)))
+    record = run_plant(scenario or quick(), seed, **given)[0]
+    if plant is not None:
+        monkeypatch.setattr(synthetic, "build_plant", made)
+    return record
+
+
+def diagnosed(record, scenario=None, own=()):
+    """The diagnosis of a record, searched from the true parameters to save time."""
+    return diagnosis_from(problem_of([record], scenario or quick()), truth(), own)
+
+
+def with_zeros(*shifts):
+    """Function that returns a plant whose joints read less by shifts (6,) in rad."""
+
+    def changed(plant):
+        geometry: RobotGeometry = plant.robot.geometry
+        off = geometry.shifted(np.array(shifts)).deviations_from(geometry)
+        return replace(plant, robot=plant.robot.moved(off))
+
+    return changed
+
+
+def zero(monkeypatch):
+    return record_of(2, monkeypatch, with_zeros(0, 3e-4, 0, 0, 0, 0))
+
+
+def scale(monkeypatch):
+    record = record_of(3)
+    record["command"] /= 1.0017
+    return record
+
+
+def late(monkeypatch):
+    return record_of(4, latency_s=6e-3)
+
+
+def drift(monkeypatch):
+    """The clock of the drives falls behind by 1 ms a second."""
+    return record_of(5, latency_s=1e-3 * quick().timing.frame_times(10.0))
+
+
+CASES = {
+    "zero of joint 2": (zero, 3e-4),
+    "scale of the commands": (scale, 1.7e-3),
+    "latency of the commands": (late, 6e-3),
+    "drift of the commands' clock": (drift, 1e-3),
+}
+"""Records whose residual an injected cause doubles, and the true size of the cause."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_cause_that_was_injected_is_named_first_with_its_size(name, monkeypatch):
+    make, true = CASES[name]
+    found = diagnosed(make(monkeypatch))
+    assert found.misfit.found > 1.4
+    assert not found.none_of_these
+    first = found.findings[0]
+    assert first.name == name
+    size = first.sizes[0]
+    assert abs(size.value - true) < 3 * size.std
+    assert first.share > 0.9
+    # once it is fitted, noise explains the rest
+    assert not found.left.significant
+
+
+def test_several_zeros_are_named_as_a_group_with_the_size_of_each(monkeypatch):
+    true = 2e-4 * np.random.default_rng(3).standard_normal(6)
+    found = diagnosed(record_of(6, monkeypatch, with_zeros(*true)))
+    assert found.findings[0].name == "zeros of the joints"
+    sizes = found.findings[0].sizes
+    assert [one.name for one in sizes] == [f"zero of joint {k}" for k in range(1, 7)]
+    off = [(one.value - size) / one.std for one, size in zip(sizes, true, strict=True)]
+    assert np.abs(off).max() < 3
+
+
+def test_of_two_causes_both_are_named(monkeypatch):
+    record = record_of(7, monkeypatch, with_zeros(0, 0, 0, 0, 3e-4, 0))
+    record["command"] /= 1.0017
+    found = diagnosed(record)
+    names = {one.name for one in found.findings}
+    assert names == {"zero of joint 5", "scale of the commands"}
+    assert found.explained == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_right_model_is_accused_of_nothing_but_by_chance():
+    count = 20
+    accused = [seed for seed in range(count) if diagnosed(record_of(100 + seed)).findings]
+    assert len(accused) <= binom.ppf(0.999, count, CHANCE)
+
+
+def test_a_cause_that_is_not_in_the_catalogue_is_called_none_of_these():
+    shaken = record_of(8, bias=lambda frame, pose: 8e-6 * np.sin(1.3 * frame) * np.eye(6)[0])
+    found = diagnosed(shaken)
+    assert found.misfit.significant
+    assert found.none_of_these
+    assert "none of these explains" in found.warnings()[0]
+
+
+def test_the_statistic_is_the_fall_of_the_cost_by_a_fit_of_the_same_columns():
+    rng = np.random.default_rng(0)
+    parameters, causes = rng.standard_normal((80, 7)), rng.standard_normal((80, 3))
+    residual = rng.standard_normal(80)
+    both = np.hstack([parameters, causes])
+    without, fitted = (
+        residual - rows @ np.linalg.lstsq(rows, residual)[0] for rows in (parameters, both)
+    )
+    beside = Beside.of(parameters)
+    found = score(beside.part(causes), beside.part(residual), np.linalg.norm(causes, axis=0))
+    assert found.statistic == pytest.approx(without @ without - fitted @ fitted)
+    assert found.sizes == pytest.approx(-np.linalg.lstsq(both, residual)[0][7:])
+    covariance = np.linalg.inv(both.T @ both)[7:, 7:]
+    assert found.covariance() == pytest.approx(covariance)
+
+
+def test_a_cause_that_the_parameters_take_up_has_no_statistic():
+    rng = np.random.default_rng(1)
+    parameters = rng.standard_normal((50, 4))
+    beside = Beside.of(parameters)
+    column = parameters @ rng.standard_normal((4, 1))
+    residual = beside.part(rng.standard_normal(50))
+    found = score(beside.part(column), residual, np.linalg.norm(column, axis=0))
+    assert (found.statistic, found.freedoms) == (0.0, 0)
+
+
+def bump(run, size):
+    """Joint 3 goes further by a size during the second half of a run."""
+    later = np.arange(len(run.logged)) > len(run.logged) / 2
+    return replace(run, logged=run.logged + size * np.outer(later, np.eye(6)[2]))
+
+
+bump.unit = "rad"
+
+
+def nothing(run, size):
+    return run
+
+
+def no_run(run, size):
+    return size
+
+
+def raising(run, size):
+    raise ValueError("too large")
+
+
+@pytest.fixture
+def allowed(monkeypatch):
+    monkeypatch.setenv("CMMSIM_PLUGINS", __name__)
+    monkeypatch.setitem(__import__("sys").modules, __name__, __import__("sys").modules[__name__])
+
+
+def test_an_own_cause_is_asked_beside_those_of_the_catalogue(allowed):
+    record = record_of(9)
+    half = np.arange(record.sizes["time"]) > record.sizes["time"] / 2
+    record["command"] -= 3e-4 * np.outer(half, np.eye(6)[2])
+    found = diagnosed(record, own=[own_cause(f"{__name__}:bump")])
+    first = found.findings[0]
+    assert first.name == f"{__name__}:bump"
+    assert first.sizes[0].unit == "rad"
+    assert abs(first.sizes[0].value - 3e-4) < 3 * first.sizes[0].std
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("nothing", "changes no pose of the model"),
+        ("no_run", "must return a LoopModel, returned float"),
+        ("raising", "raised ValueError: too large"),
+        ("absent", "is no importable module:name"),
+    ],
+)
+def test_an_own_cause_that_is_no_column_is_refused_in_one_line(name, said, allowed):
+    def asked():
+        diagnosed(synthetic.short_run()[0], synthetic.SHORT, [own_cause(f"{__name__}:{name}")])
+
+    assert said in refusal(EstimationError, asked)
+
+
+def test_an_own_cause_needs_a_step_above_zero(allowed, monkeypatch):
+    monkeypatch.setattr(bump, "step", -1.0, raising=False)
+    assert "step = -1.0" in refusal(EstimationError, own_cause, f"{__name__}:bump")
+
+
+def test_python_takes_causes_of_its_own():
+    record, _ = synthetic.short_run()
+    cause = Cause("bump", "rad", "bump", in_each_run(bump), 1e-4, lambda size: "mend it")
+    result = identify.identify(record, rss6(), synthetic.SHORT)
+    found = identify.diagnose(record, result, rss6(), synthetic.SHORT, causes=[cause])
+    assert "bump" in found.to_dataframe().index
+    assert "bump" in found._repr_html_()
+
+
+@pytest.fixture
+def run_folder(tmp_path, monkeypatch):
+    """A folder as `cmmsim identify` leaves it, of a record with a zero that is off."""
+    scenario = quick(**{"excitation.duration_s": 4.0})
+    plant = with_zeros(0, 5e-4, 0, 0, 0, 0)
+    record = record_of(2, monkeypatch, plant, scenario, duration_s=4.0)
+    synthetic.store_robot(record, rss6())
+    run = synthetic.short_run()[1]
+    folder = recorded_run_folder(tmp_path, scenario, (record, run))
+    assert command("identify", "--out", folder.path, "--quiet") == 0
+    return folder
+
+
+def test_identify_stores_the_diagnosis_and_warns_and_the_command_repeats_it(run_folder, capsys):
+    result = load_result(run_folder.result)
+    entry = result["diagnosis"]
+    assert entry["findings"][0]["name"] == "zero of joint 2"
+    warned = [text for text in result["identification"]["warnings"] if "diagnosis" in text]
+    assert warned == entry["warnings"]
+    assert "zero of joint 2" in warned[0]
+    capsys.readouterr()
+    assert command("diagnose", run_folder.path, "--json", "-") == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["findings"][0]["name"] == "zero of joint 2"
+    stored = load_result(run_folder.result)
+    assert stored["diagnosis"]["findings"][0]["sizes"] == again["findings"][0]["sizes"]
+    assert len(stored["identification"]["warnings"]) == len(result["identification"]["warnings"])
+    assert command("diagnose", run_folder.path) == 0
+    said = capsys.readouterr().out
+    assert "zero of joint 2" in said
+    assert "cmmsim geometry finds all zeros" in said
+
+
+def test_a_folder_without_a_result_is_not_diagnosed(tmp_path, capsys):
+    folder = recorded_run_folder(tmp_path)
+    assert command("diagnose", folder.path) == 1
+    assert "has no result.json; write it with: cmmsim identify" in one_line(capsys.readouterr().err)
