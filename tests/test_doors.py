@@ -75,13 +75,20 @@ def test_every_name_that_identify_offers_is_in_its_help_can_be_had_and_has_a_sig
 
 
 @pytest.mark.parametrize(
-    "start", ["import identify", "import cmmsim", "import identify.__main__", PYTEST]
+    ("start", "heavy"),
+    [
+        ("import identify", HEAVY),
+        ("import cmmsim", HEAVY),
+        ("import identify.__main__", HEAVY),
+        (PYTEST, HEAVY),
+        ("import identify.studies.runner", ["scipy.stats", "matplotlib"]),  # a process of a study
+    ],
 )
-def test_nothing_heavy_is_imported_before_it_is_wanted(start, tmp_path):
+def test_nothing_heavy_is_imported_before_it_is_wanted(start, heavy, tmp_path):
     """Not at the start of pytest either, for who has the package installed and tests something
     else.
     """
-    text = f"import sys; {start}; print([name for name in {HEAVY} if name in sys.modules])"
+    text = f"import sys; {start}; print([name for name in {heavy} if name in sys.modules])"
     assert python("-c", text, cwd=tmp_path, path=[ROOT]).stdout.endswith("[]\n")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from cmmsim.errors import ShapeError
 from cmmsim.geometry.pose import Array
@@ -78,7 +78,7 @@ def interval_of_mean(values: Array) -> Interval:
     if len(values) < 2:
         raise ShapeError("the interval of a mean needs at least two values, got 1")
     half = float(
-        student.ppf(0.5 + 0.5 * LEVEL, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
+        stdtrit(len(values) - 1, 0.5 + 0.5 * LEVEL) * values.std(ddof=1) / np.sqrt(len(values))
     )
     return float(values.mean()) - half, float(values.mean()) + half
 

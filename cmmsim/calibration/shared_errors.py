@@ -24,7 +24,7 @@ views share, such as one bend of the board, stays hidden from any comparison of 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from cmmsim.geometry.pose import Array
 
@@ -70,7 +70,7 @@ def shared_errors(scores: Array, information: Array, sigma2: float) -> SharedErr
     pulls = scores @ whiten / np.sqrt(sigma2)
     freedom = 2.0 * mean**2 / variance
     ratio = float(np.sum(pulls**2)) / mean
-    limit = float(chi2.isf(CHANCE, freedom) / freedom)
+    limit = float(chdtri(freedom, CHANCE) / freedom)
     covariance = (
         sigma2 * whiten @ _enlargement(pulls, ratio) @ whiten.T if ratio > limit else independent
     )

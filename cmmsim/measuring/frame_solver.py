@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from cmmsim.errors import LostError
 from cmmsim.files.rig_and_bodies import MarkedBody
@@ -44,7 +44,7 @@ CHANCE = 1e-4
 EXCESS_CHANCE = 1e-4
 # Largest mean square of the residuals over that of noise.
 LARGEST_EXCESS = 6.0
-LARGEST_MISFIT = float(chi2.isf(CHANCE, 3))
+LARGEST_MISFIT = float(chdtri(3, CHANCE))
 FEWEST = 4
 # Share of a sticker's noise in its residual, below which nothing can be checked.
 SMALLEST_SHARE = 0.01
@@ -203,7 +203,7 @@ def lost_reason(verdict: Array, first: str, left: Array) -> str:
 @lru_cache(maxsize=16)
 def _largest_totals(freedom: int) -> Array:
     """Return sums of squares (freedom + 1,), by their freedom, beyond which they exceed noise."""
-    return np.asarray(chi2.isf(EXCESS_CHANCE, np.maximum(np.arange(freedom + 1), 1)))
+    return np.asarray(chdtri(np.maximum(np.arange(freedom + 1), 1), EXCESS_CHANCE))
 
 
 def no_outlines(rig: StereoRig) -> Outlines:

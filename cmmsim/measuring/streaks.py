@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError
@@ -33,7 +33,7 @@ CHANCE = 1e-4
 # Ellipses in both images together: four stickers.
 FEWEST = 8
 # Largest squared misfit of one ellipse that counts: a partly hidden sticker is no streak.
-LARGEST_MISFIT = float(chi2.isf(CHANCE, 3))
+LARGEST_MISFIT = float(chdtri(3, CHANCE))
 # Most rounds, and a change of d far below what moves a centre or shows in an ellipse.
 ROUNDS = 8
 SETTLED_PX = 0.05
@@ -89,8 +89,7 @@ class _Ellipses:
     def explained(self) -> bool:
         """True if nothing but noise is left in the good ones."""
         return bool(
-            self._squared_misfits[self.good].sum()
-            < chi2.isf(CHANCE, 3 * np.count_nonzero(self.good))
+            self._squared_misfits[self.good].sum() < chdtri(3 * np.count_nonzero(self.good), CHANCE)
         )
 
     @property
@@ -139,7 +138,7 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
         _require_short(still)
         return None
     # Six numbers of a movement must explain more than chance lets them.
-    if still.misfit - found[1].misfit < chi2.isf(CHANCE, 6):
+    if still.misfit - found[1].misfit < chdtri(6, CHANCE):
         return None
     movement, ellipses = found
     if ellipses.longest_px > LONGEST_SMEAR_PX:

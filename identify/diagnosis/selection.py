@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from dynamics import DynamicsError
 from identify.arrays import Array
@@ -191,7 +191,7 @@ def chance_of(found: Score, residual: Array, rows: Rows) -> float:
     spread = np.eye(found.freedoms)
     if share:
         spread = spread + share * rows.spread(left, found.directions)
-    return float(chi2.sf(along @ np.linalg.solve(spread, along), found.freedoms))
+    return float(chdtrc(found.freedoms, along @ np.linalg.solve(spread, along)))
 
 
 def alike(first: Ranked, ranking: Sequence[Ranked], noise: float) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from dynamics.inertia import MOMENTS, SMALLEST, physical_inertias
 from dynamics.parameters import ParameterLayout
@@ -128,7 +128,7 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     return ParameterBounds(layout, matrix, lower, tuple(statements), physical)
 
 
-HALF_WIDTH = float(norm.ppf(0.975))
+HALF_WIDTH = float(ndtri(0.975))
 """Half the width of a 95 % interval, in standard deviations."""
 
 

@@ -27,14 +27,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.output_error import OutputErrorProblem
 from identify.files.dataset import POSE
 
-SIGNIFICANT = float(norm.ppf(0.999))
+SIGNIFICANT = float(ndtri(0.999))
 """Standard deviations above the expected residual from which on the rest is an error of the model.
 """
 
@@ -205,8 +205,8 @@ def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whit
         correlations[:, lag - 1] = np.sum(centred[lag:] * centred[:-lag], axis=0) / power
         # Gaps leave fewer pairs than n - k; their number stands for it in the variance of r_k.
         statistics += (count + 2) * count * correlations[:, lag - 1] ** 2 / max(pairs, 1.0)
-    together = float(chi2.sf(statistics.sum(), lags * len(statistics)))
-    return Whiteness(correlations, np.asarray(chi2.sf(statistics, lags)), together)
+    together = float(chdtrc(lags * len(statistics), statistics.sum()))
+    return Whiteness(correlations, np.asarray(chdtrc(lags, statistics)), together)
 
 
 @dataclass(frozen=True)

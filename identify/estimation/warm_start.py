@@ -24,10 +24,10 @@ a run, lp0 e and li0 integral(e) with the gains of the starting guess, and they 
 """
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import lsq_linear
-from scipy.signal import lfilter
 
 from dynamics.closed_loop import FrameTiming
 from dynamics.closed_loop.command_schedule import acting_times
@@ -269,7 +269,7 @@ def first_order(samples: Array, time_constant: float, rate_hz: float) -> Array:
     # trapezoidal rule
     half = 0.5 / (rate_hz * time_constant)
     rest = samples[:1]
-    return rest + lfilter([half, half], [1 + half, half - 1], samples - rest, axis=0)
+    return rest + scipy.signal.lfilter([half, half], [1 + half, half - 1], samples - rest, axis=0)
 
 
 def running_integral(samples: Array, rate_hz: float) -> Array:

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from identify.arrays import Array
 from identify.errors import StudyError
@@ -64,7 +64,7 @@ def reach(confidence: float, freedom: int) -> float:
 
     scipy's own interval is NaN if the standard deviation is zero.
     """
-    return float(student.ppf(0.5 + 0.5 * confidence, freedom))
+    return float(stdtrit(freedom, 0.5 + 0.5 * confidence))
 
 
 def scale_regression(squares: Array, design: Array) -> ScaleRegression:

@@ -17,10 +17,10 @@ the RMS of the worst axis and run.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dynamics import DynamicsError, load_robot
@@ -46,6 +46,9 @@ from identify.scenario import Timing, load_scenario
 from identify.scenario.plant_sections import AUTO
 from identify.scenario.sections import Identification
 from identify.validation.unseen import model_on_record
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 START = "starting guess"
 
@@ -303,11 +306,13 @@ PANELS = (
 )
 
 
-def estimators_figure(scores: Sequence[Score]) -> Figure:
+def estimators_figure(scores: Sequence[Score]) -> "Figure":
     """Draw the scores on logarithmic axes, one panel a figure of merit.
 
     A figure that does not exist, such as that of an unstable model, has no point.
     """
+    from matplotlib.figure import Figure  # rows of studies compare and draw nothing
+
     figure = Figure(figsize=(14, 1.2 + 0.42 * len(scores)), layout="constrained")
     places = np.arange(len(scores))[::-1]
     for axes, (title, label, field, factor) in zip(

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from identify.arrays import Array
 from identify.reporting.figures.style import (
@@ -215,7 +215,7 @@ def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float
     axes.plot(*centres.T, linestyle="none", marker="+", color=BLUE, label="measured pose")
 
 
-REACH = float(chi2.ppf(COVERED, 2))
+REACH = float(chdtri(2, 1 - COVERED))
 """Squared Mahalanobis distance within which `COVERED` of the poses lie."""
 
 RING = f"holds {100 * COVERED:g} % of true poses"
