@@ -1,29 +1,29 @@
 """Identification of parallel robots from images: experiments, estimation, validation, reports.
 
-The one place where robots (`dynamics`) and the optical sensor (`cmmsim`) meet.
+This package combines robots (`dynamics`) with the optical sensor (`cmmsim`).
 
 Experiment
     load_scenario(name_or_path, **entries) -> Scenario   built in (`scenario_names()`), or a file
     set_up(scenario, seed) -> Setup             robot, plant, sensor; `setup.run()` makes a record
-    run_experiment(scenario, seed) -> Dataset   both in one call; `record.truth` is its truth
+    run_experiment(scenario, seed) -> Dataset   both in one call; `record.truth` is the truth
 
 Identification
     identify(record) -> IdentificationResult    `result.table(truth=record.truth)`, `result.robot`
     diagnose(record, result) -> Diagnosis       causes for which the model misses the record
-    setup.unseen_errors(result) -> UnseenErrors model against plant on trajectories it never saw
+    setup.unseen_errors(result) -> UnseenErrors model against plant on validation trajectories
     unseen_errors(parameters, robot, scenario, seed) -> ndarray   the same for any parameters
 
 Studies
-    Study(scenario, vary={...}, repeats=N)      `study.run()` is a table with a row for each
+    Study(scenario, vary={...}, repeats=N)      `study.run()` is a table with a row per experiment
 
 A record of your own
     build_record(*, time, ...) -> Dataset       from arrays over the frames
-    store_anchor(record, anchor)                what fixes the scale: ScaleAnchor(name, value, std)
+    store_anchor(record, anchor)                scale anchor: ScaleAnchor(name, value, std)
     store_payload(record, payload, std)         a known load: payload_vector(mass_kg, inertia_kg_m2)
 
 Pictures
-    run_figures(folder) -> dict                 figures of a finished run, for print, by their names
-    identify.scene                              room that draws robot, cameras, images and replays
+    run_figures(folder) -> dict                 figures of a finished run, for print, by name
+    identify.scene                              package that draws robot, cameras and replays
 
 Every error that a user can cause is an IdentifyError, a `cmmsim.CmmError` or a
 `dynamics.DynamicsError`. Names are imported on first use: CasADi and OpenGL take seconds to load,
@@ -70,7 +70,7 @@ _HOME = {
 
 __all__ = ["IdentifyError", *_HOME]
 
-if not TYPE_CHECKING:  # a type checker would take every name for one that this knows
+if not TYPE_CHECKING:  # with __getattr__, a type checker would accept every name
 
     def __getattr__(name: str) -> Any:
         if name not in _HOME:

@@ -1,6 +1,4 @@
-"""The command ``cmmsim`` from its first line on: Ctrl-C ends it in one line, also while the
-libraries are loaded.
-"""
+"""Entry point of the command ``cmmsim``. It handles Ctrl-C even while the libraries are loaded."""
 
 import sys
 
@@ -8,7 +6,7 @@ from identify.runtime import STOPPED, honoured, loading
 
 
 def main() -> None:
-    """Run the command; exit status and one line on standard error where Ctrl-C ends it."""
+    """Run the command. After Ctrl-C, print one line and exit with the status STOPPED."""
     try:
         with honoured():
             with loading():

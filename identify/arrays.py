@@ -10,15 +10,15 @@ Array = NDArray[np.float64]
 BLOCK = 600
 """Number of rows that are factored at once.
 
-With as many columns as there are parameters, a block fits into a processor's cache.
+A block with one column per parameter fits into the cache of a processor.
 """
 
 
 def triangular_factor(*parts: Array) -> Array:
     """Return the triangular factor R of the QR factorisation of a tall matrix (n, p).
 
-    The columns are given in one or more parts (n, q) or (n,) side by side. The signs of its rows
-    are arbitrary. Factoring block by block takes half the time of a factorisation at once.
+    The columns are given in one or more parts (n, q) or (n,) side by side. The signs of the rows of
+    R are arbitrary. Factoring block by block takes half the time of a single factorisation.
 
     References
     ----------
@@ -37,11 +37,11 @@ def triangular_factor(*parts: Array) -> Array:
 def agreed(values: ArrayLike, bits: int = 27) -> Array:
     """Round an array to `bits` bits of its largest entry, on which all processors agree.
 
-    The default keeps a relative resolution of some 1e-8. Kernels of BLAS and vectorised sines
-    differ in the last bits from one processor to another. A search that begins with numbers on a
-    grid takes the same steps on all of them. The spacing is a power of two, so that rounding is
-    exact. A number whose last bits differ across the edge between two grid points is rounded apart.
-    With fewer bits than the number is exact to, that hardly ever happens.
+    The default has a relative resolution of about 1e-8. Kernels of BLAS and vectorised sines differ
+    in the last bits from processor to processor. A search that begins with rounded numbers takes
+    the same steps on all processors. The spacing of the grid is a power of two, so that rounding is
+    exact. Two processors disagree only if their values lie on both sides of the middle between two
+    grid points. This is very rare if the grid is much coarser than the differences.
 
     Examples
     --------
@@ -53,4 +53,4 @@ def agreed(values: ArrayLike, bits: int = 27) -> Array:
     if largest == 0.0 or not np.isfinite(largest):
         return array
     grid = 2.0 ** (round(math.log2(largest)) - bits)
-    return np.asarray(np.rint(array / grid) * grid + 0.0)  # no zero is negative
+    return np.asarray(np.rint(array / grid) * grid + 0.0)  # + 0.0 removes negative zeros

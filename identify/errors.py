@@ -1,4 +1,4 @@
-"""Errors that a user can cause or meet, with the value, the limit and the valid names."""
+"""Errors that a user can cause or meet. Messages have the value, the limit and the valid names."""
 
 LONGEST = 4000
 """Largest number of characters of a message."""
@@ -10,7 +10,7 @@ class IdentifyError(Exception):
     def __str__(self) -> str:
         """Return the message on one line of at most `LONGEST` characters.
 
-        A file's content can be part of it.
+        The limit is needed because a message can quote the content of a file.
         """
         text = " ".join(super().__str__().splitlines())
         return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
@@ -25,7 +25,7 @@ class TrajectoryError(IdentifyError):
 
 
 class FilterError(IdentifyError):
-    """A filter that the sampling rate or the length of the record does not allow."""
+    """A filter that does not fit the sampling rate or the length of the record."""
 
 
 class RecordError(IdentifyError):
@@ -33,11 +33,11 @@ class RecordError(IdentifyError):
 
 
 class OutputFolderError(IdentifyError):
-    """A run folder that already holds something, or lacks what an earlier stage writes."""
+    """A run folder that already holds other files, or lacks a file of an earlier stage."""
 
 
 class WriteError(IdentifyError):
-    """A file or folder that cannot be written: no room, no permission, or no such place."""
+    """A file or folder that cannot be written: disk full, no permission, or no such path."""
 
 
 class EstimationError(IdentifyError):
@@ -45,7 +45,7 @@ class EstimationError(IdentifyError):
 
 
 class VerificationError(IdentifyError):
-    """A model that differs from an independent engine by more than the goal."""
+    """A result beyond its limit, such as a difference from an independent engine."""
 
 
 class StudyError(IdentifyError):
@@ -53,4 +53,4 @@ class StudyError(IdentifyError):
 
 
 class StudyInterrupted(StudyError):
-    """A study that its user stopped. Its finished part is kept."""
+    """A study that its user stopped. Its finished rows are stored."""

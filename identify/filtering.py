@@ -1,8 +1,8 @@
 """Zero-phase Butterworth filter (section 4.2), derivatives of sampled signals, and filling of gaps.
 
-Forward and reverse filtering squares the magnitude. ``order`` is that of one pass, as in Matlab's
-filtfilt, so the gain at the cutoff is 1/2. Parts of SciPy are loaded on first use, because every
-command reads a scenario, which asks here only for the padding.
+Forward and reverse filtering squares the magnitude. ``order`` is the order of one pass, as in
+Matlab's filtfilt, so the gain at the cutoff is 1/2. Modules of SciPy are loaded on first use,
+because every command reads a scenario, which uses only `padding_samples`.
 """
 
 import numpy as np
@@ -71,9 +71,9 @@ def zero_phase_filter(
 def padding_samples(rate_hz: float, cutoff_hz: float, order: int) -> int:
     """Return the number of samples by which a record is extended at both ends.
 
-    They cover three time constants of the filter's slowest pole.
+    The extension covers three time constants of the filter's slowest pole.
     """
-    # Butterworth poles lie on a circle; the slowest is nearest to the imaginary axis.
+    # Butterworth poles lie on a circle. The slowest pole is nearest to the imaginary axis.
     slowest_decay = 2 * np.pi * cutoff_hz / rate_hz * np.sin(np.pi / (2 * order))
     return int(max(3 * (order + 1), np.ceil(3 / slowest_decay)))
 
@@ -84,7 +84,7 @@ def filtered_derivatives(
     """Return filtered samples (N, ...) with their first and second time derivatives.
 
     A quintic spline interpolates the filtered samples and is then differentiated. The derivatives
-    are less exact towards both ends, so leave the first and last few samples out of a fit.
+    are less accurate towards both ends, so a fit should omit the first and last few samples.
 
     Raises
     ------

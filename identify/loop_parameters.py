@@ -19,7 +19,7 @@ from identify.scenario.plant_sections import FILTERED, Control, Servo
 from identify.scenario.section import ACTUATOR_KEYS, Section
 
 NOMINAL = "initial"
-"""Parameter set that is used if none is named."""
+"""Default parameter set."""
 
 
 def loop_settings(
@@ -27,10 +27,10 @@ def loop_settings(
 ) -> LoopSettings:
     """Return the settings of the loop around the plant or the model.
 
-    The latency is the mean one. Friction law, drive law and integration steps are those of the
-    plant or the model, and only the torque limit is taken from `control`.
+    The latency is the mean latency. Friction law, drive law and integration steps come from `side`,
+    the plant or the model. Only the torque limit comes from `control`.
 
-    Raises ScenarioError if only the constant of sliding actuators is set and the robot's actuators
+    Raises ScenarioError if only the key for sliding actuators is set but the robot's actuators
     turn, or the reverse.
     """
     smoothing = of_actuators(robot, side, "smoothing_velocity")
@@ -52,7 +52,7 @@ def drives_of(side: Plant | Model, torque_limit: float | None) -> Drives:
 
 
 def settled_drive(identification: Any) -> DriveName:
-    """Return the drive law of an identification entry of a result; PID if it has none.
+    """Return the drive law of an identification entry of a result, by default PID.
 
     Raises RecordError for an unknown law.
     """
@@ -69,15 +69,15 @@ def check_parameter_set(robot: Robot, set_name: str) -> None:
         valid = ", ".join(sorted(robot.parameter_sets))
         raise ScenarioError(
             f"robot {robot.name} has no parameter set {set_name!r}; it has {valid} "
-            "(plant.parameters names the truth, model.start_parameters what identification starts "
-            "from)"
+            "(plant.parameters names the truth, model.start_parameters the initial guess)"
         )
 
 
 def of_actuators(robot: Robot, section: Section, name: str) -> Any:
-    """Return the value of a setting whose key depends on the kind of actuators, turning or sliding.
+    """Return the value of a setting with one key for turning and one for sliding actuators.
 
-    Raises ScenarioError, naming both keys, if only the other kind's is set.
+    Raises ScenarioError if only the key for the other kind of actuators is set. The message names
+    both keys.
     """
     turning, sliding = ACTUATOR_KEYS[name]
     own, other = (sliding, turning) if robot.layout.prismatic else (turning, sliding)
@@ -87,8 +87,8 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
         and getattr(section, other) is not None
     ):
         raise ScenarioError(
-            f"{type(section).__name__.lower()}.{other} = {getattr(section, other):g} is of "
-            f"actuators that {'turn' if robot.layout.prismatic else 'slide'}; those of "
+            f"{type(section).__name__.lower()}.{other} = {getattr(section, other):g} is for "
+            f"actuators that {'turn' if robot.layout.prismatic else 'slide'}; the actuators of "
             f"{robot.name} {'slide' if robot.layout.prismatic else 'turn'}: set {own}"
         )
     return getattr(section, own)
@@ -96,17 +96,18 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
 
 @dataclass(frozen=True)
 class ParameterChoice:
-    """Dynamic parameters (p,) [SI] and, in words, their source."""
+    """Dynamic parameters (p,) [SI], and a text that names their source."""
 
     values: Array
     source: str
 
 
 def choose_parameters(robot: Robot, choice: str | None = None) -> ParameterChoice:
-    """Return the parameters of a named set or of a result file; by default the nominal set.
+    """Return the parameters of a named set or of a result file, by default the nominal set.
 
     Raises ScenarioError, with the valid names, if there is neither such a set nor such a file.
-    Raises RecordError if a result file lacks estimates, or if one is not a number in its range.
+    Raises RecordError if a result file lacks estimates, or if an estimate is not a number in its
+    range.
     """
     name = NOMINAL if choice is None else choice
     if name in robot.parameter_sets:

@@ -1,8 +1,8 @@
-"""Parts that can be chosen by name: built-in ones, and a user's own as ``module:function``.
+"""Parts that can be chosen by name: built-in parts, and a user's own part as ``module:function``.
 
-To build one in, write it in a file of its own and name it here as ``module:function``. Nothing is
-imported before it is chosen, so every room can look here. A user's own part runs only if its module
-is allowed, see `cmmsim.allowed_plugins`.
+To build in a part, write it in a file of its own and add its ``module:function`` here. A part is
+imported only when it is chosen, so every package can import this module. A user's own part runs
+only if its module is allowed, see `cmmsim.allowed_plugins`.
 """
 
 import importlib
@@ -63,16 +63,16 @@ def check_choice(
     built_in : mapping
         Built-in parts by name.
     error : type, optional
-        Exception that is raised, with the valid names.
+        Exception to be raised. Its message has the valid names.
     """
     if given not in built_in and not is_own(given):
         raise error(f"unknown {what} {given!r}; valid: {', '.join(built_in)}, or module:function")
 
 
 def chosen(given: str, what: str, built_in: Mapping[str, str]) -> Callable[..., Any]:
-    """Return the built-in part of a name, or a user's own.
+    """Return the built-in part of a name, or a user's own part.
 
-    The arguments are those of `check_choice`. Raises ScenarioError if there is no such part.
+    For the arguments see `check_choice`. Raises ScenarioError if there is no such part.
     """
     check_choice(given, what, built_in)
     if given not in built_in:
@@ -91,13 +91,13 @@ def own_function(name: str, what: str, error: type[IdentifyError]) -> Callable[.
     what : str
         Noun for the error message, such as "kind" or "estimator".
     error : type
-        Exception that is raised.
+        Exception to be raised.
 
     Raises
     ------
     error
-        The module is not allowed to run (the message says what to type), the module or the
-        function does not exist, or what is named cannot be called.
+        The module is not allowed to run (the message states how to allow it), the module or the
+        function does not exist, or the named object is not a function.
     """
     try:
         function = own_part(what, name)

@@ -1,4 +1,4 @@
-"""The stages of a run, each reading what the one before wrote into the run folder."""
+"""Stages of a run. Each stage reads files that earlier stages wrote into the run folder."""
 
 import time
 from collections.abc import Mapping
@@ -22,10 +22,11 @@ __all__ = ["excite", "identify", "identify_own", "is_begun", "record", "report",
 def run(
     scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None
 ) -> None:
-    """All stages: excite, record, identify, validate, report; those that are done are left out.
+    """Run all stages that are not finished: excite, record, identify, validate, report.
 
-    What cannot work is refused before any file. A folder in which the same run was begun keeps what
-    is there, and the run goes on; the numbers are those of a run at once.
+    Settings that cannot work are refused before any file is written. If the folder holds the
+    beginning of the same run, the run is continued. Its results equal those of an uninterrupted
+    run.
     """
     began = time.perf_counter()
     run_folder = RunFolder(folder)
@@ -51,10 +52,10 @@ def record(
     workers: int | None = None,
     setup: Setup | None = None,
 ) -> cmmsim.Taught:
-    """Run the plant on the exciting trajectory; writes experiment.nc, and payload.nc where the
-    scale anchor is a payload. Returns what the sensor was taught.
+    """Run the plant on the exciting trajectory, and return the taught frames of the sensor.
 
-    setup: that of the run where it is at hand, its sensor taught.
+    Writes experiment.nc, and payload.nc if the scale anchor is a payload. setup: setup of the run
+    with a taught sensor, if there is one already.
     """
     run_folder, opened, trajectories = open_run(folder, progress)
     began = time.perf_counter()
@@ -85,18 +86,19 @@ def report(
     run_began: float | None = None,
     seconds: Mapping[str, float] | None = None,
 ) -> None:
-    """Draw the figures, and write report.html with them, and result.json with the seconds.
+    """Draw the figures, and write report.html, and result.json with the duration of all stages.
 
-    run_began: when a whole run began. seconds: further ones of it.
+    run_began: time at which a whole run began, from `time.perf_counter`. seconds: durations of
+    earlier stages.
     """
     from identify.reporting.report import (
         write_report,
-    )  # imports Matplotlib, for which no other stage waits
+    )  # imports Matplotlib, which the other stages do not need
 
     began = time.perf_counter()
     path = RunFolder(folder).result
 
-    # A run with a report is finished, so that its last result must not come after the report.
+    # A report marks a finished run, so result.json must not be written after the report.
     def timed_result() -> dict[Path, bytes]:
         result = load_result(path)
         now = time.perf_counter()

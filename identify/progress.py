@@ -43,13 +43,13 @@ class SilentProgress:
 
 
 LINE_S = 60.0
-"""Interval between the lines of a stage when the output is no terminal, seconds."""
+"""Interval between the lines of a stage if the output is not a terminal, seconds."""
 
 
 class RichProgress:
     """Progress as bars with elapsed and remaining time.
 
-    When the output is no terminal, a stage prints a plain line once a minute and at its end.
+    If the output is not a terminal, a stage prints a plain line once per minute and at its end.
     """
 
     def __init__(self, console: Console | None = None, rate: str = "") -> None:
@@ -106,12 +106,12 @@ class RichProgress:
 
 
 def terminal_progress(quiet: bool, rate: str = "") -> Progress:
-    """Return a command's progress: bars with a `rate` in that unit, or nothing if quiet."""
+    """Return the progress of a command: bars with a rate in the unit `rate`, silent if quiet."""
     return SilentProgress() if quiet else RichProgress(rate=rate)
 
 
 class _RateColumn(ProgressColumn):
-    """Column with the number of steps a second."""
+    """Column with the number of steps per second."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
@@ -124,7 +124,7 @@ class _RateColumn(ProgressColumn):
 
 
 def print_warnings(warnings: Iterable[str]) -> None:
-    """Print each warning as one line on standard error, also when the command is quiet."""
+    """Print each warning as one line on standard error, even if the command is quiet."""
     for warning in warnings:
         typer.echo(f"warning: {' '.join(warning.split())}", err=True)
 
@@ -143,9 +143,9 @@ def print_table(
     header : sequence of str
         Names of the columns.
     rows : iterable of sequences of str
-        Cells, shown as they are: brackets, such as those of a unit, are not markup.
+        Cells. Square brackets, for example of a unit, are printed and not read as markup.
     words : collection of str
-        Names of the columns that are flush left, because they hold words. Numbers are flush right.
+        Names of the columns that hold words and are aligned left. Other columns are aligned right.
     title, note : str, optional
         Lines above and below the table.
     """

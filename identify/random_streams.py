@@ -1,23 +1,23 @@
-"""Numbers of all random streams of this package, so that no two of one seed are the same.
+"""Numbers of all random streams of this package. They make the streams of a seed independent.
 
 Streams of an experiment are children of its seed, `SeedSequence(seed, spawn_key=(stream, ...))`.
-What is drawn once a run has the number of the run behind its own. The search of a trajectory and
-the teaching share a number without sharing a draw: the search draws from the child itself, the
+Streams of a single run append the number of the run. The search of a trajectory and the teaching
+have the same number but no common random numbers: the search draws from the child itself, and the
 sensor from a seed that the child generates.
 
-Streams beside an experiment mix their number into the seed, `SeedSequence([seed, stream])`, or are
-the same for every seed. Their numbers may equal those of children, as 5 does, because a mixed seed
-and a child are different sequences.
+Streams outside an experiment mix their number into the seed, `SeedSequence([seed, stream])`, or are
+the same for every seed. A number such as 5 can be used for both purposes, because a mixed seed and
+a child are different sequences.
 
-Each kind of row of a study numbers the children of the row's sequence itself, and `cmmsim` numbers
-those of a sensor's seed.
+Each kind of row of a study numbers the children of the row's sequence in its own module. `cmmsim`
+numbers the children of a sensor's seed.
 """
 
 import numpy as np
 
 # Children of the seed of an experiment.
 EXCITATION = 0  # candidates of the exciting trajectory
-UNSEEN = 1  # unseen trajectories
+UNSEEN = 1  # validation trajectories
 SEARCH = 2  # search from the candidates
 TEACHING = 2  # teaching of the sensor
 ANCHOR = 3  # error of the quantity that fixes the scale
@@ -26,14 +26,14 @@ LOAD = 8  # true load
 CALIBRATION = 9  # calibration of the cameras, as the estimator knows it
 MEAN_LATENCY = 10  # true mean latency
 STATIC_POSES = 14  # candidate poses of a kinematic calibration
-UNSEEN_POSES = 15  # its unseen poses
+UNSEEN_POSES = 15  # validation poses of a kinematic calibration
 ENCODER_OFFSETS = 16  # offsets of the encoders
 ENCODERS = 17  # readings of the encoders
 STATIC_NOISE = 18  # noise of the measured static poses
-TRUE_GEOMETRY = 19  # true geometry, about one that was calibrated before
+TRUE_GEOMETRY = 19  # true geometry, drawn about a calibrated geometry
 EXPOSURES = 25  # true delay of the right camera's exposure
 
-# Children of the same seed, which experiments follow by the number of the run.
+# Children of the same seed. The number of the run is appended.
 NOISE = 4  # noise of the sensor
 LATENCY = 5  # latency of the frames
 PREDICTION = 6  # noise of the predicted poses
@@ -49,14 +49,14 @@ RESAMPLING = 301  # with a sensor's seed: resampled frames of the moving bar
 
 
 def child(seed: int | np.random.SeedSequence, *stream: int) -> np.random.SeedSequence:
-    """Return the sequence of a stream, independent of all others of the seed.
+    """Return the sequence of a stream, independent of all other streams of the seed.
 
     Parameters
     ----------
     seed : int or numpy.random.SeedSequence
-        Seed of an experiment, or sequence of a study's row, which is not changed.
+        Seed of an experiment, or sequence of a study's row. The sequence is not changed.
     *stream : int
-        Number of the stream, and further numbers such as that of the run.
+        Number of the stream, and further numbers such as the number of the run.
 
     Returns
     -------
@@ -91,5 +91,5 @@ def integer_seed(seed: int | np.random.SeedSequence) -> int:
 
 
 def mixed_generator(stream: int, *seed: int) -> np.random.Generator:
-    """Return the generator of a stream beside an experiment, for one seed or the same for all."""
+    """Return the generator of a stream outside an experiment, with or without a seed."""
     return np.random.default_rng([*seed, stream])

@@ -1,4 +1,4 @@
-"""Cores of the machine, and a Ctrl-C that is neither lost nor leaves work half done."""
+"""Number of cores and threads, and reliable handling of Ctrl-C."""
 
 import os
 import signal
@@ -15,7 +15,7 @@ from threadpoolctl import OpenBLASController, register, threadpool_limits
 
 
 class _CasadiBlas(OpenBLASController):
-    """BLAS that CasADi brings for IPOPT. Its name is one that threadpoolctl does not look for."""
+    """BLAS library that CasADi ships for IPOPT. threadpoolctl does not know its file name."""
 
     filename_prefixes = ("libcasadi-tp-openblas",)
 
@@ -28,19 +28,19 @@ _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 def one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function so that every BLAS loaded by now uses one thread.
+    """Decorate a function so that every loaded BLAS library uses one thread.
 
-    A second thread slows the many small matrices of a search down: by a fifth on free cores, by
-    half on busy ones. With one thread, rounding depends neither on the cores nor on the
-    environment.
+    A second thread makes the many small matrix products of a search slower, by a fifth on idle
+    cores and by half on busy cores. With one thread, rounding does not depend on the number of
+    cores or on the environment.
     """
     return cast(Callable[P, R], _one_thread(function))
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use.
+    """Return the number of cores that this process is allowed to use.
 
-    Only Linux tells it. On other systems it is the number of cores of the machine.
+    Systems other than Linux do not report this. There it is the number of cores of the machine.
     """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -50,10 +50,10 @@ STOPPED = 130
 
 
 class Noting:
-    """Handler of Ctrl-C that raises KeyboardInterrupt and remembers that it came.
+    """Handler of Ctrl-C that raises KeyboardInterrupt and records that Ctrl-C came.
 
-    It must remember, because an import may swallow the exception or turn it into another error. So
-    may CasADi where it turns a matrix into an array.
+    The record is needed because an import, or CasADi during the conversion of a matrix to an array,
+    can swallow the exception or turn it into another error.
     """
 
     def __init__(self) -> None:
@@ -67,9 +67,9 @@ class Noting:
 
 @contextmanager
 def noted() -> Iterator[Noting]:
-    """Note Ctrl-C while the block runs, for `raise_noted`.
+    """Record Ctrl-C while the block runs, for `raise_noted`.
 
-    A block inside another uses the handler of the outer one, so both know of it.
+    A nested block uses the handler of the outer block, so Ctrl-C is recorded in both.
     """
     old = signal.getsignal(signal.SIGINT)
     noting = old if isinstance(old, Noting) else Noting()
@@ -86,7 +86,7 @@ def noted() -> Iterator[Noting]:
 def raise_noted() -> None:
     """Raise KeyboardInterrupt again if Ctrl-C came since the `noted` block began.
 
-    Call it before long work begins.
+    It is called before long work begins.
     """
     handler = signal.getsignal(signal.SIGINT)
     if isinstance(handler, Noting) and handler.came:
@@ -95,11 +95,11 @@ def raise_noted() -> None:
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Raise KeyboardInterrupt at each import of the block once Ctrl-C came in a `noted` block.
+    """After Ctrl-C in a `noted` block, raise KeyboardInterrupt at each import in this block.
 
-    Libraries swallow the exception while they look for optional ones. All the others would then be
-    loaded before the command ends, which takes a minute on a busy machine. Clean-up that imports
-    does not belong in the block.
+    Libraries that look for optional libraries can swallow the exception. All further libraries
+    would then be loaded before the command ends, which takes a minute on a busy machine. Clean-up
+    code with imports does not belong in the block.
     """
     reminder = _Reminder()
     sys.meta_path.insert(0, reminder)
@@ -110,7 +110,7 @@ def loading() -> Iterator[None]:
 
 
 class _Reminder:
-    """Finder of modules that finds none and reminds of Ctrl-C."""
+    """Module finder that finds no modules, and raises KeyboardInterrupt after Ctrl-C."""
 
     def find_spec(self, *_: object) -> None:
         raise_noted()
@@ -118,9 +118,10 @@ class _Reminder:
 
 @contextmanager
 def honoured() -> Iterator[None]:
-    """Leave the block with KeyboardInterrupt after Ctrl-C, even if foreign code swallowed it.
+    """After Ctrl-C, leave the block with KeyboardInterrupt.
 
-    Foreign code may also have turned it into another error.
+    This holds even if code of a library has swallowed the exception or turned it into another
+    error.
     """
     with noted() as noting:
         try:
@@ -149,16 +150,16 @@ def held() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, old)
-        if came:  # the handler from before the block gets it now
+        if came:  # now for the handler from before the block
             signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager
 def deaf_offspring() -> Iterator[None]:
-    """Hide Ctrl-C from the threads and processes that start in the block, and from their own.
+    """Block Ctrl-C in the threads and processes that start in the block, and in their children.
 
-    Ctrl-C is for the main process, which ends them. Windows has no such signal mask, and there the
-    block changes nothing.
+    Only the main process handles Ctrl-C, and ends the others. Windows has no such signal mask, and
+    there the block has no effect.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -171,9 +172,9 @@ def deaf_offspring() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """End this process when its parent is gone, even in the middle of work.
+    """End this process when its parent has ended, even in the middle of work.
 
-    Without this, a process of `multiprocessing` would wait or compute without end.
+    Without this, a process of `multiprocessing` would wait or compute forever.
     """
     threading.Thread(target=_end_after, args=(parent_process(),), daemon=True).start()
 
@@ -181,14 +182,14 @@ def end_with_parent() -> None:
 def _end_after(parent: BaseProcess | None) -> None:
     if parent is not None:
         parent.join()
-        os._exit(1)  # sys.exit would end this thread alone
+        os._exit(1)  # sys.exit would end only this thread
 
 
 def _is_ours() -> bool:
-    """Tell whether Ctrl-C may be handled here.
+    """Return whether this thread can handle Ctrl-C.
 
-    It may in the main thread, unless something has turned it off, as nohup does, and the shell of a
-    script for a command in the background.
+    Only the main thread can. The signal can also be turned off, for example by nohup, or by the
+    shell for a background command of a script.
     """
     in_main = threading.current_thread() is threading.main_thread()
     return in_main and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None)
@@ -197,10 +198,10 @@ def _is_ours() -> bool:
 def stoppable(command: Callable[P, None]) -> Callable[P, None]:
     """Decorate a command so that Ctrl-C ends it with one line and the exit status `STOPPED`.
 
-    A command that reports Ctrl-C itself, by typer.Exit, is left alone.
+    A command that reports Ctrl-C itself, by typer.Exit, is not changed.
     """
 
-    import typer  # late: Ctrl-C while it is loaded is to be heard by `honoured`
+    import typer  # late, so that Ctrl-C during this import is handled by `honoured`
 
     @wraps(command)
     def run(*arguments: P.args, **options: P.kwargs) -> None:
@@ -210,11 +211,12 @@ def stoppable(command: Callable[P, None]) -> Callable[P, None]:
             except typer.Exit:
                 raise
             except (KeyboardInterrupt, Exception) as error:
-                # An error after Ctrl-C is most likely what foreign code made of it.
+                # An error after Ctrl-C is most likely KeyboardInterrupt, converted by a library.
                 if isinstance(error, Exception) and not interrupt.came:
                     raise
                 typer.echo(
-                    "stopped: what is done is kept; the same command goes on from there", err=True
+                    "stopped: finished work is stored; the same command continues from there",
+                    err=True,
                 )
                 raise typer.Exit(STOPPED) from None
 

@@ -1,6 +1,6 @@
 """JSON schemas of all files that a user writes, for editors.
 
-`python -m identify.schemas` writes them anew.
+`python -m identify.schemas` updates the schema files.
 """
 
 import json
@@ -24,7 +24,7 @@ SCHEMAS: dict[Path, Callable[[], dict[str, Any]]] = {
     ROOT / "identify/studies/built_in/study.schema.json": study_schema,
     ROOT / "identify/record/record.schema.json": record_schema,
 }
-"""File of each schema, and the function that makes it from the models that read such files."""
+"""File of each schema, and the function that makes the schema from the models of such files."""
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""From a scenario and a seed to the robot, its plant and its sensor, and to what they do together.
+"""Setup of an experiment from a scenario and a seed: robot, plant, sensor, and their runs.
 
-The set-up is made once. It runs the experiment as often as one likes, and judges what was
-identified from the record.
+A setup is made once. It can run the experiment repeatedly, and validate the identified model.
 """
 
 from __future__ import annotations
@@ -54,16 +53,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnseenErrors:
-    """Errors of a model on trajectories that it never saw.
+    """Errors of a model on the validation trajectories.
 
-    poses (runs, N, 6): pose of the model less that of the plant, m and rad; NaN where the loop of
-    the model is unstable.
+    poses (runs, N, 6): pose of the model minus pose of the plant, m and rad. A run is NaN if the
+    loop of the model is unstable.
     """
 
     poses: Array
 
     def rms(self) -> pd.Series:
-        """Root mean square over all runs and frames of each coordinate, um and urad."""
+        """Return the root mean square of each coordinate over all runs and frames, um and urad."""
         import pandas as pd
 
         names = [
@@ -84,14 +83,23 @@ class UnseenErrors:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Parts of the experiment that a scenario describes; `set_up` makes it.
+    """Parts of the experiment that a scenario describes. `set_up` makes a setup.
 
-    The scenario is resolved here, once, and each part when it is first asked for. What runs,
-    designs, measures or tracks is given the parts that it reads, and no scenario.
+    Each part is made at its first use. Functions that run, design, measure or track get the parts
+    that they read, and not the scenario.
 
-    scenario: with the renderer chosen. seed: of all that is random. loaded: the robot of the
-    scenario's file, if it is loaded already. calibrated: what is known of its geometry, if that is
-    not what the scenario says. progress: where a calibration of the cameras shows its progress.
+    Attributes
+    ----------
+    scenario : Scenario
+        Scenario with the renderer of this machine in place of "auto".
+    seed : int
+        Seed of all random numbers.
+    loaded : Robot, optional
+        Robot of the scenario, if it is loaded already.
+    calibrated : KnownGeometry, optional
+        Known geometry that replaces the known geometry of the scenario.
+    progress : Progress, optional
+        Display of the progress of a camera calibration.
     """
 
     scenario: Scenario
@@ -138,7 +146,7 @@ class Setup:
             loop=KnownLoop(
                 side=self.side,
                 prior=identification.prior,
-                # Whichever side states it, the filter is that of the same drives.
+                # Model and plant have the same drives, so either of them can state the filter.
                 filter_time=scenario.model.derivative_filter_s or switches.derivative_filter_s,
                 control=control,
             ),
@@ -155,7 +163,7 @@ class Setup:
 
     @cached_property
     def sensor_plan(self) -> SensorPlan:
-        """The sensor that is to be made."""
+        """Description of the sensor to be made."""
         scenario = self.scenario
         return SensorPlan(
             name=scenario.sensor,
@@ -168,7 +176,7 @@ class Setup:
 
     @cached_property
     def sensor(self) -> cmmsim.Sensor:
-        """The stereo sensor. A run teaches it, unless that has been done."""
+        """The stereo sensor. A run teaches it, unless it has been taught before."""
         return self.sensor_plan.untaught(self.robot, self.seed, self.progress)
 
     @cached_property
@@ -185,7 +193,7 @@ class Setup:
 
     @cached_property
     def trajectories(self) -> TrajectorySet:
-        """The exciting trajectory and the unseen ones, searched when they are first asked for."""
+        """The exciting and the validation trajectories, designed at first use."""
         return design_trajectories(self.design, self.seed)
 
     def run(
@@ -199,30 +207,30 @@ class Setup:
         Parameters
         ----------
         path : str or Path, optional
-            File to which record and truth are written. The default is one in the user's cache
-            folder, named after scenario and seed, which the next such run replaces.
+            File to which record and truth are written. The default is a file in the user's cache
+            folder, named after scenario and seed. The next run with the same names replaces it.
         progress : Progress, optional
-            Where the progress is shown.
+            Display of the progress.
         payload : bool
-            True carries the scenario's known load on the platform. Such a record beside one
-            without it shows the scale. The record holds the load as stated, the truth as drawn
-            from its standard deviations.
+            Whether the platform carries the scenario's known load. A record with the load and a
+            record without it determine the scale. The record holds the stated load, and the truth
+            holds the load that was drawn from the standard deviations.
 
         Returns
         -------
         xarray.Dataset
-            What the experimenter sees. Its attribute ``path`` names the file, and ``record.truth``
-            reads the truth from there.
+            Record of the run. Its attribute ``path`` names the file, and ``record.truth`` reads the
+            truth from this file.
 
         Raises
         ------
         ScenarioError, TrajectoryError, WriteError, cmmsim.CmmError, dynamics.DynamicsError
-            The experiment cannot be done, or its file cannot be written.
+            The experiment cannot be run, or its file cannot be written.
 
         Warns
         -----
         UserWarning
-            The cache folder cannot be written, so that the record has no file and no truth.
+            The cache folder cannot be written. The record then has no file and no truth.
         """
         progress = progress or SilentProgress()
         trajectory = self.trajectories.excitation
@@ -237,29 +245,31 @@ class Setup:
         if path is not None:
             write_bytes(path, content, parents=True)
             return done.record.assign_attrs(path=str(path))
-        # `record.truth` reads the truth from a file, so that every record needs one.
+        # `record.truth` reads the truth from a file, so every record needs a file.
         kept = Path(platformdirs.user_cache_dir("cmmsim")) / "records"
         suffix = "-payload" if payload else ""
         target = kept / f"{self.scenario.name}-{self.seed}{suffix}.nc"
         try:
             write_bytes(target, content, parents=True)
         except WriteError as error:
-            warnings.warn(f"the record is not kept: {error}", stacklevel=2)
+            warnings.warn(f"the record is not stored: {error}", stacklevel=2)
             return done.record
         return done.record.assign_attrs(path=str(target))
 
     def unseen_errors(self, result: IdentificationResult) -> UnseenErrors:
-        """Run plant and identified model on the unseen trajectories, both with an ideal sensor.
+        """Run plant and identified model on the validation trajectories, with an ideal sensor.
 
         Raises
         ------
         EstimationError
-            The argument is no result of an identification.
+            The argument is not an IdentificationResult.
         dynamics.DynamicsError
-            The result is of another robot, or no loop can have its parameters.
+            The result is of another robot, or its parameters are outside their range.
         """
         if not isinstance(result, IdentificationResult):
-            raise EstimationError(f"{result!r} is no result: identify.identify(record) gives one")
+            raise EstimationError(
+                f"{result!r} is not a result: identify.identify(record) returns one"
+            )
         scenario = self.scenario.with_drive(result.drive.law)
         return UnseenErrors(unseen_errors(result.estimate, self.robot, scenario, self.seed))
 
@@ -267,7 +277,7 @@ class Setup:
 def with_renderer(scenario: Scenario) -> Scenario:
     """Return the scenario with the renderer of this machine in place of "auto".
 
-    Where OpenGL is missing, one line of warning says so.
+    Without OpenGL, a warning is given.
     """
     return scenario.with_overrides({"renderer": choose_renderer(scenario.renderer).name})
 
@@ -280,21 +290,21 @@ def set_up(
     Parameters
     ----------
     scenario : Scenario
-        What `load_scenario` returns.
+        Scenario, for example from `load_scenario`.
     seed : int or numpy.random.SeedSequence
-        Seed of all that is random, such as what a row of a study is given.
+        Seed of all random numbers. A row of a study gets a SeedSequence.
     progress : Progress, optional
-        Where a calibration of the cameras shows its progress.
+        Display of the progress of a camera calibration.
 
     Returns
     -------
     Setup
-        Its `run` makes a record, its `unseen_errors` judge a result.
+        The setup. Its method `run` makes a record, and `unseen_errors` validates a result.
 
     Raises
     ------
     ScenarioError
-        The argument is no scenario, or its plant or sensor cannot be made.
+        The argument is not a Scenario, or its plant or sensor cannot be made.
     cmmsim.CmmError, dynamics.DynamicsError
         The files of sensor or robot are not valid.
 
@@ -306,9 +316,11 @@ def set_up(
     'rss6'
     """
     if not isinstance(scenario, Scenario):
-        raise ScenarioError(f"{scenario!r} is no scenario: identify.load_scenario(name) gives one")
+        raise ScenarioError(
+            f"{scenario!r} is not a scenario: identify.load_scenario(name) returns one"
+        )
     setup = Setup(with_renderer(scenario), integer_seed(seed), progress=progress)
-    # A plant or a sensor that cannot be made is refused here, and not when it is first used.
+    # Errors of the plant or the sensor are raised here, and not at their first use.
     _ = setup.plant, setup.sensor
     return setup
 
@@ -320,9 +332,9 @@ def run_experiment(
     progress: Progress | None = None,
     payload: bool = False,
 ) -> xr.Dataset:
-    """Do the experiment of a scenario once, and return its record.
+    """Run the experiment of a scenario once, and return its record.
 
-    The parameters are those of `set_up` and `Setup.run`, and so are the errors.
+    For parameters and errors see `set_up` and `Setup.run`.
 
     Examples
     --------
@@ -337,12 +349,13 @@ def run_experiment(
 def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed: int = 0) -> Array:
     """Return the pose errors (runs, N, 6) [m, rad] of a model against the plant.
 
-    Both run on the scenario's unseen trajectories for this seed, each with its own friction law and
-    steps. An ideal sensor closes both loops, so the errors come only from the parameters (p,) and
-    from what the model leaves out. They are NaN if, and only if, the model's loop is unstable.
+    Both run on the scenario's validation trajectories for this seed, each with its own friction law
+    and steps. An ideal sensor closes both loops, so the errors are caused only by the parameters
+    (p,) and by effects that the model lacks. They are NaN if, and only if, the model's loop is
+    unstable.
 
     Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
-    range. Raises TrajectoryError if no unseen trajectory keeps the robot's limits.
+    range. Raises TrajectoryError if no validation trajectory is within the robot's limits.
     """
     setup = Setup(scenario, seed, loaded=robot)
     return errors_of_model(parameters, setup.plant, setup.design, seed)

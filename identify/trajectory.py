@@ -1,11 +1,11 @@
 """Reference trajectories: Fourier series of the platform's coordinates (eq. 37), and their file.
 
-Coordinates are those entries of the pose ``[x y z alpha beta gamma]``, m and rad, that the platform
-can change. With ``w = 2 pi f0 l`` each is
+Coordinates are the entries of the pose ``[x y z alpha beta gamma]``, m and rad, that the platform
+can change. With ``w = 2 pi f0 l`` each coordinate is
 
     chi(t) = offset + sum_l  s_l sin(w t) / w  -  c_l cos(w t) / w.
 
-The start is smooth when the series begins at the home pose, at rest and without acceleration:
+The start is smooth if the series begins at the home pose, at rest and without acceleration:
 ``offset = home + sum_l c_l / w``, ``sum_l s_l = 0`` and ``sum_l l c_l = 0``.
 """
 
@@ -53,7 +53,7 @@ class FourierTrajectory:
     def __post_init__(self) -> None:
         for name in ("sine", "cosine", "offset"):
             value = np.array(getattr(self, name), dtype=float)
-            # A frozen trajectory must not change through its arrays.
+            # The arrays of a frozen trajectory must not be writable.
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         m = len(self.chart.freedoms)
@@ -120,10 +120,10 @@ def random_trajectory(
     position_amplitude_m: float,
     orientation_amplitude_rad: float,
 ) -> FourierTrajectory:
-    """Draw a trajectory with a smooth start that fills the box about home in every coordinate.
+    """Draw a random trajectory with a smooth start that fills the box about home.
 
-    Normal coefficients are projected onto the conditions of a smooth start, then scaled axis by
-    axis.
+    Normally distributed coefficients are projected onto the conditions of a smooth start. Then each
+    coordinate is scaled so that it reaches the edge of the box.
 
     Parameters
     ----------
@@ -167,14 +167,14 @@ def random_trajectory(
     # With a home of zero, poses are distances from home.
     shape = from_home(replace(chart, home=(0.0,) * 6), fundamental_hz, sine, cosine)
     box = box_of(chart, position_amplitude_m, orientation_amplitude_rad)
-    # At 200 samples a period of the highest harmonic, its peak is found to about 1e-4.
+    # With 200 samples per period of the highest harmonic, a peak is found to about 1e-4.
     period = np.linspace(0.0, 1.0 / fundamental_hz, 200 * harmonics, endpoint=False)
     scale = (box / np.abs(chart.coordinates(shape.pose(period))).max(axis=0))[:, None]
     return from_home(chart, fundamental_hz, scale * sine, scale * cosine)
 
 
 def from_home(chart: Chart, fundamental_hz: float, sine: Array, cosine: Array) -> FourierTrajectory:
-    """Return the trajectory with coefficients (m, n) [m/s, rad/s] that is at home at t = 0."""
+    """Return the trajectory with these coefficients (m, n) [m/s, rad/s] and at home at t = 0."""
     w = 2 * np.pi * fundamental_hz * np.arange(1, sine.shape[1] + 1)
     home = chart.coordinates(np.array(chart.home))
     return FourierTrajectory(chart, fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
@@ -189,12 +189,12 @@ def check_travel(
     least_leverage: float = LEAST_LEVERAGE,
     most_condition: float = MOST_CONDITION,
 ) -> float:
-    """Check that the robot may follow a trajectory.
+    """Check that a robot can follow a trajectory within its limits.
 
     Parameters
     ----------
     robot : dynamics.Robot
-        Robot that is to follow.
+        Robot that shall follow the trajectory.
     trajectory : FourierTrajectory
         Trajectory of the platform.
     t : array_like, shape (N,)
@@ -228,7 +228,7 @@ def check_travel(
         }
         return check_motion(robot, trajectory.pose(times), times, **limits).travel.value
     except DynamicsError as error:
-        raise TrajectoryError(f"the robot may not follow the trajectory: {error}") from error
+        raise TrajectoryError(f"the robot cannot follow the trajectory: {error}") from error
 
 
 def _without(rows: Array, direction: Array) -> Array:
@@ -237,10 +237,10 @@ def _without(rows: Array, direction: Array) -> Array:
 
 
 FREE = "free"
-"""Chart of files that state none."""
+"""Chart for files without an entry for it."""
 
 HOME = (0.0,) * 6
-"""Home of files that state none. A chart that is free does not use it."""
+"""Home for files without an entry for it. The chart "free" does not use it."""
 
 FORMAT = "cmmsim trajectories, version 1"
 EQUATION = (
@@ -259,11 +259,11 @@ UNITS = {
 
 @dataclass(frozen=True)
 class TrajectorySet:
-    """Trajectories of a run: one for excitation, and unseen ones for validation.
+    """Trajectories of a run: the exciting trajectory and the validation trajectories.
 
-    All have the same chart. ``observability_index`` (eq. 39) is that of the excitation,
-    ``first_index`` that of the first random candidate, ``median_index`` the median of all
-    candidates.
+    All have the same chart. ``observability_index`` (eq. 39) is the index of the exciting
+    trajectory, ``first_index`` the index of the first random candidate, and ``median_index`` the
+    median index of all candidates.
     """
 
     seed: int
@@ -280,7 +280,7 @@ def save_trajectories(path: Path | str, trajectories: TrajectorySet) -> None:
 
 
 def trajectories_json(trajectories: TrajectorySet) -> str:
-    """Return the file of the set, with its digest."""
+    """Return the text of the file of the set, with its digest."""
     data = {
         "format": FORMAT,
         "equation": EQUATION,

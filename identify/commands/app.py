@@ -31,8 +31,8 @@ HELP = """
 Identify a parallel robot from rendered stereo images, and prove how good the result is.
 
 A simulated stereo camera measures the pose of a simulated robot, a visual servo moves it along an
-exciting trajectory, and its dynamic parameters are estimated from the record. Unseen trajectories
-judge them.
+exciting trajectory, and its dynamic parameters are estimated from the record. The identified model
+is then validated on trajectories that were not used for the estimate.
 """
 
 EXAMPLES = """
@@ -40,13 +40,13 @@ Examples:
   cmmsim run quick                     a whole experiment in a minute
   cmmsim run quick --robot ups6        with another robot, or your own file
   cmmsim new robot mine.toml           a commented file to start from
-  cmmsim check mine.toml               what a designer wants to know of a robot
+  cmmsim check mine.toml               check the design of a robot
   cmmsim study --list                  studies, such as error against noise
-  cmmsim COMMAND --help                what a command reads, writes and returns
+  cmmsim COMMAND --help                files and exit status of a command
 """
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Errors of a file that finds no room on its disk, or is larger than a file may be."""
+"""Error numbers of a full disk, an exhausted quota, and a file above the size limit."""
 
 app = typer.Typer(
     name="cmmsim",
@@ -62,14 +62,15 @@ app = typer.Typer(
 def main() -> None:
     """Run the command.
 
-    A known error becomes one line on standard error and an exit status of `identify.commands.help`.
+    A known error is printed as one line on standard error. The exit statuses are those of
+    `identify.commands.help`.
     """
     warnings.showwarning = _show_warning
     try:
         with _printing():
             app()
     except Exception as error:
-        # An unknown error is a defect, whose traceback is wanted.
+        # An unknown error is a defect of the program, and its traceback is needed.
         if not is_known(error):
             raise
         typer.echo(f"error: {' '.join(str(error).split())}", err=True)
@@ -80,14 +81,15 @@ def main() -> None:
 
 @contextmanager
 def _printing() -> Iterator[None]:
-    """Raise WriteError if standard output is a file that finds no more room."""
+    """Raise WriteError if standard output is a file on a full disk."""
     try:
         yield
     except OSError as error:
-        # All other files are written inside `identify.files.atomic.writing`; its error names them.
+        # All other files are written inside `identify.files.atomic.writing`, and errors of that
+        # function have a file name.
         if error.filename is not None or error.errno not in NO_ROOM:
             raise
-        # Otherwise Python writes the rest when it exits, and fails again.
+        # Without closing it, Python would write the rest at exit, and fail again.
         with suppress(OSError):
             sys.stdout.close()
         raise WriteError(f"cannot write standard output: {error.strerror}") from None
@@ -96,12 +98,12 @@ def _printing() -> Iterator[None]:
 def _show_warning(
     message: Warning | str, category: type[Warning], *place: object, **more: object
 ) -> None:
-    """Print a warning as one line, without the place in the code that gave it."""
+    """Print a warning as one line, without its place in the code."""
     typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 def is_known(error: Exception) -> bool:
-    """Tell whether an error is one that a user can cause or meet, in any of the three packages."""
+    """Return whether an error is one of those that the three packages raise on purpose."""
     if isinstance(error, IdentifyError) or (
         isinstance(error, OSError) and error.filename is not None
     ):

@@ -37,8 +37,8 @@ def calibrate(
         typer.Option(
             "--sensor",
             metavar="NAME|FILE",
-            help="Optional: sensor whose file takes the cameras; with --render, whose cameras "
-            "render, ctrack780 where it is left out.",
+            help="Sensor whose file is written again with the calibrated cameras; with --render, "
+            "the sensor whose cameras render, ctrack780 by default.",
             autocompletion=completion("sensor"),
         ),
     ] = None,
@@ -46,8 +46,8 @@ def calibrate(
         str | None,
         typer.Option(
             "--distortion",
-            help="Free terms: none, radial2 (k1, k2) or brown5 (k1, k2, p1, p2, k3), which is the "
-            "default.",
+            help="Estimated terms: none, radial2 (k1, k2) or brown5 (k1, k2, p1, p2, k3), which is "
+            "the default.",
             show_default=False,
         ),
     ] = None,
@@ -59,7 +59,7 @@ def calibrate(
         typer.Option(
             "--min-images",
             min=3,
-            help="Fewest pairs that must show the board to both cameras; 3 where it is left out.",
+            help="Smallest number of pairs in which both pictures show the board; 3 by default.",
             show_default=False,
         ),
     ] = None,
@@ -68,14 +68,14 @@ def calibrate(
         typer.Option(
             "--halves",
             min=1,
-            help="Also calibrate so often from two random halves of the pictures, and say whether "
-            "these agree as they state: ten times tell.",
+            help="Number of random splits of the pictures into halves. Both halves of each split "
+            "are calibrated, and compared within their stated uncertainty; ten splits are enough.",
         ),
     ] = None,
     render: Annotated[
         int | None,
         typer.Option(
-            "--render", min=1, help="Render this many pairs of pictures instead, and stop."
+            "--render", min=1, help="Only render this many pairs of pictures; calibrate nothing."
         ),
     ] = None,
     seed: Annotated[
@@ -83,8 +83,7 @@ def calibrate(
         typer.Option(
             "--seed",
             min=0,
-            help="Seed of the rendered poses and of their noise, or of the halves; 0 where it is "
-            "left out.",
+            help="Seed of the rendered poses and their noise, or of the halves; 0 by default.",
             show_default=False,
         ),
     ] = None,
@@ -92,13 +91,13 @@ def calibrate(
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Calibrate a stereo camera from pictures of a board: photographs, or rendered ones.
+    """Calibrate a stereo camera from photographed or rendered pictures of a board.
 
     Both cameras take a picture of the board at the same time, 10 to 30 times. Move the board all
     over both images and into their corners, and tilt it by 30 degrees and more to all sides. LEFT
-    and RIGHT are folders of the pictures; the first file name of one folder goes with the first of
-    the other and so on, in lexicographic order: img10 stands before img2, so number them img02,
-    img10. A picture may be PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, 8 or 16 bit.
+    and RIGHT are folders of pictures. Files of the two folders are paired in lexicographic order of
+    their names. In this order img10 stands before img2, so number them img02, img10. A picture is
+    PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, 8 or 16 bit.
 
     Reads both folders and the description of the board:
 
@@ -113,10 +112,10 @@ def calibrate(
       dark = true           # dots darker than the board, of dots only
 
     Writes into the folder calibration.json, which is also the JSON: estimates with standard
-    deviations, covariance, residuals, images used and rejected (where the points of a picture err
-    alike, the covariance is enlarged, with a warning); rig.toml, the tables of a sensor file's
-    cameras; with --sensor also sensor.toml, that whole sensor file with the calibrated cameras; and
-    residuals.png, coverage.png, distortion.png.
+    deviations, covariance, residuals, and the images used and rejected. If the points of a picture
+    have correlated errors, the covariance is enlarged, with a warning. It also writes rig.toml, the
+    camera tables of a sensor file; residuals.png, coverage.png and distortion.png; and with
+    --sensor also sensor.toml, that whole sensor file with the calibrated cameras.
 
     \b
     Examples:
@@ -124,7 +123,7 @@ def calibrate(
       cmmsim calibrate photos/left photos/right --board board.toml --out mine \\
         --sensor ctrack780 --distortion radial2
       cmmsim calibrate photos/left photos/right --board board.toml --out mine \\
-        --halves 10                       and whether halves of them agree
+        --halves 10                       also compare halves of the pictures
     Render pictures to try it with, and calibrate from them:
       cmmsim calibrate --render 20 --out pictures
       cmmsim calibrate --render 20 --sensor mine.toml --out pictures
@@ -199,11 +198,11 @@ def _require_none(reason: str, **given: object) -> None:
 def _view(
     left: Path, right: Path, board: "Board", template: "SensorTemplate | None", progress: Progress
 ) -> "tuple[list[PairView], tuple[int, int]]":
-    """Find the board in all pairs of pictures. Return what they show of it, and their size."""
+    """Return the board points found in all pairs of pictures, and the picture size."""
     from cmmsim.calibration import pair_images, read_grey, view_pairs
 
     files = pair_images(left, right)
-    # What cannot be written is refused before the search, which takes minutes.
+    # A wrong picture size is refused before the search, which takes minutes.
     if template is not None:
         height, width = read_grey(files[0].left).shape
         template.require_size((width, height))
@@ -214,9 +213,10 @@ def _view(
 def _write(
     folder: Path, found: "Calibration", template: "SensorTemplate | None", content: dict[str, Any]
 ) -> list[str]:
-    """Write all files, made before the first is written.
+    """Write all files of a calibration.
 
-    Returns a line for the user if no sensor can have these cameras.
+    All contents are made before the first file is written. If no sensor can have these cameras,
+    returns a warning for the user.
     """
     from cmmsim.calibration import require_sensor, rig_tables
     from cmmsim.errors import SensorFileError
@@ -236,11 +236,14 @@ def _write(
     files = {"rig.toml": rig_tables(found), "calibration.json": content, **drawn}
     if sensor is not None:
         try:
-            # It is checked in the folder, because it may name the file it is based on from there.
+            # sensor.toml is checked in its folder, because its base file can be a path relative to
+            # this folder.
             save_files(folder, {"sensor.toml": sensor, **files}, require_sensor)
         except SensorFileError as error:
             save_files(folder, files)
-            return [f"sensor.toml is not written, no sensor can have these cameras: {error}"]
+            return [
+                f"sensor.toml is not written, because no sensor can have these cameras: {error}"
+            ]
     else:
         save_files(folder, files)
     return []
@@ -255,7 +258,7 @@ def _render(
     progress: Progress,
     quiet: bool,
 ) -> None:
-    """Write pictures into left/ and right/, and board.toml beside them: all of them, or nothing."""
+    """Write pictures into left/ and right/, and board.toml beside them: all files, or none."""
     import cv2
     import numpy as np
 
@@ -302,8 +305,9 @@ def _print_summary(found: "Calibration", apart: "Halves | None", folder: Path) -
         typer.echo(f"not used: {name}: {reason}")
     if apart is not None:
         typer.echo(
-            f"halves of the pictures differ by {apart.mean_square:.2f} times the variance that "
-            f"they state, on average over {len(apart.squares)} splits; 1 is expected, give or take "
-            f"{apart.chance:.2f} in a single split: {apart.verdict}"
+            "squared differences between halves of the pictures are "
+            f"{apart.mean_square:.2f} times their stated variance, on average over "
+            f"{len(apart.squares)} splits; 1 ± {apart.chance:.2f} is expected of a single split: "
+            f"{apart.verdict}"
         )
     typer.echo(f"calibration: {folder}")

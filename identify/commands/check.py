@@ -1,4 +1,4 @@
-"""Command ``check``: a robot file judged before anything is built or run."""
+"""Command ``check``: checks a robot file before anything is built or run."""
 
 from textwrap import shorten
 from typing import Annotated
@@ -21,7 +21,7 @@ from identify.progress import print_table, terminal_progress
 LONGEST = 160
 """Largest number of characters of a finding in the error message.
 
-The table and the JSON have all of it.
+The table and the JSON hold the whole text.
 """
 
 
@@ -30,7 +30,7 @@ def check(
     scenario: Annotated[
         str,
         typer.Option(
-            help="Scenario whose servo, timing and limits count.",
+            help="Scenario that gives the servo, timing and limits.",
             autocompletion=completion("scenario"),
         ),
     ] = "paper",
@@ -47,15 +47,16 @@ def check(
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Say in a page what a designer wants to know of a robot.
+    """Check the design of a robot, on one page.
 
-    Reach, travel and singularities at home and over the travel, assembly modes, holding torques,
-    what its motion can show, inertias that no body has, whether its loop is stable, up to which
-    gains and down to which frame rate, what bandwidth and damping its gains give and which gains
-    give those that the scenario's [control] asks for, and whether the platform that the scenario's
-    sensor sees is the robot's: each with its number and limit, and with the leg that it concerns.
+    The checks of the mechanism are reach, travel and singularities at home and over the travel,
+    assembly modes, holding torques, identifiable parameters, and physically possible inertias. The
+    checks of the loop are its stability, the largest stable gains and lowest stable frame rate, the
+    bandwidth and damping of its gains, and the gains for the bandwidth and damping that the
+    scenario's [control] requests. The platform in the scenario's sensor file must be the robot's
+    platform. Each finding has its value, its limit, and the leg that it concerns.
 
-    Reads a robot file, and a scenario. Writes nothing but the JSON: whether all is well, and the
+    Reads a robot file and a scenario. Writes only the JSON: whether all checks pass, and the
     findings.
 
     \b

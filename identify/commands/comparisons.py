@@ -1,4 +1,4 @@
-"""Commands that compare estimators on one record, estimates of several runs, or excitations."""
+"""Commands that compare estimators, estimates from several runs, or methods of excitation."""
 
 import math
 from dataclasses import asdict, replace
@@ -62,17 +62,17 @@ def estimators(
     context: typer.Context,
     out: WholeRunOption,
     only: Annotated[
-        list[str] | None, repeatable("Name of an estimator, or module:function of one's own", "all")
+        list[str] | None, repeatable("Name of an estimator, or module:function of your own", "all")
     ] = None,
     add: Annotated[
         list[str] | None,
-        repeatable("Estimator of one's own beside these, as module:function", "none"),
+        repeatable("Additional estimator of your own, as module:function", "none"),
     ] = None,
     torque_noise: Annotated[
         float | None,
         typer.Option(
             min=0,
-            help="Standard deviation of a torque, N m, or of a force, N.",
+            help="Standard deviation of measured torques, N m, or forces, N.",
             show_default="0.02, 0.5",
         ),
     ] = None,
@@ -80,7 +80,7 @@ def estimators(
         float | None,
         typer.Option(
             min=0,
-            help="Standard deviation of a joint angle, rad, or length, m.",
+            help="Standard deviation of measured joint angles, rad, or lengths, m.",
             show_default="1e-5, 1e-6",
         ),
     ] = None,
@@ -89,7 +89,7 @@ def estimators(
         typer.Option(
             min=4,
             max=40,
-            help="Bits a turn, or over the travel, of the encoders.",
+            help="Bits of an encoder per turn, or over the travel of a linear joint.",
             show_default="17, 1 um steps",
         ),
     ] = None,
@@ -100,14 +100,14 @@ def estimators(
 ) -> None:
     """Compare nine estimators, and your own, on the record of a run.
 
-    The paper's output error beside its variants and beside what the literature does with measured
-    joint torques and encoders (inverse dynamics; poses from the camera, or by forward kinematics).
-    The run has no such instruments: they are simulated from its truth, with the noise given here.
-    Where the joint controller is known it has the true gains. All are judged by the truth of the
-    record and of the unseen trajectories. An estimator of one's own is a function of the evidence,
-    see identify.estimators.estimator.
+    The estimators are the paper's output error, its variants, and estimators of the literature
+    that use measured joint torques and encoders (inverse dynamics, with poses from the camera or
+    from forward kinematics). These instruments are simulated from the truth of the run, with the
+    noise given here. An estimator that knows the joint controller gets its true gains. All are
+    compared with the truth of the record and of the validation trajectories. An estimator of your
+    own is a function of the evidence; see identify.estimators.estimator.
 
-    Reads scenario.toml, experiment.nc and validation.nc of the folder.
+    Reads scenario.toml, experiment.nc and validation.nc from the folder.
 
     Writes instruments.nc, estimators.json, which is also the JSON, and figures/estimators.png
     there.
@@ -150,7 +150,7 @@ def estimators(
 
 
 def _entry(score: "Score") -> dict[str, Any]:
-    """Return a score as JSON has it, with its parameters by name."""
+    """Return a score as a JSON entry, with its parameters by name."""
     entry = asdict(score)
     estimate = entry.pop("parameters")
     std = entry.pop("std")
@@ -170,9 +170,9 @@ def _print_scores(scores: list["Score"], out: Path) -> None:
         ("estimator",),
         "estimators on one record, against one truth",
         "groups: RMS and median relative error of the base parameters that the record shows; "
-        "gains: RMS relative error of those of the joint controller; position, angle: model "
-        "against true plant on unseen trajectories, RMS of the worst axis and run; runs: how often "
-        "the model was simulated",
+        "gains: RMS relative error of the gains of the joint controller; position, angle: RMS "
+        "difference of model and true plant on the validation trajectories, of the worst axis and "
+        "run; runs: number of simulations of the model",
     )
     for score in scores:
         if score.note:
@@ -181,8 +181,8 @@ def _print_scores(scores: list["Score"], out: Path) -> None:
 
 
 def _score_row(score: "Score") -> list[str]:
-    """Return a row of the table, with a dash for what is not finite, as for an unstable model."""
-    # An estimator that was given the true gains has no error of them.
+    """Return a row of the table. A value that is not finite, as of an unstable model, is a dash."""
+    # An estimator that was given the true gains has no error in them.
     gains = "given" if "gains" in score.uses else _short(100 * score.gain_distance)
     groups = [_short(100 * value) for value in (score.group_distance, score.group_median)]
     poses = [_short(value) for value in (score.position_um, score.orientation_urad, score.seconds)]
@@ -205,8 +205,8 @@ def variation(
             "--designed",
             min=3,
             metavar="COUNT",
-            help="Record this many new runs, each on an exciting trajectory designed for it by the "
-            "scenario's method, instead of taking the unseen runs.",
+            help="Number of new runs to record in place of the validation runs. The scenario's "
+            "method designs an exciting trajectory for each.",
         ),
     ] = None,
     workers: Annotated[
@@ -215,23 +215,23 @@ def variation(
             "--workers",
             min=1,
             max=MOST_WORKERS,
-            help="Processes that design and render.",
-            show_default="one a core",
+            help="Number of processes that design and render.",
+            show_default="one per core",
         ),
     ] = None,
     json: JsonFile = None,
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Identify from each of several runs alone, and see how the estimates vary (the paper's table
-    5).
+    """Identify from each of several runs separately, and print the scatter of the estimates (the
+    paper's table 5).
 
-    As in the paper, from the unseen runs of validation.nc; or from newly recorded ones, which are
-    kept as variation.nc. The masses of the links vary most: only what accelerates shows them, so
-    that fast trajectories tell more of them than long ones.
+    The runs are the validation runs of validation.nc, as in the paper, or newly recorded runs,
+    which are stored as variation.nc. The masses of the links vary most. They act only through
+    accelerations, so fast trajectories determine them better than long trajectories.
 
-    Reads scenario.toml and validation.nc of the folder; with --designed trajectories.json in place
-    of the latter.
+    Reads scenario.toml and validation.nc from the folder; with --designed, trajectories.json in
+    place of validation.nc.
 
     Writes variation.json, which is also the JSON, variation.md and figures/variation.png there.
 
@@ -295,13 +295,13 @@ def variation(
 def compare_excitation(
     setup: "Setup", folder: Path, progress: Progress, json: Path | None, quiet: bool
 ) -> None:
-    """Search with every method, and write comparison.json and comparison.png into `folder`."""
+    """Run every search method, and write comparison.json and comparison.png into `folder`."""
     from identify.excitation.comparison import compare_methods, comparison_figure
     from identify.excitation.information import knowledge
     from identify.record.known_geometry import KnownGeometry
 
     scenario = setup.scenario
-    # The methods are compared on the robot of the file, which no run has to calibrate for it.
+    # The methods are compared with the geometry of the robot file, so no calibration is needed.
     setup = replace(setup, calibrated=KnownGeometry(setup.nominal))
     design = setup.design
     times = scenario.timing.frame_times(design.settings.duration_s)
@@ -316,7 +316,7 @@ def compare_excitation(
 
 
 def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:
-    """Print one row for each method, and its shares of the limits."""
+    """Print one row per method, and how much of each limit its trajectory uses."""
     title = f"criterion {found.criterion}, seed {found.seed}, {found.candidates} random candidates"
     print_table(METHODS_HEADER, map(_method_row, found.entries), ("method", "stopped"), title, note)
     for entry in found.entries:
@@ -325,8 +325,8 @@ def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:
         typer.echo(f"{entry.method}: share of each limit used: {used}")
     typer.echo(
         "maximised: the criterion (information: of the linearised loop). index: the paper's "
-        "observability index, eq. 39. narrows: factor by which a run narrows what is known before "
-        "of the parameters, with the simulated loop; - where that is unstable. Candidates and "
+        "observability index, eq. 39. narrows: factor by which a run reduces the prior uncertainty "
+        "of the parameters, with the simulated loop; - if that loop is unstable. Candidates and "
         f"functions took {found.preparation_seconds:.1f} s. Files: {folder}"
     )
 

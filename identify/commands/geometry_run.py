@@ -39,18 +39,19 @@ def geometry(
 ) -> None:
     """Calibrate the geometry of a robot with the optical CMM.
 
-    The robot stands at poses that show most of its geometry. Joint encoders read its joints, the
-    mean of some frames its pose; joint places, axes, zero angles and lengths follow, each with its
-    standard deviation. Numbers and combinations that the poses cannot tell stay where the robot
-    file has them, and are named. The scenario's [geometry] says how; its [plant] how far the
-    simulated robot is off.
+    The robot stands still at poses chosen for the most information about its geometry. At each pose
+    the encoders measure the joint coordinates, and the mean of some frames is the measured pose.
+    Joint positions, axes, zero angles and lengths are estimated, each with its standard deviation.
+    Numbers and combinations that the poses do not determine keep the values of the robot file, and
+    are listed. The scenario's [geometry] has the settings; its [plant] has the geometry errors of
+    the simulated robot.
 
-    Reads a scenario, or poses of your own: a JSON file with joints (N, n) in rad or m, joint_std
-    (n,), poses (N, 6) in m and rad and covariances (N, 6, 6), as poses.json is; base_covariance and
-    platform_covariance (6, 6) say how well the frames of the measurement are known, and are left
-    out where they are not. It writes geometry.json, geometry.md, geometry.png and geometry.svg,
-    covariance.nc, poses.json, and robot.toml, the calibrated robot, which every other command
-    takes; cmmsim run --set geometry.known=FILE takes it with its covariance.
+    Reads a scenario, or poses of your own from a JSON file like poses.json: joints (N, n) in rad or
+    m, joint_std (n,), poses (N, 6) in m and rad and covariances (N, 6, 6). The optional
+    base_covariance and platform_covariance, each (6, 6), state how well the base and platform
+    frames are known. It writes geometry.json, geometry.md, geometry.png, geometry.svg,
+    covariance.nc, poses.json and robot.toml. robot.toml is the calibrated robot, which every other
+    command reads; cmmsim run --set geometry.known=FILE reads it with its covariance.
 
     \b
     Examples:

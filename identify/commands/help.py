@@ -13,22 +13,23 @@ MISUSED = 2
 ROWS_FAILED = 3
 BEYOND_LIMIT = 4
 STATUSES = {
-    DONE: "It is done.",
-    NOT_DONE: "It cannot be done; one line on standard error says why.",
-    MISUSED: "The command line is wrong: no such command or option, or a value that it cannot "
-    "have.",
-    ROWS_FAILED: "The study is done, but some of its rows failed, and say why.",
-    BEYOND_LIMIT: "It is done, and what it judges is beyond its limit, which one line names.",
-    STOPPED: "Ctrl-C has ended it.",
+    DONE: "The command succeeded.",
+    NOT_DONE: "The command failed; one line on standard error says why.",
+    MISUSED: "The command line is wrong: no such command or option, or a value that is not "
+    "allowed.",
+    ROWS_FAILED: "The study has finished, but some rows failed; their errors are in the table.",
+    BEYOND_LIMIT: "The command has finished, but a result is beyond its limit; one line on "
+    "standard error names it.",
+    STOPPED: "Ctrl-C stopped the command.",
 }
 """Meaning of every exit status, the same in all commands."""
 
 OTHERS = "Further commands"
-"""Group of the commands that name none."""
+"""Title of the commands that have no group of their own."""
 
 
 class Command(TyperCommand):
-    """Command whose help ends with the exit statuses that it may have."""
+    """Command whose help ends with the list of its possible exit statuses."""
 
     statuses: ClassVar[tuple[int, ...]] = (DONE, NOT_DONE, MISUSED, STOPPED)
 
@@ -45,15 +46,15 @@ class Judging(Command):
 
 
 class StudyCommand(Command):
-    """Command of studies, whose rows may fail and whose laws are limits."""
+    """Command of studies. Rows can fail, and the expected laws are limits."""
 
     statuses: ClassVar[tuple[int, ...]] = tuple(STATUSES)
 
 
 class Commands(TyperGroup):
-    """Group of commands, which help lists before its options.
+    """Group of commands. Its help lists the commands before the options.
 
-    It also reports that Ctrl-C has ended a command, where typer alone would print nothing.
+    If Ctrl-C stops a command, "aborted" is printed, because typer alone would print nothing.
     """
 
     def invoke(self, ctx: Any) -> Any:
@@ -73,7 +74,7 @@ class Commands(TyperGroup):
         self.format_options(ctx, formatter)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands by their groups, each with the whole first paragraph of its help."""
+        """Write the commands group by group, each with the first paragraph of its help."""
         groups: dict[str, list[tuple[str, str]]] = {}
         for name in self.list_commands(ctx):
             command = self.get_command(ctx, name)
@@ -89,7 +90,7 @@ class Commands(TyperGroup):
                 formatter.write_dl([(name.ljust(widest), sentence) for name, sentence in rows])
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the options alone, because the commands stand before them."""
+        """Write only the options, because the commands have been written before."""
         options = [
             record
             for one in self.get_params(ctx)

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from dynamics.robot_file import RobotDescription
 
 IMPORT_HELP = """
-Read a robot from a file of another program, where its legs are of kinds that are known.
+Read a robot from a file of another program. Its legs must be of the known kinds.
 
-Writes a robot file: geometry, inertias and friction as they are there, in one parameter set
-`initial`. Joints are checked one by one; a mechanism that is no such robot is refused in one line
-that says why.
+Writes a robot file with the geometry, inertias and friction of that file, as the parameter set
+`initial`. Each joint is checked. A mechanism that is not such a robot is refused with the reason in
+one line.
 """
 
 imports = typer.Typer(
@@ -28,7 +28,8 @@ imports = typer.Typer(
 )
 
 Out = Annotated[
-    Path, typer.Option(metavar="ROBOT.toml", help="Robot file to write; replaced if there.")
+    Path,
+    typer.Option(metavar="ROBOT.toml", help="Robot file to write. An existing file is replaced."),
 ]
 
 
@@ -40,7 +41,7 @@ def mjcf(
     out: Out,
     quiet: Quiet = False,
 ) -> None:
-    """Read a robot from MJCF, as MuJoCo compiles it: defaults, includes and masses of geoms count.
+    """Read a robot from MJCF, with the defaults, includes and geom masses that MuJoCo applies.
 
     Reads an MJCF file. Writes a robot file.
 
@@ -60,7 +61,8 @@ def urdf(
     closures: Annotated[
         Path,
         typer.Option(
-            metavar="YAML", help="closed_loop, type, name_mot, as example-parallel-robots has them."
+            metavar="YAML",
+            help="YAML file with closed_loop, type and name_mot, as in example-parallel-robots.",
         ),
     ],
     out: Out,
@@ -85,7 +87,7 @@ def urdf(
 
 
 def _read(read: Callable[..., Any], *files: Path) -> tuple["RobotDescription", list[str]]:
-    """Read a robot from files that may be anybody's, within limits of time and memory."""
+    """Read a robot from untrusted files, within limits of time and memory."""
     from identify.files.limited_process import StrangerError, within_limits
 
     try:

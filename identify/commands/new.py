@@ -1,4 +1,4 @@
-"""Command ``new``: commented starting files that work as they are, with a schema for editors."""
+"""Command ``new``: commented template files that work without changes, with editor schemas."""
 
 import json
 import re
@@ -22,8 +22,8 @@ from identify.files.atomic import write_files
 NEW_HELP = """
 Write a commented file to start from: a robot, sensor, scenario, study, or record.
 
-Each works as it is. The first line of a TOML file names its JSON schema, by which editors complete
-and check what is written. A file that is there already is never replaced.
+Each file works without changes. The first line of a TOML file names its JSON schema, which editors
+use to complete and check the keys. An existing file is never replaced.
 """
 
 new = typer.Typer(
@@ -31,7 +31,7 @@ new = typer.Typer(
 )
 
 File = Annotated[
-    Path, typer.Argument(metavar="FILE.toml", help="File to write, which must not be there.")
+    Path, typer.Argument(metavar="FILE.toml", help="File to write. It must not exist yet.")
 ]
 
 
@@ -86,8 +86,8 @@ def sensor(
 def scenario(
     file: File, like: Annotated[str, _like("scenario")] = "quick", quiet: Quiet = False
 ) -> None:
-    """Write a scenario file with every key, its unit and its meaning; what holds without being said
-    is commented out.
+    """Write a scenario file with every key, its unit and its meaning; keys at their default values
+    are commented out.
 
     Reads nothing of yours. Writes one TOML file.
 
@@ -112,13 +112,13 @@ def study(
         typer.Option(
             "--like",
             help=f"Built-in study to start from: {', '.join(built_in_names('study'))}.",
-            show_default="one that shows what a study may have",
+            show_default="an example with all keys",
             autocompletion=completion("study"),
         ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write a study file: what is varied, over which values, what is drawn, and the laws that it
+    """Write a study file: the factors and their values, the plots, and the laws that the results
     should follow.
 
     Reads nothing of yours. Writes one TOML file.
@@ -139,17 +139,16 @@ def study(
 @new.command(cls=Command)
 def record(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE.csv", help="Table to write, which must not be there.")
+        Path, typer.Argument(metavar="FILE.csv", help="Table to write. It must not exist yet.")
     ],
     robot: RobotArgument = "rss6",
     quiet: Quiet = False,
 ) -> None:
-    """Write an empty record of a robot of your own as CSV, and beside it the TOML file that goes
-    with it.
+    """Write a template for a record of your own: a CSV table, and a TOML file that describes it.
 
-    The table has the columns of this robot, comments that say what they hold and which rules a
-    record keeps, and two rows at rest to show how one looks. The TOML file holds robot, timing,
-    servo gains, what fixes the scale, and how exact the poses are.
+    The table has the columns of this robot, comments that explain the columns and the rules of a
+    record, and two example rows at rest. The TOML file holds the robot, timing, servo gains, the
+    quantity that fixes the scale, and the uncertainty of the poses.
 
     Reads a robot file. Writes FILE.csv and FILE.toml.
 
@@ -168,7 +167,9 @@ def record(
     )
 
     if file.suffix != ".csv":
-        raise OutputFolderError(f"cannot write {file}: the name of a record's table ends in .csv")
+        raise OutputFolderError(
+            f"cannot write {file}: the name of a record's table must end in .csv"
+        )
     chosen = load_robot(robot)
     beside = description_file(file)
     # The path is absolute, because the description may be read from another folder.
@@ -193,9 +194,10 @@ def _copy(kind: str, like: str, file: Path) -> str:
 
 
 def _named(text: str, file: Path) -> str:
-    """Replace the name in a TOML text by that of its file."""
+    """Set the key `name` of a TOML text to the name of its file."""
     line = f"name = {json.dumps(file.stem)}"
-    # A function, because re.sub would take backslashes in a text for references to groups.
+    # The replacement is a function, because re.sub would read backslashes in a string as group
+    # references.
     return re.sub(r"^name = .*$", lambda _: line, text, count=1, flags=re.MULTILINE)
 
 
@@ -204,29 +206,29 @@ def _schema(kind: str) -> Path:
 
 
 def _with_schema(schema: Path, text: str) -> str:
-    """Put a line before a TOML text that tells editors its schema, that of this installation."""
+    """Put a first line before a TOML text that names the schema of this installation."""
     return f"#:schema {schema.resolve().as_uri()}\n{text}"
 
 
 def _toml(file: Path) -> Path:
     if file.suffix != ".toml" or not re.fullmatch(r"[\w.-]+", file.stem):
         raise OutputFolderError(
-            f"cannot write {file}: its name must end in .toml, and have letters, digits, dots, _ "
-            "and - before that"
+            f"cannot write {file}: its name must end in .toml, and consist of letters, digits, "
+            "dots, _ and -"
         )
     return file
 
 
 def _write(texts: Mapping[Path, str], read: Callable[[Path], Any]) -> None:
-    """Write files of one folder that are not there yet: all of them, or none.
+    """Write new files into one folder: all of them, or none.
 
-    The first one must be readable by `read`. Raises OutputFolderError if a file is there, and the
-    errors of `read`, such as for an impossible name.
+    `read` must be able to read the first file. Raises OutputFolderError if a file exists, and the
+    errors of `read`, for example for an invalid name.
     """
     for path in texts:
         if path.exists():
             raise OutputFolderError(
-                f"{path} is there already, and is not replaced; name another file, or remove it"
+                f"{path} exists already and is not replaced; name another file, or remove it"
             )
     write_files({path: text.encode() for path, text in texts.items()}, parents=True, check=read)
 

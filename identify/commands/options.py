@@ -23,13 +23,13 @@ BUILT_IN = {
 """Package and folder of the built-in files of each kind."""
 
 STANDARD_OUTPUT = "-"
-"""Name that stands for standard output in place of a file."""
+"""File name that means standard output."""
 
 
 def built_in_folder(kind: str) -> Path:
     """Return the folder of the built-in files of a kind.
 
-    Its package is not imported, since a shell waits for completions.
+    The package is only located and not imported, because shell completion must be fast.
     """
     package, folder = BUILT_IN[kind]
     spec = find_spec(package)
@@ -42,9 +42,9 @@ def built_in_names(kind: str) -> list[str]:
 
 
 def completion(kind: str) -> Callable[[str], list[str]]:
-    """Return the completion of a name or path of this kind for a shell.
+    """Return the shell completion for names and paths of this kind.
 
-    It offers built-in names, TOML files, and folders to look into.
+    The completion offers built-in names, TOML files, and folders.
     """
 
     def offered(incomplete: str) -> list[str]:
@@ -70,12 +70,12 @@ def named(kind: str, help_: str | None = None, **more: Any) -> Any:
 
 
 def new_folder(default: str) -> Any:
-    """Return the option of a folder to write into. `default` is the default's name in help."""
+    """Return the option for an output folder. Help shows `default` as the default value."""
     return typer.Option("--out", help="Output folder, new or empty.", show_default=default)
 
 
 def repeatable(what: str, default: str) -> Any:
-    """Return an option that may be given several times. `default` is the default's name in help."""
+    """Return an option that can be given several times. Help shows `default` as its default."""
     return typer.Option(help=f"{what}; repeatable.", show_default=default)
 
 
@@ -87,17 +87,17 @@ RobotOption = Annotated[
     typer.Option(
         "--robot",
         metavar="NAME|FILE",
-        help="Another robot than the scenario's.",
+        help="Robot in place of the scenario's robot.",
         show_default="scenario's",
         autocompletion=completion("robot"),
     ),
 ]
 NewFolder = Annotated[Path | None, new_folder("runs/SCENARIO-SEED")]
 RunFolderOption = Annotated[
-    Path, typer.Option("--out", help="Folder of the run, as the stage before left it.")
+    Path, typer.Option("--out", help="Folder of the run, with the files of the stage before.")
 ]
 WholeRunOption = Annotated[
-    Path, typer.Option("--out", help="Folder of a whole run, as cmmsim run leaves it.")
+    Path, typer.Option("--out", help="Folder of a finished run, as cmmsim run writes it.")
 ]
 Seed = Annotated[
     int,
@@ -108,8 +108,8 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable. What cmmsim "
-        "new scenario FILE writes has all keys.",
+        help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable. The file that "
+        "cmmsim new scenario FILE writes lists all keys.",
     ),
 ]
 EstimatorSettings = Annotated[
@@ -119,7 +119,8 @@ EstimatorSettings = Annotated[
         metavar="KEY=VALUE",
         help="Replace a setting of the estimator, in the sections identification, model or filter "
         "of the scenario: "
-        "identification.method=command_driven; repeatable. The record was made with the rest.",
+        "identification.method=command_driven; repeatable. Other sections cannot change, because "
+        "the record was made with them.",
     ),
 ]
 MOST_WORKERS = 1000
@@ -131,12 +132,13 @@ Workers = Annotated[
         "--workers",
         min=1,
         max=MOST_WORKERS,
-        help="Processes that render.",
-        show_default="one a core",
+        help="Number of processes that render.",
+        show_default="one per core",
     ),
 ]
 Quiet = Annotated[
-    bool, typer.Option("--quiet", help="No progress bars and no tables; warnings stay.")
+    bool,
+    typer.Option("--quiet", help="Print no progress bars and no tables, only warnings."),
 ]
 
 
@@ -151,15 +153,16 @@ Plugins = Annotated[
         metavar="MODULE",
         is_eager=True,
         callback=_allow,
-        help="Module of your own whose parts files and options may name as module:function; "
-        f"repeatable. {ALLOWED} names such modules for all commands.",
+        help="Module of your own that is allowed to be imported: files and options then name its "
+        "parts as module:function; "
+        f"repeatable. The variable {ALLOWED} names such modules for all commands.",
     ),
 ]
-"""Modules that parts of a user's own may come from. They are allowed as soon as they are read."""
+"""Modules of the user's own parts. They are allowed as soon as the option is read."""
 
 
 def allow_named(names: list[str] | None) -> None:
-    """Allow the modules of parts that the user has typed as ``module:function`` in an option."""
+    """Allow the modules of parts that an option names as ``module:function``."""
     allow_plugin(*(name.partition(":")[0] for name in names or () if is_own(name)))
 
 
@@ -168,8 +171,8 @@ JsonFile = Annotated[
     typer.Option(
         "--json",
         metavar="FILE",
-        help="Also write the figures as JSON into this file, replaced if there; - prints them in "
-        "place of the tables.",
+        help="Also write the figures as JSON into this file, which is replaced if it exists; "
+        "- prints the JSON in place of the tables.",
     ),
 ]
 
@@ -177,9 +180,9 @@ JsonFile = Annotated[
 def tell(
     entry: dict[str, Any], json_file: Path | None, quiet: bool, say: Callable[[], None]
 ) -> None:
-    """Hand out a command's figures: as JSON if it is asked for, and in words unless `quiet`.
+    """Output the figures of a command: as JSON if requested, and as text unless `quiet`.
 
-    `say` prints the words. Raises WriteError if the file cannot be written.
+    `say` prints the text. Raises WriteError if the file cannot be written.
     """
     if str(json_file) == STANDARD_OUTPUT:
         typer.echo(as_json(entry), nl=False)
@@ -191,7 +194,9 @@ def tell(
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:
-    """Return overrides from ``KEY=VALUE`` texts. A value is TOML, or else a string.
+    """Return overrides from ``KEY=VALUE`` texts.
+
+    A value is read as TOML. If that fails, it is a string.
 
     Raises ScenarioError for a text without ``=``.
     """
@@ -207,9 +212,9 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
 
 
 def chosen_scenario(name: str, settings: list[str] | None, robot: str | None) -> Scenario:
-    """Load the scenario of a name or path, with values replaced, and with another robot if named.
+    """Load the scenario of this name or path, with replaced values, and with `robot` unless None.
 
-    Raises ScenarioError if there is no such scenario, or for a setting that it cannot have.
+    Raises ScenarioError if there is no such scenario or if a setting is invalid.
     """
     chosen = {} if robot is None else {"robot": robot}
     return load_scenario(name).with_overrides(chosen | parse_settings(settings))

@@ -21,21 +21,23 @@ THRESHOLD = 1e-3
 """Magnitude of an entry of R below which the paper counts it as zero (section 4.2)."""
 
 PAPERS = "rss6"
-"""Robot of the paper. The paper's numbers are printed only with this one."""
+"""Robot of the paper. The paper's numbers are printed only with this robot."""
 
 DECADES = (0, 3, 6)
-"""Decimal exponents of the units in which the paper's threshold is tried: N, kN, MN."""
+"""Decimal exponents of the force units in which the paper's threshold is tried: N, kN, MN."""
 
 
 def base_parameters(
     robot: RobotArgument = "rss6", json: JsonFile = None, quiet: Quiet = False
 ) -> None:
-    """Print which combinations of its dynamic parameters a robot's motion can show at all.
+    """Print the base parameters of a robot: the combinations of dynamic parameters that a motion
+    can identify.
 
-    A parameter that stands alone can be identified by itself, one in a sum only as part of it, and
-    the unseen ones by no motion. Where only poses are measured, one common factor stays unknown.
+    A parameter that stands alone can be identified by itself. A parameter in a sum can be
+    identified only as part of that sum. The parameters listed last have no effect on any motion. If
+    only poses are measured, one common factor of all parameters remains unknown.
 
-    Reads a robot file. Writes nothing but the JSON, which has the coefficients of each combination.
+    Reads a robot file. Writes only the JSON, which has the coefficients of each combination.
 
     \b
     Examples:
@@ -50,7 +52,7 @@ def base_parameters(
     found = base.base_parameters(matrix, chosen.layout)
     singular = base.rank_by_singular_values(matrix)
     angle = base.angle_to_singular_vectors(matrix, found)
-    # The paper's threshold has a unit, so what it finds depends on the units of the matrix.
+    # The paper's threshold has a unit, so the rank depends on the units of the matrix.
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
     entry = _groups(found, singular, angle)
     tell(
@@ -69,16 +71,16 @@ def _print_groups(
     typer.echo(f"No motion shows: {', '.join(found.unseen) or 'none of them, all are shown'}.")
     typer.echo(
         f"The {len(found.names)} parameters make {found.rank} base parameters, which are all that "
-        f"a motion can show; singular values find {singular}. What is independent stands out of "
-        f"the others by {found.gap[1]:.1e} of its length or more, what is not by "
-        f"{found.gap[0]:.1e} at most; both ways find the same groups to {angle:.1e} rad."
+        f"a motion can show; singular values find {singular}. Independent columns of the regressor "
+        f"stand out of the others by at least {found.gap[1]:.1e} of their length, dependent "
+        f"columns by at most {found.gap[0]:.1e}; both ways find the same groups to {angle:.1e} rad."
     )
     tried = ", ".join(f"{count} in units of {unit:g} N" for unit, count in counts.items())
-    # The joint controller has three gains, which the printed count adds.
+    # The printed count adds the three gains of the joint controller.
     left = len(found.names) - len(found.unseen)
     typer.echo(
         f"The paper's rule, a diagonal of R above {THRESHOLD:g} without scaling, depends on the "
-        f"units, and finds {tried}. Deleting only what no motion shows leaves {left} parameters, "
+        f"units, and finds {tried}. Without the parameters that no motion shows, {left} remain, or "
         f"{left + 3} with the gains of the joint "
         f"controller{'; its table lists 49' if papers else ''}."
     )
@@ -111,7 +113,7 @@ def workspace(
     json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
-    """Map where a robot can go around home: travel, reach and conditioning.
+    """Map the workspace of a robot around home: travel, reach and conditioning.
 
     Reads a robot file.
 
@@ -175,30 +177,30 @@ def mjcf(
         str | None,
         typer.Option(
             metavar="SET|FILE",
-            help="Parameter set of the robot, or result.json of a run: its estimates.",
+            help="Parameter set of the robot, or result.json of a run, for its estimates.",
             show_default="initial",
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="File to write; replaced if there.", show_default="ROBOT.xml"
+            metavar="FILE",
+            help="File to write. An existing file is replaced.",
+            show_default="ROBOT.xml",
         ),
     ] = None,
     allow_unphysical_inertia: Annotated[
         bool,
         typer.Option(
             "--allow-unphysical-inertia",
-            help="Where a body breaks Ix + Iy >= Iz, write the nearest inertia that MuJoCo "
-            "accepts.",
+            help="If a body breaks Ix + Iy >= Iz, write the nearest inertia that MuJoCo accepts.",
         ),
     ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the robot as MJCF, a closed chain that MuJoCo loads.
 
-    Reads a robot file, and where --parameters names one the result.json of a run. Writes one XML
-    file.
+    Reads a robot file, and the result.json that --parameters names. Writes one XML file.
 
     \b
     Examples:
@@ -226,9 +228,9 @@ def mjcf(
 
 
 def _changes(robot: "Robot", parameters: "Array") -> list[str]:
-    """Describe, in lines, the inertias that the export changed.
+    """Return lines that describe the inertias that the export changed.
 
-    Each line tells how much the change alters the robot's accelerations.
+    Each line states how much the change alters the robot's accelerations.
     """
     from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 

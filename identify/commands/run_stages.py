@@ -34,7 +34,7 @@ from identify.progress import print_warnings, terminal_progress
 from identify.runtime import loading
 
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
-"""Files that the first two stages leave."""
+"""Files that the first two stages write."""
 
 
 def run(
@@ -49,17 +49,17 @@ def run(
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Do a whole experiment, from designing the motion to the report.
+    """Run a whole experiment, from designing the motion to the report.
 
     Chooses an exciting trajectory, moves the simulated robot along it with images in the loop,
-    identifies the robot from the record, judges the model on unseen trajectories, and writes the
-    report. A goal that is missed is said, and does not change the exit status.
+    identifies the robot from the record, validates the model on further trajectories, and writes
+    the report. A missed goal is reported, and does not change the exit status.
 
     Reads a scenario, and the robot and sensor that it names.
 
     Writes into the folder: scenario.toml, trajectories.json, experiment.nc, result.json,
     covariance.nc, validation.nc, model.nc, report.html and figures; with geometry.known=calibrated
-    also geometry. The JSON is result.json.
+    also the folder geometry. The JSON is result.json.
 
     \b
     Examples:
@@ -69,15 +69,15 @@ def run(
       cmmsim run quick --robot ups6           another robot, or your own file
       cmmsim run quick --set timing.latency_s=0.0167 --set pose_method=planes
       cmmsim run quick --set plant.geometry_error_m=1e-4
-                                              joints off by 0.1 mm: the model
-                                              is wrong, and the residuals tell
+                                              joints off by 0.1 mm: a wrong
+                                              model, seen in the residuals
     """
     with loading():
         from identify.setup import Setup, with_renderer
 
     chosen = chosen_scenario(scenario, settings, robot)
     path = out or Path("runs") / f"{chosen.name}-{seed}"
-    # An experiment that was begun in this folder goes on, so its files may be there.
+    # An experiment that was begun in this folder is continued, so its files are allowed there.
     begun = _pipeline().is_begun(Setup(with_renderer(chosen), seed), path)
     folder = context.with_resource(new_run_folder(path, BEGUN if begun else UNFINISHED))
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
@@ -90,19 +90,18 @@ def warm_up(
     robot: RobotOption = None,
     settings: Settings = None,
     all_robots: Annotated[
-        bool, typer.Option("--all-robots", help="Compile every built-in robot, too.")
+        bool, typer.Option("--all-robots", help="Also compile every built-in robot.")
     ] = False,
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Compile once, for this user, all that runs of a scenario need, so that no run waits for it
-    later.
+    """Compile all machine code that runs of a scenario need, so that later runs do not wait for it.
 
-    A robot is compiled for itself, and one with another number of joints or freedoms compiles the
-    loop anew.
+    Each robot has machine code of its own. The loop is compiled once for each number of joints and
+    degrees of freedom.
 
-    Reads a scenario and its robot. Writes machine code into the cache of this user (CMMSIM_CACHE
-    names another folder).
+    Reads a scenario and its robot. Writes machine code into the cache folder of this user, or into
+    the folder that the variable CMMSIM_CACHE names.
 
     \b
     Examples:
@@ -130,19 +129,20 @@ def excite(
     compare: Annotated[
         bool,
         typer.Option(
-            "--compare", help="Only compare the methods: writes comparison.json and comparison.png."
+            "--compare",
+            help="Only compare the search methods, and write comparison.json and comparison.png.",
         ),
     ] = False,
     json: JsonFile = None,
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Choose the exciting trajectory and the unseen ones: the first stage of an experiment.
+    """Choose the exciting and the validation trajectories: the first stage of an experiment.
 
     Reads a scenario and its robot.
 
-    Writes scenario.toml and trajectories.json into the folder; with --compare, what each method of
-    search finds instead. The JSON is trajectories.json or comparison.json.
+    Writes scenario.toml and trajectories.json into the folder. With --compare, it writes the
+    results of all search methods instead. The JSON is trajectories.json or comparison.json.
 
     \b
     Examples:
@@ -152,7 +152,7 @@ def excite(
     """
     chosen = chosen_scenario(scenario, settings, robot)
     name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
-    # What an interrupted search has left may be replaced.
+    # Files of an interrupted search are allowed there, and are replaced.
     may_hold = () if compare else UNFINISHED
     folder = context.with_resource(new_run_folder(out or Path("runs") / name, may_hold))
     with loading():
@@ -176,10 +176,10 @@ def record(
     """Move the simulated robot along the exciting trajectory with images in the loop: the second
     stage.
 
-    Reads scenario.toml and trajectories.json of the folder.
+    Reads scenario.toml and trajectories.json from the folder.
 
-    Writes experiment.nc there: the record, and the truth in a group of its own; payload.nc too,
-    where a known load is what fixes the scale.
+    Writes experiment.nc there: the record, and the truth in a group of its own. If a known load
+    fixes the scale, it also writes payload.nc.
 
     \b
     Example:
@@ -196,7 +196,8 @@ def identify(
         Path | None,
         typer.Option(
             "--out",
-            help="Folder of the run, as the stage before left it; with --record a new one.",
+            help="Folder of the run, with the files of the stage before; with --record a new "
+            "folder.",
             show_default="with --record: runs/NAME-OF-THE-RECORD",
         ),
     ] = None,
@@ -205,8 +206,8 @@ def identify(
         typer.Option(
             "--record",
             metavar="FILE",
-            help="Identify from a record of your own, netCDF or CSV; a second one of the same "
-            "robot under a known load, where that fixes the scale.",
+            help="Identify from a record of your own, netCDF or CSV. Repeat the option for a "
+            "record of the same robot under a known load, if that load fixes the scale.",
             show_default=False,
         ),
     ] = None,
@@ -217,19 +218,19 @@ def identify(
 ) -> None:
     """Estimate the robot's parameters from the record: the third stage.
 
-    Reads scenario.toml, trajectories.json and experiment.nc of the folder; or a record of your own,
-    netCDF as experiment.nc is, or a CSV table with a TOML file of the same name beside it, which
-    says what it is a record of. cmmsim new record mine.csv writes both, with comments that say
-    which columns there are, and these rules:
+    Reads scenario.toml, trajectories.json and experiment.nc from the folder, or a record of your
+    own. A record of your own is a netCDF file like experiment.nc, or a CSV table with a TOML file
+    of the same name beside it that describes the experiment. cmmsim new record mine.csv writes a
+    template of both, with comments that explain the columns and these rules:
 
     A record begins at rest: before its first row the robot has stood still at the first reference
-    pose. It has one row a frame, without gaps; a lost frame keeps its row, with empty measured
-    columns. Units are m, rad and s. What breaks a rule is refused with its line or frame.
+    pose. It has one row per frame, without gaps. A lost frame has a row with empty measured
+    columns. Units are m, rad and s. If a rule is broken, the error names the line or the frame.
 
-    Writes result.json and covariance.nc there, and from a record of your own also scenario.toml,
-    experiment.nc and model.nc: go on with cmmsim report, since nothing is known of the truth that
-    could be validated. What is set here stays in scenario.toml, so that validate, report and the
-    next identify go on with it; result.json, which is also the JSON, lists all settings of its
+    Writes result.json, which is also the JSON, and covariance.nc into the folder. From a record of
+    your own it also writes scenario.toml, experiment.nc and model.nc; continue with cmmsim report,
+    because validate needs the truth. Settings given here are stored in scenario.toml, so that
+    validate, report and the next identify use them. result.json lists all settings of the
     estimator.
 
     \b
@@ -253,7 +254,7 @@ def identify(
         )
     else:
         folder = RunFolder(out)
-        # No trajectories were designed for a record of one's own.
+        # No trajectories were designed for a user's own record.
         folder.require(*(PLANNED[:1] if folder.holds_own_record else PLANNED))
         context.with_resource(working_in(out))
         _pipeline().identify(out, progress, chosen)
@@ -269,9 +270,9 @@ def validate(
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Judge the identified model on trajectories that it has never seen: the fourth stage.
+    """Validate the identified model on trajectories that were not used for it: the fourth stage.
 
-    Reads scenario.toml, trajectories.json, experiment.nc, result.json and covariance.nc of the
+    Reads scenario.toml, trajectories.json, experiment.nc, result.json and covariance.nc from the
     folder.
 
     Writes validation.nc and model.nc there, and completes result.json, which is also the JSON.
@@ -296,7 +297,8 @@ def report(
 ) -> None:
     """Draw the figures of a run and write its report, one file that opens without a network.
 
-    Reads result.json, the records and model.nc of the folder. Writes report.html and figures there.
+    Reads result.json, the records and model.nc from the folder. Writes report.html and figures
+    there.
 
     \b
     Example:
@@ -318,7 +320,7 @@ def _warned(folder: RunFolder) -> dict[str, Any]:
 
 
 def _summary() -> Any:
-    """Import the summary of a run late, as the stages are."""
+    """Import the summary of a run late, for the same reason as the stages."""
     from identify.reporting import tables as run_summary
 
     return run_summary

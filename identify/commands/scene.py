@@ -1,4 +1,4 @@
-"""Commands that show: a run as a page that replays it, and a robot or a sensor as it stands."""
+"""Commands that replay a run on an HTML page, and that show a robot and a sensor at home."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,22 +30,24 @@ def replay(
     ] = None,
     motion: Annotated[
         str,
-        typer.Option(metavar="NAME", help="Which motion: excitation, or an unseen one, as run01."),
+        typer.Option(
+            metavar="NAME", help="Motion to show: excitation, or a validation run such as run01."
+        ),
     ] = "excitation",
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
     """Show a run as one HTML page that opens without a network.
 
-    It has robot, stickers and cameras in space, what both cameras see, and the measured, true and
-    modelled poses over time, their differences enlarged. Open it in a browser.
+    The page shows the robot, stickers and cameras in space, the images of both cameras, and the
+    measured, true and modelled poses over time, with enlarged differences. Open it in a browser.
 
     Reads the files of a run that has been recorded. It writes RUN/replay.html.
 
     \b
     Examples:
       cmmsim replay runs/quick-0
-      cmmsim replay runs/quick-0 --motion run01   the first unseen trajectory
+      cmmsim replay runs/quick-0 --motion run01   first validation trajectory
     """
     from identify.scene import read_motion, write_page
 
@@ -67,21 +69,25 @@ def show(
     ] = None,
     png: Annotated[
         Path | None,
-        typer.Option("--png", metavar="FILE", help="Draw a picture for print: .png, .pdf or .svg."),
+        typer.Option(
+            "--png",
+            metavar="FILE",
+            help="Write a picture for print in place of the page: .png, .pdf or .svg.",
+        ),
     ] = None,
     renderer: Annotated[
         str,
         typer.Option(
-            help="What draws the camera images: analytic, or pyrender, which needs OpenGL."
+            help="Renderer of the camera images: analytic, or pyrender, which needs OpenGL."
         ),
     ] = "analytic",
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Show a robot and a sensor as they stand, as one HTML page or as a picture.
+    """Show a robot and a sensor at the home pose, as one HTML page or as a picture.
 
-    A robot is shown before the sensor ctrack780 where its platform fits that, or before the sensor
-    that is named with it. The page opens without a network.
+    A robot is shown with the sensor that is named with it. Without such a name it is shown with
+    ctrack780, if the platform of that sensor fits. The page opens without a network.
 
     Reads the file of a robot, of a sensor, or of one of each. It writes NAME.html, or a picture for
     print.
@@ -114,7 +120,7 @@ def show(
 
 
 def write_picture(path: Path, cell: "Workcell", renderer: str) -> None:
-    """Draw the scene, and the cameras' images beside it, into a file. Raises WriteError."""
+    """Draw the scene with the camera images beside it into a file. Raises WriteError."""
     from identify.files.atomic import check_writable, figure_bytes, write_bytes
     from identify.scene import overview_figure, scene_figure, stereo_view
 
@@ -132,8 +138,8 @@ def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
     Raises
     ------
     ScenarioError
-        There are two robots, two sensors, or something that is neither, or two that do not fit
-        each other.
+        Two robots or two sensors are named, a file is neither robot nor sensor, or robot and
+        sensor do not fit each other.
     RobotFileError, CmmError
         A file cannot be used.
     """
@@ -152,7 +158,7 @@ def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
     named = next((name for name, kind in zip(names, kinds, strict=True) if kind == "sensor"), None)
     if robot is None or named is not None:
         return workcell(robot, None if named is None else read_sensor_file(named)), []
-    # No sensor was asked for, so a robot that does not fit the usual one is shown alone.
+    # The user named no sensor, so a robot that does not fit the default sensor is shown alone.
     try:
         return workcell(robot, read_sensor_file(SENSOR)), []
     except ScenarioError as error:

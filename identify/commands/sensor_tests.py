@@ -1,4 +1,4 @@
-"""Commands about a sensor alone: its test like a real instrument, and its detectors."""
+"""Commands about a sensor alone: its acceptance test, and a comparison of detectors."""
 
 import math
 from dataclasses import asdict
@@ -35,8 +35,8 @@ def acceptance(
     renderer: Annotated[
         str | None,
         typer.Option(
-            help="pyrender, analytic, auto, or statistical, which draws nothing.",
-            show_default="what the sensor file says",
+            help="pyrender, analytic, auto, or statistical, which renders no images.",
+            show_default="the sensor file's renderer",
         ),
     ] = None,
     standard: Annotated[
@@ -59,8 +59,9 @@ def acceptance(
 ) -> None:
     """Test a sensor like a real instrument: lengths, a moving bar, latency.
 
-    The sensor's own cameras take noisy pictures of artefacts in its measuring volume, its own
-    detection and triangulation measure them, and what is true of the artefacts judges the result.
+    The cameras of the sensor take noisy pictures of artefacts in the measuring volume. Its
+    detection and triangulation measure the artefacts, and the results are compared with the true
+    values.
 
     \b
     vdi    seven lines through the volume, five lengths each: length error
@@ -72,7 +73,7 @@ def acceptance(
     Reads a sensor file.
 
     Writes acceptance.md, acceptance.json, which is also the JSON, and figures/*.png into the
-    folder. The limit is that of the length error.
+    folder. The exit status depends on the limit of the length error only.
 
     \b
     Examples:
@@ -158,8 +159,8 @@ def detectors(
     """Compare the detectors of sticker centres with the Cramer-Rao bound, which no detector can
     beat.
 
-    The first row is what the sensor sees of the platform at home; the others are all combinations
-    of the options.
+    The first row of the table is the sensor's view of the platform at home. The other rows are all
+    combinations of the options.
 
     Reads a sensor file.
 
@@ -218,9 +219,9 @@ def _row(score: "Score") -> dict[str, Any]:
 
 
 def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:
-    """Print one row for each condition, with the bound and the rms error of each detector.
+    """Print one row per condition, with the bound and the rms error of each detector.
 
-    The row of the working point is also told in words below.
+    A sentence per detector then describes the working point.
     """
     names = list(dict.fromkeys(score.detector for score in scores))
     # Scores come condition by condition, each with the detectors in the same order.

@@ -51,8 +51,8 @@ def study(
         bool,
         typer.Option(
             "--insecure",
-            help="Take a scheduler that asks for no certificate: whoever reaches it can run code "
-            "as you.",
+            help="Accept a scheduler without certificates. Everyone who reaches it can then run "
+            "code under your account.",
         ),
     ] = False,
     settings: Annotated[
@@ -60,37 +60,40 @@ def study(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Replace an entry of the study: repeats=5, or scenario.timing.latency_s=0.01 in "
-            "every row, or, with a list, a factor: 'sensor.rig.baseline=[0.5,1.0]'; repeatable.",
+            help="Replace an entry of the study (repeats=5), a value of the scenario in all rows "
+            "(scenario.timing.latency_s=0.01), or the list of a factor "
+            "('sensor.rig.baseline=[0.5,1.0]'); repeatable.",
         ),
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Seed of all randomness.", show_default="what the study says"),
+        typer.Option(min=0, help="Seed of all randomness.", show_default="the study's seed"),
     ] = None,
     repeats: Annotated[
         int | None,
-        typer.Option(min=1, help="Rows at each point.", show_default="what the study says"),
+        typer.Option(min=1, help="Rows at each point.", show_default="the study's repeats"),
     ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
             min=0,
             max=MOST_WORKERS,
-            help="Processes on this machine; 0: none but this one.",
-            show_default="one a core",
+            help="Number of worker processes on this machine; 0 runs all rows in this process.",
+            show_default="one per core",
         ),
     ] = None,
     beside: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of a finished study with the same factors, drawn beside this one; "
-            "repeatable."
+            help="Folder of a finished study with the same factors, to be plotted beside this "
+            "study; repeatable."
         ),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help=f"Do run more than {MANY_ROWS} rows.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help=f"Confirm that more than {MANY_ROWS} rows shall run.")
+    ] = False,
     show: Annotated[
-        bool, typer.Option("--show", help="Only print the file of the study, to start from.")
+        bool, typer.Option("--show", help="Only print the file of the study, as a template.")
     ] = False,
     list_: Annotated[bool, typer.Option("--list", help="Only list the built-in studies.")] = False,
     kinds: Annotated[
@@ -98,25 +101,28 @@ def study(
         typer.Option("--kinds", help="Only list the kinds of row, with their options and figures."),
     ] = False,
     json: JsonFile = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar and no summary.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Print no progress bar and no summary.")
+    ] = False,
     plugin: Plugins = None,
 ) -> None:
     """Run a study: a scenario varied over factors, row by row, on all cores or on many machines.
 
-    What is finished stays in the folder: after Ctrl-C, or whatever ends the program, the same
-    command goes on where it stopped. The same study gives the same figures however it is run. More
-    repeats, by --repeats or in the file, are added to what is there; with fewer, the others are
-    left out of the table and the summary, but none is lost. Title, figures and laws may change too;
-    any other change makes another study, which needs another folder.
+    Finished rows are stored in the folder. After Ctrl-C or a crash, the same command continues
+    where the study stopped. Results do not depend on the number of workers or machines. If the
+    number of repeats is raised, by --repeats or in the file, the new rows are added. If it is
+    lowered, the further rows are left out of the table and the summary, but stay stored. Title,
+    plots and laws can change too. Any other change makes another study, which needs another
+    folder.
 
     Reads a study file, and the scenario, robot and sensor that it names. cmmsim new study mine.toml
     writes a commented one to start from; --show prints a built-in one.
 
-    Writes into the folder study.json, the resolved study; rows.jsonl, finished rows as they come;
-    study.parquet, one table of factors, figures with units, seeds, seconds and errors; study.nc,
-    the figures by factors and repeat; summary.md and summary.json, which is also the JSON, renewed
-    now and then while it runs; and figures as PNG, PDF and SVG, with --beside also those of both
-    studies side by side.
+    Writes into the folder study.json, the resolved study; rows.jsonl, the rows in the order in
+    which they finish; study.parquet, a table of factors, figures with units, seeds, seconds and
+    errors; study.nc, the figures as arrays over factors and repeat; summary.md and summary.json,
+    which is also the JSON; and plots as PNG, PDF and SVG. The summaries are renewed while the study
+    runs. With --beside there are also plots of the studies side by side.
 
     \b
     Examples:
@@ -129,17 +135,18 @@ def study(
         --set 'sensor.camera.dark_noise=[800.0,1600.0]' --set repeats=5
 
     \b
-    A kind of row of your own, kind = "my_module:run", in a module on PYTHONPATH,
-    allowed by --plugin my_module:
+    To define a kind of row of your own, put a function like this into a module on
+    PYTHONPATH, write kind = "my_module:run" in the study, and allow the module by
+    --plugin my_module:
       def run(scenario, seed, options):            # or run(scenario, seed)
           rng = numpy.random.default_rng(seed)     # a SeedSequence
           return {"error_um": ...}                 # numbers, units in names
 
     \b
-    On many machines, all with this cmmsim, dask[distributed], and the files that
-    are named; how to make certificates is in docs/howto/studies.md:
-      dask scheduler --protocol tls                on one
-      dask worker tls://HOST:8786 --nthreads 1     on each, once a core
+    To use many machines, install this cmmsim, dask[distributed] and the files of
+    the study on each; docs/howto/studies.md describes how to make certificates:
+      dask scheduler --protocol tls                on one machine
+      dask worker tls://HOST:8786 --nthreads 1     on each, once per core
       cmmsim study STUDY --scheduler tls://HOST:8786
     """
     if list_:
@@ -170,8 +177,8 @@ def study(
     chosen = load_study(name).with_settings(changes)
     if chosen.rows > MANY_ROWS and not yes:
         raise StudyError(
-            f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say "
-            "--yes"
+            f"study {chosen.name!r} has {chosen.rows:,} rows; confirm more than {MANY_ROWS:,} rows "
+            "by --yes"
         )
     with loading():
         from identify.studies.memory import check_memory
@@ -181,7 +188,7 @@ def study(
 
     count = cores() if workers is None else workers
     shared = prepare(chosen)
-    # The memory of other machines is not known here.
+    # Only the memory of this machine is known.
     if scheduler is None:
         check_memory(chosen, shared, max(count, 1))
     others = rows_beside(chosen, beside or ())
@@ -219,12 +226,12 @@ def _workers(scheduler: str | None, workers: int, insecure: bool) -> "Workers":
 
 
 def _summary(study: "Study", folder: Path, frame: "pd.DataFrame", **how: Any) -> dict[str, Any]:
-    """Write the summary of a table of rows, and return what it holds."""
+    """Write the summary of a table of rows, and return its content."""
     from identify.studies import summary
     from identify.studies.table import written
 
     with written(
-        folder / summary.MARKDOWN, "; all rows are kept, and the same command writes it again"
+        folder / summary.MARKDOWN, "; all rows are stored, and the same command writes it again"
     ):
         return summary.write(folder, study, frame, **how)
 
@@ -233,13 +240,13 @@ def _say(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
     for law in laws:
         typer.echo(_law_line(law))
     again = f", {outcome.found} of them from before" if outcome.found else ""
-    again += f" ({outcome.beyond} more, of further repeats, are kept)" if outcome.beyond else ""
+    again += f" ({outcome.beyond} rows of further repeats stay stored)" if outcome.beyond else ""
     figures = ", figures" if (folder / "figures").is_dir() else ""
     typer.echo(f"{outcome.rows} rows{again}; summary.md{figures} and study.parquet: {folder}")
 
 
 def _judge(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
-    """Exit with a status of its own, and a line on standard error, if rows or laws failed."""
+    """If rows or laws failed, print a line on standard error and exit with the status for it."""
     broken = [law for law in laws if law["verdict"] == "failed"]
     if broken:
         typer.echo(f"{len(broken)} of {len(laws)} laws failed; {_law_line(broken[0])}", err=True)
@@ -278,8 +285,8 @@ def _list_kinds() -> None:
 
     for kind in KINDS.values():
         typer.echo(
-            f"{kind.name}: {kind.what}\n\nIt reads {kind.reads}, and its options; no other factor "
-            "is taken.\n"
+            f"{kind.name}: {kind.what}\n\nIt reads {kind.reads}, and its options. Other factors "
+            "are refused.\n"
         )
         options = [
             (path, str(field.default), factor_unit(path), str(field.description))

@@ -1,4 +1,4 @@
-"""Command ``track``: the benefit of a model to a control law."""
+"""Command ``track``: how much control laws gain from a model of the robot."""
 
 from math import isfinite
 from pathlib import Path
@@ -44,7 +44,8 @@ def track(
         typer.Option(
             "--run",
             metavar="DIR",
-            help="Folder of a run whose estimates are the identified model; else it is made.",
+            help="Folder of a run whose estimates are the identified model. Without it, such a "
+            "run is made.",
         ),
     ] = None,
     motion: Annotated[
@@ -52,7 +53,7 @@ def track(
         typer.Option(
             "--motion",
             metavar="FILE",
-            help="CSV file of poses to follow instead of the usual motions.",
+            help="CSV file of poses to follow in place of the standard motions.",
         ),
     ] = None,
     out: Annotated[Path | None, new_folder("runs/track-SCENARIO-SEED")] = None,
@@ -65,17 +66,17 @@ def track(
 ) -> None:
     """Follow motions under control laws that know a model of the robot.
 
-    The simulated robot follows the scenario's unseen trajectories, a circle and a square, with
-    images in the loop: under the paper's servo (pid), with joint commands shaped by the inverse
-    dynamics (feedforward), or with torques (computed_torque). The law knows the starting model, the
-    identified one, or the truth. The results are the errors of the true poses, the effort, and how
-    much of the squared error would go if the sensor, the model or the latency were exact. The
-    scenario's [control] says whether an observer predicts the pose, and what the actuators take and
-    give.
+    The simulated robot follows the scenario's validation trajectories, a circle and a square, with
+    images in the loop. The laws are the paper's servo (pid), joint commands shaped by the inverse
+    dynamics (feedforward), and torques (computed_torque). A law knows the initial guess of the
+    model, the identified model, or the true model. The results are the errors of the true poses,
+    the effort, and the share of the squared error that an exact sensor, an exact model or zero
+    latency would remove. The scenario's [control] states whether an observer predicts the pose, and
+    the limits of the actuators.
 
-    Reads a scenario; the folder of a whole run, if one is named; and, if named, a CSV file of poses
-    with the columns t, x, y, z, alpha, beta, gamma in s, m and rad. It writes track.json and
-    scenario.toml.
+    Reads a scenario, the folder of a finished run that --run names, and a CSV file of poses that
+    --motion names, with the columns t, x, y, z, alpha, beta, gamma in s, m and rad. It writes
+    track.json and scenario.toml.
 
     \b
     Examples:
@@ -112,7 +113,7 @@ def track(
 
 
 def _each(given: list[str], every: tuple[str, ...]) -> list[str]:
-    # A dict drops the names that are given twice, and keeps their order.
+    # A dict drops repeated names and preserves their order.
     return list(dict.fromkeys(name for one in given for name in (every if one == ALL else (one,))))
 
 
@@ -124,7 +125,7 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
     done = [run for run in entry["runs"] if "failed" not in run]
     if done:
         _print_tables(done, entry["effort_unit"])
-    # If all runs are lost, the error of the command names the first.
+    # If all runs have failed, the error message of the command describes the first.
     for run in entry["runs"] if done else entry["runs"][1:]:
         if "failed" in run:
             typer.echo(f"lost: {_called(run)}: {run['failed']}")
@@ -156,8 +157,8 @@ def _print_tables(done: list[dict[str, Any]], effort_unit: str) -> None:
     ]
     of_effort = ("law", "model", f"effort\n{effort_unit}", "sensor", "model", "latency", "rest")
     said = (
-        "rms effort, and what of the squared error of positions an exact sensor, model or "
-        "latency would take away"
+        "rms effort, and the share of the squared position error that an exact sensor, an exact "
+        "model or zero latency would remove"
     )
     print_table(of_effort, shares, header[:2], said)
 

@@ -1,1 +1,1 @@
-"""Model of a recorded run: what drives it, its residuals, and their whitening."""
+"""Model of a recorded run: its input, its residuals, and their whitening."""

@@ -1,6 +1,6 @@
 """Model of a recorded run, from the record and the model's side of a scenario.
 
-A record that cannot carry an identification is refused, see `identify.record.checks`.
+A record that is not suitable for an identification is refused, see `identify.record.checks`.
 """
 
 from dataclasses import dataclass, replace
@@ -38,25 +38,26 @@ from identify.scenario.plant_sections import DriveName
 
 @dataclass(frozen=True)
 class ModelSide:
-    """Robot and loop as the estimator knows them, and how it reads a record.
+    """Robot and loop as the estimator knows them, and its settings for reading a record.
 
     Attributes
     ----------
     robot : Robot
         Robot with its known geometry.
     settings : LoopSettings
-        Settings of the loop around the model. The latency is the mean one where no record says
+        Settings of the loop around the model. Its mean latency is used if a record does not state
         when commands acted.
     model : Model
-        Parameter set that a search starts from, and the law of the drives, which may be open.
+        Parameter set of the initial guess, and the law of the drives, which can be left open.
     timing : Timing
-        Timing of the frames. Beside that of `settings`, it says how well the latency is known.
+        Timing of the frames. In addition to the timing in `settings`, it has the standard deviation
+        of the latency.
     low_pass : Filter
-        Filter of the measured poses in all fits that are linear.
+        Filter of the measured poses in all linear fits.
     nuisances : tuple of str
         Kinds of errors that all poses have in common, and that are estimated beside the parameters.
     fewest_frames : int
-        Number of frames that a record needs at least to carry an identification.
+        Smallest number of frames of a record for an identification.
     """
 
     robot: Robot
@@ -68,14 +69,14 @@ class ModelSide:
     fewest_frames: int
 
     def with_drive(self, law: DriveName) -> "ModelSide":
-        """Return the same with an identified law of the drives, if the model leaves that open."""
+        """Return a copy with an identified law of the drives, if the model leaves the law open."""
         model = self.model.with_drive(law)
         drives = drives_of(model, self.settings.drives.torque_limit)
         return replace(self, model=model, settings=replace(self.settings, drives=drives))
 
 
 def model_side(robot: Robot, scenario: Scenario) -> ModelSide:
-    """Return the model's side of a scenario. Raises ScenarioError as `loop_settings`."""
+    """Return the model's side of a scenario. Raises the ScenarioError of `loop_settings`."""
     model = scenario.model
     timing = scenario.timing
     return ModelSide(
@@ -90,29 +91,29 @@ def model_side(robot: Robot, scenario: Scenario) -> ModelSide:
 
 
 def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
-    """Return the model of a record that can carry an identification.
+    """Return the model of a record that is suitable for an identification.
 
     Raises
     ------
     RecordError, EstimationError
-        As `predicting_model`. An EstimationError also tells that the record is too short, that a
-        channel is constant, or that the reference stands still, is faster than the frames can
-        show, does not begin at rest, or is in other units or frames than the robot's.
+        The errors of `predicting_model`. In addition, EstimationError if the record is too short,
+        if a channel is constant, if the reference does not move, is too fast for the frame rate, or
+        does not begin at rest, or if units or frames differ from those of the robot.
     """
     check_origin(record, side.robot, side.timing, side.settings.servo)
-    # before the model is made, as nothing can be filtered in a record that is too short
+    # Checked before the model is made, because a short record cannot be filtered.
     check_length(record.sizes["time"], side.fewest_frames, side.timing.frame_rate_hz)
     run = _model(record, side)
     check_reference(run.reference, side.timing.frame_rate_hz)
     check_channels(side.robot.geometry.chart, run.measured, run.logged, run.ok)
-    # torques cannot be compared with joint coordinates
+    # Torques cannot be compared with joint coordinates.
     joint_commands = None if run.settings.drives.torques else run.logged
     check_plausible(side.robot, run.reference, run.measured, run.ok, joint_commands)
     return run
 
 
 def predicting_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
-    """Return the model of a record that is long enough for a prediction at least.
+    """Return the model of a record that is suitable for a prediction.
 
     Raises
     ------
@@ -129,7 +130,7 @@ def predicting_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
 
 
 def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
-    """Combine what a record of this robot and loop holds with what the estimator knows of them."""
+    """Return the model of a record, from its data and the knowledge of the estimator."""
     robot = side.robot
     ok = record["measured_ok"].values.astype(bool)
     check_good_share(ok, drift_warnings([record]))
@@ -146,7 +147,7 @@ def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
         payload_std=load_std,
         acted=logged_latencies(record, side.timing),
     )
-    # what poses notice of these errors depends on the noise of the run, which is known by now
+    # Common errors are added to the model afterwards, because they need its whitener.
     run = replace(run, common=_common_errors(record, side, run))
     return torque_model(run, side.low_pass) if takes_torques(record) else run
 

@@ -1,6 +1,6 @@
 """Model of one recorded run, and its residuals against the measured poses.
 
-The model is driven by its own servo or by the logged commands. Its residuals are whitened by the
+The model is driven by its own servo or by the logged commands. Its residuals are whitened with the
 covariance of the sensor's noise and of the errors that all measured poses have in common.
 """
 
@@ -34,9 +34,9 @@ from identify.record.stored_common_errors import NONE, CommonErrors, Marginal
 from identify.runtime import cores
 
 LONG_GAP_S = 0.5
-"""Longest time, s, of lost frames in a row without a warning.
+"""Longest time, s, of consecutive lost frames without a warning.
 
-The model runs through these frames unobserved.
+The model runs through these frames without measurements.
 """
 
 
@@ -47,26 +47,26 @@ class LoopModel:
     Attributes
     ----------
     measured, ok : ndarray, shapes (N, 6) and (N,)
-        Measured poses, NaN where lost, and which frames were measured.
+        Measured poses, NaN where lost, and marks of the measured frames.
     covariance : ndarray, shape (6, 6)
         Covariance of one measured pose.
     logged : ndarray, shape (N, n)
-        Commands of the joints as they were given.
+        Logged commands of the joints.
     payload, payload_std : ndarray, shape (p,)
-        What a known load on the platform adds to the parameters, and its standard deviations.
+        Change of the parameters by a known load on the platform, and its standard deviations.
     common : CommonErrors
         Errors that all measured poses have in common.
     driven : bool
         True if the model's joints get the logged commands, False if its own servo acts.
     acted : ndarray, shape (N,), optional
-        Latencies of the commands, s, where they were logged. None: all have that of the timing.
+        Logged latencies of the commands, s. If None, all commands have the latency of the timing.
     drawn : ndarray, shape (k,), optional
-        Common errors that the model contains, in their standard deviations. None: it contains none.
+        Common errors that the model contains, in their standard deviations. None means no errors.
     marginal : Marginal, optional
         Whitener of the residuals for common errors, see `with_common_errors`.
     groups : RigidGroups, optional
-        Combinations of the inertial parameters on which the motion depends. Where they are given,
-        sensitivities are those with respect to their pivots and to all other parameters.
+        Combinations of the inertial parameters on which the motion depends. If they are given,
+        sensitivities are with respect to their pivots and to all other parameters.
     """
 
     robot: Robot
@@ -86,28 +86,28 @@ class LoopModel:
     groups: RigidGroups | None = None
 
     def driven_by_commands(self) -> "LoopModel":
-        """Return the same run with the model's joints driven by the logged commands."""
+        """Return a copy of the model with joints driven by the logged commands."""
         return replace(self, driven=True, marginal=None)
 
     def having(self, drawn: Array) -> "LoopModel":
-        """Return the same run with a model that contains these common errors (k,).
+        """Return a copy of the model that contains these common errors (k,).
 
-        They are in standard deviations. An error that no model can contain is reduced.
+        The errors are in standard deviations. They are limited so that no latency is negative.
         """
         contained = np.maximum(drawn, self._lowest) if len(drawn) else None
         return replace(self, drawn=contained, marginal=None)
 
     def with_common_errors(self, parameters: Array) -> "LoopModel":
-        """Return the same run with residuals that are whitened for its common errors, too.
+        """Return a copy of the model with residuals that are also whitened for common errors.
 
-        Their modes are those of a model with these parameters (p,), about the errors that it
-        contains. Raises LoopFailure if that model is unstable.
+        The modes are evaluated at these parameters (p,), about the errors that the model contains.
+        Raises LoopFailure if the model is unstable.
         """
         if not self.common.all_names:
             return self
         seen = self.modes(parameters)[self.ok]
         modes = np.asarray(self.whitener @ seen).reshape(-1, seen.shape[2])
-        # errors of measured poses do not reach a model without a servo
+        # Errors of measured poses have no effect on a model without a servo.
         inside = slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
         had = modes[:, inside] @ self.errors_had[inside]
         return replace(self, marginal=Marginal.of(modes, had))
@@ -115,9 +115,10 @@ class LoopModel:
     def modes(self, parameters: Array) -> Array:
         """Return the shift (N, 6, k) of the measured poses against the model by the common errors.
 
-        It is the shift for one standard deviation of each error. A model driven by the logged
-        commands moves as the plant did, and what is measured beside that is the error. A closed
-        loop sees the error as well, and its servo takes the platform where the error does not show.
+        It is the shift for one standard deviation of each error. If the logged commands drive the
+        model, an error of the measured poses appears directly in the residuals. In a closed loop
+        the servo measures the error as well, and moves the platform so that the error hardly
+        appears in the measured poses.
         """
         if not self.driven:
             return self._apart(parameters, lambda run: run.measured)
@@ -135,10 +136,10 @@ class LoopModel:
         shown: Callable[[ClosedLoopRun], Array],
         beside: Array | float | None = None,
     ) -> Array:
-        """Return central differences (N, 6, k) of what a run shows, per unit of each common error.
+        """Return central differences (N, 6, k) of poses of a run, per unit of each common error.
 
-        shown: picks the poses (N, 6) of a run. beside (N, 6, k): columns of the errors of measured
-        poses that the loop does not see, for which nothing is simulated.
+        shown: function that returns the poses (N, 6) of a run. beside (N, 6, k): given columns for
+        the errors of measured poses. If it is given, these errors are not simulated.
         """
         drawn = self.errors_had
         modes = np.zeros((*self.measured.shape, len(drawn)))
@@ -152,13 +153,13 @@ class LoopModel:
             for k in moving
             for sign in (1.0, -1.0)
         ]
-        # threads are enough: the compiled loop runs without Python's lock
+        # Threads are enough, because the compiled loop runs without Python's global lock.
         with ThreadPoolExecutor(cores()) as pool:
             found = list(pool.map(lambda end: shown(self.having(end).simulate(parameters)), ends))
         for place, k in enumerate(moving):
             more, less = found[2 * place : 2 * place + 2]
             high, low = ends[2 * place : 2 * place + 2]
-            # less than two units where the lower end would be a negative latency
+            # The distance is less than two units if the lower end would be a negative latency.
             modes[:, :, k] = (more - less) / (high[k] - low[k])
         if (geometry := self.common.geometry) is None:
             return modes
@@ -167,7 +168,7 @@ class LoopModel:
 
     @property
     def latencies(self) -> Array | None:
-        """Latencies (N,) of the model's commands, s, or None if all have that of its timing.
+        """Latencies (N,) of the model's commands, s. None: all have the latency of the timing.
 
         They include the common error of the latency that the model contains.
         """
@@ -180,7 +181,7 @@ class LoopModel:
 
     @property
     def _lowest(self) -> Array:
-        """Least values (k,) of the errors that a model can contain. No latency is negative."""
+        """Smallest allowed values (k,) of the common errors, by which no latency is negative."""
         lowest = np.full(len(self.common.names) + bool(self.common.latency_std), -np.inf)
         if self.common.latency_std:
             mean = self.settings.timing.latency_s if self.acted is None else self.acted.mean()
@@ -189,7 +190,7 @@ class LoopModel:
 
     @property
     def errors_had(self) -> Array:
-        """Common errors (k,) that the model contains: of the poses, and of the latency."""
+        """Common errors (k,) that the model contains: errors of the poses, then of the latency."""
         count = len(self.common.names) + bool(self.common.latency_std)
         return np.zeros(count) if self.drawn is None else self.drawn
 
@@ -205,11 +206,11 @@ class LoopModel:
         Parameters
         ----------
         parameters : ndarray, shape (p,)
-            Parameters without a known load, which is added.
+            Parameters without the known load. The load is added.
         sensitivities : bool
-            True returns derivatives with respect to the parameters, too.
+            Whether derivatives with respect to the parameters are also computed.
         robot : Robot, optional
-            Robot that moves, if it is another one than the servo knows.
+            Robot that moves. The default is the robot that the servo knows.
         noise : ndarray, shape (N, 6), optional
             Noise of the poses that the servo measures.
 
@@ -229,7 +230,7 @@ class LoopModel:
             return simulate_commands(*given, self.logged, sensor, latencies=late)
         if sensitivities:
             return differentiate_servo(*given, sensor, latencies=late, groups=self.groups)
-        # another robot moves, but the servo goes by the one that it knows
+        # The servo always uses the robot that it knows, even if another robot moves.
         return simulate_servo(*given, sensor, servo_robot=self.robot, latencies=late)
 
     def simulate_repeats(
@@ -237,8 +238,8 @@ class LoopModel:
     ) -> list[ClosedLoopRun | LoopFailure]:
         """Simulate the model once for each noise (N, 6) of noises (runs, N, 6).
 
-        The servo measures its poses with that noise. A run that is unstable is returned as its
-        LoopFailure.
+        The servo measures its poses with this noise. For an unstable run, the LoopFailure is
+        returned in place of the run.
         """
         sensed = np.asarray(self._sensed(noises))
         given = self.robot, parameters + self.payload, self.reference, self.settings
@@ -248,23 +249,23 @@ class LoopModel:
 
     @property
     def _lost(self) -> NDArray[np.bool_] | None:
-        """Frames (N,) at which the model's servo measures nothing, or None under commands."""
+        """Marks (N,) of frames without a measurement by the model's servo. None without a servo."""
         return None if self.driven else ~self.ok
 
     def commands_before(self, frame: int) -> tuple[Array, Array | None]:
-        """Return the commands (k, n) that may act at a frame or later, and their latencies.
+        """Return the commands (k, n) before a frame that can still act at it, and their latencies.
 
-        They were issued before the frame. At the first frame it is the first command of the run.
-        The latencies (k,) are in s, or None if all have that of the timing.
+        For the first frame it is the first command of the run. The latencies (k,) are in s. They
+        are None if all commands have the latency of the timing.
         """
         rows = slice(max(0, frame - MAX_DELAY_FRAMES - 2), max(frame, 1))
         latencies = self.latencies
         return self.logged[rows], None if latencies is None else latencies[rows]
 
     def _sensed(self, noise: Array | None) -> Array | None:
-        """Return what is added to the poses (N, 6) that the model's servo measures.
+        """Return the sum of the common errors in the model and of noise (..., N, 6).
 
-        It is the common errors that the model contains, and noise (..., N, 6).
+        It is added to the poses (N, 6) that the model's servo measures.
         """
         if self.drawn is None or not self.common.names or self.driven:
             return noise
@@ -278,14 +279,14 @@ class LoopModel:
     def misses(self, parameters: Array, ahead: bool = False) -> Array:
         """Return the whitened residuals model - measurement (n, 6) of the good frames.
 
-        With `ahead` they come from a run with the sensitivities that `shown_residuals` will need.
+        With `ahead`, the run also computes the sensitivities that `shown_residuals` will need.
         Raises LoopFailure if the model is unstable.
         """
         return self.without_common(self._missed(self._latest_run(parameters, sensitivities=ahead)))
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
-        """Return the model's run, which is kept until the next of its kind. Raises LoopFailure."""
-        # a copy, as the caller may change the array
+        """Return the model's run, cached for repeated parameters. Raises LoopFailure."""
+        # A copy, because the caller can change the array.
         given = parameters.tobytes()
         known, run = self._runs.get(sensitivities, (b"", None))
         if run is None or known != given:
@@ -295,14 +296,14 @@ class LoopModel:
 
     @cached_property
     def _runs(self) -> dict[bool, tuple[bytes, ClosedLoopRun]]:
-        """Latest runs without and with sensitivities, and the parameters of each."""
+        """Latest run without and latest run with sensitivities, and their parameters."""
         return {}
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
         """Return `misses` (n, 6) of a model driven by the logged commands.
 
-        They are white if the model is right. rng: draws what a fit to the poses themselves has
-        taken out of the residuals. Raises LoopFailure if the model is unstable.
+        They are white if the model is right. rng: generator that a subclass uses if it fits states
+        to the poses. Raises LoopFailure if the model is unstable.
         """
         return self.misses(parameters)
 
@@ -335,7 +336,7 @@ class LoopModel:
     def _missed(self, run: ClosedLoopRun) -> Array:
         """Return the residuals (n, 6) of a run of the model, whitened by the noise alone.
 
-        The part that is due to the common errors that the model contains is taken out.
+        The part due to the common errors in the model is subtracted.
         """
         seen = run.pose if self.driven or self.drawn is None else run.measured
         missed = self.whiten(seen - self.measured)
@@ -354,10 +355,7 @@ class LoopModel:
         return self.marginal.modes.reshape(count, 6, -1)
 
     def without_common(self, rows: Array) -> Array:
-        """Return rows (n, 6, ...) whitened for the common errors, too.
-
-        The rows are whitened by the noise already.
-        """
+        """Whiten rows (n, 6, ...) for the common errors. They are whitened by the noise already."""
         if self.marginal is None:
             return rows
         stacked = rows.reshape(self.marginal.directions.shape[0], -1)
@@ -368,7 +366,7 @@ class LoopModel:
         return without_gaps(self.measured, self.ok)
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a warning if many frames in a row were lost, which weakens the estimate."""
+        """Return a warning if many consecutive frames were lost, which weakens the estimate."""
         edges = np.flatnonzero(np.diff(np.concatenate([[0], ~self.ok, [0]])))
         if not len(edges):
             return ()
@@ -380,10 +378,10 @@ class LoopModel:
         return (
             f"{gaps[longest]} frames in a row were lost from t = "
             f"{edges[2 * longest] / rate_hz:.2f} s on: the model runs through "
-            f"{gaps[longest] / rate_hz:.2f} s unobserved",
+            f"{gaps[longest] / rate_hz:.2f} s without measurements",
         )
 
     @cached_property
     def whitener(self) -> Array:
-        """Matrix (6, 6) that brings pose differences to standard deviations of the sensor."""
+        """Matrix (6, 6) that scales pose differences to standard deviations of the sensor."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)), dtype=float)

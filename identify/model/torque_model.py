@@ -1,12 +1,12 @@
-"""Model of a record whose drives took torques, in short spans.
+"""Model of a record with torque commands, simulated in short spans.
 
-No robot stands on torques alone. Under logged torques nothing holds the model where the robot was,
-and a deviation grows by some e^7 in a second. Over a span of half a second it stays small.
-Coordinates and rates at the start of each span are fitted to its measured poses by Gauss-Newton,
-for every set of parameters. The poses of a run are then those of the fitted spans. Their
-derivatives with respect to the parameters are those at fitted starts (variable projection in
-Kaufman's form; BIT 15, 1975). Beside the span's own poses next to nothing is known of its start, so
-that 2 m of its residuals go into the start.
+Under logged torques the model has no feedback, and a deviation from the robot grows by about e^7
+per second. Over a span of half a second it stays small. For every set of parameters, the
+coordinates and rates at the start of each span are fitted to its measured poses by Gauss-Newton.
+The poses of a run are the poses of the fitted spans. Their derivatives with respect to the
+parameters account for the fit of the starts (variable projection in Kaufman's form; BIT 15, 1975).
+Prior knowledge of a start is negligible, so the fit of a start uses 2 m degrees of freedom of the
+residuals of its span.
 """
 
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,7 @@ from identify.model.loop_model import LoopModel
 from identify.scenario import Filter
 
 SPAN_S = 0.5
-"""Length of a span, s. One twice as long is e^3.5 times as sensitive to its start."""
+"""Length of a span, s. A span twice as long is e^3.5 times as sensitive to its start."""
 
 STEPS = 8
 """Largest number of Gauss-Newton steps of a start."""
@@ -41,12 +41,12 @@ SETTLED = 1e-3
 """Largest change of a pose, in standard deviations, at which the steps end."""
 
 SHORTEST = 4
-"""Largest number of frames of a span that is not halved when no start is known."""
+"""Length in frames up to which a span is not halved for the search of its start."""
 
 NEAR = 10.0
-"""Standard deviation of a start about the filtered poses, in those of the noise.
+"""Standard deviation of a start about the filtered poses, in standard deviations of the noise.
 
-It is so large that next to nothing is known of the start.
+It is so large that the filtered poses hardly affect the fit.
 """
 
 RATE = 20.0
@@ -55,7 +55,7 @@ RATE = 20.0
 
 @dataclass(frozen=True)
 class Fit:
-    """Span that was run from a start (2 m,).
+    """Run of a span from a start (2 m,).
 
     Attributes
     ----------
@@ -64,7 +64,8 @@ class Fit:
     seen : ndarray, shape (6 n, 2 m)
         Derivatives of the whitened poses with respect to the start.
     missed : ndarray, shape (6 n + 2 m,)
-        Residuals of the measured poses, and of the filtered start in its standard deviations.
+        Residuals of the measured poses, then differences from the filtered start, both in standard
+        deviations.
     """
 
     start: Array
@@ -77,7 +78,7 @@ class Fit:
 class TorqueModel(LoopModel):
     """Model of a run under torques.
 
-    starts (k, 2 m): coordinates and rates of the filtered poses where the k spans begin.
+    starts (k, 2 m): filtered coordinates and rates at the beginning of the k spans.
     """
 
     starts: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -92,8 +93,8 @@ class TorqueModel(LoopModel):
     ) -> ClosedLoopRun:
         """Simulate the model in fitted spans, with derivatives of its poses.
 
-        What the run holds beside poses is that of the first span. Raises LoopFailure where a span
-        leaves the reach.
+        All other data of the returned run are from the first span. Raises LoopFailure if a span
+        leaves the reach of the robot.
         """
         fits = self._fits(parameters, robot)
         pose = np.concatenate([fit.run.pose for fit in fits])
@@ -103,7 +104,7 @@ class TorqueModel(LoopModel):
                 for fit, (first, last) in zip(fits, self._spans, strict=True)
             ]
         )
-        # no servo is in the loop that would follow the noise
+        # Without a servo, noise does not move the model.
         measured = pose if noise is None else pose + noise
         return replace(fits[0].run, pose=pose, measured=measured, pose_sensitivity=slopes)
 
@@ -117,14 +118,11 @@ class TorqueModel(LoopModel):
         return [self.simulate(parameters, noise=noise) for noise in noises]
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
-        """Return the model's run.
-
-        Only the fits of the latest one are kept, from which the next fits start.
-        """
+        """Return the model's run. Only its fits are cached, because the next fits start there."""
         return self.simulate(parameters, sensitivities)
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
-        """Return `misses`, with drawn noise where the fit of the starts has taken it out.
+        """Return `misses`, with random noise added along the directions that the starts fit.
 
         They are white if the model is right.
         """
@@ -148,8 +146,8 @@ class TorqueModel(LoopModel):
     def _fits(self, parameters: Array, robot: Robot | None) -> list[Fit]:
         """Return the fits of all spans.
 
-        Those of the latest evaluation are kept, since later calls ask for them again, or begin
-        there.
+        The fits of the latest parameters are cached. Later calls with the same parameters reuse
+        them, and calls with other parameters start from them.
         """
         key = parameters.tobytes() + self.errors_had.tobytes()
         if robot is None and key in self._latest:
@@ -160,7 +158,7 @@ class TorqueModel(LoopModel):
         spans = zip(self._spans, self.starts, before, strict=True)
         fits = [self._fitted(values, moved, span, start, near) for span, start, near in spans]
         if robot is None:
-            # one set of fits only: each holds the sensitivities of all its frames
+            # Only one set of fits is cached, because each holds the sensitivities of all frames.
             self._latest.clear()
             self._latest[key] = fits
         return fits
@@ -173,10 +171,10 @@ class TorqueModel(LoopModel):
         filtered: Array,
         before: Fit | None,
     ) -> Fit:
-        """Return the fit of a span with the start that fits it best.
+        """Return the fit of a span with its best start.
 
-        The search begins at the start of the fit before, if there is one and the span runs from
-        there. Else it begins at the start that fits half of the span, or at the filtered one.
+        The search begins at the start of the previous fit, if there is one and the span runs from
+        there. Otherwise it begins at the best start of half of the span, or at the filtered start.
         Raises LoopFailure.
         """
         near = np.diag(1 / self._width)
@@ -192,7 +190,7 @@ class TorqueModel(LoopModel):
             step = np.linalg.lstsq(np.vstack([fit.seen, near]), fit.missed, rcond=None)[0]
             if np.abs(fit.seen @ step).max(initial=0.0) < SETTLED:
                 break
-            # a whole step may go too far, even out of the reach
+            # A full step can be too large, and even leave the reach of the robot.
             for halving in range(HALVINGS):
                 start = fit.start - 0.5**halving * step
                 lower = self._tried(parameters, robot, span, start, filtered)
@@ -219,7 +217,7 @@ class TorqueModel(LoopModel):
         first, last = span
         coordinates, rates = np.split(start, 2)
         pose = chart.pose(coordinates)
-        # drives that take torques have no integrals, nor does a run without its servo
+        # Drives with torque commands have no integrals, and neither has a run without a servo.
         no_joint_integral = np.zeros(robot.layout.joints)
         no_pose_integral = np.zeros(len(coordinates))
         before, earlier = self.commands_before(first)
@@ -252,7 +250,7 @@ class TorqueModel(LoopModel):
     def _slopes(self, fit: Fit, ok: np.ndarray) -> Array:
         """Return derivatives (n, 6, p) of a span's poses with respect to the parameters.
 
-        The start follows the parameters.
+        They include the change of the fitted start.
         """
         states = fit.seen.shape[1]
         near = np.diag(1 / self._width)
@@ -266,13 +264,13 @@ class TorqueModel(LoopModel):
 
 
 def torque_model(run: LoopModel, low_pass: Filter) -> TorqueModel:
-    """Return the model of a recorded run whose commands are torques, and which begins at rest."""
+    """Return the model of a recorded run with torque commands that begins at rest."""
     drives = Drives(torques=True, torque_limit=run.settings.drives.torque_limit)
     chart = run.robot.geometry.chart
     rate_hz = run.settings.timing.frame_rate_hz
     measured = chart.coordinates(run.without_gaps())
     place, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
-    rate[0] = 0.0  # the run begins at rest, whatever the filter says at its end
+    rate[0] = 0.0  # the run begins at rest, but the filter is inaccurate at the ends
     starts = np.hstack([place, rate])[span_edges(len(run.ok), rate_hz)[:-1]]
     parts = {name: getattr(run, name) for name in LoopModel.__dataclass_fields__}
     return TorqueModel(
@@ -281,9 +279,9 @@ def torque_model(run: LoopModel, low_pass: Filter) -> TorqueModel:
 
 
 def span_edges(frames: int, rate_hz: float) -> list[int]:
-    """Return where the spans of a run begin, and its number of frames.
+    """Return the first frame of each span of a run, followed by its number of frames.
 
-    All spans are of about the same length.
+    All spans have about the same length.
     """
     count = max(1, round(frames / (SPAN_S * rate_hz)))
     return [int(edge) for edge in np.linspace(0, frames, count + 1).round()]

@@ -1,8 +1,8 @@
-"""Checks that a record can carry an identification.
+"""Checks that a record is suitable for an identification.
 
-A record must be of this robot and loop, long enough, and moving. It must begin at rest and be in m
-and rad, which no shape and no type can show. Each check raises EstimationError with what it found.
-Frames are counted from 0.
+A record must come from this robot and loop, be long enough, and contain motion. It must begin at
+rest and be in m and rad. Each check raises EstimationError with its finding. Frames are counted
+from 0.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,13 +27,13 @@ from identify.scenario import Excitation, Filter, Timing
 from identify.trajectory import FourierTrajectory
 
 MINIMUM_GOOD_SHARE = 0.5
-"""Share of frames that must have been measured."""
+"""Smallest share of measured frames."""
 
 REFERENCE_GAP = 0.05
-"""Share of its travel by which a reference may differ from the integral of its rate."""
+"""Largest difference of a reference from the integral of its rate, as a share of its travel."""
 
 ROUNDING = 1e-9
-"""Difference, m or rad, that counts as rounding. It is relative where frame rates are compared."""
+"""Difference, m or rad, that counts as rounding. For frame rates it is a relative difference."""
 
 ASYMMETRY = 1e-6
 """Largest difference of two mirrored entries of a covariance that counts as rounding.
@@ -43,16 +43,16 @@ Its unit is the product of the two standard deviations.
 
 
 class TooFewFramesError(EstimationError):
-    """Error for a record most of whose frames were lost."""
+    """Error for a record in which most frames were lost."""
 
 
 def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoGains) -> None:
-    """Check that a record is whole, of this robot, and made with the model's timing and servo.
+    """Check that a record is complete, of this robot, and made with the model's timing and servo.
 
     Raises
     ------
     RecordError
-        The record is not whole, or does not state its scenario.
+        The record is not complete, or does not state its scenario.
     EstimationError
         Robot, joints, timing or servo differ, or frames are missing.
     """
@@ -60,15 +60,15 @@ def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoG
     check_robot(record, robot)
     if record.sizes["joint"] != robot.layout.joints:
         raise EstimationError(
-            f"the record has commands of {record.sizes['joint']} joints, robot {robot.name!r} has "
-            f"{robot.layout.joints}"
+            f"the record has commands of {record.sizes['joint']} joints, but robot {robot.name!r} "
+            f"has {robot.layout.joints}"
         )
     recorded = recorded_scenario(record)
     for section, ours in (("timing", timing.model_dump()), ("servo", asdict(servo))):
         for key, value in getattr(recorded, section).model_dump().items():
             if value != ours[key]:
                 raise EstimationError(
-                    f"the record was made with {section}.{key} = {value!r}, the scenario says "
+                    f"the record was made with {section}.{key} = {value!r}, but the scenario has "
                     f"{ours[key]!r}"
                 )
     rate_hz = timing.frame_rate_hz
@@ -79,27 +79,27 @@ def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoG
             f"timing.frame_rate_hz of its attribute scenario is {rate_hz:g}"
         )
     steps = np.diff(np.asarray(record["time"].values, dtype=float)) * rate_hz
-    # a time of NaN must not pass, which `>` would let
+    # `not ... <=` also refuses NaN times, which `>` would accept.
     if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
         worst = int(np.abs(steps - 1).argmax())
         raise EstimationError(
             f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of {rate_hz:g} Hz "
-            "apart: frames are missing in the record; keep lost ones with measured_ok = 0"
+            "apart: frames are missing in the record; store lost frames with measured_ok = 0"
         )
 
 
 def check_trajectory(
     record: xr.Dataset, trajectory: FourierTrajectory, timing: Timing, duration_s: float
 ) -> None:
-    """Check that the reference is the exciting trajectory (eq. 37) at all frames of its duration.
+    """Check that the reference is the exciting trajectory (eq. 37) at all its frames.
 
-    duration_s: that of the excitation.
+    duration_s: duration of the excitation, s.
     """
     asked = timing.frame_times(duration_s)
     if record.sizes["time"] != len(asked):
         raise EstimationError(
             f"the record has {record.sizes['time']} frames, and the scenario asks for {len(asked)} "
-            f"(excitation.duration_s = {duration_s:g} s): it is of another experiment"
+            f"(excitation.duration_s = {duration_s:g} s): the record is of another experiment"
         )
     gap = np.abs(poses(record, "reference") - trajectory.pose(asked))
     if not gap.max() <= ROUNDING:
@@ -107,14 +107,14 @@ def check_trajectory(
         raise EstimationError(
             f"the record's reference is not the exciting trajectory: its {POSE[worst]} differs by "
             f"{gap[frame, worst]:.3g} {'m' if worst < 3 else 'rad'} at t = {asked[frame]:.2f} s: "
-            "it is of another experiment"
+            "the record is of another experiment"
         )
 
 
 def check_reference(reference: Reference, rate_hz: float) -> None:
     """Check that the reference moves, and that its poses are the integral of its rates.
 
-    A motion faster than half the frame rate looks like a slow one in the poses. Its rates reveal
+    A motion faster than half the frame rate looks like a slow motion in the poses. The rates reveal
     it.
     """
     poses = reference.poses
@@ -122,9 +122,9 @@ def check_reference(reference: Reference, rate_hz: float) -> None:
     travel = np.ptp(poses, axis=0)
     if not travel.any():
         raise EstimationError(
-            "the reference is the same pose in every frame: nothing was asked to move"
+            "the reference is the same pose in every frame: no motion was requested"
         )
-    if len(poses) <= SPLINE_DEGREE:  # no spline goes through so few
+    if len(poses) <= SPLINE_DEGREE:  # too few poses for a spline
         return
     times = np.arange(len(poses)) * (1.0 / rate_hz)
     integral = make_interp_spline(times, rates, k=SPLINE_DEGREE).antiderivative()
@@ -133,16 +133,17 @@ def check_reference(reference: Reference, rate_hz: float) -> None:
     worst = int(np.argmax(gap - REFERENCE_GAP * travel))
     if gap[worst] > REFERENCE_GAP * travel[worst] + ROUNDING:
         raise EstimationError(
-            f"the reference's {POSE[worst]} travels {travel[worst]:.3g}, and its rate makes it "
-            f"another motion, up to {gap[worst]:.3g} away: it has harmonics above half of "
+            f"the reference's {POSE[worst]} travels {travel[worst]:.3g}, and differs from the "
+            f"integral of its rate by up to {gap[worst]:.3g}: it has harmonics above half of "
             f"{rate_hz:g} Hz, or the rate is not its derivative"
         )
 
 
 def fewest_frames(timing: Timing, low_pass: Filter, excitation: Excitation) -> int:
-    """Return the number of frames that a record needs at least.
+    """Return the smallest allowed number of frames of a record.
 
-    They are one period of the highest harmonic, and what the filter takes at the ends.
+    A record must contain one period of the highest harmonic, and be longer than the padding that
+    the filter needs.
     """
     return max(
         padding_samples(timing.frame_rate_hz, low_pass.cutoff_hz, low_pass.order) + 1,
@@ -154,15 +155,15 @@ def check_length(frames: int, fewest: int, rate_hz: float, what: str = "the reco
     """Check that a record has at least the `fewest_frames`. The message begins with `what`."""
     if frames < fewest:
         raise EstimationError(
-            f"{what} {frames} frames ({frames / rate_hz:.3g} s), at least {fewest} are needed: one "
-            "period of the highest harmonic, and what the filter takes at its ends"
+            f"{what} {frames} frames ({frames / rate_hz:.3g} s), at least {fewest} are needed, for "
+            "one period of the highest harmonic and for the padding of the filter"
         )
 
 
 def check_good_share(ok: NDArray[np.bool_], seen: Sequence[str] = ()) -> None:
-    """Check that enough of the frames were measured, as `ok` (N,) states.
+    """Check that enough frames were measured, those where `ok` (N,) is true.
 
-    The message of the TooFewFramesError ends with `seen`, what a watch saw of the cameras.
+    The message of the TooFewFramesError ends with `seen`, the warnings of the drift watch.
     """
     if ok.mean() < MINIMUM_GOOD_SHARE:
         why = "".join(f": {warning}" for warning in seen)
@@ -175,8 +176,8 @@ def check_good_share(ok: NDArray[np.bool_], seen: Sequence[str] = ()) -> None:
 def check_channels(chart: Chart, measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
     """Check that every coordinate and every command changes.
 
-    Coordinates are those of the measured poses (N, 6) in the good frames, `ok` (N,). Commands (N,
-    n) are taken in all frames. Components that the chart holds fixed may stand still.
+    Coordinates are computed from the measured poses (N, 6) in the good frames, `ok` (N,). Commands
+    (N, n) are checked in all frames. Components that the chart fixes are not checked.
     """
     channels = list(zip(chart.coordinate_names, chart.coordinates(measured[ok]).T, strict=True))
     channels += [
@@ -185,7 +186,8 @@ def check_channels(chart: Chart, measured: Array, logged: Array, ok: NDArray[np.
     for name, values in channels:
         if np.ptp(values) == 0:
             raise EstimationError(
-                f"{name} is {values[0]:g} in every frame: nothing moved, or the channel is dead"
+                f"{name} is {values[0]:g} in every frame: nothing moved, or the channel does not "
+                "work"
             )
 
 
@@ -204,7 +206,7 @@ def checked_covariance(covariances: Array, ok: NDArray[np.bool_]) -> Array:
 def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
     """Check that the covariances (n, 6, 6) of these frames (n,) are symmetric.
 
-    Later computations read one triangle only.
+    Later computations read only one triangle of each matrix.
     """
     gap = np.abs(covariances - covariances.transpose(0, 2, 1))
     std = np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
@@ -221,24 +223,24 @@ def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
 
 
 REST_RATE = 0.05
-"""Share of its largest rate with which a reference may begin."""
+"""Largest initial rate of a reference, as a share of its largest rate."""
 
 REST_POSE = 0.1
-"""Distance from the reference at which the first measured pose may be.
+"""Largest distance of the first measured pose from the reference.
 
 It is a share of the largest travel of the positions, or of the angles.
 """
 
 TRAVELS = 2.0
-"""Distance, in travels, at which a measured pose may be from the reference.
+"""Largest distance of a measured pose from the reference, as a multiple of its travel.
 
-A command may be as far from the joint coordinates of the reference.
+The same limit holds for commands and the joint coordinates of the reference.
 """
 
 BUILT = 0.05
-"""Share of the joints' travel limit by which commands may differ from those of the robot file.
+"""Difference of commands from the inverse kinematics that is always allowed.
 
-A robot that is built otherwise than its file needs other commands.
+It is a share of the joints' travel limit, because the real geometry differs from the robot file.
 """
 
 OTHER_UNITS = {
@@ -246,7 +248,7 @@ OTHER_UNITS = {
     "degrees": (1.0, np.pi / 180),
     "mm and degrees": (1e-3, np.pi / 180),
 }
-"""Factors of positions and of angles from units in which records come by mistake."""
+"""Factors of positions and of angles for units that records have by mistake."""
 
 
 def check_plausible(
@@ -254,9 +256,9 @@ def check_plausible(
 ) -> None:
     """Refuse a record that does not begin at rest, or is in other units or frames than the robot.
 
-    measured (N, 6): poses, NaN where lost. ok (N,): frames that were measured. logged (N, n): joint
-    commands, if any. Raises EstimationError with the frame, what was found, and units in which it
-    would fit.
+    measured (N, 6): poses, NaN where lost. ok (N,): true for measured frames. logged (N, n): joint
+    commands, or None. Raises EstimationError with the frame, the finding, and the units in which
+    the record would fit.
     """
     _check_reach(robot, reference.poses)
     _check_rest(reference)
@@ -290,11 +292,11 @@ def _check_rest(reference: Reference) -> None:
 
 
 def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]) -> None:
-    """Check that the measured poses stay near the reference, and begin where it does."""
+    """Check that the measured poses begin at the reference, and stay near it."""
     travel = np.repeat(np.ptp(reference.poses, axis=0).reshape(2, 3).max(axis=1), 3)
-    # angles that nobody asked to move have no travel to compare with
+    # Without travel of the reference there is no scale to compare with.
     usual = np.where(travel > 0, travel, np.inf)
-    # only at rest, in the first frame, must the robot be where the reference is
+    # The robot must be at the reference only in the first frame, at rest.
     limits = np.full(len(ok), TRAVELS)
     limits[0] = REST_POSE
 
@@ -312,7 +314,7 @@ def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]
         raise EstimationError(
             f"in frame {frame} the measured {POSE[worst]} is {measured[frame, worst]:.6g} and the "
             f"reference {reference.poses[frame, worst]:.6g}, {100 * found[frame, worst]:.0f} % of "
-            f"its travel apart: {rest}both are in different frames or "
+            f"its travel apart: {rest}the two poses are in different coordinate frames or "
             f"units{_unit_hint(measured, near)}"
         )
 
@@ -337,12 +339,12 @@ def _check_commands(robot: Robot, reference: Reference, logged: Array) -> None:
         raise EstimationError(
             f"the command of joint {joint + 1} in frame {frame} is {logged[frame, joint]:.6g}, and "
             f"the reference needs {wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} "
-            f"{unit} away: zero, direction or unit of the joints differ from the robot file's{hint}"
+            f"{unit} away: zero, direction or unit of the joints differ from the robot file{hint}"
         )
 
 
 def _unit_hint(poses: Array, fits: Callable[[Array], bool]) -> str:
-    """Return a hint at units in which poses (N, 6) would fit, or an empty string."""
+    """Return a hint at the units in which poses (N, 6) would fit, or an empty string."""
     for units, (position, angle) in OTHER_UNITS.items():
         if fits(poses * np.repeat([position, angle], 3)):
             return f"; in {units} it would fit, and records are in m and rad"

@@ -1,22 +1,22 @@
 """Conditions of a run that its record states beside the frames.
 
-Law. A model can close its own loop around the visual servo only. Of another control law the record
-states the name, and what its commands are: joint commands or, if the drives took them, torques. A
-record that states nothing was made under the servo.
+Law. A model can simulate the closed loop only with the visual servo. For another control law, the
+record states the name of the law, and whether its commands are joint commands or torques. A record
+without this information was made with the servo.
 
-Times of commands. A command acts from the instant at which it is written to the drives. With a
-latency that jitters, every command acts after another time, and a model that takes the mean for all
-of them describes another loop. If a record holds no such times, the model's commands have the
-latency of the timing. The log is that of a clock. It does not show how far the mean latency is from
-the stated one (`timing.latency_std_s`).
+Times of commands. A command acts from the instant at which it is written to the drives. If the
+latency jitters, it differs from command to command, and a model with the mean latency is a
+different loop. If a record holds no such times, the model uses the latency of the timing. The times
+are readings of one clock. They do not show the error of the stated mean latency
+(`timing.latency_std_s`).
 
-Load. A known load on the platform shows the scale of all parameters, where the same motion is made
-with and without it. It is a rigid body whose centre lies in the origin of the platform frame. It
-adds its mass and its principal moments of inertia to those of the platform. A record holds these
-figures as the experimenter knows them, each with its standard deviation, which says how well it was
-weighed or computed. Records that state the same figures carry the same load.
+Load. A known load on the platform determines the scale of all parameters, if the same motion is
+made with and without it. The load is a rigid body with its centre of mass in the origin of the
+platform frame. Its mass and its principal moments of inertia add to those of the platform. A record
+holds the experimenter's values of these figures and their standard deviations. Records that state
+the same figures were made with the same load.
 
-Drift. A watch over the cameras may have found that they drifted during the run.
+Drift. The drift watch reports whether the cameras drifted during the run.
 """
 
 import json
@@ -39,11 +39,11 @@ SERVO = "pid"
 """Name of the visual servo's law."""
 
 TORQUE_UNITS = {"rad": "N m", "m": "N"}
-"""Unit of commands that are torques, by that of joint commands."""
+"""Unit of torque commands, by the unit of joint commands."""
 
 
 def store_law(record: xr.Dataset, law: str, drives: Drives) -> None:
-    """Store with a record the law under which it was made, and what the drives took."""
+    """Store with a record its control law and the kind of its commands."""
     record.attrs |= {"law": law, "torque_commands": np.int8(drives.torques)}
     said = record["command"].attrs
     units = TORQUE_UNITS[said["units"]] if drives.torques else said["units"]
@@ -63,7 +63,7 @@ def recorded_law(record: xr.Dataset) -> str:
 
 
 def takes_torques(record: xr.Dataset) -> bool:
-    """Tell whether a record's commands are torques. Raises RecordError if it says neither."""
+    """Return whether a record's commands are torques. Raises RecordError for an invalid mark."""
     said = record.attrs.get("torque_commands", 0)
     if said not in (0, 1):
         raise RecordError(f"the record's attribute torque_commands is {said!r}, must be 0 or 1")
@@ -76,14 +76,14 @@ OPTIONAL: Variables = {
     COMMAND_TIME: (
         ("time",),
         "s",
-        "time at which the command of this frame acted; NaN where the frame was lost and nothing "
+        "time at which the command of this frame acted; NaN if the frame was lost and no command "
         "was written. Without this variable all commands have the latency of the timing",
     )
 }
-"""Variables that a record may hold beside the others."""
+"""Optional variables of a record."""
 
 CLOCK_S = 1e-6
-"""Difference, s, that two clock readings of the same instant may have."""
+"""Largest difference, s, of two clock readings of the same instant."""
 
 SAME_S = 1e-9
 """Difference, s, below which latencies are the same."""
@@ -102,20 +102,20 @@ def check_command_times(record: xr.Dataset, source: str) -> None:
     time = record["time"].values
     unsaid = np.flatnonzero(~(np.isfinite(acted) | np.isnan(acted) & lost))
     early = np.flatnonzero(acted < time - CLOCK_S)
-    # lost frames have written nothing, and stand between those that have
+    # Lost frames without a command are skipped.
     written = np.flatnonzero(~np.isnan(acted))
     back = written[1:][np.diff(acted[written]) < -CLOCK_S]
     overtaken = (
-        "is before that of an earlier frame: a command that was overtaken acts with the one that "
-        "overtook it"
+        "is before that of an earlier frame: if a later command arrives first, both must have the "
+        "time of its arrival"
     )
     for frames, what in (
-        (unsaid, "is not finite, and that frame was measured"),
-        (early, "is before the frame itself, which its command answers"),
+        (unsaid, "is not finite, although the frame was measured"),
+        (early, "is before the frame itself"),
         (back, overtaken),
     ):
         if len(frames):
-            more = f"; so in {len(frames)} frames" if len(frames) > 1 else ""
+            more = f"; the same in {len(frames)} frames" if len(frames) > 1 else ""
             raise RecordError(
                 f"{source}: {COMMAND_TIME} of frame {frames[0]} (t = {time[frames[0]]:.6g} s) is "
                 f"{acted[frames[0]]:.6g} s; it {what}{more}"
@@ -128,21 +128,21 @@ def command_time_warnings(records: Sequence[xr.Dataset], timing: Timing) -> tupl
         return ()
     return (
         f"the latency varies by {1e3 * timing.latency_jitter_s:.3g} ms from frame to frame, and a "
-        f"record does not say when its commands acted ({COMMAND_TIME}): the model takes the mean "
-        "for all, and is another loop",
+        f"record does not state when its commands acted ({COMMAND_TIME}): the model uses the mean "
+        "latency for all commands, which is a different loop",
     )
 
 
 def logged_latencies(record: xr.Dataset, timing: Timing) -> Array | None:
     """Return the logged latency of each frame's command (N,) in s.
 
-    None if all have that of the timing. Raises EstimationError for one that is longer than a loop
-    can have.
+    Returns None if all commands have the latency of the timing. Raises EstimationError for a
+    latency that is longer than a loop can have.
     """
     if COMMAND_TIME not in record:
         return None
     found = record[COMMAND_TIME].values - record["time"].values
-    # lost frames have written nothing, and get the latency of the timing
+    # Lost frames without a command get the latency of the timing.
     latencies: Array = np.where(np.isnan(found), timing.latency_s, np.maximum(found, 0.0))
     in_frames = latencies * timing.frame_rate_hz
     if (in_frames > MAX_DELAY_FRAMES).any():
@@ -163,16 +163,16 @@ ADDED = {
 }
 """Attributes of a record, with the parameter to which each adds, and its unit.
 
-The standard deviation of `payload_mass` is `payload_mass_std`, and so for the others.
+The standard deviation of each attribute has the same name with `_std` at the end.
 """
 
 
 def payload_vector(
     layout: ParameterLayout, mass_kg: float, inertia_kg_m2: tuple[float, float, float]
 ) -> Array:
-    """Return what a load adds to a robot's parameters (p,).
+    """Return the change (p,) of a robot's parameters by a load.
 
-    Given the standard deviations of its figures, it is the standard deviations of that.
+    For the standard deviations of the figures, it returns the standard deviations of the change.
     """
     added = np.zeros(len(layout.names))
     for (parameter, _), value in zip(ADDED.values(), (mass_kg, *inertia_kg_m2), strict=True):
@@ -185,7 +185,7 @@ def store_payload(
 ) -> None:
     """Store a load (p,) with the record made under it.
 
-    std (p,): standard deviations of the load. None: it is known exactly.
+    std (p,): standard deviations of the load. If None, the load is known exactly.
     """
     deviations = np.zeros(len(layout.names)) if std is None else std
     for name, (parameter, _) in ADDED.items():
@@ -194,15 +194,15 @@ def store_payload(
 
 
 def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array, Array]:
-    """Return the load (p,) of a record and its standard deviations (p,), zero if it states none.
+    """Return the load (p,) of a record and its standard deviations (p,), zero without a load.
 
-    Raises RecordError if a figure is missing, a figure or its standard deviation is no finite
-    number >= 0, the moments are of no body, or a standard deviation exceeds its figure.
+    Raises RecordError if a figure is missing, a figure or its standard deviation is not a finite
+    number >= 0, no body has these moments, or a standard deviation exceeds its figure.
     """
     load = np.zeros(len(layout.names))
     std = np.zeros(len(layout.names))
     stated = record.attrs
-    # a record that states one figure must state all
+    # A record that states one figure must state all of them.
     if not any(name in stated or f"{name}_std" in stated for name in ADDED):
         return load, std
     try:
@@ -237,9 +237,9 @@ def store_finding(record: xr.Dataset, finding: Mapping[str, Any]) -> None:
 
 
 def read_finding(record: xr.Dataset) -> dict[str, Any] | None:
-    """Return the finding that a record holds, or None if nobody watched.
+    """Return the finding that a record holds, or None if there was no drift watch.
 
-    Raises RecordError if the attribute is no finding.
+    Raises RecordError if the attribute is not a finding.
     """
     if DRIFT not in record.attrs:
         return None
@@ -248,7 +248,7 @@ def read_finding(record: xr.Dataset) -> dict[str, Any] | None:
         _ = finding["warning"]
     except (TypeError, ValueError, KeyError) as error:
         raise RecordError(
-            f"{DRIFT} of the record is no finding: {type(error).__name__} {error}"
+            f"{DRIFT} of the record is not a finding: {type(error).__name__} {error}"
         ) from None
     return dict(finding)
 

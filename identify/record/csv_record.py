@@ -1,7 +1,7 @@
 """Records as CSV tables: their columns, their rules, and reading them.
 
-A row is a frame, and a column is a number whose unit is at the end of the column's name. Lines that
-begin with # are comments. Messages name the line of the file, counted from 1.
+Each row is a frame. Each column is a number, and the name of the column ends with the unit. Lines
+that begin with # are comments. Error messages name the line of the file, counted from 1.
 """
 
 import csv
@@ -19,32 +19,32 @@ from identify.files.dataset import POSE
 
 RULES = """\
 A record begins at rest: before its first row the robot has stood still at the first reference pose,
-and the reference starts from there without a jump of its rate. It has one row a frame, at the frame
-rate of [timing], without gaps: a frame whose pose the sensor lost stays, with empty measured
-columns. Units are m, rad and s. Poses are those of the platform frame in the base frame of the
-robot file, R = Rx(alpha) Ry(beta) Rz(gamma); time is the instant at which the sensor saw the pose.
-A command is the joint coordinate that the servo asked for from its row on, with the zero and the
-direction of the robot file; it acts at its command_time_s, which may be empty only in a row whose
-pose was lost, and without that column after the latency of [timing]. Rates are time derivatives of
-the reference pose's six numbers, not the angular velocity; without these columns they are taken
-from a spline through the reference.
+and the reference starts there with a rate of zero. A record has one row per frame at the frame rate
+of [timing], without gaps. A frame without a measured pose has a row with empty measured columns.
+Units are m, rad and s. A pose is the pose of the platform frame in the base frame of the robot
+file, R = Rx(alpha) Ry(beta) Rz(gamma). The time of a row is the instant at which the sensor saw the
+pose. A command is the joint coordinate that the servo requests from its row on, with the zero and
+the direction of the robot file. It acts from its command_time_s on, or without that column after
+the latency of [timing]. An empty command_time_s is allowed only in a row without a measured pose.
+Rates are the time derivatives of the six numbers of the reference pose, not the angular velocity.
+Without rate columns, rates are computed from a spline through the reference.
 """
-"""Rules that a record of one's own must keep."""
+"""Rules for records of users."""
 
 LARGEST = 200_000_000
-"""Largest size of a table, bytes. An hour at 60 Hz takes a hundred million."""
+"""Largest size of a table, bytes. An hour at 60 Hz takes a hundred million bytes."""
 
 TIME_ROUNDING = 1e-3
-"""Share of a frame period by which a stated time may be off."""
+"""Largest error of the time between two rows, as a share of the frame period."""
 
 UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
 
 
 @dataclass(frozen=True)
 class Group:
-    """Columns that belong together: their names, and what they mean.
+    """Columns that belong together: their names and their meaning.
 
-    Columns of an optional group may be left out, but only all of them.
+    A table has either all columns of an optional group, or none of them.
     """
 
     names: tuple[str, ...]
@@ -59,9 +59,7 @@ def columns_of(robot: Robot) -> dict[str, Group]:
     pairs = [(a, b) for k, a in enumerate(POSE) for b in POSE[k:]]
     return {
         "time": Group(("time_s",), "time since the first row"),
-        "reference": Group(
-            tuple(f"reference_{a}_{UNITS[a]}" for a in POSE), "pose that was asked for"
-        ),
+        "reference": Group(tuple(f"reference_{a}_{UNITS[a]}" for a in POSE), "desired pose"),
         "measured": Group(
             tuple(f"measured_{a}_{UNITS[a]}" for a in POSE),
             "pose that the sensor measured, or empty",
@@ -71,7 +69,7 @@ def columns_of(robot: Robot) -> dict[str, Group]:
         ),
         "command_time": Group(
             ("command_time_s",),
-            "time at which the row's command was written to the drives, or empty",
+            "time at which the command of the row was written to the drives, or empty",
             True,
         ),
         "rate": Group(
@@ -88,9 +86,9 @@ def columns_of(robot: Robot) -> dict[str, Group]:
 
 @dataclass(frozen=True)
 class Table:
-    """Groups of columns of a file, each (N, k), and the line of each row.
+    """Groups of columns of a file, each (N, k), and the line number of each row.
 
-    Cells that are empty are NaN.
+    Empty cells are NaN.
     """
 
     path: Path
@@ -110,15 +108,15 @@ class Table:
             raise RecordError(
                 f"{self.path} line {self.lines[row + 1]}: time_s is {times[row + 1]:g} after "
                 f"{times[row]:g} in the row before, which is {frames[row]:.4g} frames of "
-                f"{rate_hz:g} Hz (timing.frame_rate_hz) and not one; a frame that was lost keeps "
-                "its row, with empty measured columns"
+                f"{rate_hz:g} Hz (timing.frame_rate_hz) and not one; a lost frame must have a row "
+                "with empty measured columns"
             )
 
 
 def read_table(path: Path, robot: Robot) -> Table:
     """Read the table of a robot's record.
 
-    Raises RecordError if the file does not exist, a column is missing or unknown, a cell is no
+    Raises RecordError if the file does not exist, a column is missing or unknown, a cell is not a
     number, or there are no rows.
     """
     groups = columns_of(robot)
@@ -138,7 +136,7 @@ def read_table(path: Path, robot: Robot) -> Table:
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield number and cells of each line that is neither empty nor a comment."""
     content = read_bytes(path, f"record {path}", RecordError, LARGEST)
-    # spreadsheets write a mark in front, which utf-8-sig takes away
+    # Spreadsheets write a byte order mark at the beginning, which utf-8-sig removes.
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -155,17 +153,17 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 def _checked_header(
     path: Path, number: int, header: list[str], groups: Mapping[str, Group]
 ) -> list[str]:
-    """Return the names of the groups that the header has, each of which must be whole."""
+    """Return the names of the groups in a header. Raises RecordError if a group is incomplete."""
     if len(header) == 1 and ";" in header[0]:
         raise RecordError(
-            f"{path} line {number}: cells are separated by commas, and these by semicolons"
+            f"{path} line {number}: cells are separated by semicolons, and must be by commas"
         )
     known = [name for group in groups.values() for name in group.names]
     for name in header:
         if name not in known:
             raise RecordError(f"{path} line {number}: unknown column {name!r}{_meant(name, known)}")
         if header.count(name) > 1:
-            raise RecordError(f"{path} line {number}: column {name!r} stands there twice")
+            raise RecordError(f"{path} line {number}: there are two columns {name!r}")
     for group in groups.values():
         missing = [name for name in group.names if name not in header]
         if missing and not (group.optional and len(missing) == len(group.names)):
@@ -176,13 +174,13 @@ def _checked_header(
 
 
 def _meant(name: str, known: list[str]) -> str:
-    """Return a hint at the column that a name may stand for, or else at all columns."""
+    """Return a hint at the column that was probably meant, or else a list of all columns."""
     stem = name.rpartition("_")[0]
     alike = [one for one in known if stem and one.startswith(f"{stem}_")]
-    # reference_x_mm means reference_x_m, but rate_x_mm does not mean rate_x_m_s
+    # For reference_x_mm the hint is reference_x_m, but for rate_x_mm it is not rate_x_m_s.
     meant = [one for one in alike if "_s" not in one[len(stem) + 1 :]]
     if len(meant) == 1:
-        return f": {meant[0]} is meant, in {meant[0].rpartition('_')[2]}"
+        return f": use {meant[0]}, in {meant[0].rpartition('_')[2]}"
     return f"; the columns are {', '.join(known)}"
 
 
@@ -194,12 +192,12 @@ def _numbers(path: Path, number: int, header: list[str], cells: list[str]) -> li
     values = []
     for name, cell in zip(header, cells, strict=True):
         try:
-            if "_" in cell:  # float() would take 1_0 for 10
+            if "_" in cell:  # float() would read 1_0 as 10
                 raise ValueError
             values.append(float(cell) if cell else np.nan)
         except ValueError:
             raise RecordError(
-                f"{path} line {number}: {name} is {cell[:40]!r}, which is no number"
+                f"{path} line {number}: {name} is {cell[:40]!r}, which is not a number"
             ) from None
         may_be_empty = name.startswith(("measured_", "covariance_", "command_time"))
         if not (np.isfinite(values[-1]) or may_be_empty):

@@ -1,12 +1,13 @@
 """Effect of an inexactly known geometry on all poses of a record.
 
-The true robot differs from the known one by dg, one draw with the covariance of its calibration. To
-first order the measured poses are those of the model plus J dg, with J the derivative of the
-model's poses with respect to the geometric numbers. The servo uses the known geometry throughout.
+The true robot differs from the known robot by dg, a single random draw with the covariance of the
+calibration. To first order the measured poses are the poses of the model plus J dg. J is the
+derivative of the model's poses with respect to the geometric numbers. The servo uses the known
+geometry throughout.
 
-J is taken by central differences of whole runs, one standard deviation of dg to either side, along
-independent directions. A direction is left out if it moves no pose of the run by what the noise
-would show. The derivatives of the loop closure tell which these are.
+J is computed by central differences of whole runs, one standard deviation of dg to either side,
+along independent directions. A direction is omitted if its effect on the poses is far below the
+noise. The derivatives of the loop closure determine these directions.
 """
 
 from collections.abc import Callable
@@ -32,8 +33,9 @@ PREFIX = "geometry."
 class GeometryErrors:
     """Errors of the geometry of a known robot.
 
-    covariance (g, g): that of the true geometric numbers about the robot's, m and rad. poses (N, 6)
-    of the run and whitener (6, 6) of its noise tell which directions are noticed.
+    covariance (g, g): covariance of the true geometric numbers about those of the robot, m and rad.
+    poses (N, 6): poses of the run. whitener (6, 6): whitener of its noise. Poses and whitener
+    determine which directions are noticed.
     """
 
     robot: Robot
@@ -48,18 +50,19 @@ class GeometryErrors:
 
     @property
     def factor(self) -> Array:
-        """Factor F (g, g) with F F^T the covariance.
+        """Factor F (g, g) with F F^T equal to the covariance.
 
-        Its columns are independent directions, the most noticed ones first.
+        Its columns are independent directions, the most noticed direction first.
         """
         return self._noticed[0]
 
     def modes(self, poses_of: Callable[[Robot], Array]) -> Array:
-        """Return the changes (N, 6, g) of a run's poses along each direction, zero where unnoticed.
+        """Return the changes (N, 6, g) of a run's poses along each direction.
 
-        poses_of: function that returns the poses (N, 6) of a run of a robot near the known one.
+        The changes are zero along unnoticed directions. poses_of: function that returns the poses
+        (N, 6) of a run of a robot near the known robot.
         """
-        # threads are enough: the compiled loop runs without Python's lock
+        # Threads are enough, because the compiled loop runs without Python's global lock.
         with ThreadPoolExecutor(cores()) as pool:
             found = list(pool.map(poses_of, [robot for pair in self._moved for robot in pair]))
         modes = np.zeros((*self.poses.shape, len(self.covariance)))
@@ -84,7 +87,7 @@ class GeometryErrors:
 
     @cached_property
     def _noticed(self) -> tuple[Array, int]:
-        """Factor, and the number of its directions that are noticed."""
+        """Factor of the covariance, and the number of noticed directions."""
         geometry = self.robot.geometry
         root = factor(self.covariance)
         chart = geometry.chart
@@ -98,20 +101,20 @@ class GeometryErrors:
 
     @cached_property
     def _moved(self) -> list[tuple[Robot, Robot]]:
-        """Robot with its geometry off by plus and by minus each noticed direction."""
+        """Robots with the geometry changed by plus and minus each noticed direction."""
         directions, count = self._noticed
         return [(self.robot.moved(one), self.robot.moved(-one)) for one in directions.T[:count]]
 
 
 def store_geometry_covariance(record: xr.Dataset, robot: Robot, covariance: Array) -> None:
-    """Store with a record how well the geometry of its robot is known."""
+    """Store with a record the covariance of the geometry of its robot."""
     names = list(robot.geometry.number_names)
     record[COVARIANCE] = xr.DataArray(
         covariance,
         dims=("geometric_number", "geometric_number_2"),
         attrs={
             "units": "m2, m rad and rad2",
-            "long_name": "covariance of the true geometric numbers about the known",
+            "long_name": "covariance of the true geometric numbers about the known numbers",
         },
     )
     record.coords.update({"geometric_number": names, "geometric_number_2": names})
@@ -120,7 +123,7 @@ def store_geometry_covariance(record: xr.Dataset, robot: Robot, covariance: Arra
 def read_geometry_covariance(record: xr.Dataset, robot: Robot) -> Array | None:
     """Return the covariance (g, g) of the geometric numbers of a record's robot, or None.
 
-    Raises RecordError if it is of other numbers, not finite, or no covariance.
+    Raises RecordError if its names are other numbers, or if it is not finite or not a covariance.
     """
     if COVARIANCE not in record:
         return None

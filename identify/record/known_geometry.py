@@ -1,4 +1,4 @@
-"""Geometry as servo and estimator know it: of the robot file, or calibrated from static poses."""
+"""Geometry that servo and estimator know: from the robot file, or calibrated from static poses."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,20 +14,20 @@ from identify.record.run_error_covariance import covariance_fault
 from identify.scenario.sections import Geometry
 
 FOLDER = "geometry"
-"""Folder within a run that holds the run's own calibration."""
+"""Folder within a run that holds the calibration of this run."""
 
 COVARIANCE = "covariance.nc"
-"""Name of the file that stands beside the file of a calibrated robot."""
+"""Name of the covariance file beside the file of a calibrated robot."""
 
 SAME_ROBOT = 20.0
-"""Tolerances by which a number of a calibrated robot may be off the robot file's."""
+"""Largest difference of a calibrated number from the robot file, in tolerances of the geometry."""
 
 
 @dataclass(frozen=True)
 class KnownGeometry:
-    """Robot as it is known, and the covariance (g, g) of its true geometric numbers, m and rad.
+    """Robot with its known geometry, and the covariance (g, g) of the geometry, m and rad.
 
-    The covariance is None if the numbers are taken as exact.
+    The covariance is None if the geometry is assumed exact.
     """
 
     robot: Robot
@@ -35,11 +35,11 @@ class KnownGeometry:
 
 
 def known_geometry(nominal: Robot, settings: Geometry, folder: Path | None = None) -> KnownGeometry:
-    """Return the geometry of a robot as the settings have it known.
+    """Return the known geometry of a robot according to the settings.
 
-    It is that of the robot file, of an earlier calibration, or of the calibration in a run's
-    folder. Raises ScenarioError if the file does not exist, the covariance beside it is missing or
-    not valid, or the calibration is of another robot.
+    The geometry comes from the robot file, from an earlier calibration, or from the calibration in
+    the folder of a run. Raises ScenarioError if the file does not exist, its covariance is missing
+    or not valid, or the calibration is of another robot.
     """
     if settings.exact:
         return KnownGeometry(nominal)
@@ -67,14 +67,14 @@ def known_geometry(nominal: Robot, settings: Geometry, folder: Path | None = Non
         )
     if fault := covariance_fault(covariance):
         raise ScenarioError(f"{said}: {COVARIANCE} {fault}")
-    # the nominal robot with the calibrated numbers has functions that are compiled already
+    # The calibrated numbers are put into the nominal robot, because its functions are compiled.
     return KnownGeometry(
         nominal.moved(found.geometry.deviations_from(nominal.geometry)), covariance
     )
 
 
 def _check_same(said: str, found: Robot, nominal: Robot, settings: Geometry) -> None:
-    """Raise ScenarioError, with the number that differs, for a calibration of another robot."""
+    """Raise ScenarioError if a calibration is of another robot. The message names the number."""
     there = found.geometry
     here = nominal.geometry
     if [type(leg) for leg in there.legs] != [type(leg) for leg in here.legs]:

@@ -1,10 +1,10 @@
-"""Records of one's own, from netCDF or CSV, with all that an identification needs to know of them.
+"""Records of users, from netCDF or CSV, with the scenario for their identification.
 
-A netCDF record states its scenario and its scale anchor itself. A CSV table has a TOML file of the
-same name beside it. That file is a scenario; only its sections robot, timing, servo, model, filter,
-identification and payload are used. Its table `[record]` holds what was measured beside the poses.
+A netCDF record contains its scenario and its scale anchor. A CSV table has a TOML file of the same
+name beside it. That file is a scenario; only its sections robot, timing, servo, model, filter,
+identification and payload are used. Its additional table `[record]` holds further measurements.
 
-Files to fill in for a record of one's own are an empty table, and what goes with it.
+The template for a user's record is a table with two example rows, and its TOML file.
 """
 
 from collections.abc import Mapping
@@ -35,28 +35,29 @@ from identify.scenario.sections import LOAD_UNITS, Identification, Payload
 from identify.scenario.settings_file import one_line, starting_toml
 
 DESCRIPTION = "record"
-"""The one table of that file that is not part of a scenario."""
+"""Name of the table of that file that is not part of a scenario."""
 
 
 class Measured(Section):
-    """Measurements beside the poses: what fixes the scale, and how exact a measured pose is."""
+    """Measurements beside the poses: the value of the scale anchor, and the accuracy of poses."""
 
     anchor_value: float | None = quantity(
         None,
         "kg, N m/rad or N/m",
-        "what identification.scale_anchor measured: platform_mass or joint_gain",
+        "measured value of the quantity that identification.scale_anchor names: platform_mass or "
+        "joint_gain",
         gt=0,
     )
     position_std_m: float | None = quantity(
         None,
         "m",
-        "standard deviation of a measured position, where the table has no covariance columns",
+        "standard deviation of a measured position, needed if the table has no covariance columns",
         gt=0,
     )
     orientation_std_rad: float | None = quantity(
         None,
         "rad",
-        "standard deviation of a measured angle, where the table has no covariance columns",
+        "standard deviation of a measured angle, needed if the table has no covariance columns",
         gt=0,
     )
     under_payload: bool = Field(
@@ -65,15 +66,15 @@ class Measured(Section):
 
 
 def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
-    """Read records from files, and return them with the scenario of the first.
+    """Read records from files, and return them with the scenario of the first record.
 
-    Further records are of the same robot under a known load.
+    Further records are records of the same robot under a known load.
 
     Raises
     ------
     RecordError
-        A file cannot be read, or breaks a rule of records (`csv_record.RULES`). The message names
-        the line.
+        A file cannot be read, or violates a rule of records (`csv_record.RULES`). The message
+        names the line.
     ScenarioError
         Robot, timing or servo are not valid.
     dynamics.RobotFileError
@@ -106,7 +107,7 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
         time=table.groups["time"][:, 0] - start,
         reference_pose=table.groups["reference"],
         reference_rate=_rates(table, scenario.timing.frame_period_s),
-        # the pose of a row that is marked as lost is ignored
+        # Poses in rows that are marked as lost are ignored.
         measured_pose=np.where(ok[:, None], poses, np.nan),
         measured_covariance=_covariances(table, measured, ok),
         measured_ok=ok,
@@ -125,14 +126,14 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
 
 
 def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
-    """Read the description of a CSV record: its scenario, and what was measured beside the poses.
+    """Read the description of a CSV record: its scenario and further measurements.
 
-    Raises RecordError or ScenarioError if there is no such file, it is no TOML, or its content is
+    Raises RecordError or ScenarioError if there is no such file, it is not TOML, or its content is
     not valid.
     """
     if not is_file(path):
         raise RecordError(
-            f"there is no file {path}, which says what {table.name} is a record of; cmmsim new "
+            f"there is no file {path}, which must describe the record {table.name}; cmmsim new "
             "record writes both"
         )
     content = parse_toml(read_text(path, str(path), RecordError), str(path), RecordError)
@@ -141,15 +142,15 @@ def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
         measured = Measured.model_validate(own)
     except ValidationError as error:
         raise RecordError(f"{path}: [{DESCRIPTION}] {one_line(error, Measured)}") from error
-    # a scenario has a name, which this file need not state
+    # A scenario needs a name, but this file does not have to state it.
     name = path.stem if is_name(path.stem) else DESCRIPTION
     return SCENARIOS.from_dict({"name": name} | content, str(path), path.parent), measured
 
 
 def record_schema() -> dict[str, Any]:
-    """Return the JSON schema, for editors, of the files beside CSV records.
+    """Return the JSON schema of the TOML files beside CSV records.
 
-    The file `record.schema.json` holds it.
+    Editors read it from the file `record.schema.json`.
     """
     schema = scenario_schema()
     own = Measured.model_json_schema()
@@ -162,7 +163,7 @@ def record_schema() -> dict[str, Any]:
 def _measured_ok(table: Table) -> NDArray[np.bool_]:
     """Return which rows (N,) hold a measured pose.
 
-    They have no empty cell and, if the table has a column measured_ok, a 1 there.
+    Such a row has no empty measured cell. If the table has a column measured_ok, it is 1.
     """
     whole = np.asarray(np.isfinite(table.groups["measured"]).all(axis=1))
     if "ok" not in table.groups:
@@ -170,7 +171,7 @@ def _measured_ok(table: Table) -> NDArray[np.bool_]:
     stated = table.groups["ok"][:, 0]
     for wrong, why in (
         (~np.isin(stated, (0, 1)), "measured_ok must be 1 or 0"),
-        ((stated == 1) & ~whole, "measured_ok is 1, and a measured column is empty"),
+        ((stated == 1) & ~whole, "measured_ok is 1, but a measured column is empty"),
     ):
         if wrong.any():
             raise RecordError(f"{table.path} line {table.lines[int(np.argmax(wrong))]}: {why}")
@@ -178,9 +179,9 @@ def _measured_ok(table: Table) -> NDArray[np.bool_]:
 
 
 def _rates(table: Table, frame_period_s: float) -> Array:
-    """Return the rates (N, 6) of the reference: stated, or of a spline through its poses."""
+    """Return the rates (N, 6) of the reference, from the table or from a spline through it."""
     poses = table.groups["reference"]
-    # too few rows for a spline are refused later, with the length of the record
+    # A record that is too short for a spline is refused later, by the check of its length.
     if "rate" in table.groups or len(poses) < 6:
         return table.groups.get("rate", np.zeros_like(poses))
     times = np.arange(len(poses)) * frame_period_s
@@ -190,7 +191,7 @@ def _rates(table: Table, frame_period_s: float) -> Array:
 def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Array:
     """Return the covariances (N, 6, 6) of the measured poses.
 
-    They are those of the table, or follow from the stated standard deviations.
+    They come from the table, or from the standard deviations in the description.
     """
     if "covariance" in table.groups:
         rows, columns = np.triu_indices(len(POSE))
@@ -200,8 +201,8 @@ def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Arr
     if measured.position_std_m is None or measured.orientation_std_rad is None:
         raise RecordError(
             f"{table.path} has no covariance columns, so {description_file(table.path)} must state "
-            f"position_std_m and orientation_std_rad in [{DESCRIPTION}]: how exact a measured pose "
-            "is"
+            f"position_std_m and orientation_std_rad in [{DESCRIPTION}], the standard deviations "
+            "of a measured pose"
         )
     std = np.repeat([measured.position_std_m, measured.orientation_std_rad], 3)
     return np.tile(np.diag(std**2), (len(ok), 1, 1))
@@ -210,15 +211,16 @@ def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Arr
 def _state_anchor(
     record: xr.Dataset, settings: Identification, measured: Measured, source: Path
 ) -> None:
-    """Store with a record what fixes the scale of its parameters."""
+    """Store with a record the quantity that fixes the scale of its parameters."""
     record.attrs["scale_anchor"] = settings.scale_anchor
-    # these two measure no parameter
+    # These two anchors have no measured value.
     if settings.scale_anchor in ("payload", "prior"):
         return
     if measured.anchor_value is None or settings.anchor_std is None:
         raise RecordError(
-            f"{source}: the scale anchor {settings.scale_anchor} needs what was measured, "
-            f"anchor_value in [{DESCRIPTION}], and how exactly, anchor_std in [identification]"
+            f"{source}: the scale anchor {settings.scale_anchor} needs the measured value, "
+            f"anchor_value in [{DESCRIPTION}], and its standard deviation, anchor_std in "
+            "[identification]"
         )
     record.attrs |= {
         "scale_anchor_value": measured.anchor_value,
@@ -227,7 +229,7 @@ def _state_anchor(
 
 
 def _state_payload(record: xr.Dataset, layout: ParameterLayout, payload: Payload) -> None:
-    """Store with a record the load that the platform carried, and how well it is known."""
+    """Store with a record the load on the platform and its standard deviations."""
     load: Mapping[str, Any] = payload.model_dump()
     vectors = []
     for std in ("", "_std"):
@@ -241,16 +243,16 @@ SCHEMA = Path(__file__).parent / "record.schema.json"
 SHOWN_ROWS = 2
 WIDTH = 96
 SECTIONS = ("robot", "timing", "servo", "model", "filter", "identification", "payload")
-"""Parts of a scenario that a record is made with, or that an identification reads."""
+"""Sections of a scenario that describe the recorded experiment or that an identification reads."""
 
-# values of a starting file, for the user to replace
+# Example values in the template, for the user to replace.
 FRAME_RATE_HZ = 60.0
 POSITION_STD_M = 5e-6
 ORIENTATION_STD_RAD = 2e-5
 
 
 def table_text(robot: Robot) -> str:
-    """Return a table with comments, the columns of a robot, and rows at rest at its home pose."""
+    """Return a table with comments, the columns of a robot, and rows at rest at the home pose."""
     groups = columns_of(robot)
     comments = [*wrap(RULES, WIDTH), ""]
     for group in groups.values():
@@ -274,9 +276,9 @@ def table_text(robot: Robot) -> str:
 
 
 def description_text(robot: Robot, name_or_path: str, table: str) -> str:
-    """Return what goes with a table: robot, timing, servo and scale.
+    """Return the text of the TOML file for a table: robot, timing, servo and scale.
 
-    The user replaces them by those of the record.
+    The user replaces the example values.
     """
     mass = float(robot.parameter_sets["initial"].vector[robot.layout.names.index("platform.mass")])
     made_with = Scenario.model_validate(
@@ -295,9 +297,9 @@ def description_text(robot: Robot, name_or_path: str, table: str) -> str:
         anchor_value=mass, position_std_m=POSITION_STD_M, orientation_std_rad=ORIENTATION_STD_RAD
     )
     head = [
-        f"# What {table} is a record of. Entries that are commented out have the value that holds "
-        "without them; those",
-        "# that are not, replace by what your machine and its controller have.",
+        f"# Description of the record {table}. Entries that are commented out show the default "
+        "value. Replace the values of",
+        "# the other entries by the values of your machine and its controller.",
     ]
     own = starting_toml(measured).rstrip("\n").split("\n")
     sections = starting_toml(made_with, SECTIONS)

@@ -1,7 +1,7 @@
-"""Provenance of records and results: scenario, seed, robot, and digests of what was read.
+"""Provenance of records and results: scenario, seed, robot, and digests of the files read.
 
-A stage that is repeated leaves the files of later stages where they are. By the digests these
-stages find files that no longer belong together.
+If a stage is repeated, the files of later stages stay in the folder. The later stages use the
+digests to detect files that no longer belong together.
 """
 
 import json
@@ -26,19 +26,19 @@ from identify.scenario import Scenario, scenario_from_toml
 ROBOT = "robot_geometry"
 """Attribute with the geometry of the robot file.
 
-A name alone does not say which robot file was meant.
+The name of a robot alone does not identify the file.
 """
 
 ROUNDING = 1e-9
-"""Largest difference of a number of a geometry, SI, by another computer's arithmetic."""
+"""Largest difference of a geometric number, SI units, that counts as rounding."""
 
 SHARED = ("base_joints", "platform_joints", "home_pose", "travel_limit", "gravity")
 """Numbers of a geometry that do not depend on the kind of its legs."""
 
 OLDER = "crank_length"
-"""Number that the geometry in records of older versions has.
+"""Number by which a geometry of an older version is recognised.
 
-These versions give the other numbers of the legs other names.
+In these versions the numbers of the legs have other names, and are not compared.
 """
 
 STATED = (
@@ -52,31 +52,31 @@ STATED = (
     *ADDED,
     *(f"{name}_std" for name in ADDED),
 )
-"""Attributes that an identification reads, beside timing and servo of the scenario."""
+"""Attributes that an identification reads, beside the timing and servo of the scenario."""
 
 ENTRY = "made_of"
-"""Entry of a result with digests by the file's name.
+"""Entry of a result with the digest of each file, by file name.
 
-Results of older versions have none, and are not checked.
+Results of older versions do not have this entry, and are not checked.
 """
 
 RECORDS = ("experiment.nc", "payload.nc")
-"""Files that an identification may have read."""
+"""Files with records for an identification."""
 
 _AGAIN = {"validation.nc": "validate", "model.nc": "validate"}
-"""Stage that renews a result after a change of a file, where it is not `identify`."""
+"""Stage that must be repeated after a change of a file. For other files it is `identify`."""
 
 
 def recorded_scenario(record: xr.Dataset) -> Scenario:
     """Return the scenario that a record was made with.
 
-    Raises RecordError if the record states none, with what to set, or one that is not valid.
+    Raises RecordError if the record does not state a scenario, or if the scenario is not valid.
     """
     text = record.attrs.get("scenario")
     if text is None:
         raise RecordError(
-            "the record has no attribute scenario, which says with what timing and servo it was "
-            "made: set record.attrs['scenario'] = scenario.to_toml(), or make the record by "
+            "the record has no attribute scenario, which states its timing and servo: "
+            "set record.attrs['scenario'] = scenario.to_toml(), or make the record by "
             "identify.build_record"
         )
     if not isinstance(text, str):
@@ -91,7 +91,7 @@ def recorded_scenario(record: xr.Dataset) -> Scenario:
 
 
 def recorded_seed(record: xr.Dataset) -> int:
-    """Return the seed of a record, or zero if it states none, as the record of a real robot.
+    """Return the seed of a record, or zero if it has none, like the record of a real robot.
 
     Raises RecordError unless the seed is a whole number >= 0.
     """
@@ -109,12 +109,12 @@ def store_robot(record: xr.Dataset, robot: Robot) -> None:
 
 
 def check_robot(record: xr.Dataset, robot: Robot) -> None:
-    """Check that a record is of a robot of this name and, if it states one, of this geometry.
+    """Check that a record is of a robot with this name and, if stated, with this geometry.
 
     Raises
     ------
     EstimationError
-        The name differs, or a number of the geometry, of which the message names the first.
+        The name or a number of the geometry differs. The message names the first such number.
     RecordError
         The geometry cannot be read.
     """
@@ -146,7 +146,7 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
 
 
 def _numbers(robot: Robot) -> dict[str, Any]:
-    """Return all numbers of a geometry by name, those of a leg as `leg2.crank_length`."""
+    """Return all numbers of a geometry by name. A number of a leg is named `leg2.crank_length`."""
     geometry = robot.geometry
     numbers: dict[str, Any] = {
         **{name: np.asarray(getattr(geometry, name)).tolist() for name in SHARED},
@@ -167,47 +167,47 @@ def _read(text: object) -> dict[str, Array]:
         }
     except (ValueError, TypeError, AttributeError) as error:
         raise RecordError(
-            f"the record's attribute {ROBOT} is no JSON object of numbers: {error}"
+            f"the record's attribute {ROBOT} is not a JSON object of numbers: {error}"
         ) from error
 
 
 class RunFiles:
-    """Contents of the files of a run, each read once, when it is first asked for.
+    """Contents of the files of a run. Each file is read once, at its first use.
 
-    Raises RecordError for a file that is damaged.
+    Raises RecordError for a damaged file.
     """
 
     def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
 
     experiment = cached_property(lambda self: read(self.folder.experiment))
-    # the same run under a known load
+    # Record of the same motion under a known load.
     payload = cached_property(lambda self: read(self.folder.payload))
     validation = cached_property(lambda self: read_runs(self.folder.validation))
     model = cached_property(lambda self: read_model_runs(self.folder.model))
 
-    # names of the estimates, and their covariance
+    # Names of the estimates, and their covariance.
     named_covariance = cached_property(lambda self: read_covariance(self.folder.covariance))
 
     @property
     def covariance(self) -> Array:
-        """Covariance (p + k, p + k) of the p estimates and of k common errors of the poses.
+        """Covariance (p + k, p + k) of the p estimates and the k common errors of the poses.
 
-        A result without common errors has k = 0.
+        For a result without common errors, k = 0.
         """
         return self.named_covariance[1]
 
     def covariance_of(self, robot: Robot) -> Array:
-        """Return `covariance`, which must be that of a robot's parameters.
+        """Return `covariance` after a check that it belongs to the parameters of a robot.
 
-        Raises RecordError if the file is of others.
+        Raises RecordError if the file has other parameters.
         """
         names = robot.layout.names
         found = self.named_covariance[0][: len(names)]
         if found != names:
             said = ", ".join(sorted(set(found) ^ set(names))) or "another order"
             raise RecordError(
-                f"{self.folder.covariance} is of other parameters than the result: {said}"
+                f"{self.folder.covariance} has other parameters than the result: {said}"
             )
         return self.covariance
 
@@ -220,24 +220,25 @@ class RunFiles:
         return {name: digest(self.content(name)) for name in names}
 
     def check_made_of(self, *names: str, result: Mapping[str, Any] | None = None) -> None:
-        """Check that a result was made of the files of these names, as far as it states them.
+        """Check that a result was made from the present files of these names.
 
-        The default result is that of the folder, if it has one.
+        Files without a digest in the result are not checked. The default result is the result in
+        the folder, if there is one.
 
         Raises
         ------
         OutputFolderError
-            A file is gone.
+            A file is missing.
         RecordError
-            A file is another one, with the stage to repeat, or is damaged, or the result's digests
-            are not valid.
+            A file has changed (the message names the stage to repeat), a file is damaged, or the
+            digests of the result are not valid.
         """
         run = self.folder
         if result is None:
             result = load_result(run.result) if run.result.is_file() else {}
         known = result.get(ENTRY, {})
         if not isinstance(known, dict):
-            raise RecordError(f"{run.result}: {ENTRY} must be digests by the file's name")
+            raise RecordError(f"{run.result}: {ENTRY} must be digests by file name")
         for name in (name for name in names if name in known):
             run.require(name)
             if self.digests(name)[name] != known[name]:
@@ -249,11 +250,11 @@ class RunFiles:
 
 
 def digest(content: xr.Dataset | Sequence[xr.Dataset] | Mapping[str, xr.Dataset] | Array) -> str:
-    """Return the digest, hexadecimal, of one or several records, of model runs, or of a covariance.
+    """Return the hexadecimal digest of one or several records, of model runs, or of a covariance.
 
-    Records count in their order, and model runs by their names. Digests are equal where later
-    stages read the same, in whatever file and whenever it was written. Raises RecordError for a
-    record that does not state its scenario.
+    The digest depends on the order of records, and on the names of model runs. It depends only on
+    data that later stages read, and not on the file or the time of writing. Raises RecordError for
+    a record that does not state its scenario.
     """
     if isinstance(content, np.ndarray):
         return array_digest({"covariance": content})
@@ -270,15 +271,15 @@ def digest(content: xr.Dataset | Sequence[xr.Dataset] | Mapping[str, xr.Dataset]
 
 
 def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
-    """Return the digest, hexadecimal, of named arrays of numbers, whatever their order and type.
+    """Return the hexadecimal digest of named arrays of numbers, whatever their order and type.
 
-    It is of the numbers and not of a file's bytes, which differ from one writing to the next.
+    The bytes of a file would not do, because they differ each time the file is written.
     """
     whole = sha256()
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name], dtype="<f8")
         whole.update(f"{name} {values.shape}\n".encode())
-        # NaN has many bit patterns: this makes them one
+        # NaN has many bit patterns, and np.where replaces them by one.
         whole.update(np.where(np.isnan(values), np.nan, values).tobytes())
     return whole.hexdigest()
 
@@ -286,7 +287,7 @@ def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
 def _record_digest(records: Sequence[xr.Dataset]) -> str:
     whole = sha256()
     for record in records:
-        # only what an identification reads: a new title or date is no other record
+        # A new title or date does not make another record.
         held = ("time", *VARIABLES, *(name for name in OPTIONAL if name in record))
         arrays = {name: record[name].values for name in held}
         stated = {name: plain(record.attrs[name]) for name in STATED if name in record.attrs}

@@ -1,9 +1,9 @@
 """Records of runs as xarray datasets in netCDF, and runs of models on the same motion.
 
-A record is what the experimenter sees of a run. It is the main group of its file. The truth stands
-in a group of its own (`identify.experiment.truth`), so that an estimator that reads a record cannot
-see it. Several runs share a file as the groups ``run01``, ``run01/truth``, ``run02``, ... Model
-runs (``model.nc``) are the groups ``excitation``, ``run01``, ``run02``, ...
+A record holds the data of a run that an experimenter has. It is the main group of its file. The
+truth is a separate group (`identify.experiment.truth`), so that an estimator that reads a record
+cannot see it. Several runs share a file as the groups ``run01``, ``run01/truth``, ``run02``, ...
+Model runs (``model.nc``) are the groups ``excitation``, ``run01``, ``run02``, ...
 """
 
 from __future__ import annotations
@@ -63,14 +63,14 @@ VARIABLES: Variables = {
     "measured_covariance": (
         ("time", "pose_component", "pose_component_2"),
         "m2, m rad and rad2",
-        "covariance of the measured pose's noise, new in every frame, as the sensor states it",
+        "covariance of the noise of the measured pose, as the sensor states it for this frame",
     ),
     "measured_ok": (("time",), "1", "1 where the sensor measured the pose, 0 where it was lost"),
     "command": (("time", "joint"), "rad", "joint command of the visual servo from this frame on"),
 }
 
 MAY_BE_LOST = ("measured_position", "measured_orientation", "measured_covariance")
-"""Variables that are NaN where the pose was lost."""
+"""Variables that are NaN in frames in which the pose was lost."""
 
 
 def build_record(
@@ -98,18 +98,18 @@ def build_record(
     reference_pose, reference_rate : array_like, shape (N, 6)
         Desired poses and their rates.
     measured_pose : array_like, shape (N, 6)
-        Measured poses. They may be NaN where lost.
+        Measured poses. Lost poses are NaN.
     measured_covariance : array_like, shape (N, 6, 6)
         Covariances of the measured poses.
     measured_ok : array_like, shape (N,)
         1 where the pose was measured, 0 where it was lost.
     command : array_like, shape (N, n)
-        Commands of the n joints, each from its frame on: rad, or m where they are prismatic.
+        Commands of the n joints, each valid from its frame on: rad, or m for prismatic joints.
     command_time : array_like, shape (N,), optional
-        Times at which the commands were written to the drives, s, from which on they act. See
-        `identify.record.conditions`.
+        Times at which the commands were written to the drives, s. A command acts from this time
+        on. See `identify.record.conditions`.
     scenario_toml : str
-        Timing and servo of the run, as `Scenario.to_toml` gives them.
+        TOML text with the timing and servo of the run, as `Scenario.to_toml` returns it.
     robot : str
         Name of the robot.
     frame_rate_hz : float
@@ -117,7 +117,7 @@ def build_record(
     seed : int, optional
         Seed of a simulated run. The record of a real robot has none.
     prismatic : bool
-        True where the joints are prismatic.
+        True if the joints are prismatic.
 
     Returns
     -------
@@ -127,8 +127,8 @@ def build_record(
     Raises
     ------
     RecordError
-        A shape is wrong, a number is not finite where nothing was lost, or an entry of
-        `measured_ok` is neither 1 nor 0.
+        A shape is wrong, a number of a measured frame is not finite, or an entry of `measured_ok`
+        is neither 1 nor 0.
     """
     logged = {} if command_time is None else {COMMAND_TIME: np.asarray(command_time, dtype=float)}
     record = described_dataset(
@@ -175,7 +175,7 @@ def record_groups(record: xr.Dataset, truth: xr.Dataset | None = None) -> dict[s
 
 
 def read(path: Path | str, run: str = "") -> xr.Dataset:
-    """Read and check the record of a file, or of one of its runs (``"run01"``); never the truth.
+    """Read and check the record of a file, or of one of its runs (``"run01"``), without the truth.
 
     Raises RecordError if the file is truncated, a variable is missing, a shape is wrong, or a
     number is not finite.
@@ -216,7 +216,7 @@ def run_names(path: Path | str) -> list[str]:
     names = [name for name in group_names(path) if name.startswith("run") and "/" not in name]
     if not names:
         raise RecordError(f"{path} holds no runs (groups run01, run02, ...)")
-    # by number: as text, run100 stands before run11
+    # Sorting by text would put run100 before run11.
     return sorted(names, key=lambda name: int(name.removeprefix("run")))
 
 
@@ -228,8 +228,8 @@ def run_name(number: int) -> str:
 def poses(record: xr.Dataset, kind: str) -> Array:
     """Return the poses (N, 6), m and rad, of one kind.
 
-    Kinds of a record are ``measured``, NaN where lost, and ``reference``. Those of a model run are
-    ``initial`` and ``identified``. Raises RecordError if the dataset has no such poses.
+    A record has the kinds ``measured``, NaN where lost, and ``reference``. A model run has the
+    kinds ``initial`` and ``identified``. Raises RecordError if the dataset has no such poses.
     """
     missing = [name for name in (f"{kind}_position", f"{kind}_orientation") if name not in record]
     if missing:
@@ -241,9 +241,9 @@ def poses(record: xr.Dataset, kind: str) -> Array:
 
 
 def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
-    """Return a record that is complete, of the right shapes, and finite where nothing was lost.
+    """Check that a record is complete, of the right shapes, and finite where measured. Return it.
 
-    Raises RecordError with the first thing that is not so.
+    Raises RecordError with the first fault.
     """
     check_variables(record, VARIABLES, source)
     stated = record["measured_ok"].values
@@ -275,12 +275,12 @@ MODEL_VARIABLES: Variables = {
     "initial_position": (
         ("time", "axis"),
         "m",
-        "position of the model with the starting parameters",
+        "position of the model with the initial guess of the parameters",
     ),
     "initial_orientation": (
         ("time", "angle"),
         "rad",
-        "orientation of the model with the starting parameters",
+        "orientation of the model with the initial guess of the parameters",
     ),
     "identified_position": (
         ("time", "axis"),
@@ -298,15 +298,15 @@ PREDICTED: Variables = {
     "std_position": (
         ("time", "axis"),
         "m",
-        "predicted deviation of the plant from the identified model",
+        "predicted standard deviation of the plant's position from the identified model",
     ),
     "std_orientation": (
         ("time", "angle"),
         "rad",
-        "predicted deviation of the plant from the identified model",
+        "predicted standard deviation of the plant's orientation from the identified model",
     ),
 }
-"""Variables of unseen trajectories, since elsewhere nothing is predicted."""
+"""Additional variables of runs of validation trajectories."""
 
 
 def build_model_run(
@@ -315,16 +315,16 @@ def build_model_run(
     identified_pose: ArrayLike,
     std: ArrayLike | None = None,
 ) -> xr.Dataset:
-    """Build the dataset of both models' poses in a run.
+    """Build the dataset of the poses of the initial and the identified model in a run.
 
     Parameters
     ----------
     time : array_like, shape (N,)
         Times of the frames, s.
     initial_pose, identified_pose : array_like, shape (N, 6)
-        Poses of the models, m and rad. After a model has diverged they become NaN.
+        Poses of the models, m and rad. Poses of a diverged model that are not finite become NaN.
     std : array_like, shape (N, 6), optional
-        Predicted deviations of the plant from the identified model.
+        Predicted standard deviations of the plant's poses from the identified model.
 
     Raises
     ------
@@ -339,7 +339,7 @@ def build_model_run(
     if std is not None:
         values |= pose_parts(std, "std", "std_position", "std_orientation")
         variables = MODEL_VARIABLES | PREDICTED
-    # a model that has diverged may be infinite
+    # Poses of a diverged model can be infinite.
     finite = {name: np.where(np.isfinite(v), v, np.nan) for name, v in values.items()}
     return described_dataset(finite, time, variables)
 
@@ -360,7 +360,7 @@ def model_groups(
 
 
 def read_model_runs(path: Path | str) -> Mapping[str, xr.Dataset]:
-    """Read all model runs by group name, ``excitation`` among them.
+    """Read all model runs by group name, including ``excitation``.
 
     Raises RecordError if the file is truncated, a variable is missing, or a shape is wrong.
     """

@@ -1,7 +1,7 @@
-"""Covariances of errors that are drawn once a run.
+"""Covariances of errors that are constant during a run.
 
-These functions check a covariance, factor it, and find the directions of the errors that poses
-notice.
+These functions check a covariance, factor it, and find the directions of the errors with a
+noticeable effect on the poses.
 """
 
 import numpy as np
@@ -9,34 +9,35 @@ import numpy as np
 from identify.arrays import Array
 
 NOTICED = 0.1
-"""Effect below which a direction of the errors is left out.
+"""Effect below which a direction of the errors is omitted.
 
-Its unit is the standard deviation of the noise of all frames together.
+The effect is the norm over all frames, in standard deviations of the noise.
 """
 ROUNDING = 1e-9
-"""Asymmetry, or size of a negative eigenvalue, of correlations that counts as rounding."""
+"""Asymmetry or negative eigenvalue of a correlation matrix that counts as rounding."""
 
 
 def covariance_fault(covariance: Array) -> str:
-    """Return why a matrix (k, k) is no covariance with variances > 0, or an empty string."""
+    """Return why a matrix (k, k) is not a covariance, or an empty string. Variances must be > 0."""
     if not np.isfinite(covariance).all():
         return "is not finite"
     if not (np.diag(covariance) > 0.0).all():
-        return "is no covariance: it has a variance that is not > 0"
+        return "is not a covariance: it has a variance that is not > 0"
     std = np.sqrt(np.diag(covariance))
     unit = covariance / np.outer(std, std)
     if np.abs(unit - unit.T).max() > ROUNDING:
-        return "is no covariance: it is not symmetric"
+        return "is not a covariance: it is not symmetric"
     least = float(np.linalg.eigvalsh(unit)[0])
     if least < -ROUNDING:
-        return f"is no covariance: as correlations it has the eigenvalue {least:.2g}, < 0"
+        return f"is not a covariance: its correlations have the negative eigenvalue {least:.2g}"
     return ""
 
 
 def factor(covariance: Array) -> Array:
     """Return a factor L (k, k) with L L^T equal to a covariance."""
     std = np.sqrt(np.diag(covariance))
-    # correlations: eigenvalues of m2 and rad2 side by side would lose digits
+    # Correlations are decomposed, because eigenvalues of mixed units (m2 and rad2) would lose
+    # digits.
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     return np.asarray(std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -49,12 +50,12 @@ def noticed_directions(root: Array, seen: Array) -> tuple[Array, int]:
     root : ndarray, shape (k, k)
         Factor of the covariance.
     seen : ndarray, shape (..., k)
-        Effect of its columns on the measurements, in standard deviations of their noise.
+        Effect of each column on the measurements, in standard deviations of their noise.
 
     Returns
     -------
     tuple of ndarray, shape (k, k), and int
-        Another factor, with the most noticed direction first, and the number of noticed directions.
+        Turned factor, with the most noticed direction first, and the number of noticed directions.
     """
     sizes, turns = np.linalg.svd(np.linalg.qr(seen.reshape(-1, len(root)), mode="r"))[1:]
     return np.asarray(root @ turns.T), int(np.sum(sizes > NOTICED))

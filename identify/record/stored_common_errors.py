@@ -1,18 +1,18 @@
 """Errors that all measured poses of a record have in common.
 
-Cameras and taught frames are known only so well. Their errors d are drawn once a run, with a
-covariance, and move the measured poses by J(pose) d. A record states J of every frame and the
-covariance beside its poses.
+Cameras and taught frames are not known exactly. Their errors d are constant during a run, have a
+known covariance, and move the measured poses by J(pose) d. Beside its poses, a record contains J
+of every frame and the covariance of d.
 
-An estimator that whitens poses by the noise alone takes such an error for one of the model. Here
+An estimator that whitens poses by the noise alone would attribute such an error to the model. Here
 the error is marginalised. With noise of unit covariance and modes M = J L, where L L^T is the
 covariance of d, the residuals have the covariance 1 + M M^T. With M = U S V^T their whitener is
 
     1 - U (1 - (1 + S^2)^-1/2) U^T.
 
-That is the same as estimating d beside everything else, with d known beforehand by its covariance.
-M may depend on d, as for a latency, or for cameras within a servo. The model then contains the most
-likely d, and M is taken there.
+This is equivalent to estimating d together with the parameters, with a prior of this covariance. M
+can depend on d, for example for a latency, or for cameras within a servo. The model then contains
+the most likely d, and M is evaluated there.
 """
 
 from dataclasses import dataclass
@@ -44,15 +44,16 @@ class CommonErrors:
     changes : ndarray, shape (N, 6, k)
         Change of the measured poses per unit of each error.
     covariance : ndarray, shape (k, k)
-        Covariance of the true values about the known ones.
+        Covariance of the true values about the known values.
     latency_std : float
-        Standard deviation of the mean latency of the frames, s. Only a model of the loop can turn
-        it into poses.
+        Standard deviation of the mean latency of the frames, s. Its effect on the poses needs a
+        model of the loop.
     geometry : GeometryErrors, optional
-        Errors of the robot's geometry, which need such a model, too. None where it is exact.
+        Errors of the robot's geometry. Their effect needs a model of the loop, too. None if the
+        geometry is exact.
     whitener : ndarray, shape (6, 6), optional
-        Whitener of the poses' noise, which tells the directions of the errors that poses notice.
-        None: they notice all.
+        Whitener of the noise of the poses. It determines the noticed directions of the errors. If
+        None, all directions count as noticed.
     """
 
     names: tuple[str, ...]
@@ -64,7 +65,7 @@ class CommonErrors:
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all errors: of the poses, then of the latency, then of the geometry."""
+        """Names of all errors: errors of the poses, then the latency, then the geometry."""
         latency = (LATENCY,) if self.latency_std else ()
         return (*self.names, *latency, *(self.geometry.names if self.geometry else ()))
 
@@ -76,7 +77,7 @@ class CommonErrors:
         return np.asarray(block_diag(self.factor, *latency, *geometry))
 
     def known_as(self, other: "CommonErrors") -> bool:
-        """Tell whether other errors are the same, and equally well known."""
+        """Return whether other errors have the same names and covariances."""
         pairs = [(self.covariance, other.covariance)]
         if self.geometry and other.geometry:
             pairs.append((self.geometry.covariance, other.geometry.covariance))
@@ -86,13 +87,13 @@ class CommonErrors:
     def by_kind(self, modes: Array) -> dict[str, Array]:
         """Split effects of the errors by their kinds (`kind_of`).
 
-        modes (..., k): effects of k independent numbers of standard deviation one, whose factor is
-        `whole_factor`. The part of each kind has the same shape. Errors of different kinds are
-        taken as independent.
+        modes (..., k): effects of the k columns of `whole_factor`, each with standard deviation
+        one. The part of each kind has the same shape. Errors of different kinds are assumed
+        independent.
         """
         root = self.whole_factor
         kinds = np.array([kind_of(name) for name in self.all_names])
-        # back to each error in its own unit, where kinds stand apart
+        # Effects per error in its own unit: there the kinds are separate columns.
         per_error = modes @ np.linalg.pinv(root)
         return {
             kind: (per_error * (kinds == kind)) @ root for kind in dict.fromkeys(kinds.tolist())
@@ -100,15 +101,15 @@ class CommonErrors:
 
     @property
     def factor(self) -> Array:
-        """Factor L (k, k) with L L^T the covariance.
+        """Factor L (k, k) with L L^T equal to the covariance.
 
-        With a whitener, the columns that poses notice most come first.
+        With a whitener, the most noticed columns come first.
         """
         return self._noticed[0]
 
     @property
     def noticed(self) -> int:
-        """Number of columns of the factor that poses notice."""
+        """Number of columns of the factor that have a noticeable effect on the poses."""
         return self._noticed[1]
 
     @cached_property
@@ -127,7 +128,7 @@ class CommonErrors:
 
 
 NONE = CommonErrors((), np.zeros((0, 6, 0)), np.zeros((0, 0)))
-"""Common errors of a record that states none."""
+"""Common errors of a record without common errors."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,7 @@ class Marginal:
     modes : ndarray, shape (m, k)
         Modes of the m residuals.
     had : ndarray, shape (m,)
-        Part of the residuals that is due to the common errors that the model contains. It counts as
-        no error.
+        Part of the residuals that is due to the common errors that the model contains.
     directions, seen : ndarray, shapes (m, k) and (k,)
         Directions U of the modes, and the standard deviations S along them.
     """
@@ -152,19 +152,19 @@ class Marginal:
 
     @classmethod
     def of(cls, modes: Array, had: Array | float = 0.0) -> "Marginal":
-        """Return the whitener for modes (m, k) and `had` (m,), as for the class."""
+        """Return the whitener for modes (m, k) and `had` (m,)."""
         directions, seen, _ = np.linalg.svd(modes, full_matrices=False)
         return cls(modes, np.broadcast_to(had, len(modes)), directions, seen)
 
     def whiten(self, rows: Array) -> Array:
         """Whiten residuals (m,) or their derivatives (m, p)."""
-        # the whitener is applied by its few directions; as a matrix it would be (m, m)
+        # The whitener is applied along its few directions. As a matrix it would be (m, m).
         along = (1.0 - 1.0 / np.sqrt(1.0 + self.seen**2)) * (self.directions.T @ rows).T
         return np.asarray(rows - self.directions @ along.T)
 
 
 def store_common_errors(record: xr.Dataset, errors: CommonErrors) -> None:
-    """Store the common errors of a record's poses with it."""
+    """Store the common errors of the poses with a record."""
     record[CHANGES] = xr.DataArray(
         errors.changes,
         dims=("time", "pose_component", "common_error_name"),
@@ -178,7 +178,7 @@ def store_common_errors(record: xr.Dataset, errors: CommonErrors) -> None:
         dims=("common_error_name", "common_error_name_2"),
         attrs={
             "units": "of both errors",
-            "long_name": "covariance of the common errors, the same along the run",
+            "long_name": "covariance of the common errors, which are constant during the run",
         },
     )
     names = list(errors.names)
@@ -186,7 +186,7 @@ def store_common_errors(record: xr.Dataset, errors: CommonErrors) -> None:
 
 
 def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErrors:
-    """Return the common errors of a record that are of these kinds (`kind_of`), or NONE.
+    """Return the common errors of a record with these kinds (`kind_of`), or NONE.
 
     Raises RecordError if one of the two variables is missing, a shape is wrong, a number is not
     finite, or the covariance is not valid.
@@ -194,10 +194,10 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
     given = [name for name in (CHANGES, COVARIANCE) if name in record]
     if not given:
         return NONE
-    # one without the other says nothing of the errors
+    # Neither variable can be interpreted without the other.
     if len(given) == 1:
         raise RecordError(
-            f"the record holds {given[0]} and not {({CHANGES, COVARIANCE} - {*given}).pop()}"
+            f"the record holds {given[0]} but not {({CHANGES, COVARIANCE} - {*given}).pop()}"
         )
     changes, covariance = (
         np.asarray(record[name].values, dtype=float) for name in (CHANGES, COVARIANCE)

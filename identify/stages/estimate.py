@@ -1,4 +1,4 @@
-"""Stage from the records in a run folder to the identified parameters and their covariance."""
+"""Stage that estimates the parameters and their covariance from the records in a run folder."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -40,11 +40,11 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
 
     The result does not contain the truth.
 
-    ``settings`` of the estimator, by dotted path, replace those of the scenario. Once they have
-    given a result, scenario.toml holds them for the later stages.
+    ``settings`` of the estimator, by dotted path, replace settings of the scenario. After a
+    successful identification, scenario.toml holds them for the later stages.
 
-    Raises the errors of `identification.identify`, and ScenarioError for a setting that the record
-    was made with.
+    Raises the errors of `identification.identify`, and ScenarioError for settings that do not
+    belong to the estimator.
     """
     run_folder = RunFolder(folder)
     if run_folder.holds_own_record:
@@ -70,9 +70,9 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
 def identify_own(
     paths: Sequence[Path], folder: Path, progress: Progress, settings: Mapping[str, Any]
 ) -> None:
-    """Estimate the parameters from a user's own records; write a run folder without the truth.
+    """Estimate the parameters from a user's own records, and write a run folder without the truth.
 
-    Nothing is written if the records cannot carry an identification.
+    Nothing is written if the records are not suitable for an identification.
 
     Raises the errors of `identify` and of `read_own_records`.
     """
@@ -98,10 +98,10 @@ def _identified_files(
     seed: int | None,
     progress: Progress,
 ) -> dict[Path, bytes]:
-    """Identify from records by file; return covariance.nc and result.json.
+    """Identify from records by file name, and return the contents of covariance.nc and result.json.
 
-    A user's own record has no seed, and `validate`, which otherwise writes model.nc, cannot judge
-    it. So model.nc is returned as well.
+    For a user's own record, which has no seed, model.nc is returned as well, because `validate`
+    cannot write it without the truth.
     """
     began = time.perf_counter()
     nominal = load_robot(scenario.robot)
@@ -114,7 +114,7 @@ def _identified_files(
             diagnosis = diagnose(list(records.values()), result, robot, scenario)
             advance()
     seen = next(iter(records.values()))
-    # The models run with the drive law that was identified.
+    # The models run with the identified drive law.
     side = model_side(robot, scenario).with_drive(result.drive.law)
     before, after = (
         model_on_record(side, values, seen) for values in (result.initial, result.estimate)
@@ -123,7 +123,7 @@ def _identified_files(
     measured = recording.poses(seen, "measured")
     ok = seen["measured_ok"].values.astype(bool)
     covariance = result.whole_covariance
-    # By these digests later stages see whether the result belongs to its files.
+    # Later stages check by these digests whether the result belongs to its files.
     made_of = {name: digest(one) for name, one in records.items()} | {
         "covariance.nc": digest(covariance)
     }

@@ -1,4 +1,4 @@
-"""Plan of a run: its trajectories and its scenario, which all later stages read."""
+"""Plan of a run: its trajectories and its scenario. All later stages read them."""
 
 import time
 from dataclasses import replace
@@ -31,7 +31,7 @@ from identify.trajectory import TrajectorySet, check_travel, load_trajectories, 
 
 
 def is_begun(setup: Setup, folder: Path) -> bool:
-    """Tell whether a folder has the plan of this run, and no report yet."""
+    """Return whether a folder has the plan of this run, and no report yet."""
     run_folder = RunFolder(folder)
     if not (run_folder.scenario.is_file() and run_folder.trajectories.is_file()):
         return False
@@ -43,12 +43,15 @@ def is_begun(setup: Setup, folder: Path) -> bool:
 
 
 def begin(setup: Setup, folder: Path, progress: Progress) -> tuple[Setup, dict[str, float]]:
-    """Excite and teach; return the setup with its sensor taught, and the seconds of each stage."""
+    """Design the trajectories and teach the sensor.
+
+    Returns the setup with the taught sensor, and the duration of each stage in seconds.
+    """
     began = time.perf_counter()
     calibration, setup = _calibrated(setup, progress)
     calibrated_at = time.perf_counter()
     _ = setup.plant, setup.sensor
-    # Fail before the search for a trajectory, which takes time.
+    # Missing OpenGL is reported before the search for a trajectory, which takes long.
     if setup.scenario.renderer == "pyrender":
         cmmsim.require_opengl()
     trajectories = _designed(setup, progress)
@@ -62,9 +65,9 @@ def begin(setup: Setup, folder: Path, progress: Progress) -> tuple[Setup, dict[s
 
 
 def excite(setup: Setup, folder: Path, progress: Progress) -> None:
-    """Choose the trajectories; write scenario.toml and trajectories.json.
+    """Choose the trajectories, and write scenario.toml and trajectories.json.
 
-    The folder geometry is also written if the run calibrates it.
+    If the run calibrates the geometry, the folder geometry is also written.
     """
     calibration, setup = _calibrated(setup, progress)
     plan = setup.sensor_plan
@@ -75,7 +78,7 @@ def excite(setup: Setup, folder: Path, progress: Progress) -> None:
 def open_run(
     folder: Path, progress: Progress | None = None
 ) -> tuple[RunFolder, Setup, TrajectorySet]:
-    """Read the plan of a run folder, and resolve it with the geometry that its estimator knows."""
+    """Read the plan of a run folder. The setup has the geometry that the estimator knows."""
     run_folder = RunFolder(folder)
     scenario = load_scenario(run_folder.whole_scenario)
     trajectories = load_trajectories(run_folder.trajectories)
@@ -85,7 +88,7 @@ def open_run(
 
 
 def _calibrated(setup: Setup, progress: Progress) -> tuple[GeometryOutcome | None, Setup]:
-    """Calibration of the geometry before a run, if there is one, and the setup that knows it."""
+    """Return the geometry calibration before a run, or None, and the setup that uses it."""
     if setup.scenario.geometry.known != "calibrated":
         return None, setup
     outcome = run_geometry(setup, progress)
@@ -109,12 +112,12 @@ def check_planned(
 
 
 def record_files(settings: Identification) -> tuple[str, ...]:
-    """Return the names of the record and, if the anchor needs one, of the run under a load."""
+    """Return the file names of the record and, if the anchor needs it, of the run under a load."""
     return RECORDS if settings.scale_anchor == "payload" else RECORDS[:1]
 
 
 def _designed(setup: Setup, progress: Progress) -> TrajectorySet:
-    """Trajectories that avoid limits and singularities. The robot is compiled on first use."""
+    """Return trajectories that avoid limits and singularities. The robot is compiled first."""
     scenario = setup.scenario
     plant = setup.plant
     robot = plant.nominal
@@ -125,11 +128,11 @@ def _designed(setup: Setup, progress: Progress) -> TrajectorySet:
         "excitation.duration_s gives",
     )
     check_parameter_set(robot, scenario.model.start_parameters)
-    # What is cheap to refuse was refused by now: compiling takes seconds, and the search minutes.
+    # Fast checks come first, because compiling takes seconds, and the search minutes.
     compile_robots((robot, plant.robot), progress)
     plant.check()
     trajectories = design_trajectories(setup.design, setup.seed, progress)
-    # Near a singularity the message names time and leg (section 3.3).
+    # The message of check_travel names time and leg of a singularity (section 3.3).
     unseen = [(path, scenario.validation.duration_s) for path in trajectories.validation]
     for path, duration_s in [(trajectories.excitation, scenario.excitation.duration_s), *unseen]:
         check_travel(robot, path, scenario.timing.frame_times(duration_s), **plant.runs.limits)
@@ -139,7 +142,7 @@ def _designed(setup: Setup, progress: Progress) -> TrajectorySet:
 def _write_plan(
     folder: Path, setup: Setup, trajectories: TrajectorySet, calibration: GeometryOutcome | None
 ) -> None:
-    """Write the scenario last: with it a plan is finished."""
+    """Write the plan. The scenario is written last, and marks a complete plan."""
     run_folder = RunFolder(folder)
     if calibration is not None:
         calibration.write(folder / FOLDER)
@@ -148,5 +151,5 @@ def _write_plan(
 
 
 def scenario_file(run_folder: RunFolder, text: str) -> dict[Path, bytes]:
-    """Return the content of the scenario's file, by its path."""
+    """Return the content of the scenario file, by its path."""
     return {run_folder.scenario: sealed_toml(text).encode()}

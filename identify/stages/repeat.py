@@ -1,4 +1,4 @@
-"""Runs of a plant on exciting trajectories of their own, which show how estimates vary."""
+"""Runs of a plant on several exciting trajectories, which show the scatter of the estimates."""
 
 from dataclasses import replace
 from functools import partial
@@ -18,12 +18,12 @@ def designed_runs(
 ) -> list[Experiment]:
     """Run the plant with images in the loop on `count` exciting trajectories.
 
-    Each trajectory is designed from random candidates of its own by the scenario's method, and is
-    as long as the exciting run. The workers are as in `run_unseen`.
+    The scenario's method designs each trajectory from separate random candidates. All runs are as
+    long as the exciting run. For the workers see `run_unseen`.
 
     Raises the errors of the stages `excite` and `record`.
     """
-    # Seeds of their own keep these runs apart from the experiment's.
+    # Separate seeds make these runs independent of the experiment's runs.
     own = stream_seed(setup.seed, DESIGN)
     seeds = [stream_seed(own, number) for number in range(count)]
     trajectories = []
@@ -35,7 +35,7 @@ def designed_runs(
             trajectories.append(trajectory)
             advance()
     duration_s = setup.scenario.excitation.duration_s
-    # The records say how long these runs are, which stand for those of the validation.
+    # These runs replace the validation runs, so the records state their duration as such.
     lasting = setup.scenario.with_overrides({"validation.duration_s": duration_s})
     setup = replace(setup, scenario=lasting, seed=own)
     plan = setup.sensor_plan

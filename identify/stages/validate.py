@@ -1,4 +1,4 @@
-"""Stage that runs the identified model and the plant on unseen trajectories and opens the truth."""
+"""Stage that compares the identified model with the plant on the validation trajectories."""
 
 import time
 from dataclasses import replace
@@ -40,17 +40,17 @@ def validate(
     workers: int | None = None,
     taught: cmmsim.Taught | None = None,
 ) -> None:
-    """Run plant and models on the unseen trajectories and open the truth.
+    """Run plant and models on the validation trajectories, and compare with the truth.
 
     Writes validation.nc, model.nc and result.json.
 
-    Raises RecordError if the result is incomplete, or was made of another record or covariance.
-    Raises OutputFolderError for a user's own record, whose truth nobody knows.
+    Raises RecordError if the result is incomplete, or was made from another record or covariance.
+    Raises OutputFolderError for a user's own record, because its truth is unknown.
     """
     if RunFolder(folder).holds_own_record:
         raise OutputFolderError(
-            f"{folder} holds a record of your own: no plant is there that could run unseen "
-            f"trajectories; go on with: cmmsim report --out {folder}"
+            f"{folder} holds a record of your own: there is no plant that could run validation "
+            f"trajectories; continue with: cmmsim report --out {folder}"
         )
     run_folder, setup, trajectories = open_run(folder)
     began = time.perf_counter()
@@ -79,7 +79,7 @@ def validate(
     model_poses = [[model_on_record(side, values, seen) for values in models] for seen in records]
     found = result["identification"].get("nuisance_estimates", {})
     predictions = predicted_runs(side, records[1:], models[1], covariance, seed, progress, found)
-    # The exciting run was fitted, so nothing is predicted for it.
+    # The exciting run was used for the fit, so there is no prediction for it.
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [
         build_model_run(seen["time"].values, initial, identified, std)
@@ -109,7 +109,7 @@ def validate(
 
 
 def _identified_models(robot: Robot, run_folder: RunFolder, result: dict[str, Any]) -> list[Array]:
-    """Parameters (p,) of the starting model and of the identified one."""
+    """Return the parameters (p,) of the initial guess and of the identified model."""
     try:
         return [
             parameter_vector(robot, result["identification"], column)

@@ -1,16 +1,16 @@
 """Batches of a study on the workers of a Dask cluster that is already running.
 
-A worker that dies loses only the batches it had, which are computed elsewhere. A batch whose
-workers died is taken apart, and each of its rows is tried alone. A row that then kills its worker
-again becomes an error of this row.
+If a worker dies, other workers compute its batches. If several workers die with the same batch, the
+batch is split, and each of its rows is computed alone. If a worker dies again during such a row,
+the row gets an error.
 
-Whoever can speak to a scheduler can run code as its owner. A scheduler beyond this machine must
-therefore be reached by TLS, with the certificates of Dask's own configuration.
+Everyone who can connect to a scheduler can run code under the account of its owner. A scheduler on
+another machine must therefore be reached by TLS, with the certificates of Dask's configuration.
 
-A callback puts finished batches into a queue, which is read with a time limit. The limit of
-``distributed.as_completed`` would hold for the whole study, and it polls ten times a second.
-``Client.get_versions(check=True)`` compares Dask's own packages, also those of the scheduler, which
-computes nothing. Here the packages are compared that compute the rows.
+A callback puts finished batches into a queue, which is read with a time limit. The time limit of
+``distributed.as_completed`` would apply to the whole study, and that function polls ten times a
+second. ``Client.get_versions(check=True)`` compares the packages of Dask, even on the scheduler,
+which computes nothing. Here the packages that compute the rows are compared.
 """
 
 import asyncio
@@ -33,23 +33,23 @@ from identify.studies.runner import Batches, Suspects, compute
 from identify.studies.study_design import Case, Finished, Shared
 
 WORKERLESS_SECONDS = 180
-"""Longest time that a cluster may be without workers, s. On a busy machine they start slowly."""
+"""Longest allowed time without workers, s. On a busy machine workers start slowly."""
 
 ANSWER_SECONDS = 30
-"""Longest time that a scheduler may take to answer, s."""
+"""Longest allowed time for an answer of a scheduler, s."""
 
-GONE = "the Dask scheduler is gone; the same command goes on from here with another"
+GONE = "the Dask scheduler is gone; the same command with another scheduler continues the study"
 
-REMEDY = "install the same on all machines"
+REMEDY = "install the same version on all machines"
 
 BATCHES_A_WORKER = 3
-"""Batches on their way for each worker: one in work, and the next ones at hand."""
+"""Number of submitted batches per worker: one being computed, and the next batches waiting."""
 
 
 class DaskExecutor:
     """Executor of a study's batches on the workers of a client.
 
-    Only a few batches are on their way at a time.
+    Only a few batches per worker are submitted at a time.
     """
 
     def __init__(self, client: Client) -> None:
@@ -62,7 +62,7 @@ class DaskExecutor:
         self._seen = time.monotonic()
 
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
-        """Yield batches as they are done.
+        """Yield batches in the order in which they finish.
 
         Raises
         ------
@@ -79,9 +79,9 @@ class DaskExecutor:
             raise gone(error) from error
 
     def _send_more(self, shared: Shared, batches: Batches) -> bool:
-        """Keep all workers busy. Return False at the end.
+        """Submit batches so that all workers are busy. Return False at the end.
 
-        Rows that may kill their workers come last, one at a time.
+        Rows during which workers have died come last, one at a time.
         """
         workers = self._count_workers()
         while len(self._open) < BATCHES_A_WORKER * workers and (cases := batches.take(workers)):
@@ -91,7 +91,7 @@ class DaskExecutor:
         return bool(self._open)
 
     def _send(self, shared: Shared, cases: list[Case]) -> None:
-        # With pure=True, Dask would answer a second try with the failure of the first.
+        # With pure=True, Dask would return the failure of the first try for a second try.
         future = self._client.submit(_compute_alike, product_version(), shared, cases, pure=False)
         self._open[future.key] = (future, cases)
         future.add_done_callback(self._done.put)
@@ -99,7 +99,7 @@ class DaskExecutor:
     def _next(self) -> list[Finished]:
         """Return the next finished batch.
 
-        It is empty if none has finished yet, or if its workers died and it was taken apart.
+        The batch is empty if none has finished yet, or if its workers died and it was split.
         """
         try:
             future = self._done.get(timeout=1.0)
@@ -122,8 +122,8 @@ class DaskExecutor:
     def _result(self, future: Future) -> list[Finished]:
         """Return the rows of a finished batch.
 
-        If they were lost with their worker, Dask computes them again. That may take a while, but
-        not without any worker.
+        If the rows were lost with their worker, Dask computes them again. The wait is unlimited,
+        but ends with an error if the cluster has no workers.
         """
         while True:
             try:
@@ -132,9 +132,9 @@ class DaskExecutor:
                 self._check_cluster()
 
     def _count_workers(self) -> int:
-        """Return the number of workers, at most a second old.
+        """Return the number of workers, asked for at most a second ago.
 
-        It is at least 1, since a worker may be about to come.
+        The number is at least 1, because a worker can still join.
         """
         if time.monotonic() > self._asked + 1.0:
             self._workers = max(1, self._ask_workers())
@@ -152,14 +152,15 @@ class DaskExecutor:
             raise StudyError(GONE)
         if not self._ask_workers() and time.monotonic() > self._seen + WORKERLESS_SECONDS:
             raise StudyError(
-                f"no Dask worker for {WORKERLESS_SECONDS} s; the same command goes on from here"
+                f"no Dask worker for {WORKERLESS_SECONDS} s; the same command continues the study"
             )
 
 
 def _compute_alike(version: str, shared: Shared, cases: list[Case]) -> list[Finished]:
-    """Compute rows on a worker, which may have come after the others were checked.
+    """Compute rows on a worker.
 
-    Raises StudyError if the worker has another version of cmmsim than the study.
+    The version is checked here again, because a worker can join after the first check. Raises
+    StudyError if the worker has another version of cmmsim than the study.
     """
     require_product(f"worker {get_worker().address}", product_version(), version, REMEDY)
     return compute(shared, cases)
@@ -171,10 +172,10 @@ def gone(error: OSError) -> StudyError:
 
 
 CONNECT_SECONDS = 20
-"""Longest time that a scheduler may take to answer at first, s. TLS takes seconds if it is busy."""
+"""Longest allowed time for the first answer of a scheduler, s. A busy TLS takes seconds."""
 
 ENCRYPTED = ("tls", "wss")
-"""Kinds of address for which both sides show a certificate."""
+"""Kinds of address for which both sides present a certificate."""
 
 
 @contextmanager
@@ -186,25 +187,25 @@ def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecut
     address : str
         Address of the scheduler.
     insecure : bool, optional
-        Also take a scheduler that anybody on the network can speak to.
+        Also accept a scheduler to which everyone on the network can connect.
 
     Raises
     ------
     StudyError
-        No scheduler answers there, anybody can speak to it, it has no workers, or one of its
-        workers has another version of cmmsim.
+        No scheduler answers at the address, everyone can connect to it, it has no workers, or a
+        worker has another version of cmmsim.
     """
     _silence_dask()
     try:
         kind, place = parse_address(address)
-        # A client of an address of no kind would go on trying in the background.
+        # For an address of an unknown kind, a client would keep trying in the background.
         host = get_backend(kind).get_address_host(place)
     except (ValueError, ImportError) as error:
         raise _no_scheduler(address, str(error)) from error
     if kind not in ENCRYPTED and not insecure and not _is_here(host):
         raise StudyError(
-            f"{address} asks for no certificate: whoever reaches it can run code as you; "
-            "name a tls:// address, or say --insecure"
+            f"{address} asks for no certificate: everyone who reaches it can run code under your "
+            "account; name a tls:// address, or use --insecure"
         )
     security = Security()
     if kind in ENCRYPTED:
@@ -213,11 +214,11 @@ def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecut
         asyncio.run(_identity(address, security))
         client = Client(address, security=security, timeout=CONNECT_SECONDS)
     except OSError as error:
-        why = str(error) or "nothing listens there, or what does says nothing"
+        why = str(error) or "nothing listens there, or the program there does not answer"
         raise _no_scheduler(address, why) from error
     except Exception as error:
-        # Dask takes the first bytes of whatever it is told for the size of a message.
-        raise _no_scheduler(address, "what listens there speaks another protocol") from error
+        # Dask reads the first bytes of any answer as the size of a message.
+        raise _no_scheduler(address, "the program there uses another protocol") from error
     with client:
         try:
             client.wait_for_workers(1, timeout=CONNECT_SECONDS)
@@ -233,7 +234,7 @@ def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecut
 
 
 def _is_here(host: str) -> bool:
-    """Tell whether only this machine reaches a host."""
+    """Return whether only this machine can reach a host."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -241,7 +242,7 @@ def _is_here(host: str) -> bool:
 
 
 def _check_certificates(address: str, security: Security) -> None:
-    """Refuse to call a scheduler without certificates. Raises StudyError."""
+    """Raise StudyError if there are no certificates for a scheduler."""
     try:
         there = security.get_connection_args("client").get("ssl_context")
         why = "none are named"
@@ -256,10 +257,10 @@ def _check_certificates(address: str, security: Security) -> None:
 
 
 def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
-    """Compare the versions that workers answered, by address, with those here.
+    """Compare the versions on the workers, by address, with the versions in this process.
 
-    A worker that answered with an error cannot run cmmsim. One that did not answer (OSError) is
-    gone, and does not count.
+    A worker that answered with an error cannot run cmmsim. A worker that did not answer (OSError)
+    is gone, and is not checked.
 
     Raises
     ------
@@ -281,8 +282,8 @@ def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
 async def _identity(address: str, security: Security) -> object:
     """Ask a scheduler for its identity.
 
-    A client would wait without end for something that listens and never answers. Raises OSError if
-    nothing answers in time, and other errors if something else does.
+    A client would wait forever for a program that listens and never answers. Raises OSError if
+    there is no answer in time, and other errors if the answer is not from a scheduler.
     """
     arguments = security.get_connection_args("client")
     async with rpc(address, connection_args=arguments) as scheduler:
@@ -297,7 +298,7 @@ def _no_scheduler(address: str, why: str) -> StudyError:
 
 
 def _silence_dask() -> None:
-    """Silence Dask's log of workers that come and go, which is no news for the user of a study."""
+    """Silence Dask's log of joining and leaving workers, which users of a study do not need."""
     for name in (
         "distributed",
         "distributed.client",

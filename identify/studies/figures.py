@@ -1,7 +1,7 @@
-"""Figures of a study as PNG, PDF and SVG.
+"""Plots of a study as PNG, PDF and SVG.
 
-They show the figures of its rows against each factor with bands, or over two factors as a map, and
-its laws.
+They show the figures of the rows against each factor with bands, as a map over two factors, and the
+laws.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -27,14 +27,14 @@ from identify.studies.theory import CONFIDENCE as LAWS
 from identify.studies.theory import Verdict, law_data, point_statistics, with_data
 
 PANEL = (3.4, 2.8)
-"""Width and height of a panel, inches. The width is that of a journal's column."""
+"""Width and height of a panel, inches. The width fits a column of a journal."""
 STYLE: Any = {
     "font.size": 8,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "legend.framealpha": 0.8,
     "legend.edgecolor": "none",
-    "pdf.fonttype": 42,  # letters stay letters
+    "pdf.fonttype": 42,  # text stays text
     "svg.fonttype": "none",
 }
 CURVES: list[dict[str, Any]] = [
@@ -46,23 +46,23 @@ CURVES: list[dict[str, Any]] = [
         strict=True,
     )
 ]
-"""Markers, lines and colours, so that curves differ even without colour."""
+"""Markers, lines and colours. Curves can be distinguished even without colour."""
 FORMATS = ("png", "pdf", "svg")
 LEAST_SPAN = 2.0
 """Smallest ratio of the ends of a logarithmic axis. It makes small differences look small."""
 WIDEST_BAND = 3.0
-"""Factor by which bands may extend a logarithmic axis beyond the curves. Wider ones run out of it.
+"""Largest factor by which bands extend a logarithmic axis beyond the curves. Wider bands are cut.
 """
 LETTERS_PER_INCH = 14.0
-"""Letters of a title per inch, a little fewer than there is room for."""
+"""Letters of a title per inch, a little fewer than fit."""
 BESIDE = 1.02
-"""Ratio between the places of two curves that have the same levels."""
+"""Ratio between the abscissae of two neighbouring curves with the same levels."""
 MOST_CURVES = 6
-"""Largest number of settings of the other factors drawn as separate curves, else all as one."""
+"""Largest number of separate curves. For more settings of the other factors, all are one curve."""
 NEAREST_TICKS = 0.09
-"""Smallest distance of two ticks above each other, as a share of the axis."""
+"""Smallest distance of two ticks of a vertical axis, as a share of the axis."""
 LETTER = 0.034
-"""Width of a letter of a tick's number, as a share of the axis."""
+"""Width of a letter of a tick label, as a share of the axis."""
 TICKS: list[list[float]] = [
     [1 + k / 10 for k in range(90)],
     [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8],
@@ -71,7 +71,7 @@ TICKS: list[list[float]] = [
     [1, 3],
     [1],
 ]
-"""Choices of ticks within a decade of a logarithmic axis. The first one that has room is taken."""
+"""Choices of ticks within a decade of a logarithmic axis. The first choice that fits is used."""
 MOST_TICKS = 7
 
 Others = Sequence[tuple[str, pd.DataFrame]]
@@ -81,7 +81,7 @@ Others = Sequence[tuple[str, pd.DataFrame]]
 def draw(
     folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]
 ) -> None:
-    """Write the figures of a study's finished rows. `shown` names the rows' figures to draw."""
+    """Write the plots of a study's finished rows. `shown` names the figures to plot."""
     if not len(done) or not shown:
         return
     _write(folder, _figures(study, done, shown, verdicts))
@@ -90,9 +90,9 @@ def draw(
 def draw_side_by_side(
     folder: Path, study: Study, done: pd.DataFrame, shown: list[str], others: Others
 ) -> None:
-    """Write figures that show the finished rows of other studies beside a study's own.
+    """Write plots that show the finished rows of a study and of other studies side by side.
 
-    They are drawn against each factor, or against the studies if these vary nothing.
+    The abscissa is each factor, or the name of the study if there are no factors.
     """
     names, tables = zip((study.name, done), *others, strict=True)
     together = pd.concat(
@@ -119,7 +119,7 @@ def _write(folder: Path, figures: Iterable[tuple[str, Figure]]) -> None:
 def _figures(
     study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]
 ) -> Iterator[tuple[str, Figure]]:
-    """Yield all figures of a study with the names of their files."""
+    """Yield all plots of a study with the names of their files."""
     for path in study.factors:
         yield f"by_{path}", factor_figure(study, done, path, shown)
     grid = [path for path, values in study.factors.items() if isinstance(values, list)]
@@ -135,7 +135,7 @@ def _figures(
 
 
 def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str]) -> Figure:
-    """Draw the rms of each figure against one factor with its band.
+    """Plot the rms of each figure with its band against one factor.
 
     There is a curve for each setting of the other factors.
     """
@@ -167,14 +167,14 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
 def map_figure(
     study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: list[str]
 ) -> Figure:
-    """Draw the rms of each figure over two factors, over all settings of the others."""
+    """Draw maps of the rms of each figure over two factors. Other factors are averaged."""
     figure, panels = panel_grid(len(shown), *PANEL)
     for axes, name in zip(panels, shown, strict=True):
         squares = done.assign(square=done[name] ** 2)
         table = np.sqrt(squares.pivot_table("square", paths[0], paths[1], "mean", sort=False))
         rms: Array = table.to_numpy(dtype=float)
         picture = axes.imshow(rms, aspect="auto", origin="lower")
-        # The default colour map is bright in its upper part, where white letters are hard to read.
+        # White letters are hard to read on the bright upper part of the colour map.
         bright = 0.4 * np.nanmin(rms) + 0.6 * np.nanmax(rms)
         for (row, column), value in np.ndenumerate(rms):
             ink = "black" if value > bright else "white"
@@ -192,7 +192,7 @@ def map_figure(
 
 
 def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]]) -> Figure:
-    """Draw the quantity of each law against its factor, with the power that the law states.
+    """Plot the quantity of each law against its factor, with the power law that is expected.
 
     The axes are logarithmic.
     """
@@ -222,9 +222,9 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
 
 
 def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
-    """Return the factor's value in each row.
+    """Return the value of a factor in each row.
 
-    If the factor is a figure, it is its mean over the rows of the same point.
+    If the factor is a figure, the value is its mean over the rows of the same point.
     """
     if factor in study.factors or not study.factors:
         return rows[factor]
@@ -239,7 +239,7 @@ def _title(figure: Figure, text: str) -> None:
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:
-    """Return the rows of each setting of the other factors with a label.
+    """Return a label and the rows for each setting of the other factors.
 
     If there are too many settings, all rows are one curve.
     """
@@ -255,7 +255,7 @@ def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFra
 
 
 def _beside(levels: pd.Series, place: int, count: int) -> pd.Series:
-    """Move the levels of one of several curves a little, so that their bands do not overlap."""
+    """Shift the levels of one of several curves a little, so that bands do not overlap."""
     if count == 1 or not pd.api.types.is_numeric_dtype(levels) or not (levels > 0).all():
         return levels
     return levels * BESIDE ** (place - (count - 1) / 2)
@@ -285,9 +285,10 @@ def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, place: int)
 
 
 def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) -> None:
-    """Draw the power law with that exponent through the middle of the data.
+    """Draw the power law with this exponent through the middle of the data.
 
-    Nothing is drawn if the factor is not positive, because it then has no powers.
+    Nothing is drawn if a value of the factor is not positive, because a power law needs positive
+    values.
     """
     x = pd.to_numeric(factor, errors="coerce").to_numpy(dtype=float)
     if not np.all(x > 0.0):
@@ -305,7 +306,7 @@ def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) 
 
 
 def scale(axes: Axes, factor: pd.Series) -> None:
-    """Make axes logarithmic if everything on them is positive, with ticks that do not touch."""
+    """Make axes logarithmic if all their values are positive, with ticks that do not touch."""
     if pd.api.types.is_numeric_dtype(factor) and (factor > 0).all() and factor.nunique() > 1:
         axes.set_xscale("log")
         levels = (
@@ -339,7 +340,7 @@ def scale(axes: Axes, factor: pd.Series) -> None:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Return round numbers between the ends of a logarithmic axis, as many as have room."""
+    """Return round numbers between the ends of a logarithmic axis, as many as fit."""
     decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     inside: list[float] = []
     for places in TICKS:
@@ -347,7 +348,7 @@ def _log_ticks(low: float, high: float) -> list[float]:
         inside = [value for value in found if low <= value <= high]
         if len(inside) <= MOST_TICKS and _far_apart(inside, low, high) == inside:
             return inside
-    # No choice has room, so every k-th of the fewest is taken, with k rounded up.
+    # No choice fits, so every k-th tick of the last choice is used, with k rounded up.
     return inside[:: -(-len(inside) // MOST_TICKS)]
 
 
@@ -360,9 +361,9 @@ def _set_ticks(axis: Axis, values: list[float]) -> None:
 def _far_apart(
     values: list[float], low: float, high: float, share: float = NEAREST_TICKS
 ) -> list[float]:
-    """Return those of ascending values that keep a distance from the last one kept.
+    """Return a selection of ascending values with a minimum distance.
 
-    `share` is that distance as a share of a logarithmic axis.
+    `share` is this distance as a share of a logarithmic axis.
     """
     kept: list[float] = []
     for value in values:

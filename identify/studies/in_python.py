@@ -1,4 +1,4 @@
-"""Studies without a study file: a scenario, what is varied, and a table of the outcome."""
+"""Studies without a study file: a scenario, its factors, and a table of the results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from identify.studies.study_design import prepare
 from identify.studies.study_file import Study as StudyFile
 
 BOOKKEEPING = ("row", "seed_entropy", "seed_spawn_key", "seconds", "error")
-"""Columns of the table of a study's folder that are no figures."""
+"""Columns of a study's table that are neither factors nor figures, except `repeat`."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Study:
     Parameters
     ----------
     scenario : Scenario or str
-        Scenario, or name or path of one.
+        Scenario, or the name or path of a scenario.
     vary : mapping
         Lists of values by dotted path: ``scenario.`` and a key of a scenario, ``sensor.`` and a
         key of a sensor file, or ``options.`` and an option of the kind.
@@ -41,7 +41,7 @@ class Study:
     kind : str
         Kind of the rows, or ``module:function`` of an allowed module.
     changes : mapping
-        Values that hold in every row, by dotted path.
+        Values of all rows, by dotted path.
     seed : int
         Seed of all rows.
 
@@ -78,25 +78,26 @@ class Study:
         Parameters
         ----------
         workers : int, optional
-            Number of processes, 0 for this one alone. The default is one for each core. A script
-            that asks for processes calls this below ``if __name__ == "__main__":``.
+            Number of worker processes. With 0, this process computes all rows. The default is one
+            process per core. A script that uses processes must call this method below
+            ``if __name__ == "__main__":``.
         folder : str or Path, optional
-            Folder in which finished rows are kept; the same call goes on from there. Without one
-            nothing is kept.
+            Folder in which finished rows are stored. The same call with the same folder continues
+            the study. By default nothing is stored.
         progress : Progress, optional
-            Where the rows are counted.
+            Display of the number of finished rows.
 
         Returns
         -------
         pandas.DataFrame
-            A row for each setting and repeat: the factors by their paths, and the figures.
+            One row per setting and repeat, with the factors by their paths, and the figures.
 
         Raises
         ------
         StudyError
             The study is not valid, or a row failed.
         StudyInterrupted
-            Ctrl-C ended it.
+            Ctrl-C stopped the study.
         """
         scenario = self.scenario
         if not isinstance(scenario, Scenario):

@@ -1,4 +1,4 @@
-"""Names of a study's columns: keys with units for tables, and words for figures."""
+"""Labels of a study's columns: keys with units for tables, and words for plots."""
 
 import re
 from textwrap import wrap
@@ -8,7 +8,7 @@ from identify.studies.study_design import field_of, valid_keys
 from identify.studies.study_file import Study
 
 PRINTED = {"um": "µm", "urad": "µrad"}
-"""Units as a figure shows them."""
+"""Units as plots show them."""
 
 SUFFIXES = {
     "_um": "um",
@@ -20,7 +20,7 @@ SUFFIXES = {
     "_rad": "rad",
     "_percent": "%",
 }
-"""Units at the ends of names. Users' own kinds of row state theirs in no other way."""
+"""Units by the ends of names. Users' own kinds of row state units only in names."""
 
 WIDEST = 36
 """Largest number of letters in a line of a label."""
@@ -41,7 +41,7 @@ def factor_unit(path: str) -> str:
 def unit_of(name: str, study: Study) -> str:
     """Return the unit of a factor or figure in a study's table.
 
-    It is empty if the column has no unit, or if none is stated.
+    The text is empty if the column has no unit, or if no unit is stated.
     """
     if name == "seconds":
         return "s"
@@ -58,13 +58,13 @@ def labelled(name: str, study: Study) -> str:
 
 
 def axis_label(name: str, study: Study, per: str | None = None) -> str:
-    """Describe a column, or one divided by another, in words with its unit in brackets.
+    """Describe a column, or the ratio of two columns, in words with its unit in brackets.
 
     The text is wrapped to lines of WIDEST letters.
     """
     words = _words(name, study)
     unit = _unit(name, study)
-    # A ratio has the names of its columns, because both in words would fill a paragraph.
+    # A ratio is labelled by the names of its columns, because two descriptions would be too long.
     if per is not None:
         words = f"{_plain_name(name)} / {_plain_name(per)}"
         unit = "/".join(filter(None, (unit, _unit(per, study))))
@@ -73,19 +73,19 @@ def axis_label(name: str, study: Study, per: str | None = None) -> str:
 
 
 def setting(path: str, value: object) -> str:
-    """Return a factor and its value as a legend shows them, such as "frame rate 10 Hz"."""
+    """Return a factor and its value for a legend, such as "frame rate 10 Hz"."""
     return " ".join(filter(None, (_plain_name(path), number(value), factor_unit(path))))
 
 
 def number(value: object) -> str:
-    """Format a float with four digits, or all before the point, and other values as they are."""
+    """Format a float with four digits, or with all digits before the point if there are more."""
     if not isinstance(value, float):
         return str(value)
     return f"{value:.4g}" if not 1e4 <= abs(value) < 1e7 else f"{value:.0f}"
 
 
 def _words(name: str, study: Study) -> str:
-    """Return the first part of a column's description, or its name in plain letters without one."""
+    """Return the first part of a column's description, or without a description its name."""
     columns = KINDS[study.kind].columns if study.kind in KINDS else {}
     if name in columns:
         said = columns[name].meaning
@@ -94,7 +94,7 @@ def _words(name: str, study: Study) -> str:
         field = field_of(name, kind.options if kind else None)
         said = (field.description if field is not None else None) or ""
     first = re.split(r"[;:]", said)[0]
-    # Words such as "the same as above" refer to another column, which a label does not show.
+    # A description that begins with "the same" refers to another column, so the name is used.
     return _plain_name(name) if not first or first.startswith("the same") else first
 
 
@@ -110,6 +110,6 @@ def _plain_name(name: str) -> str:
 
 
 def _suffix(name: str) -> tuple[str, str]:
-    """Split a name into the part before the unit at its end, and that unit."""
+    """Split a name into its first part and the unit at its end."""
     end = next((end for end in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(end)), "")
     return name.removesuffix(end) if end else name, SUFFIXES.get(end, "")

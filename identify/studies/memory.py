@@ -9,7 +9,7 @@ from identify.studies.study_design import Case, Shared
 from identify.studies.study_file import Range, Study
 
 LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
-"""Factors that decide the length of a record or of a stretch of a path."""
+"""Factors that determine the length of a record or of a stretch of a path."""
 
 PROCESS = 0.5e9
 """Memory of a process before its first row, bytes."""
@@ -18,10 +18,7 @@ GB = 1e9
 
 
 def check_memory(study: Study, shared: Shared, workers: int) -> None:
-    """Refuse a study whose longest rows, one a worker, need more memory than this machine has.
-
-    Raises StudyError with both numbers.
-    """
+    """Raise StudyError if the longest rows, one per worker, need more memory than there is."""
     kind = find_kind(study.kind)
     if kind.memory is None:
         return

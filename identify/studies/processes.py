@@ -1,12 +1,13 @@
-"""Batches of a study on processes of this machine, which no other user can reach.
+"""Batches of a study on processes of this machine.
 
-Each process is joined to this one by a pipe of its own, which has no name, address or file. It gets
-a batch, and the next one when the rows it found are on the disk. If a process dies, another takes
-its place. The rows of its batch are computed again when all others are done, each alone. A row that
-then ends its process again becomes an error of this row.
+Each process is connected to the main process by a pipe. The pipe has no name, address or file, so
+other users cannot reach it. A process gets its next batch when the rows of the batch before are on
+the disk. If a process dies, a new process replaces it. The rows of its batch are computed again at
+the end, each alone. If a process dies again during such a row, the row gets an error.
 
-`concurrent.futures.ProcessPoolExecutor` is not used. If one process dies, it ends all of them and
-does not say which rows that one had. If this process is killed, its processes wait without end.
+`concurrent.futures.ProcessPoolExecutor` is not used. If one process dies, that executor ends all
+processes and does not report the rows of the dead process. If the main process is killed, its
+processes wait forever.
 """
 
 import os
@@ -26,25 +27,25 @@ from identify.studies.study_design import Case, Finished, Shared
 from identify.studies.worker import work
 
 SPAWN = get_context("spawn")
-"""Way to start processes anew, so that they inherit neither threads nor the locks these hold."""
+"""Start method of the processes, by which they inherit neither threads nor locks."""
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Variables that limit a process to one thread, set before it loads its libraries.
+"""Variables that limit a process to one thread, because there are as many processes as cores.
 
-There are as many processes as cores.
+They are set before a process loads its libraries.
 """
 
 MEMORY_SHARE = 0.95
-"""Part of its share of the memory that a process may take. It ends before the machine does."""
+"""Memory limit of a process, as a part of the machine's memory divided by the processes."""
 
 LOOK_S = 1.0
 """Interval at which the memory of the processes is checked, s."""
 
 STILLBORN = 3
-"""Number of processes that may die one after the other before they are ready."""
+"""Number of consecutive processes that die before they are ready at which the study fails."""
 
 END_S = 10.0
-"""Longest time that a killed process may take to end, s."""
+"""Longest time to wait for the end of a killed process, s."""
 
 
 class ProcessExecutor:
@@ -57,7 +58,7 @@ class ProcessExecutor:
         self._looked = time.monotonic()
 
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
-        """Yield batches as they are done.
+        """Yield batches in the order in which they finish.
 
         Raises
         ------
@@ -73,7 +74,7 @@ class ProcessExecutor:
                         yield finished
                 self._start_missing()
         finally:
-            # Nobody waits for the rows of a process that still computes, so it ends.
+            # After an error, processes can still compute rows that nobody will read.
             if any(worker.cases for worker in self._workers):
                 self.close()
 
@@ -92,11 +93,11 @@ class ProcessExecutor:
         except OSError as error:
             raise StudyError(
                 f"process {len(self._workers) + 1} of {self._count} cannot be started: "
-                f"{error.strerror}; name fewer with --workers"
+                f"{error.strerror}; use fewer processes (--workers)"
             ) from error
 
     def _hand_out(self, shared: Shared, batches: Batches, suspects: Suspects) -> bool:
-        """Give each idle process a batch, and suspects last, one at a time.
+        """Give each idle process a batch. Suspect rows come last, one at a time.
 
         Returns False at the end.
         """
@@ -104,15 +105,15 @@ class ProcessExecutor:
         for worker in ready:
             if not worker.cases:
                 worker.give(shared, batches.take(self._count))
-        # Nothing else runs beside a suspect, so that a second death is its own fault.
+        # A suspect row is computed alone, so that a second death is certainly its fault.
         if ready and not any(worker.cases for worker in ready):
             ready[0].give(shared, suspects.take())
         return not ready or any(worker.cases for worker in ready)
 
     def _heard(self) -> list["_Worker"]:
-        """Return the processes that are ready, have found something or have died.
+        """Return the processes that have become ready, have finished a batch or have died.
 
-        It waits LOOK_S at most, and also checks the memory of all processes.
+        Waits at most LOOK_S, and also checks the memory of all processes.
         """
         if time.monotonic() > self._looked + LOOK_S:
             self._looked = time.monotonic()
@@ -123,7 +124,10 @@ class ProcessExecutor:
         return [worker for worker in self._workers if worker.pipe in heard]
 
     def _take(self, worker: "_Worker", batches: Batches, suspects: Suspects) -> list[Finished]:
-        """Return what a process has found; nothing if it has become ready, or has died."""
+        """Return the rows that a process has finished, or its failed rows if it has died.
+
+        The list is empty for a process that has become ready.
+        """
         cases = worker.cases
         try:
             finished = worker.receive()
@@ -135,7 +139,7 @@ class ProcessExecutor:
         return finished
 
     def _bury(self, worker: "_Worker", suspects: Suspects) -> list[Finished]:
-        """Remove a dead process. Rows that have now killed two processes are returned as errors."""
+        """Remove a dead process. A row that has killed two processes is returned as an error."""
         with held():
             self._workers.remove(worker)
             worker.end()
@@ -144,7 +148,7 @@ class ProcessExecutor:
             if self._stillborn >= STILLBORN:
                 raise StudyError(
                     f"{STILLBORN} processes died before they computed a row; "
-                    "--workers 0 computes in this one, and may show why"
+                    "--workers 0 computes in the main process, and may show the reason"
                 )
         return suspects.blame(worker.cases, worker.fate)
 
@@ -157,11 +161,11 @@ class _Worker:
     ready : bool
         Whether the process has loaded its libraries.
     cases : list of Case
-        Rows that it computes now.
+        Rows that the process computes now.
     fate : str
-        Words for its end in an error message.
+        Text for an error message about the end of the process.
     pipe : Connection
-        This side of the pipe.
+        Main process's end of the pipe.
     """
 
     def __init__(self) -> None:
@@ -170,24 +174,24 @@ class _Worker:
         self.fate = "died"
         self.pipe, theirs = SPAWN.Pipe()
         self._process = SPAWN.Process(target=work, args=(theirs,), daemon=True)
-        # The tracker is started outside the block, where it would unblock Ctrl-C.
+        # The tracker is started before the block, because its start would unblock Ctrl-C.
         resource_tracker.ensure_running()
         with _one_thread_each(), deaf_offspring():
             self._process.start()
         theirs.close()
 
     def give(self, shared: Shared, cases: list[Case]) -> None:
-        """Hand over rows to compute. An empty list is no work."""
+        """Send rows to compute, unless the list is empty."""
         self.cases = cases
         if cases:
-            # OSError means that it has died, which is seen when it is heard.
+            # OSError means that the process has died, which `receive` will report.
             with suppress(OSError):
                 self.pipe.send((shared, cases))
 
     def receive(self) -> list[Finished]:
-        """Return the rows found, or none when the process becomes ready.
+        """Return finished rows, or an empty list if the process has become ready.
 
-        Raises EOFError or OSError if it has died.
+        Raises EOFError or OSError if the process has died.
         """
         finished: list[Finished] = self.pipe.recv()
         self.ready = True
@@ -195,14 +199,14 @@ class _Worker:
         return finished
 
     def keep_below(self, limit: float) -> None:
-        """End the process if it takes more memory than the limit, bytes."""
+        """Kill the process if it uses more memory than the limit, bytes."""
         with suppress(psutil.Error):
             if psutil.Process(self._process.pid).memory_info().rss > limit:
                 self.fate = f"took more than {limit / GB:.3g} GB of memory"
                 self._process.kill()
 
     def end(self) -> None:
-        """End the process, whatever it does."""
+        """Kill the process."""
         self.pipe.close()
         self._process.kill()
         self._process.join(END_S)
@@ -220,7 +224,7 @@ def local_processes(count: int) -> Iterator[ProcessExecutor]:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Set the environment of the processes that begin in the block to one thread each."""
+    """Set the environment so that processes started in the block use one thread each."""
     before = {name: os.environ[name] for name in THREADS if name in os.environ}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:

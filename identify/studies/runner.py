@@ -1,6 +1,7 @@
-"""A study from its first to its last row.
+"""Run of a study from its first to its last row.
 
-Rows that are not done yet are computed and kept at once, and all are tabulated at the end.
+Missing rows are computed, and each batch is stored as soon as it finishes. At the end all rows are
+tabulated.
 """
 
 import math
@@ -27,9 +28,16 @@ from identify.studies.table import FIRST, LAST, TABLE, tidy_table, write_table, 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A study that is done: its table, and how many of its rows were found done.
+    """Finished study.
 
-    beyond: rows that its folder keeps of repeats which it no longer has.
+    Attributes
+    ----------
+    frame : DataFrame
+        Table of all rows.
+    found : int
+        Number of rows that were finished before this run.
+    beyond : int
+        Number of stored rows of repeats that the study no longer has.
     """
 
     frame: pd.DataFrame
@@ -38,26 +46,26 @@ class Outcome:
 
     @property
     def rows(self) -> int:
-        """How many rows it has."""
+        """Number of rows."""
         return len(self.frame)
 
     @property
     def failures(self) -> list[str]:
-        """The rows that failed, each in words."""
+        """Failed rows, each as a text with its number and error."""
         bad = self.frame[self.frame["error"] != ""]
         return [f"row {row}: {error}" for row, error in zip(bad["row"], bad["error"], strict=True)]
 
 
 Executor = Callable[[Shared, "Batches"], Iterator[list[Finished]]]
-"""Computes batches until there are none left, and yields them as they are done, in any order."""
+"""Function that computes all batches, and yields their rows in the order in which they finish."""
 
 Workers = Callable[[], AbstractContextManager[Executor]]
-"""Starts what computes, for as long as the context lasts."""
+"""Function that returns an executor as a context. The workers live as long as the context."""
 
 
 @contextmanager
 def in_this_process() -> Iterator[Executor]:
-    """Workers: none but this process, one row after the other."""
+    """Provide this process as the only worker."""
     yield _serial
 
 
@@ -69,10 +77,10 @@ def _serial(shared: Shared, batches: "Batches") -> Iterator[list[Finished]]:
 
 
 SoFar = Callable[[pd.DataFrame], object]
-"""Gets the table of what is done so far."""
+"""Function that gets the table of the rows finished so far."""
 
 SO_FAR_S, SO_FAR_SHARE = 30.0, 0.02
-"""How often results so far are shown, seconds; and what share of the time that may take."""
+"""Shortest interval of intermediate results, seconds, and their largest share of the time."""
 
 
 def run_study(
@@ -83,10 +91,10 @@ def run_study(
     so_far: SoFar = lambda frame: None,
     shared: Shared | None = None,
 ) -> Outcome:
-    """Run a study in its folder, or go on with it there.
+    """Run a study in its folder, or continue it there.
 
-    The same study gives the same figures whatever the workers. Finished rows are kept, and the
-    same call goes on from there.
+    The figures do not depend on the workers. Finished rows are stored, and the same call continues
+    the study.
 
     Parameters
     ----------
@@ -95,13 +103,13 @@ def run_study(
     folder : Path
         Folder of its files.
     progress : Progress
-        Where the rows are counted.
+        Display of the number of finished rows.
     workers : callable
-        Starts what computes the rows.
+        Function that starts the workers.
     so_far : callable
-        Gets the table of what is done now and then while the study runs.
+        Function that gets the table of finished rows from time to time while the study runs.
     shared : Shared, optional
-        What the rows share, from `prepare`. The default prepares the study as its file has it.
+        Common data of the rows, from `prepare`. By default it is prepared from the study.
 
     Returns
     -------
@@ -111,11 +119,11 @@ def run_study(
     Raises
     ------
     StudyError
-        The study is not valid (see `identify.studies.study_design.prepare`), the folder is not
-        its own (see `identify.studies.store.open_folder`), the disk is full, or the workers are
+        The study is not valid (see `identify.studies.study_design.prepare`), the folder cannot be
+        used (see `identify.studies.store.open_folder`), the disk is full, or the workers are
         lost.
     StudyInterrupted
-        Ctrl-C ended it.
+        Ctrl-C stopped the study.
     """
     shared = shared or prepare(study)
     entry = resolved(study, shared)
@@ -127,9 +135,10 @@ def run_study(
                 shown = _now_and_then(lambda: so_far(tidy_table(study, journal.rows())))
                 _compute_pending(study.name, shared, design, journal, progress, workers, shown)
         except KeyboardInterrupt:
-            done = sum(1 for _ in journal.rows())  # it may have come while some were being noted
+            # The rows are counted in the file, because Ctrl-C can interrupt their registration.
+            done = sum(1 for _ in journal.rows())
             raise StudyInterrupted(
-                f"stopped: {done} of {len(design)} rows are done and kept"
+                f"stopped: {done} of {len(design)} rows are done and stored"
             ) from None
         frame = tidy_table(study, journal.rows())
         write_table(folder / TABLE, frame, entry)
@@ -138,7 +147,7 @@ def run_study(
 
 
 def _now_and_then(show: Callable[[], object]) -> Callable[[], None]:
-    """What shows, but not more often than it may."""
+    """Return a function that calls `show`, but only from time to time."""
     next_time = time.perf_counter() + SO_FAR_S
 
     def perhaps() -> None:
@@ -148,7 +157,7 @@ def _now_and_then(show: Callable[[], object]) -> Callable[[], None]:
             return
         show()
         took = time.perf_counter() - began
-        # A table of many rows takes long, and may take no more than its share of the study.
+        # A table of many rows takes long, so its share of the time is limited.
         next_time = began + took + max(SO_FAR_S, took / SO_FAR_SHARE)
 
     return perhaps
@@ -176,16 +185,19 @@ def _compute_pending(
 
 
 BATCH_SECONDS = 0.25
-"""Work in a batch, so that sending it costs little; what is lost at most with each worker when
-everything is killed.
+"""Duration of a batch, s.
+
+It is long enough that sending costs little. If all processes are killed, each loses at most this
+much work.
 """
 
 LARGEST_BATCH = 500
 
 
 class Batches:
-    """Hands out the rows that are still to be done, in batches sized by how long the last ones
-    took.
+    """Missing rows of a study, handed out in batches of about the same duration.
+
+    The size of a batch depends on the time per row of earlier batches.
     """
 
     def __init__(self, cases: Iterator[Case], count: int) -> None:
@@ -194,7 +206,7 @@ class Batches:
         self._row_seconds = BATCH_SECONDS
 
     def take(self, workers: int) -> list[Case]:
-        """The next batch for one of so many workers; empty when all rows are handed out.
+        """Return the next batch for one of `workers` workers, empty if all rows are handed out.
 
         Towards the end batches become smaller, so that all workers end together.
         """
@@ -205,15 +217,17 @@ class Batches:
         return batch
 
     def learn(self, finished: list[Finished]) -> None:
-        """Take from a finished batch how long rows take."""
+        """Update the time per row from a finished batch."""
         mean = sum(row.seconds for row in finished) / len(finished)
-        # Half of the old value stays, so that one slow batch does not make all others small.
+        # Averaging with the old value limits the effect of one slow batch.
         self._row_seconds = max(0.5 * (self._row_seconds + mean), 1e-6)
 
 
 class Suspects:
-    """Rows whose process died. Each is computed again, alone, and then is an error if its process
-    dies again: the first death may be the fault of another row.
+    """Rows of batches whose process died.
+
+    Each row is computed again, alone, because another row of the batch can be the cause. If its
+    process dies again, the row gets an error.
     """
 
     def __init__(self) -> None:
@@ -221,11 +235,14 @@ class Suspects:
         self._deaths: Counter[int] = Counter()
 
     def take(self) -> list[Case]:
-        """A row to be computed while no other is; empty when there is none."""
+        """Return a list with one row, to be computed alone. It is empty if no row is left."""
         return [self._rows.pop()] if self._rows else []
 
     def blame(self, cases: list[Case], fate: str = "died") -> list[Finished]:
-        """Note what became of the process of some rows; one that was alone again, as an error."""
+        """Register the end of a process that computed these rows.
+
+        A row that was alone, and whose process ended for the second time, is returned as an error.
+        """
         self._deaths.update(case.number for case in cases)
         if len(cases) == 1 and self._deaths[cases[0].number] > 1:
             error = f"KilledWorker: its process {fate}, and again when it computed this row alone"
@@ -235,12 +252,11 @@ class Suspects:
 
 
 def compute(shared: Shared, cases: list[Case]) -> list[Finished]:
-    """Compute rows one after the other; what goes wrong in one is noted there, and the others go
-    on.
+    """Compute rows one after the other. An error in a row does not affect the other rows.
 
-    The only part of a study that runs on other processes and machines.
+    Only this function runs in other processes and on other machines.
     """
-    # The user allowed these modules to the command, and another process has not heard of it.
+    # The user allowed these modules in the main process only.
     allow_plugin(*shared.plugins)
     return [_compute(shared, case) for case in cases]
 
@@ -254,7 +270,7 @@ def _compute(shared: Shared, case: Case) -> Finished:
         figures = _plain(row, {*FIRST, *case.factors, *LAST})
     except KeyboardInterrupt:
         raise
-    except BaseException as error:  # also sys.exit() ends the row and not the study
+    except BaseException as error:  # sys.exit() in a row must not end the study
         raise_noted()
         text = " ".join(f"{type(error).__name__}: {error}".split())
         return Finished(case.number, {}, time.perf_counter() - start, text)
@@ -262,8 +278,11 @@ def _compute(shared: Shared, case: Case) -> Finished:
 
 
 def _plain(figures: Mapping[str, float], taken: set[str]) -> dict[str, float]:
-    """Figures as plain numbers; one that is none is an error of the row, so that no average hides
-    it, and so is one that no column of the table is left for."""
+    """Return figures as plain numbers.
+
+    Raises ArithmeticError for a figure that is not finite, so that no average hides it. Raises
+    ValueError for a figure with a name in `taken`, the other columns of the table.
+    """
     if hidden := sorted(taken & set(figures)):
         raise ValueError(
             f"a figure must not be called {hidden[0]!r}: the table has a column of this name"

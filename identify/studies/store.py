@@ -1,14 +1,14 @@
-"""Folder of a study: its owner, the lock while somebody works on it, and the journal of its rows.
+"""Folder of a study: its study, the lock while the study runs, and the journal of its rows.
 
 ``study.json`` is the resolved study with the versions of the software that began it. ``rows.jsonl``
-holds its finished rows, ``study.parquet`` the table made of them, and ``study.nc`` their figures by
-factors.
+holds its finished rows, ``study.parquet`` the table of these rows, and ``study.nc`` their figures
+by factors.
 
-The journal is an append-only file of JSON lines. Rows are on the disk before the next ones begin. A
-line counts only if it is complete: whatever ends the program, a line that was written stays, and a
-torn last one is cut off when the file is opened again. A database (sqlite3, write-ahead log)
-appends 22,000 rows a second where this appends 9,000, and rows come at 100 a second. With one byte
-of its log damaged, the database silently gave back 99 rows of 200, where this names the line.
+The journal is an append-only file of JSON lines. Finished rows are on the disk before a worker gets
+its next batch. A line counts only if it is complete. After a crash, an incomplete last line is cut
+off when the file is opened again. A database (sqlite3, write-ahead log) appends 22,000 rows per
+second and this journal 9,000, while rows finish at about 100 per second. With one damaged byte in
+its log, the database silently returned 99 rows of 200. This journal reports the damaged line.
 """
 
 import json
@@ -44,28 +44,29 @@ MAY_CHANGE = (
     "study.repeats",
     "scenario.description",
 )
-"""Entries that may change in a study that is continued, because they decide no row that is there.
+"""Entries that are allowed to change in a continued study, because finished rows do not depend on
+them.
 
-Rows of further repeats come after all others. With fewer repeats, the rows beyond stay in the
-journal and do not count.
+Rows of further repeats come after all other rows. With fewer repeats, the further rows stay in the
+journal and are ignored.
 """
 
-REMEDY = "go on with that version, or name another folder with --out"
+REMEDY = "continue with that version, or name another folder with --out"
 
 FINISHED = TypeAdapter(Finished)
 
 
 class Journal:
-    """Finished rows of a study with ``rows`` rows, as a context that closes the file.
+    """Journal of the finished rows of a study with ``rows`` rows, a context that closes the file.
 
     Attributes
     ----------
     path : Path
         The file.
     beyond : int
-        Number of rows in the file of repeats that the study had before and no longer has.
+        Number of rows in the file that belong to repeats that the study no longer has.
     finished : ndarray of bool, shape (rows,)
-        Mark of each row that is done.
+        True for each finished row.
     """
 
     def __init__(self, path: Path, rows: int) -> None:
@@ -78,7 +79,7 @@ class Journal:
         for row, end in self._complete_lines():
             self._note(row)
             self._end = end
-        # A torn last line goes, so that the next row begins a line of its own.
+        # An incomplete last line is removed, so that the next row begins a new line.
         os.ftruncate(self._file, self._end)
 
     def __enter__(self) -> "Journal":
@@ -88,12 +89,12 @@ class Journal:
         os.close(self._file)
 
     def append(self, rows: list[Finished]) -> None:
-        """Add finished rows. They are on the disk when this returns.
+        """Add finished rows. They are on the disk when this method returns.
 
-        Raises StudyError if the disk is full or broken. The file is then as it was before.
+        Raises StudyError if the disk is full or broken. The file is then unchanged.
         """
         text = "".join(f"{json.dumps(asdict(row))}\n" for row in rows).encode()
-        safe = f"; {self.finished.sum()} rows are safe, and the same command goes on from there"
+        safe = f"; {self.finished.sum()} rows are safe, and the same command continues the study"
         with written(self.path, safe):
             try:
                 os.lseek(self._file, self._end, os.SEEK_SET)
@@ -109,15 +110,15 @@ class Journal:
             self._note(row)
 
     def rows(self) -> Iterator[Finished]:
-        """Yield the finished rows in the order in which they were done."""
+        """Yield the finished rows in the order in which they finished."""
         for row, _ in self._complete_lines():
             if row.number < len(self.finished):
                 yield row
 
     def pending(self) -> Iterator[int]:
-        """Yield the numbers of the rows still to be done, ascending.
+        """Yield the numbers of the missing rows, ascending.
 
-        Whether a row is done is looked up when its number is reached.
+        A row that finishes before its number is reached is skipped.
         """
         return (number for number in range(len(self.finished)) if not self.finished[number])
 
@@ -128,7 +129,7 @@ class Journal:
             self.beyond += 1
 
     def _complete_lines(self) -> Iterator[tuple[Finished, int]]:
-        """Yield rows with the place where each line ends, up to a torn last line."""
+        """Yield the row and the end position of each line, up to an incomplete last line."""
         with self.path.open("rb") as file:
             end = 0
             for number, line in enumerate(file, 1):
@@ -147,9 +148,9 @@ class Journal:
 
 
 def resolved(study: Study, shared: Shared) -> dict[str, Any]:
-    """Return everything that decides the rows of a study, as JSON has it.
+    """Return everything on which the rows of a study depend, as JSON values.
 
-    It is the study's file, and the scenario and sensor that it names.
+    The entries are the study, its scenario, and its sensor.
     """
     scenario = shared.scenario
     sensor = read_sensor_file(scenario.sensor, scenario.sensor_changes)
@@ -158,16 +159,16 @@ def resolved(study: Study, shared: Shared) -> dict[str, Any]:
         "scenario": scenario.model_dump(mode="json"),
         "sensor": sensor.model_dump(mode="json"),
     }
-    # Through JSON and back, as tuples become lists in the file with which this is compared.
+    # The entry is compared with a JSON file, in which tuples are lists.
     return dict(json.loads(json.dumps(entry)))
 
 
 @contextmanager
 def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Journal]:
-    """Work on the folder of a resolved study, new or begun before, while nobody else may.
+    """Open and lock the folder of a resolved study, new or begun before.
 
-    A study that is refused before its first row leaves nothing behind that was not there. Ctrl-C
-    leaves a study that has begun.
+    If a new study is refused before its first row, its new files and folders are removed. After
+    Ctrl-C they are not removed.
 
     Parameters
     ----------
@@ -181,8 +182,8 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
     Raises
     ------
     StudyError
-        The folder is of another study, in use, holds something else or cannot be made, one of its
-        files is damaged, or rows would be added to those of another version of cmmsim.
+        The folder belongs to another study, is in use, holds other files or cannot be made. One of
+        its files is damaged, or its rows were computed by another version of cmmsim.
     """
     _check_content(folder)
     _check_entries(folder)
@@ -202,12 +203,12 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
 
 @contextmanager
 def _locked_study(folder: Path, entry: dict[str, Any], rows: int, new: bool) -> Iterator[Journal]:
-    """Hold the lock of a study's folder; ``new``: the study is not there before."""
+    """Lock a study's folder, and open its journal. ``new``: the study did not exist before."""
     with locked(folder, StudyError):
         try:
             begun = _claim(folder, entry)
             with Journal(folder / JOURNAL, rows) as journal:
-                # A finished study gets no rows, so any version may tabulate it.
+                # A finished study gets no rows, so any version is allowed to tabulate it.
                 if not journal.finished.all():
                     same_versions({f"the study in {folder}": begun}, REMEDY)
                 yield journal
@@ -218,7 +219,7 @@ def _locked_study(folder: Path, entry: dict[str, Any], rows: int, new: bool) -> 
 
 
 def _check_content(folder: Path) -> None:
-    """Refuse to put a study among files that are not a study's."""
+    """Refuse a folder that holds other files than those of a study."""
     if folder.exists() and not folder.is_dir():
         raise StudyError(f"study folder {folder} is a file; name another with --out")
     if folder.is_dir() and not (folder / STUDY).exists():
@@ -232,28 +233,28 @@ def _check_content(folder: Path) -> None:
 def _check_entries(folder: Path) -> None:
     """Refuse links, pipes and the like under the names of a study's files.
 
-    A pipe would be waited for without end, and rows would be written to where a link points.
+    Reading a pipe would wait forever, and rows would be written to the target of a link.
     """
     for name in (STUDY, JOURNAL, TABLE, VIEW):
         path = folder / name
         if path.is_symlink() or (path.exists() and not path.is_file()):
-            raise StudyError(f"{path} is a link or no file; name another folder with --out")
+            raise StudyError(f"{path} is a link or not a file; name another folder with --out")
 
 
 def _claim(folder: Path, entry: dict[str, Any]) -> dict[str, str]:
-    """Make the folder that of a study, or refuse if it is that of another.
+    """Write study.json, or refuse if the folder belongs to another study.
 
-    Returns the versions that began its rows.
+    Returns the versions of the software that computed the first rows.
     """
     here = _study_file(folder / STUDY)
     stored: dict[str, str] | None = here.pop(VERSIONS, None) if here else None
-    # A study without rows begins with the versions of today.
+    # A study without rows gets the present versions.
     begun = stored if stored and _has_rows(folder) else versions()
     for name, found in ((STUDY, here), (TABLE, study_in(folder / TABLE))):
         if found is not None and (others := _differences(found, entry)):
             raise StudyError(
-                f"{folder / name} is of another study, which differs in {', '.join(others[:4])}; "
-                "name another folder with --out"
+                f"{folder / name} belongs to another study, which differs in "
+                f"{', '.join(others[:4])}; name another folder with --out"
             )
     with written(folder / STUDY):
         write_text(folder / STUDY, json.dumps(entry | {VERSIONS: begun}, indent=1) + "\n")
@@ -272,7 +273,7 @@ def _has_rows(folder: Path) -> bool:
 
 
 def _study_file(path: Path) -> dict[str, Any] | None:
-    """Return what a folder states of its study, or None."""
+    """Return the content of study.json, or None if there is no such file."""
     if not path.exists():
         return None
     try:
@@ -282,7 +283,7 @@ def _study_file(path: Path) -> dict[str, Any] | None:
 
 
 def _differences(one: Any, other: Any, path: str = "") -> list[str]:
-    """Return the paths at which two resolved studies differ in what decides their rows."""
+    """Return the paths at which two resolved studies differ, without entries in MAY_CHANGE."""
     if isinstance(one, dict) and isinstance(other, dict):
         keys = [*one, *(key for key in other if key not in one)]
         return [

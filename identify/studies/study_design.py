@@ -1,10 +1,10 @@
-"""Design of a study: all of its rows, and the checks before any of them is computed.
+"""Design of a study: its rows, and the checks before any row is computed.
 
 Rows are numbered repeat by repeat, and within a repeat point by point, with the last factor varying
-fastest. The seed of row n is the n-th child that ``numpy.random.SeedSequence(seed).spawn`` gives.
-The numbers of a row therefore depend neither on the machines, nor on the order of work, nor on
-further repeats. Without repeats they do not depend on further points of a sample either. Rows are
-made when they are asked for, so a large grid takes no memory.
+fastest. The seed of row n is the n-th child that ``numpy.random.SeedSequence(seed).spawn`` returns.
+The figures of a row therefore do not depend on the machines, on the order of work, or on further
+repeats. Without repeats they do not depend on further points of a sample either. Rows are generated
+on demand, so a large grid takes no memory.
 """
 
 import difflib
@@ -32,13 +32,13 @@ from identify.studies.rows.kind import Kind, check_read
 from identify.studies.study_file import Law, Range, Study
 
 ROOTS = ("scenario.", "sensor.", "options.")
-"""Prefixes of the names of factors. No figure has one of them."""
+"""Prefixes of the names of factors. No figure has such a prefix."""
 
 SENSOR_CHANGES = "sensor_changes"
-"""Table of a scenario that takes the keys ``sensor.`` of a study."""
+"""Table of a scenario that holds the keys ``sensor.`` of a study."""
 
 NEAREST = 4
-"""Number of valid names in an error message."""
+"""Number of suggested names in an error message."""
 
 STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -52,7 +52,7 @@ class Case:
     number : int
         Number of the row.
     repeat : int
-        Number of its repeat.
+        Number of the repeat.
     factors : dict
         Value of each factor by dotted path.
     """
@@ -64,18 +64,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Finished:
-    """Row that is done.
+    """Finished row.
 
     Attributes
     ----------
     number : int
         Number of the row.
     figures : dict
-        Its figures by name; empty if it failed.
+        Figures by name. Empty if the row failed.
     seconds : float
-        Time it took, s.
+        Computing time, s.
     error : str
-        Reason of the failure in one line; empty if there was none.
+        Reason of the failure in one line. Empty if the row did not fail.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT | ConfigDict(extra="forbid")
@@ -88,7 +88,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Shared:
-    """Everything that the rows of a study share.
+    """Common data of all rows of a study.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class Shared:
     options: dict[str, Any]
     seed: int
     plugins: tuple[str, ...] = dataclass_field(default_factory=allowed_plugins)
-    """Modules whose parts may run, also on other machines."""
+    """Modules of users that are allowed to run, also on other machines."""
 
     def row_scenario(self, case: Case) -> Scenario:
         """Return the scenario of a row. Raises ScenarioError if its factors conflict."""
@@ -135,7 +135,7 @@ class Design:
         return self._study.rows
 
     def case(self, number: int) -> Case:
-        """Return the row of a number."""
+        """Return the row with this number."""
         repeat, point = divmod(number, self._study.points)
         return Case(
             number, repeat, self._drawn(point) if self._study.sample else self._on_grid(point)
@@ -164,11 +164,11 @@ class Design:
         values = self._study.factors[path]
         if isinstance(values, list):
             return values[int(share * len(values))]
-        # A user's own kind has no model of its options, and its module may be missing here.
+        # A user's own kind has no model of its options, and its module is not needed here.
         kind = KINDS.get(self._study.kind)
         field = field_of(path, kind.options if kind else None)
         if field is not None and field.annotation is int:
-            # Both ends are drawn, as often as any other integer.
+            # All integers from low to high are equally probable.
             return int(values.low) + int(share * (values.high - values.low + 1))
         if values.scale == "log":
             return float(values.low * (values.high / values.low) ** share)
@@ -176,7 +176,7 @@ class Design:
 
 
 def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings ``scenario.`` and ``sensor.`` as overrides of a scenario."""
+    """Return the overrides of a scenario for settings with ``scenario.`` and ``sensor.``."""
     found = {}
     for path, value in settings.items():
         root, _, key = path.partition(".")
@@ -188,24 +188,25 @@ def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def prepare(study: Study, given: Scenario | None = None) -> Shared:
-    """Check a study's keys, values, kind and laws, and load what its rows share.
+    """Check a study's keys, values, kind and laws, and load the common data of its rows.
 
-    The first row is checked as a whole. Values that contradict each other only in other rows become
-    errors of these rows.
+    The first row is checked completely. If values contradict each other only in other rows, these
+    rows will get errors.
 
     Parameters
     ----------
     study : Study
         The study.
     given : Scenario, optional
-        Scenario that it varies. The default is the one that the study names.
+        Scenario that is varied. The default is the scenario that the study names.
 
     Raises
     ------
     StudyError
         The scenario does not exist, or the changes contradict it. The kind, a key, an option, or a
-        figure or factor of a law is unknown (the message names valid ones). A value is wrong, rows
-        of this kind do not read a key, or the statistical renderer was not proved for the sensor.
+        figure or factor of a law is unknown (the message suggests valid names). A value is wrong,
+        rows of this kind do not read a key, or the statistical renderer was not validated for the
+        sensor.
     ScenarioError
         The factors of the first row contradict each other.
     """
@@ -213,7 +214,7 @@ def prepare(study: Study, given: Scenario | None = None) -> Shared:
     kind.checked(study.options)
     _check_keys(study, kind)
     try:
-        # The renderer is chosen here, once for all machines.
+        # "auto" is resolved here, so that all machines use the same renderer.
         scenario = with_renderer(
             (given or load_scenario(study.scenario)).with_overrides(overrides(study.changes))
         )
@@ -228,8 +229,8 @@ def prepare(study: Study, given: Scenario | None = None) -> Shared:
     if getattr(row_options, "sensor", "images") == "images":
         plan = Setup(row_scenario).sensor_plan
         try:
-            # The statistical renderer was proved for some sensors, and their cameras refuse it for
-            # others, when they are first asked for.
+            # The statistical renderer was validated for some sensors only. The property `camera`
+            # raises CmmError for others.
             if plan.renderer == "statistical":
                 _ = Sensor(plan.file, renderer=plan.renderer).camera
         except CmmError as error:
@@ -237,7 +238,8 @@ def prepare(study: Study, given: Scenario | None = None) -> Shared:
     for name in study.figures or [] if kind.columns else []:
         if name not in kind.columns:
             raise StudyError(
-                f"figures has {name!r}, no figure of {study.kind}; {_nearest(name, kind.columns)}"
+                f"figures has {name!r}, which is not a figure of {study.kind}; "
+                f"{_nearest(name, kind.columns)}"
             )
     for place, law in enumerate(study.theory, start=1):
         try:
@@ -248,10 +250,10 @@ def prepare(study: Study, given: Scenario | None = None) -> Shared:
 
 
 def _check_keys(study: Study, kind: Kind) -> None:
-    """Refuse keys that do not exist or are given twice, and values that do not fit them."""
+    """Refuse keys that do not exist or are given twice, and values of the wrong type."""
     for path, value in study.changes.items():
         if path.startswith("options."):
-            raise StudyError(f"changes.{path}: what holds in every row stands in [options]")
+            raise StudyError(f"changes.{path}: options of all rows belong in [options]")
         _check_values(path, [value], kind)
     for path, values in study.factors.items():
         if path.startswith("options.") and path.partition(".")[2] in study.options:
@@ -267,18 +269,18 @@ def _check_keys(study: Study, kind: Kind) -> None:
             raise StudyError(
                 f"factors.{path} = {values} has values of several kinds: {', '.join(sorted(types))}"
             )
-        # Lists cannot be in a set, but their texts can.
+        # Values can be lists, which are not hashable, so their texts are compared.
         if len({repr(value) for value in values}) < len(values):
             raise StudyError(
-                f"factors.{path} = {values} has a value twice; repeats = N computes every point N "
-                "times"
+                f"factors.{path} = {values} has a value twice; use repeats = N to compute every "
+                "point N times"
             )
 
 
 def _check_values(path: str, values: list[Any], kind: Kind) -> None:
     """Refuse a path that does not exist, and values that are not of its type.
 
-    Options of a user's own kind may be any.
+    Options of a user's own kind are not checked.
     """
     if kind.options is None and path.startswith("options."):
         return
@@ -288,7 +290,7 @@ def _check_values(path: str, values: list[Any], kind: Kind) -> None:
         own = [key for key in known if path.startswith("options.") and key.startswith("options.")]
         valid = f"the kind has {', '.join(own)}" if own else _nearest(path, known)
         raise StudyError(f"unknown key {path!r}; {valid}")
-    # As in JSON, so that a list is a tuple's spelling but a text or a truth value is no number.
+    # Strict validation as JSON accepts a list for a tuple, but no text or bool for a number.
     annotation: Any = Annotated[field.annotation, field]
     adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=ConfigDict(allow_inf_nan=False))
     for value in values:
@@ -301,10 +303,10 @@ def _check_values(path: str, values: list[Any], kind: Kind) -> None:
 
 @lru_cache(maxsize=8)
 def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
-    """Return every dotted path that a study may vary, with its field.
+    """Return every dotted path that a study can vary, with its field.
 
-    A path is one of a scenario, of a sensor file, or of `options`, the model of a kind's options if
-    it has one.
+    The paths are keys of scenarios, of sensor files, and of `options`, the model of the options of
+    a kind.
     """
     found = _leaves(Scenario, "scenario.") | _leaves(SensorFile, "sensor.")
     for path in (f"scenario.{SENSOR_CHANGES}", "sensor.based_on"):
@@ -313,9 +315,9 @@ def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
 
 
 def field_of(path: str, options: type[BaseModel] | None = None) -> FieldInfo | None:
-    """Return the field of a dotted path that a study may vary, or None.
+    """Return the field of a dotted path that a study can vary, or None.
 
-    The path may also be that of a number by its name in a table of a scenario.
+    The path can also name a number in a table of a scenario.
     """
     tables = (f"scenario.{table}." for table in numbers_by_name())
     entry = FieldInfo(annotation=float) if path.startswith(tuple(tables)) else None
@@ -328,7 +330,7 @@ def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
     for name, field in model.model_fields.items():
         kinds = (field.annotation, *get_args(field.annotation))
         inner = next((a for a in kinds if isinstance(a, type) and issubclass(a, BaseModel)), None)
-        # A list of sections is one value, since no dotted path leads to its entries.
+        # A list of sections counts as one value, because no dotted path leads to its entries.
         listed = getattr(field.annotation, "__origin__", None) is list
         if inner is None or listed:
             found[f"{prefix}{name}"] = field
@@ -338,10 +340,10 @@ def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
 
 
 def _nearest(name: str, known: Collection[str]) -> str:
-    """Suggest valid names in words.
+    """Return a text that suggests valid names.
 
-    They are those with the same last part or a similar spelling, else the first of the same root,
-    else the first of all.
+    Names with the same last part or a similar spelling are suggested. If there are none, the first
+    names with the same root are suggested, or else the first of all names.
     """
     last = [key for key in known if key.rpartition(".")[2] == name.rpartition(".")[2]]
     alike = difflib.get_close_matches(name, known, n=NEAREST, cutoff=0.5)
@@ -351,16 +353,16 @@ def _nearest(name: str, known: Collection[str]) -> str:
 
 
 def _check_law(law: Law, study: Study, figures: list[str]) -> None:
-    """Refuse a law about figures that rows do not have, or about factors and values not varied.
+    """Refuse a law with unknown figures, or with factors or values that the study does not vary.
 
     The figures of a user's own kind are unknown before its rows are computed. `figures` is then
-    empty, and they are not checked.
+    empty, and the figures of the law are not checked.
     """
     for key in ("figure", "per", "equals"):
         name = getattr(law, key)
         if figures and name is not None and name not in figures:
             raise StudyError(
-                f"{key} = {name!r} is no figure of {study.kind}; {_nearest(name, figures)}"
+                f"{key} = {name!r} is not a figure of {study.kind}; {_nearest(name, figures)}"
             )
     if law.factor is None:
         return
@@ -374,4 +376,4 @@ def _check_law(law: Law, study: Study, figures: list[str]) -> None:
         value for value in law.order or [] if isinstance(values, list) and value not in values
     ]
     if unknown:
-        raise StudyError(f"order has {unknown[0]!r}, and {law.factor} has the values {values}")
+        raise StudyError(f"order has {unknown[0]!r}, but {law.factor} has the values {values}")

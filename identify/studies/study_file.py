@@ -1,8 +1,8 @@
 """Study files in TOML: the scenario, its variation, and the laws that its rows should follow.
 
-The help of ``cmmsim study`` shows a file. The keys of what is varied are dotted paths:
-``scenario.`` and a key of a scenario, ``sensor.`` and a key of a sensor file, ``options.`` and an
-option of the kind.
+``cmmsim new study FILE`` writes a commented file. The keys of factors and changes are dotted paths:
+``scenario.`` and a key of a scenario, ``sensor.`` and a key of a sensor file, or ``options.`` and
+an option of the kind.
 """
 
 import math
@@ -20,26 +20,26 @@ from identify.scenario.settings_file import SettingsFiles, one_line
 
 
 class Law(Section):
-    """Statement about the rms of a figure over rows, with all other factors held fixed.
+    """Statement about the rms of a figure over rows, with all other factors fixed.
 
-    A law states one of three things. ``exponent``: the figure grows with a numeric factor as
-    ``factor ** exponent``. ``equals``: its rms is that of another figure. ``order``: it grows along
-    these values of a factor. ``tolerance`` is the error of the statement itself: of the exponent,
-    or of the logarithm of a ratio.
+    A law has one of three forms. ``exponent``: the rms is proportional to ``factor ** exponent``
+    of a numeric factor. ``equals``: the rms equals the rms of another figure. ``order``: the rms
+    grows along these values of a factor. ``tolerance`` is the allowed error of the exponent, or of
+    the logarithm of a ratio.
     """
 
-    figure: str = Field(description="figure of the rows, its rms over rows is meant")
-    per: str | None = Field(None, description="figure that it is divided by, row by row")
+    figure: str = Field(description="figure of the rows; the law is about its rms over rows")
+    per: str | None = Field(None, description="divisor: another figure of the same row")
     factor: str | None = Field(None, description="factor by dotted path")
     exponent: float | None = Field(
         None, ge=-100, le=100, description="the figure grows as this power of the factor"
     )
-    equals: str | None = Field(None, description="figure of the same rms")
+    equals: str | None = Field(None, description="figure that has the same rms")
     order: list[Any] | None = Field(
         None, description="values of the factor, the smallest rms first"
     )
-    tolerance: float = Field(0.0, ge=0, le=1e3, description="by how much the law itself may be off")
-    why: str = Field("", description="where the law comes from")
+    tolerance: float = Field(0.0, ge=0, le=1e3, description="allowed error of the law itself")
+    why: str = Field("", description="reason for the law")
 
     @model_validator(mode="after")
     def _states_one_thing(self) -> "Law":
@@ -60,7 +60,7 @@ class Law(Section):
 
     @property
     def quantity(self) -> str:
-        """Figure, divided by the other one if there is one."""
+        """Figure, or its ratio to the figure `per`, as text."""
         return self.figure if self.per is None else f"{self.figure} / {self.per}"
 
     @property
@@ -74,7 +74,7 @@ class Law(Section):
 
     @property
     def expected(self) -> str:
-        """Exponent or ratio to be measured, in words."""
+        """Expected exponent or ratio, as text."""
         if self.order is not None:
             return "ratio > 1"
         value = "ratio 1" if self.exponent is None else f"{self.exponent:g}"
@@ -103,29 +103,30 @@ class Range(Section):
 
 
 class Study(Section):
-    """Content of a study file. Load one with `load_study`."""
+    """Content of a study file. `load_study` reads a file."""
 
     name: Name = Field(description="short name, used for folders")
-    title: str = Field("", description="what the study asks")
+    title: str = Field("", description="question of the study, the title of its figures")
     kind: str = Field(description="kind of row: a built-in one, or module:function")
     scenario: str = Field(
-        "paper", description="built-in scenario, or path of a scenario file from this file on"
+        "paper",
+        description="built-in scenario, or path of a scenario file relative to this file",
     )
-    changes: dict[str, Any] = Field({}, description="values that hold in every row, by dotted path")
+    changes: dict[str, Any] = Field({}, description="values of all rows, by dotted path")
     factors: dict[str, list[Any] | Range] = Field(
         {}, description="values of each factor, by dotted path"
     )
     sample: int | None = Field(
-        None, description="points drawn at random; none: the whole grid", ge=1
+        None, description="number of points drawn at random; none: the whole grid", ge=1
     )
     repeats: int = Field(1, description="rows at each point", ge=1)
     seed: int = Field(0, description="seed of all randomness", ge=0)
-    theory: list[Law] = Field([], description="laws with which the summary compares")
+    theory: list[Law] = Field([], description="laws with which the summary compares the rows")
     options: dict[str, Any] = Field({}, description="options of the kind")
     figures: list[str] | None = Field(
         None,
-        description="figures of the rows that are drawn and tabulated; none: the main ones of the "
-        "kind",
+        description="figures of the rows that are plotted and tabulated; none: the main figures of "
+        "the kind",
     )
 
     @field_validator("changes", mode="before")
@@ -148,7 +149,7 @@ class Study(Section):
         for path, values in self.factors.items():
             if isinstance(values, Range) and self.sample is None:
                 raise ValueError(
-                    f"factors.{path} has low and high, which needs sample = N; a grid needs a list"
+                    f"factors.{path} with low and high needs sample = N; a grid needs a list"
                 )
             if isinstance(values, list) and not values:
                 raise ValueError(f"factors.{path} has no values")
@@ -175,7 +176,7 @@ class Study(Section):
 
         An example is ``{"repeats": 5, "scenario.timing.latency_s": 0.01}``. A key of the scenario,
         of the sensor or of the options becomes a factor if its value is a list, or a table of low
-        and high. Any other value holds in every row.
+        and high. Any other value becomes the value of all rows.
 
         Raises
         ------
@@ -206,7 +207,7 @@ class Study(Section):
                 raise StudyError(
                     f"unknown key {path!r} of study {self.name!r}; valid names: "
                     f"{', '.join(single)}, and scenario.*, "
-                    "sensor.* and options.* for what its rows vary"
+                    "sensor.* and options.* for factors and changes"
                 )
         return STUDIES.from_dict(data, f"study {self.name!r}")
 
@@ -226,29 +227,29 @@ STUDIES = SettingsFiles(
 
 
 STARTING = Path(__file__).parent / "starting.toml"
-"""Study file that shows what one may have."""
+"""Template of a study file, with all keys."""
 
 
 def load_study(name_or_path: str | Path) -> Study:
-    """Load a built-in study by name, or one from a TOML file.
+    """Load a built-in study by name, or a study from a TOML file.
 
-    Paths in a file start from its folder. The keys of factors and changes are checked later, by
-    `identify.studies.study_design`.
+    Paths in a file are relative to its folder. The keys of factors and changes are checked later,
+    by `identify.studies.study_design`.
 
     Raises
     ------
     StudyError
-        There is no such study (the message names the built-in ones), or the file is not TOML or
+        There is no such study (the message names the built-in studies), or the file is not TOML or
         has wrong content.
     """
     return STUDIES.load(name_or_path)
 
 
 def study_schema() -> dict[str, Any]:
-    """Return the JSON schema of study files, for editors; `built_in/study.schema.json` holds it.
+    """Return the JSON schema of study files. Editors read it from `built_in/study.schema.json`.
 
-    What is varied stands in nested tables. Their keys are those of scenarios, sensors and kinds of
-    row.
+    Factors and changes are nested tables. Their keys are keys of scenarios, of sensor files, and of
+    options.
     """
     schema = Study.model_json_schema()
     for name in ("changes", "factors"):
@@ -258,19 +259,18 @@ def study_schema() -> dict[str, Any]:
             "description": known["description"],
             "propertyNames": {"pattern": r"^(scenario|sensor|options)(\.|$)"},
         }
-    # Nothing in the schema refers to it any more.
+    # The schema does not refer to Range any more.
     del schema["$defs"]["Range"]
     return schema
 
 
 def _factor(path: str, value: Any) -> Any:
-    """Return a list or a range; raise ValueError in words for anything else."""
+    """Return a list or a range. Raises ValueError for anything else."""
     if isinstance(value, (list, Range)):
         return value
     if not isinstance(value, Mapping):
         raise ValueError(
-            f"{path} = {value!r} is no list of values; to hold it in every row write it under "
-            "[changes]"
+            f"{path} = {value!r} is not a list of values; write a value of all rows under [changes]"
         )
     try:
         return Range.model_validate(value)
@@ -279,7 +279,7 @@ def _factor(path: str, value: Any) -> Any:
 
 
 def _without(values: dict[str, Any], path: str) -> dict[str, Any]:
-    """Copy values by dotted path without that of a path and those in its table."""
+    """Copy values by dotted path, without the value of a path and the values in its table."""
     return {key: value for key, value in values.items() if not f"{key}.".startswith(f"{path}.")}
 
 

@@ -1,6 +1,6 @@
-"""Summary of a study: `summary.json` and `summary.md`, with figures beside them.
+"""Summary of a study: `summary.json` and `summary.md`, with plots.
 
-Rows that failed are counted and named. No average includes them.
+Failed rows are counted and named. No average includes them.
 """
 
 import math
@@ -26,7 +26,7 @@ MARKDOWN = "summary.md"
 NAMED = 20
 """Largest number of failed rows, and of reasons, that the summary names."""
 LONGEST = 60
-"""Largest number of points in the table of `summary.md`. `summary.json` has all."""
+"""Largest number of points in the table of `summary.md`. `summary.json` has all points."""
 
 Points = list[tuple[dict[str, Any], dict[str, Statistics]]]
 """Factors and statistics of points."""
@@ -35,7 +35,7 @@ Points = list[tuple[dict[str, Any], dict[str, Statistics]]]
 def write(
     folder: Path, study: Study, frame: pd.DataFrame, figures: bool = True, others: Others = ()
 ) -> dict[str, Any]:
-    """Write summary.json, summary.md and, if wanted, figures into a study's folder.
+    """Write summary.json, summary.md and, by default, plots into a study's folder.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ def write(
     study : Study
         The study.
     frame : DataFrame
-        Its table.
+        Table of the study.
     figures : bool, optional
-        Whether figures are drawn.
+        Whether plots are drawn.
     others : sequence of (str, DataFrame), optional
-        Names and finished rows of other studies, which are drawn beside its own.
+        Names and finished rows of other studies, which are plotted beside this study.
 
     Returns
     -------
@@ -103,19 +103,22 @@ def write(
 
 
 def main_figures(study: Study, names: list[str]) -> list[str]:
-    """Return those of the rows' figures `names` that are drawn and tabulated.
+    """Return the figures among `names` that are plotted and tabulated.
 
-    They are those that the study chooses, else the main ones of a built-in kind, else the first six
-    of a user's own kind. Raises StudyError if the study chooses one that no row has.
+    These are the figures that the study names. If it names none, they are the main figures of a
+    built-in kind, or the first six figures of a user's own kind. Raises StudyError if the study
+    names a figure that no row has.
     """
     if study.figures is not None:
-        # The first rows of a study that still runs may lack a figure of the kind.
+        # The first rows of a running study can lack a figure of the kind.
         known = KINDS[study.kind].columns if study.kind in KINDS else {}
         missing = [
             name for name in study.figures if names and name not in names and name not in known
         ]
         if missing:
-            raise StudyError(f"figures has {missing[0]!r}, and the rows have {', '.join(names)}")
+            raise StudyError(
+                f"figures has {missing[0]!r}, but the rows have only {', '.join(names)}"
+            )
         return [name for name in study.figures if name in names]
     if study.kind not in KINDS:
         return names[:6]
@@ -127,13 +130,13 @@ def main_figures(study: Study, names: list[str]) -> list[str]:
 def _points(study: Study, done: pd.DataFrame, names: list[str]) -> Points:
     """Return factors and statistics of each point that has a row.
 
-    Points of a grid keep its order, those of a sample are sorted. A sample with single rows is one
-    point as a whole.
+    Points of a grid have the order of the grid, and points of a sample are sorted. A sample without
+    repeats is summarised as one point.
     """
     paths = list(study.factors)
     if not len(done):
         return []
-    # Each row of such a sample has a point of its own, and has no band there.
+    # In a sample without repeats, each point has a single row and thus no band.
     if not paths or (study.sample is not None and study.repeats == 1):
         return [({}, _statistics(done, names))]
     return [
@@ -143,7 +146,7 @@ def _points(study: Study, done: pd.DataFrame, names: list[str]) -> Points:
 
 
 def _statistics(rows: pd.DataFrame, names: list[str]) -> dict[str, Statistics]:
-    """Return the statistics of each figure over the rows that have it."""
+    """Return the statistics of each figure over the rows that have this figure."""
     values = {name: rows[name].dropna().to_numpy(dtype=float) for name in names}
     return {name: theory.point_statistics(found) for name, found in values.items() if len(found)}
 
@@ -180,7 +183,7 @@ def _markdown(
         ]
         lines += [_law_row(verdict) for verdict in verdicts]
     if rows["failed"]:
-        lines += ["", "## Failed rows", "", "They are in no figure below."]
+        lines += ["", "## Failed rows", "", "The figures below exclude them."]
         lines += [f"- {count} x {reason}" for reason, count in entry["failures"]["reasons"].items()]
         lines += [
             "",
@@ -204,7 +207,7 @@ def _bands_text(points: Points) -> str:
     if points and all(one.rows < 2 for _, figures in points for one in figures.values()):
         return (
             "Rms over rows. With a single repeat there is no band: the same command with "
-            "--repeats 10 adds some."
+            "--repeats 10 adds repeats."
         )
     return f"Rms over rows, with its {theory.BAND_CONFIDENCE:.0%} band."
 
@@ -222,7 +225,7 @@ def _table(study: Study, points: Points, shown: list[str]) -> list[str]:
         cells += [str(count), *(_cell(figures.get(name)) for name in shown)]
         lines.append(f"| {' | '.join(cells)} |")
     if len(points) > LONGEST:
-        lines.append(f"\n{len(points) - LONGEST} more points stand in `{JSON}`.")
+        lines.append(f"\n{len(points) - LONGEST} more points are in `{JSON}`.")
     return lines
 
 

@@ -1,10 +1,10 @@
-"""Finished rows as one tidy table in Parquet, and a view of them by factors.
+"""Finished rows as one tidy table in Parquet, and as arrays over the factors in netCDF.
 
-The table holds the study in its metadata. Its columns are ``row``, ``repeat``, the seed as
-``seed_entropy`` and ``seed_spawn_key`` (the arguments of ``numpy.random.SeedSequence``), one for
-each factor under its dotted path, one for each figure with its unit in the name, ``seconds`` and
-``error``. A row that failed has NaN figures, and the reason in ``error``. A figure that only some
-rows of a user's own kind have is NaN in the others.
+The metadata of the table contain the study. Its columns are ``row``, ``repeat``, the seed as
+``seed_entropy`` and ``seed_spawn_key`` (the arguments of ``numpy.random.SeedSequence``), a column
+per factor under its dotted path, a column per figure with its unit in the name, ``seconds`` and
+``error``. A failed row has NaN figures, and the reason in ``error``. If only some rows of a user's
+own kind have a figure, it is NaN in the other rows.
 """
 
 import io
@@ -31,7 +31,7 @@ from identify.studies.study_file import Study
 
 FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
 LAST = ("seconds", "error")
-"""Columns of a study's table after its figures. Those of `FIRST` come before its factors."""
+"""Columns of a study's table after its figures. The columns `FIRST` come before its factors."""
 
 TABLE = "study.parquet"
 STUDY_KEY = b"cmmsim.study"
@@ -41,7 +41,7 @@ VERSIONS_KEY = b"cmmsim.versions"
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
     """Return the table of a study's finished rows, ordered by row.
 
-    A factor whose values are lists has them as JSON text.
+    Factor values that are lists are stored as JSON text.
     """
     design = Design(study)
     count = len(design)
@@ -58,7 +58,7 @@ def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
     columns: dict[str, Any] = {
         "row": done,
         "repeat": [case.repeat for case in cases],
-        "seed_entropy": str(study.seed),  # a seed may exceed every integer type of Parquet
+        "seed_entropy": str(study.seed),  # a seed can exceed every integer type of Parquet
         "seed_spawn_key": done,
     }
     columns |= {path: [plain(case.factors[path]) for case in cases] for path in study.factors}
@@ -74,13 +74,13 @@ def figure_names(frame: pd.DataFrame, study: Study) -> list[str]:
 
 
 def plain(value: Any) -> Any:
-    """Return a factor's value as a table holds it."""
+    """Return a factor's value as a cell of a table. Lists and tables become JSON text."""
     return json.dumps(value) if isinstance(value, (list, dict)) else value
 
 
 @contextmanager
 def written(path: Path, more: str = "") -> Iterator[None]:
-    """Turn an error of writing in the block into a StudyError, with `more` after the reason."""
+    """Convert a write error in the block into a StudyError, with `more` after the reason."""
     try:
         with writing(path):
             yield
@@ -89,9 +89,9 @@ def written(path: Path, more: str = "") -> Iterator[None]:
 
 
 def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
-    """Write a table as Parquet, whole or not at all, with the resolved study ``entry`` in it.
+    """Write a table as Parquet, with the resolved study ``entry`` in its metadata.
 
-    Raises StudyError if it cannot be written.
+    The file is written whole or not at all. Raises StudyError if it cannot be written.
     """
     table = pa.Table.from_pandas(frame, preserve_index=False)
     own = {STUDY_KEY: json.dumps(entry).encode(), VERSIONS_KEY: json.dumps(versions()).encode()}
@@ -118,15 +118,16 @@ def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
 
 
 def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.DataFrame]]:
-    """Read names and finished rows of other studies, to be shown beside those of a study.
+    """Read names and finished rows of other studies, to be plotted beside a study.
 
-    If the name of a study is taken, its rows have the name of its folder, or else the path of it.
+    If two studies have the same name, the name of the folder is used, or else the path of the
+    folder.
 
     Raises
     ------
     StudyError
-        A folder has no table, its rows are of another kind or have other factors, or it is named
-        twice.
+        A folder has no table, its rows are of another kind or have other factors, or the folder is
+        named twice.
     """
     found: dict[str, pd.DataFrame] = {}
     for folder in folders:
@@ -137,7 +138,7 @@ def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.Dat
             if name not in (study.name, *found)
         ]
         if not names:
-            raise StudyError(f"{folder} is to stand beside this study twice")
+            raise StudyError(f"{folder} is named twice to be plotted beside this study")
         found[names[0]] = rows
     return list(found.items())
 
@@ -151,7 +152,7 @@ def _rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
             for one in (study, other)
         )
         raise StudyError(
-            f"{folder} has {theirs}, and this study {ours}: they cannot stand side by side"
+            f"{folder} has {theirs}, and this study {ours}: they cannot be plotted side by side"
         )
     return other.name, frame[frame["error"] == ""]
 
@@ -159,7 +160,7 @@ def _rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
 def study_in(path: Path) -> dict[str, Any] | None:
     """Return the resolved study of a table, or None if there is no file.
 
-    Raises StudyError if it is not the table of a study.
+    Raises StudyError if the file is not the table of a study.
     """
     if not path.exists():
         return None
@@ -168,12 +169,12 @@ def study_in(path: Path) -> dict[str, Any] | None:
         return dict(json.loads(metadata[STUDY_KEY]))
     except (pa.ArrowException, KeyError, ValueError, OSError) as error:
         raise StudyError(
-            f"{path} is no table of a study: {' '.join(str(error).split())}"
+            f"{path} is not a table of a study: {' '.join(str(error).split())}"
         ) from error
 
 
 def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
-    """Return the figures by factors and repeat, NaN where a row failed or is not done.
+    """Return the figures by factors and repeat, NaN for failed and missing rows.
 
     A grid has one dimension for each factor (its dotted path) and ``repeat``. A sample has
     ``point`` and ``repeat``, and its factors are coordinates of ``point``. Units are in ``attrs``.
@@ -184,7 +185,7 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
     view = xr.Dataset.from_dataframe(figures)
     lists = {path: values for path, values in study.factors.items() if isinstance(values, list)}
     wanted = {path: [plain(value) for value in lists[path]] for path in lists if path in view.dims}
-    # The values come sorted and without those that have no row yet.
+    # from_dataframe has sorted the values, and dropped values without a row.
     view = view.reindex(wanted | {"repeat": np.arange(study.repeats)})
     if study.sample is not None:
         design = Design(study)
@@ -200,10 +201,10 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
 
 
 def write_view(path: Path, frame: pd.DataFrame, study: Study) -> None:
-    """Write the view of `to_xarray` as netCDF, whole or not at all.
+    """Write the dataset of `to_xarray` as netCDF, whole or not at all.
 
-    `xarray.open_dataset` reads it. A "/" in a name would be a group there, so it becomes "_per_".
-    Raises StudyError if it cannot be written.
+    `xarray.open_dataset` reads the file. A "/" in the name of a figure becomes "_per_", because
+    netCDF would read it as a group. Raises StudyError if the file cannot be written.
     """
     view = to_xarray(frame, study)
     with written(path):

@@ -1,21 +1,22 @@
 """Comparison of a study's rows with the laws it states, by a measured exponent or ratio.
 
-A regression of logarithms tells how the mean square of a positive figure depends on other
-quantities. The mean square of a row's figure y is modelled as exp(X beta). The estimate solves X^T
-(y^2 / mean - 1) = 0, the score of a gamma-distributed y^2 with logarithmic link (McCullagh and
-Nelder 1989, section 8.3). Unlike a straight line through logarithms, it tells how the mean square
-itself scales, whatever the distribution of the figure is and however it changes from row to row.
-The covariance is the sandwich of that score, so the rows need not be alike.
+A log-linear regression estimates how the mean square of a positive figure y depends on other
+quantities. The mean square is modelled as exp(X beta). The estimate solves
+X^T (y^2 / mean - 1) = 0, the score equation of a gamma-distributed y^2 with logarithmic link
+(McCullagh and Nelder 1989, section 8.3). This estimates the scaling of the mean square itself,
+for any distribution of the figure, while a straight line through logarithms does not. The
+covariance is the sandwich estimate of that score, so the distribution can differ between rows.
 
-The figures of one point of a study have 95 % bands. The band of the mean is Student's. The band of
-the rms is Student's of the logarithm of the mean square. A chi-square band would need the number of
-independent errors in a row's figure, while this one takes their scatter from the rows. In a count
-it held the rms of three or more normal numbers in 95 to 97 % of cases, from two rows on, and that
-of single normal numbers, the worst case, in at least 92 %. A single row has no band.
+The figures of one point of a study have 95 % bands. The band of the mean is Student's interval. The
+band of the rms is Student's interval of the logarithm of the mean square. A chi-square band would
+need the number of independent errors in a row's figure, while this band uses their scatter over the
+rows. In simulations with two or more rows it contained the rms of three or more normal numbers in
+95 to 97 % of cases. For single normal numbers, the worst case, it did so in at least 92 %. A single
+row has no band.
 
-A law fails if the interval excludes its statement, widened by the law's tolerance. Otherwise it
-passes, unless the interval is wide: then the rows are too few to say anything, and it is undecided.
-At 99 % one true law in a hundred fails by chance.
+A law fails if the 99 % interval excludes its statement, widened by the law's tolerance. Otherwise
+it passes if the interval is narrow. If the interval is wide, there are too few rows, and the law is
+undecided. One true law in a hundred fails by chance.
 """
 
 from dataclasses import dataclass
@@ -44,7 +45,7 @@ class ScaleRegression:
     coefficients : ndarray, shape (k,)
         Coefficients beta.
     covariance : ndarray, shape (k, k)
-        Their covariance.
+        Covariance of the coefficients.
     freedom : int
         Degrees of freedom.
     """
@@ -62,7 +63,7 @@ class ScaleRegression:
 def reach(confidence: float, freedom: int) -> float:
     """Return the half-width of Student's interval in standard deviations.
 
-    scipy's own interval is NaN if the standard deviation is zero.
+    scipy's function for the interval returns NaN if the standard deviation is zero.
     """
     return float(stdtrit(freedom, 0.5 + 0.5 * confidence))
 
@@ -92,10 +93,10 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
         change = float(np.abs(design @ step).max())
         if change < SETTLED:
             break
-        # No step changes a mean square by more than a factor of e, so that the fit cannot run away.
+        # To avoid divergence, a step changes no mean square by more than a factor of e.
         beta = beta + step / max(1.0, change)
     else:
-        raise StudyError(f"the fit of the scale has not settled after {ITERATIONS} steps")
+        raise StudyError(f"the fit of the scale has not converged after {ITERATIONS} steps")
     return ScaleRegression(
         beta, _sandwich(design, squares / np.exp(design @ beta) - 1.0), rows - columns
     )
@@ -104,11 +105,11 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
 def _sandwich(design: Array, residuals: Array) -> Array:
     """Return the covariance of the coefficients.
 
-    Residuals are enlarged by their leverage (HC3), because there may be few rows.
+    Residuals are enlarged according to their leverage (HC3), because rows can be few.
     """
     bread = np.linalg.inv(design.T @ design)
     leverage = np.einsum("ni,ij,nj->n", design, bread, design)
-    # A row alone at its level has leverage 1, which would divide by zero.
+    # A single row at its level has leverage 1, which would cause a division by zero.
     scores = design * (residuals / np.maximum(1.0 - leverage, 1e-6))[:, None]
     return np.asarray(bread @ (scores.T @ scores) @ bread, dtype=float)
 
@@ -164,15 +165,15 @@ def point_statistics(values: Array) -> Statistics:
 
 CONFIDENCE = 0.99
 RESOLUTION = 0.2
-"""Largest half-width of an interval that decides a law.
+"""Largest half-width of an interval with which a law passes.
 
-It is that of an exponent, or of the logarithm of a ratio.
+The interval is of an exponent, or of the logarithm of a ratio.
 """
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Finding of the rows about a law.
+    """Result of the comparison of rows with a law.
 
     Attributes
     ----------
@@ -181,11 +182,11 @@ class Verdict:
     verdict : str
         "passed", "failed" or "undecided".
     measured : float or None
-        Exponent or ratio.
+        Measured exponent or ratio.
     low, high : float
-        Ends of its interval.
+        Ends of the interval of the measured value.
     rows : int
-        Number of rows that counted.
+        Number of rows used.
     reason : str
         Reason why nothing could be measured.
     """
@@ -200,7 +201,7 @@ class Verdict:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Verdict as `summary.json` holds it."""
+        """Entry of `summary.json` for this verdict."""
         law = {"statement": self.law.statement, "why": self.law.why, "verdict": self.verdict}
         return (
             law
@@ -210,7 +211,7 @@ class Verdict:
 
 
 def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
-    """Return a verdict for each law of a study. `frame` is its table; failed rows do not count."""
+    """Return a verdict for each law of a study. `frame` is its table; failed rows are excluded."""
     done = frame[frame["error"] == ""]
     return [_check(law, study, done) for law in study.theory]
 
@@ -218,7 +219,7 @@ def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
 def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
     """Return the rows that have all figures of a law.
 
-    Raises StudyError if no row has one of them, with the figures they have.
+    Raises StudyError if no row has one of these figures. The message names the existing figures.
     """
     needed = [name for name in (law.figure, law.per, law.equals) if name is not None]
     for name in needed:
@@ -229,9 +230,9 @@ def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def law_data(law: Law, frame: pd.DataFrame) -> Array:
-    """Return the quantity of a law (n,) in rows that all have it.
+    """Return the quantity of a law (n,) in rows that have all its figures.
 
-    Raises StudyError if it would be divided by zero.
+    Raises StudyError if the divisor is zero in a row.
     """
     values = frame[law.figure].to_numpy(dtype=float)
     return values if law.per is None else values / _divisor(law.per, frame)
@@ -241,7 +242,7 @@ def _divisor(name: str, frame: pd.DataFrame) -> Array:
     values = frame[name].to_numpy(dtype=float)
     if zeros := int(np.sum(values == 0.0)):
         raise StudyError(
-            f"{name} is zero in {zeros} of {len(values)} rows, and nothing can be divided by it"
+            f"{name} is zero in {zeros} of {len(values)} rows, but the law divides by it"
         )
     return values
 
@@ -260,7 +261,7 @@ def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """Judge that the figure's mean square grows as factor ** (2 exponent), beside other factors."""
+    """Test whether the figure's mean square is proportional to factor ** (2 exponent)."""
     factor = _numeric(str(law.factor), frame)
     design = np.column_stack([_beside(law, study, frame), 2.0 * np.log(factor)])
     fit = scale_regression(law_data(law, frame) ** 2, design)
@@ -272,7 +273,7 @@ def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """Judge that two figures of the same rows are equal, by their ratio."""
+    """Test whether two figures of the same rows are equal, by their ratio."""
     ratios = law_data(law, frame) / _divisor(str(law.equals), frame)
     fit = scale_regression(ratios**2, np.full((len(frame), 1), 2.0))
     low, high = fit.interval(0, CONFIDENCE)
@@ -282,7 +283,7 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """Judge that the figure grows along values of the factor, by its smallest logarithmic step."""
+    """Test whether the figure grows along values of the factor, by its smallest step."""
     if law.factor not in frame.columns:
         raise StudyError(f"the rows have no factor {law.factor!r}")
     values = list(law.order or [])
@@ -301,16 +302,20 @@ def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, float]:
-    """Return low, middle and high of the last coefficients' least certainly positive one."""
+    """Return low, middle and high of a coefficient among the last `steps` coefficients.
+
+    It is the coefficient with the smallest lower end of its interval.
+    """
     places = range(len(fit.coefficients) - steps, len(fit.coefficients))
     low, k = min((fit.interval(k, CONFIDENCE)[0], k) for k in places)
     return low, float(fit.coefficients[k]), fit.interval(k, CONFIDENCE)[1]
 
 
 def _beside(law: Law, study: Study, frame: pd.DataFrame) -> Array:
-    """Return the columns of the design for everything else that varies.
+    """Return the columns of the design for all other factors.
 
-    A grid has a level for each setting of the other factors, a sample has their logarithms.
+    For a grid they are an indicator for each setting of the other factors. For a sample they are a
+    constant, and the covariates of each other factor.
     """
     if law.factor not in study.factors and len(study.factors) > 1:
         raise StudyError(f"a law against the figure {law.factor!r} needs a study of one factor")
@@ -324,9 +329,9 @@ def _beside(law: Law, study: Study, frame: pd.DataFrame) -> Array:
 
 
 def _covariates(values: pd.Series) -> Array:
-    """Return the columns (n, k) of another factor of a sample.
+    """Return the covariates (n, k) of another factor of a sample.
 
-    They are its logarithm, or an indicator of each value but the first.
+    They are its logarithm, or an indicator of each value except the first.
     """
     if pd.api.types.is_numeric_dtype(values) and (values > 0).all():
         return np.log(values.to_numpy(dtype=float))[:, None]

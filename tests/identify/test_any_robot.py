@@ -265,12 +265,12 @@ def test_settings_of_another_kind_of_actuators_are_refused_with_the_key_to_set()
         (
             sliding,
             "travel_margin_rad",
-            "travel_margin_rad = 0.2 is of actuators that turn; .* slide: set travel_m",
+            "travel_margin_rad = 0.2 is for actuators that turn; .* slide: set travel_m",
         ),
         (
             turning,
             "max_joint_velocity_m_s",
-            "of actuators that slide; those of rss6 turn: set max_joint_velocity_rad_s",
+            "for actuators that slide; the actuators of rss6 turn: set max_joint_velocity_rad_s",
         ),
     ):
         with pytest.raises(ScenarioError, match=says):

@@ -81,7 +81,7 @@ def test_a_record_with_half_a_frame_of_jitter_is_identified_as_well_as_one_witho
     assert not blind.groups.identifiable.any()
     assert blind.noise_ratio > 5 * blind.expected_noise_ratio
     assert blind.whiteness.p_value < 1e-9
-    assert "a record does not say when its commands acted" in blind.warnings[0]
+    assert "a record does not state when its commands acted" in blind.warnings[0]
     assert not any("commands acted" in warning for warning in found.warnings)
 
 
@@ -177,7 +177,7 @@ def test_a_lost_frame_may_have_written_nothing_and_a_time_that_cannot_be_is_name
         (
             7,
             np.nan,
-            "command_time of frame 7 .t = 0.116667 s. is nan s; it is not finite, and that frame "
+            "command_time of frame 7 .t = 0.116667 s. is nan s; it is not finite, although the frame "
             "was measured",
         ),
         (8, np.inf, "frame 8 .* is inf s; it is not finite"),

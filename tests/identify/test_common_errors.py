@@ -369,7 +369,7 @@ def test_a_record_without_them_is_whitened_as_ever():
     [
         (
             lambda record: record.drop_vars("common_error_covariance"),
-            "holds common_error and not common_error_cov",
+            "holds common_error but not common_error_cov",
         ),
         (
             lambda record: record.assign(common_error=record["common_error"] * np.nan),
@@ -379,7 +379,7 @@ def test_a_record_without_them_is_whitened_as_ever():
             lambda record: record.assign(
                 common_error_covariance=-record["common_error_covariance"]
             ),
-            "is no covariance",
+            "is not a covariance",
         ),
     ],
 )

@@ -66,5 +66,5 @@ def test_a_drift_that_no_run_can_have_is_refused_before_anything_is_taught(drift
 def test_a_finding_that_is_none_is_refused_in_one_line(text):
     record, _ = run_plant(quick(), 0, duration_s=1.0)
     record.attrs[DRIFT] = text
-    with pytest.raises(RecordError, match="drift_watch of the record is no finding"):
+    with pytest.raises(RecordError, match="drift_watch of the record is not a finding"):
         read_finding(record)

@@ -423,7 +423,9 @@ def test_a_motion_too_short_to_identify_from_can_be_predicted_and_what_cannot_be
     (prediction,) = predicted(record, truth())
     np.testing.assert_allclose(prediction.poses[0], plant.pose[0])
     assert np.all((prediction.std > 0) & (prediction.std < SIGMA))
-    with pytest.raises(EstimationError, match=r"made with servo.kp = 0.3, the scenario says 0.2"):
+    with pytest.raises(
+        EstimationError, match=r"made with servo.kp = 0.3, but the scenario has 0.2"
+    ):
         predicted(record, truth(), **{"servo.kp": 0.2})
     with pytest.raises(ParameterError, match=r"platform.mass = -23.5 kg is not allowed"):
         predicted(record, -truth())

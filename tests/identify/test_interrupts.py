@@ -117,7 +117,7 @@ def test_ctrl_c_in_a_command_is_one_line_whatever_became_of_it_and_other_errors_
         for words, line in (
             (
                 ("study", "pixel_noise"),
-                "stopped: what is done is kept; the same command goes on from there\n",
+                "stopped: finished work is stored; the same command continues from there\n",
             ),
             (("excite", "quick"), "aborted\n"),
         ):

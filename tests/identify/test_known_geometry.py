@@ -225,7 +225,7 @@ def test_what_is_no_calibration_of_this_robot_is_refused_in_one_line(tmp_path):
     bent = known.covariance.copy()
     bent[0, 1] = bent[1, 0] = 2 * bent[0, 0]
     negative = written(tmp_path / "bent", replace(known, covariance=bent))
-    assert "is no covariance: as correlations it has the eigenvalue -1, < 0" in said(
+    assert "is not a covariance: its correlations have the negative eigenvalue -1" in said(
         **{"geometry.known": str(negative)}
     )
     (path.parent / "covariance.nc").unlink()

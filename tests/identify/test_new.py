@@ -120,15 +120,15 @@ def test_a_new_record_is_read_and_asks_for_its_rows(name, capfd):
 def test_nothing_is_replaced_and_what_cannot_be_written_leaves_nothing(capfd):
     Path("there.toml").write_text("mine")
     for words, says in (
-        (("robot", "there.toml"), "there.toml is there already, and is not replaced"),
-        (("record", "there.csv"), "there.toml is there already, and is not replaced"),
+        (("robot", "there.toml"), "there.toml exists already and is not replaced"),
+        (("record", "there.csv"), "there.toml exists already and is not replaced"),
         (("study", "a.txt"), "its name must end in .toml"),
-        (("scenario", "a b.toml"), "letters, digits, dots, _ and - before"),
+        (("scenario", "a b.toml"), "and consist of letters, digits, dots, _ and -"),
         (
             ("sensor", "a.toml", "--like", "eye"),
             "unknown sensor 'eye' after --like; valid: ctrack780, ctrack780_29hz",
         ),
-        (("record", "a.toml"), "ends in .csv"),
+        (("record", "a.toml"), "must end in .csv"),
         (("record", "a.csv", "none"), "unknown robot `none`"),
     ):
         assert command("new", *words) == NOT_DONE

@@ -209,7 +209,7 @@ def moved(column, factor=1.0, shift=0.0):
     [
         (
             lambda t: t.rename(columns={"measured_alpha_rad": "measured_alpha_deg"}),
-            "measured_alpha_rad is meant, in ra",
+            "use measured_alpha_rad, in ra",
         ),
         (
             lambda t: t.rename(columns={"time_s": "t"}),
@@ -229,14 +229,17 @@ def moved(column, factor=1.0, shift=0.0):
             "line 3: time_s is 0.0333333 after 0 .* 2 frames of 60 Hz",
         ),
         (lambda t: t.iloc[:0], "has no rows below its header"),
-        (lambda t: t.assign(reference_z_m="a"), "line 2: reference_z_m is 'a', which is no number"),
+        (
+            lambda t: t.assign(reference_z_m="a"),
+            "line 2: reference_z_m is 'a', which is not a number",
+        ),
         (
             lambda t: t.assign(command_1_rad=np.inf),
             "line 2: command_1_rad is inf, must be a finite",
         ),
         (
             lambda t: t.rename(columns={"command_time_s": "command_time_ms"}),
-            "command_time_s is meant, in s",
+            "use command_time_s, in s",
         ),
         (
             lambda t: t.assign(command_time_s=0.0),
@@ -244,7 +247,7 @@ def moved(column, factor=1.0, shift=0.0):
         ),
         (
             lambda t: t.assign(measured_ok=1),
-            "line 7: measured_ok is 1, and a measured column is empty",
+            "line 7: measured_ok is 1, but a measured column is empty",
         ),
         (lambda t: t.assign(measured_ok=2), "line 2: measured_ok must be 1 or 0"),
         (moved("covariance_z_z", np.nan), "measured_covariance is not finite in 119 frames"),
@@ -255,7 +258,7 @@ def moved(column, factor=1.0, shift=0.0):
         ),
         (
             moved("measured_z", shift=0.1),
-            "in frame 0 the measured z is 0.3.* does not begin at rest, or both are in",
+            "in frame 0 the measured z is 0.3.* does not begin at rest, or the two poses are in",
         ),
         (
             moved("command_", 180 / np.pi),
@@ -337,7 +340,7 @@ def test_units_and_a_start_in_motion_are_told_of_any_record(record, spoil, says)
         (
             "anchor_std",
             "start_std",
-            "needs what was measured, anchor_value in .record., and how exactly, anchor_std",
+            "needs the measured value, anchor_value in .record., and its standard deviation, anchor_std",
         ),
         ("[timing]", "[timing", "is not valid TOML"),
     ],

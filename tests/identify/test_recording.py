@@ -250,7 +250,7 @@ def without(record, *names):
         (
             lambda r: r.isel(joint=slice(0, 5)),
             EstimationError,
-            "has commands of 5 joints, robot 'rss6' has 6",
+            "has commands of 5 joints, but robot 'rss6' has 6",
         ),
         (lambda r: r.isel(time=slice(0, 0)), RecordError, "the record has no time"),
         (
@@ -412,7 +412,7 @@ def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geo
     with pytest.raises(EstimationError, match="is of robot 'rss7', not of 'rss6'"):
         check_robot(bare.assign_attrs(robot="rss7"), rss6())
     for geometry, says in (
-        ("[1]", "no JSON object"),
+        ("[1]", "not a JSON object"),
         (json.dumps({"base_joints": [1]}), r"shape \(1,\), expected"),
     ):
         with pytest.raises(RecordError, match=says):

@@ -112,7 +112,8 @@ def test_options_reach_a_calibration_whose_cameras_no_sensor_can_have(pictures, 
     assert "swap the folders LEFT and RIGHT" in said
     assert "the cameras stand 1 m apart, those of the sensor file" in said
     assert (
-        "sensor.toml is not written, no sensor can have these cameras: rig.right_from_left" in said
+        "sensor.toml is not written, because no sensor can have these cameras: rig.right_from_left"
+        in said
     )
     names = ["calibration.json", "coverage.png", "distortion.png", "residuals.png", "rig.toml"]
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == names

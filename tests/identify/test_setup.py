@@ -87,7 +87,7 @@ def test_unseen_errors_are_those_of_the_parameters(setup, result):
     poses = identify.unseen_errors(result.estimate, setup.robot, setup.scenario, seed=3)
     np.testing.assert_array_equal(errors.poses, poses)
     assert errors.rms()["beta_urad"] == pytest.approx(1e6 * np.sqrt((poses[..., 4] ** 2).mean()))
-    with pytest.raises(EstimationError, match=r"no result: identify\.identify"):
+    with pytest.raises(EstimationError, match=r"not a result: identify\.identify"):
         setup.unseen_errors(result.estimate)
 
 
@@ -126,7 +126,7 @@ def test_entries_and_seeds_of_other_kinds_are_taken_or_refused_in_one_line():
     assert (found.timing.latency_s, found.pose_method) == (0.01, "planes")
     with pytest.raises(ScenarioError, match="latencys"):
         identify.load_scenario("quick", timing={"latencys": 0.01})
-    with pytest.raises(ScenarioError, match=r"no scenario: identify\.load_scenario"):
+    with pytest.raises(ScenarioError, match=r"not a scenario: identify\.load_scenario"):
         identify.set_up("quick")
     sequence = np.random.SeedSequence(7, spawn_key=(2,))
     made = identify.set_up(identify.load_scenario("quick", **SHORT), seed=sequence)

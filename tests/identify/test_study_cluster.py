@@ -77,7 +77,7 @@ def test_result_that_died_with_its_worker_is_waited_for_and_noted_once():
 def test_last_worker_or_a_scheduler_that_does_not_answer_ends_the_study_in_one_line(monkeypatch):
     monkeypatch.setattr(dask_cluster, "WORKERLESS_SECONDS", 0.05)
     with pytest.raises(
-        StudyError, match=r"^no Dask worker for 0.05 s; the same command goes on from here$"
+        StudyError, match=r"^no Dask worker for 0.05 s; the same command continues the study$"
     ):
         computed(lambda *_: iter(lambda: LOST, None), 1, nthreads=lambda callback_timeout: {})
     with pytest.raises(StudyError, match=r"^the Dask scheduler is gone; .* timed out$"):
@@ -263,7 +263,7 @@ def test_a_scheduler_that_anybody_can_speak_to_is_refused_unless_that_is_wanted(
     monkeypatch.setattr(dask_cluster, "CONNECT_SECONDS", 0.2)
     for address in ("tcp://192.0.2.1:8786", "192.0.2.1:8786", "tcp://[2001:db8::1]:8786"):
         for insecure, why in (
-            (False, r"\S+ asks for no certificate: .* say --insecure"),
+            (False, r"\S+ asks for no certificate: .* use --insecure"),
             (True, "no"),
         ):
             with (

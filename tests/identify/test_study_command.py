@@ -39,7 +39,7 @@ def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing
     for more, progress, says in (
         ([], "rows of mine: 4 of 4", "4 rows; "),
         (["--repeats", 3], "rows of mine: 2 of 2", "6 rows, 4 of them from before; "),
-        ([], "", "4 rows, 4 of them from before (2 more, of further repeats, are kept); "),
+        ([], "", "4 rows, 4 of them from before (2 rows of further repeats stay stored); "),
     ):
         assert command("study", mine, "--workers", 0, "--out", "a[bold]", *more) == 0
         shown = capsys.readouterr()
@@ -165,7 +165,7 @@ def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(
         f'name = "many"\nkind = "{KIND}"\nrepeats = 10\n[factors]\n{factors}\n'
     )
     assert command("study", "many.toml", "--out", "a") == 1
-    assert "10,000,000 rows; to run more than 100,000, say --yes" in one_line(
+    assert "10,000,000 rows; confirm more than 100,000 rows by --yes" in one_line(
         capsys.readouterr().err
     )
     assert not Path("a").exists()

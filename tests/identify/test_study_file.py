@@ -141,7 +141,7 @@ def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
         (toml("[changes]\nsensor.camera.dark_noise = 1.0"), ["sensor.camera.dark_noise", "both"]),
         (
             toml(factors="sensor.rig.baseline = 1.0"),
-            ["sensor.rig.baseline = 1.0 is no list", "[changes]"],
+            ["sensor.rig.baseline = 1.0 is not a list", "[changes]"],
         ),
         (toml(factors="sensor.rig.baseline = []"), ["sensor.rig.baseline", "no values"]),
         (

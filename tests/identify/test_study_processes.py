@@ -173,7 +173,7 @@ def interrupted(running, folder):
     kept = journal(folder)
     assert (
         error
-        == f"stopped: {len(kept)} of 120 rows are done and kept; the same command goes on from "
+        == f"stopped: {len(kept)} of 120 rows are done and stored; the same command goes on from "
         "there\n"
     )
     assert running.returncode == 130

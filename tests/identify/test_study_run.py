@@ -93,7 +93,7 @@ def test_what_is_done_is_shown_while_a_study_runs_but_not_all_the_time(
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (KeyboardInterrupt, "stopped: 7 of 18 rows are done and kept"),
+        (KeyboardInterrupt, "stopped: 7 of 18 rows are done and stored"),
         (SystemError("crash"), "crash"),
     ],
 )
@@ -211,7 +211,7 @@ def test_more_repeats_are_added_to_those_that_are_there(whole, tmp_path):
     same_numbers(few.frame, whole[1])
     assert (
         stop(tmp_path / "a", 2, options=options, repeats=5)
-        == "stopped: 20 of 30 rows are done and kept"
+        == "stopped: 20 of 30 rows are done and stored"
     )
     many = run(tmp_path / "a", options=options, repeats=5)
     assert (few.rows, many.found, many.rows) == (18, 20, 30)
@@ -249,7 +249,7 @@ def test_a_folder_or_a_table_of_another_study_or_of_another_sensor_file_is_refus
     run(folder, **base)
     before, another = (
         (folder / JOURNAL).read_bytes(),
-        "study.json is of another study, which differs in study.",
+        "study.json belongs to another study, which differs in study.",
     )
     assert f"{another}seed; name" in refused(seed=5, repeats=4)
     assert f"{another}factors." in refused(factors={DARK: [1.0]})
@@ -262,13 +262,13 @@ def test_a_folder_or_a_table_of_another_study_or_of_another_sensor_file_is_refus
     folder = table.parent
     folder.mkdir()
     table.write_bytes((whole[0] / TABLE).read_bytes())
-    assert "study.parquet is of another study, which differs in study.seed" in refused(
+    assert "study.parquet belongs to another study, which differs in study.seed" in refused(
         seed=5, changes={}
     )
     pd.DataFrame({"x": [1.0]}).to_parquet(table)
-    assert "study.parquet is no table of a study" in refused()
+    assert "study.parquet is not a table of a study" in refused()
     table.write_text("no table")
-    assert "study.parquet is no table of a study" in refused()
+    assert "study.parquet is not a table of a study" in refused()
 
 
 def test_folders_of_other_things_in_use_or_that_cannot_be_made_are_refused_and_left_alone(tmp_path):
@@ -312,7 +312,7 @@ def test_no_rows_are_added_to_those_of_another_version_and_with_a_warning_where_
     begun_by(cmmsim="9.8.7")
     kept = (tmp_path / JOURNAL).read_bytes()
     with pytest.raises(
-        StudyError, match=r"has cmmsim 9\.8\.7, here is \S+; go on with that version"
+        StudyError, match=r"has cmmsim 9\.8\.7, here is \S+; continue with that version"
     ):
         run(tmp_path, repeats=2)
     assert (tmp_path / JOURNAL).read_bytes() == kept

@@ -201,11 +201,12 @@ def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refus
     assert "position_rms_um" not in (tmp_path / "summary.md").read_text()
     assert drawn == [[ORIENTATION]]
     with pytest.raises(
-        StudyError, match="figures has 'speed', no figure of static_pose; the nearest are"
+        StudyError,
+        match="figures has 'speed', which is not a figure of static_pose; the nearest are",
     ):
         prepare(made_study(figures=["speed"]))
     own = made_study(kind="my_rows:count", figures=["speed"], theory=[])
-    with pytest.raises(StudyError, match=f"figures has 'speed', and the rows have {POSITION}"):
+    with pytest.raises(StudyError, match=f"figures has 'speed', but the rows have only {POSITION}"):
         summary.write(tmp_path, own, made_table(own))
 
 
@@ -388,12 +389,12 @@ def test_order_of_a_factors_values(good, bad, expected):
         (
             power(1.0, per="some"),
             {},
-            "some is zero in 30 of 120 rows, and nothing can be divided by it",
+            "some is zero in 30 of 120 rows, but the law divides by it",
         ),
         (
             Law(figure="figure_um", equals="some"),
             {},
-            "some is zero in 30 of 120 rows, and nothing can be divided",
+            "some is zero in 30 of 120 rows, but the law divides",
         ),
         (power(1.0), {"figure_um": 0.0}, "zero in every row"),
         (power(1.0), {"x": 2.0}, "do not vary"),

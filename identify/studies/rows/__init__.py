@@ -1,10 +1,9 @@
 """Kinds of row that a study can have.
 
-A built-in kind is one file here, and a line in ``KINDS``. A user's own is ``module:function``, a
-function ``run(scenario, seed)`` or ``run(scenario, seed, options)``. It takes the scenario, the
-row's ``numpy.random.SeedSequence`` and, if the study has any, the options by name. It returns the
-row's figures by name, with units in the names. Workers import it, so it must be in a module that
-they find.
+A built-in kind is one file here, and an entry in ``KINDS``. A user's own kind is named
+``module:function``. It is a function ``run(scenario, seed)`` or ``run(scenario, seed, options)`` of
+the scenario, the row's ``numpy.random.SeedSequence``, and the options by name. It returns the
+figures of the row by name, with units in the names. Workers must be able to import its module.
 """
 
 import inspect
@@ -28,10 +27,10 @@ KINDS: dict[str, Kind] = {
 
 
 def find_kind(name: str) -> Kind:
-    """Return the kind of that name, built in or a user's own.
+    """Return the kind of this name, built in or a user's own.
 
-    Raises StudyError if there is no such kind (the message names the built-in ones), module or
-    function, or if the function takes other arguments.
+    Raises StudyError if there is no such kind (the message names the built-in kinds), module or
+    function, or if the function has other arguments.
     """
     if is_own(name):
         return _own(name, own_function(name, "kind", StudyError))
@@ -43,10 +42,10 @@ def find_kind(name: str) -> Kind:
 
 
 def _own(name: str, function: Callable[..., Any]) -> Kind:
-    """Make a kind of a function that takes three arguments, or two and no options."""
+    """Make a kind from a function of three arguments, or of two arguments without options."""
     try:
         signature = inspect.signature(function)
-    except (TypeError, ValueError):  # written in C: it does not say
+    except (TypeError, ValueError):  # functions written in C can lack a signature
         return Kind(name, function)
     for count in (3, 2):
         try:

@@ -1,8 +1,8 @@
-"""Rows of kind `closed_loop`: the plant follows an unseen trajectory with images in the loop.
+"""Rows of kind `closed_loop`: the plant follows a random trajectory with images in the loop.
 
-Each row draws a trajectory in the scenario's box and runs it for `validation.duration_s`. Sensor,
-timing, servo and plant are the scenario's. The sensor teaches itself, seeded by the row, unless
-exact teaching is asked for.
+Each row draws a trajectory in the scenario's box and runs it for `validation.duration_s`, with the
+sensor, timing, servo and plant of the scenario. By default the sensor teaches itself, seeded by the
+row.
 """
 
 import numpy as np
@@ -38,7 +38,7 @@ TRAJECTORY = 1
 COLUMNS = {
     "frames": Column("1", "frames of the run"),
     "lost_frames": Column(
-        "1", "frames without a pose; they do not count in the sensor's error", main=True
+        "1", "frames without a pose; the errors of measured poses exclude them", main=True
     ),
     "tracking_position_rms_um": Column(
         "um", "deviation of the true from the desired position, rms", main=True
@@ -57,7 +57,8 @@ class ClosedLoopOptions(Section):
     """Options of rows of kind `closed_loop`."""
 
     teaching: Teaching = Field(
-        "sensor", description="by the sensor itself, seeded by the row, or exact"
+        "sensor",
+        description="sensor: the sensor teaches itself, seeded by the row; exact: without error",
     )
 
 
@@ -90,7 +91,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     setup = Setup(scenario.with_overrides(UNWATCHED))
     plan = setup.sensor_plan
     number = stream_seed(seed, EXPERIMENT)
-    # A sensor that is given no teaching teaches itself.
+    # A sensor without teaching (None) teaches itself.
     taught = exactly_taught(plan.file) if options.teaching == "exact" else None
     sensor = plan.make(setup.robot, number, taught)
     design = setup.design
@@ -121,7 +122,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
 CLOSED_LOOP = Kind(
     "closed_loop",
     compute,
-    "the robot follows an unseen trajectory with the images in the loop",
+    "the robot follows a random trajectory with images in the loop",
     COLUMNS,
     ClosedLoopOptions,
     READS,

@@ -1,4 +1,4 @@
-"""Coverage of stated intervals of identified quantities, and of poses predicted by the model."""
+"""Coverage of the stated intervals of identified quantities, and of predicted poses."""
 
 from collections.abc import Iterator, Sequence
 
@@ -30,16 +30,16 @@ def coverage(
     plant : Plant
         The true robot.
     unseen : sequence of Experiment
-        Runs of the unseen trajectories.
+        Runs of the validation trajectories.
     predicted : sequence of PosePrediction
         Prediction of each of these runs.
 
     Returns
     -------
     Row
-        Number and share of the intervals of identified quantities that contain the truth, share of
-        true coordinates on unseen trajectories within their predicted interval, and rms error of
-        the predicted positions.
+        Number of intervals of identified quantities, share of these intervals that contain the
+        truth, share of true coordinates on the validation trajectories within their predicted
+        interval, and rms error of the predicted positions.
     """
     held = [inside for *_, identified, inside in quantities(result, plant.parameters) if identified]
     errors = np.concatenate(
@@ -61,14 +61,14 @@ def coverage(
 def quantities(
     result: IdentificationResult, truth: Array
 ) -> Iterator[tuple[str, float, float, bool, bool]]:
-    """Yield every parameter, and every group of several, with its error.
+    """Yield every parameter, and every group of several parameters, with its error.
 
-    Each entry is name, error in standard deviations, relative standard deviation, whether it counts
-    as identified, and whether its 95 % interval contains the truth. `truth` holds the true
-    parameters (p,).
+    Each entry is the name, the error in standard deviations, the relative standard deviation,
+    whether the quantity counts as identified, and whether its 95 % interval contains the truth.
+    `truth` holds the true parameters (p,).
     """
     groups = result.groups
-    # A group of one parameter is that parameter, which counts already.
+    # A group of one parameter would count this parameter twice.
     several = np.count_nonzero(groups.combinations, axis=1) > 1
     parameters = (result.names, truth, result.intervals, np.ones(len(truth), dtype=bool))
     combined = (

@@ -1,8 +1,8 @@
 """Rows of kind `estimators`: errors of several estimators on the same record.
 
-The record is that of kind `identification`. Instruments at the joints are simulated from its truth
-for the estimators that need them. All estimators of a row have the same record, so rows compare
-them as pairs.
+The record is made as for the kind `identification`. Joint instruments are simulated from its truth,
+for the estimators that need them. All estimators of a row use the same record, so that their errors
+can be compared pairwise.
 """
 
 import math
@@ -43,21 +43,21 @@ FIGURES = {
     ),
     "position_um": (
         "um",
-        "position of the model on unseen trajectories, rms of the worst axis and run",
+        "position error of the model on validation trajectories, rms of the worst axis and run",
         1.0,
         None,
     ),
     "orientation_urad": (
         "urad",
-        "orientation of the model on unseen trajectories, rms of the worst axis and run",
+        "orientation error of the model on validation trajectories, rms of the worst axis and run",
         1.0,
         None,
     ),
     "seconds": ("s", "time of the estimate", 1.0, None),
 }
-"""Unit, meaning, factor and score's field of each figure, by the end of its name.
+"""Unit, meaning, factor and field of the score for each figure, by the end of its name.
 
-Without a field, it is the end of the name.
+If the field is None, its name is the end of the figure's name.
 """
 
 STARTING = START.replace(" ", "_")
@@ -67,7 +67,9 @@ class EstimatorOptions(RecordOptions):
     """Options of rows of kind `estimators`."""
 
     estimators: list[str] = Field(
-        [], description="names, or module:function of one's own; none: all built-in ones"
+        [],
+        description="names of estimators, or module:function of your own; empty: all built-in "
+        "estimators",
     )
 
     @field_validator("estimators")
@@ -85,7 +87,7 @@ COLUMNS = {
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: EstimatorOptions) -> Row:
-    """Compute one row, without the figures that an estimator does not give.
+    """Compute one row. Figures that an estimator does not return are missing.
 
     Raises EstimationError, and the errors of experiment and sensor.
     """
@@ -115,7 +117,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Estimator
 
 
 def _figures(score: Score) -> Row:
-    # An estimator of one's own is called module:function.
+    # The name of a user's own estimator is module:function.
     name = score.name.replace(" ", "_").replace(":", ".")
     return {
         f"{name}_{end}": factor * getattr(score, field or end)

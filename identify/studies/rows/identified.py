@@ -1,9 +1,9 @@
 """Rows of kind `identification`: a record, the parameters identified from it, and their errors.
 
-Unless images are asked for, the sensor is `drawn`: it adds Gaussian noise of the covariance that
-the scenario's sensor states at the home pose, so the entries of the sensor take effect. With images
-the sensor teaches itself, seeded by the row. The exciting and the unseen trajectories are those of
-`trajectory_seed`, the same in all rows. Rows thus differ by their factors and their noise only.
+By default the sensor is `drawn`: it adds Gaussian noise with the covariance that the scenario's
+sensor states at the home pose, so the entries of the sensor take effect. With images, the sensor
+teaches itself, seeded by the row. All rows have the same exciting and validation trajectories, from
+`trajectory_seed`. Rows thus differ only by their factors and their noise.
 """
 
 from dataclasses import dataclass
@@ -56,13 +56,13 @@ CHOSEN = {
     "viscous": ("viscous friction", "viscous"),
     "gains": ("joint gains", "joint_pid"),
 }
-"""Sets of parameters over which an rms is taken, with their slice of the layout.
+"""Sets of parameters over which an rms is computed, with their slice of the layout.
 
-A record always shows these, so their spread follows the noise.
+Every record identifies these parameters, so their spread follows the noise.
 """
 
 UNAWARE = "the same figure, identified without the errors that all frames have in common"
-"""Meaning of the figures `unaware_`. Labels show their names, as "the same" needs its context."""
+"""Meaning of the figures `unaware_`. Labels show the names of these figures."""
 
 COLUMNS = {
     "frames": Column("1", "frames of the record"),
@@ -85,35 +85,39 @@ COLUMNS = {
         "%", "stated standard deviation of identified groups, relative, median", main=True
     ),
     "normalised_error": Column(
-        "1", "error of identified groups over the stated one, rms; 1 where stated well"
+        "1",
+        "error of identified groups over the stated standard deviation, rms; 1 is correct",
     ),
     "intervals": Column(
         "1", "quantities that the record identifies: parameters, and groups of several"
     ),
-    "covered_percent": Column("%", "share of their 95 % intervals that hold the truth", main=True),
+    "covered_percent": Column("%", "share of these intervals (95 %) with the truth", main=True),
     "noise_ratio": Column(
-        "1",
-        "mean squared residual over the variance of the noise; 1 where noise is all that is left",
+        "1", "mean squared residual over the variance of the noise; 1 if only noise remains"
     ),
     "iterations": Column("1", "iterations of all searches"),
     "prediction_rms_um": Column(
-        "um", "error of the identified model's position on unseen trajectories, without noise"
+        "um", "error of the identified model's position on validation trajectories, without noise"
     ),
     "stated_prediction_rms_um": Column(
-        "um", "error of the model's position, as the covariance of the parameters states it"
+        "um", "error of the model's position according to the covariance of the parameters"
     ),
     "unseen_position_rms_um": Column(
-        "um", "error of the model's position on unseen trajectories, rms over axes", main=True
+        "um", "error of the model's position on validation trajectories, rms over axes", main=True
     ),
     "unseen_orientation_rms_urad": Column(
-        "urad", "error of the model's orientation on unseen trajectories, rms over axes", main=True
+        "urad",
+        "error of the model's orientation on validation trajectories, rms over axes",
+        main=True,
     ),
     "poses_covered_percent": Column(
-        "%", "share of true coordinates on unseen trajectories within the predicted 95 % intervals"
+        "%",
+        "share of true coordinates on validation trajectories within the predicted 95 % intervals",
     ),
     "predicted_position_rms_um": Column(
         "um",
-        "error of the predicted position there, with what the record taught of sensor and geometry",
+        "error of the predicted position on validation trajectories, with the estimated errors of "
+        "sensor and geometry",
     ),
     "unaware_intervals": Column("1", UNAWARE),
     "unaware_covered_percent": Column("%", UNAWARE),
@@ -123,13 +127,13 @@ COLUMNS = {
 
 
 class RecordOptions(Section):
-    """Options that say how the record is made."""
+    """Options of the record."""
 
     sensor: Literal["drawn", "images"] = Field(
-        "drawn", description="noise of the stated covariance, or images"
+        "drawn", description="drawn: noise of the stated covariance; images: rendered images"
     )
     trajectory_seed: int = Field(
-        0, ge=0, description="seed of the exciting and of the unseen trajectories"
+        0, ge=0, description="seed of the exciting and the validation trajectories"
     )
 
 
@@ -138,7 +142,7 @@ class IdentificationOptions(RecordOptions):
 
     unaware: bool = Field(
         False,
-        description="identify also as if cameras, teaching, clocks and geometry were exact",
+        description="also identify as if cameras, teaching, clocks and geometry were exact",
     )
 
 
@@ -161,7 +165,7 @@ READS = Reads(
         Idle(
             ("sensor.camera.noise",),
             DRAWN,
-            "options.sensor is drawn: that noise is added all the same",
+            "options.sensor is drawn: the stated noise is added in any case",
         ),
         Idle(
             ("scenario.renderer", "sensor.stickers.obstacle_level", *timing("exposure_s")),
@@ -185,11 +189,11 @@ READS = Reads(
 
 @dataclass(frozen=True)
 class Recorded:
-    """Runs from which a row identifies.
+    """Runs of a row.
 
-    `excitation` is the plant's run of the exciting trajectory, `unseen` its runs of the unseen
-    ones. `records` are all records to identify from, the first of which is that of `excitation`.
-    `number` is the seed of them all.
+    `excitation` is the plant's run of the exciting trajectory. `unseen` are its runs of the
+    validation trajectories. `records` are all records to identify from, first the record of
+    `excitation`. `number` is the seed of all runs.
     """
 
     plant: Plant
@@ -200,7 +204,7 @@ class Recorded:
 
 
 def row_setup(settings: Scenario, number: int) -> Setup:
-    """Return the setup of a row with a seed, which shares its robot with other rows."""
+    """Return the setup of a row with a seed. Rows with the same robot share the loaded robot."""
     return Setup(settings.with_overrides(UNWATCHED), number, robot_named(settings.robot))
 
 
@@ -244,7 +248,7 @@ def compute(
     row: Row = {}
     for prefix, settings in asked.items():
         result = identify_record(made.records, robot, settings)
-        # The model is run with the law of the drives that was identified.
+        # The model is run with the identified law of the drives.
         side = model_side(robot, settings).with_drive(result.drive.law)
         predicted = predicted_runs(
             side,
@@ -270,14 +274,13 @@ def _unseen_figures(
     unseen: list[Experiment],
     predicted: list[PosePrediction],
 ) -> Row:
-    """Return the errors of the identified model on unseen trajectories.
+    """Return the errors of the identified model on the validation trajectories.
 
     truth: true parameters (p,).
     """
     models = []
     for of, one in zip(predicted, unseen, strict=True):
-        # Such a prediction is the identified model's own run, which need not be done again.
-        if of.slopes is not None:
+        if of.slopes is not None:  # the prediction is already a run of the identified model
             models.append((of.poses, of.slopes))
             continue
         reference = recorded_reference(one.record)
@@ -313,7 +316,7 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     for figure, values in (("std", result.std), ("error", result.estimate - truth)):
         for name, (_, members) in CHOSEN.items():
             index = np.arange(len(truth))[getattr(result.layout, members)]
-            index = index[truth[index] != 0]  # drives may lack a gain
+            index = index[truth[index] != 0]  # drives can lack a gain
             row[f"{name}_{figure}_percent"] = 100.0 * float(
                 np.sqrt(np.mean((values[index] / truth[index]) ** 2))
             )
@@ -321,7 +324,7 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     true_groups = groups.combinations @ truth[result.layout.dynamic]
     seen = groups.identifiable
     row["identified_groups"] = int(seen.sum())
-    # A wrong model identifies nothing, and the row has its other figures all the same.
+    # If a wrong model identifies nothing, the row has only its other figures.
     if seen.any():
         normalised = (groups.estimate - true_groups)[seen] / groups.std[seen]
         row["group_std_percent"] = 100.0 * float(
@@ -334,14 +337,11 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
 def prediction_figures(
     models: list[tuple[Array, Array]], covariance: Array, true: list[Array]
 ) -> Row:
-    """Compare the model's position errors with those that the covariance of its parameters states.
+    """Return the model's position error, and the error that the covariance of parameters predicts.
 
-    Every direction in which the parameters can err counts as much as it shows in the positions. The
-    figure therefore has the scatter of many errors. That of a few parameters that err together
-    would have the scatter of hardly two.
-
-    `models` holds the estimated model's poses (N, 6) on each trajectory and their slopes (N, 6, p),
-    `covariance` (p, p) is that of the parameters, and `true` holds the true model's poses (N, 6).
+    `models` holds, for each trajectory, the poses (N, 6) of the estimated model and their
+    derivatives (N, 6, p) with respect to the parameters. `true` holds the poses of the true model.
+    Errors of positions scatter less from row to row than errors of single parameters.
     """
     squares = []
     stated = []
@@ -357,15 +357,15 @@ def prediction_figures(
 
 @lru_cache(maxsize=4)
 def robot_named(name: str) -> Robot:
-    """Load a robot, once a process."""
+    """Load a robot, once per process."""
     return load_robot(name)
 
 
 def designed_trajectories(setup: Setup, seed: int) -> TrajectorySet:
-    """Design the trajectories of a setup, or return those designed before.
+    """Return the trajectories of a setup, designed once per process.
 
-    The design knows neither the plant nor what is known of rig and geometry. Rows that differ only
-    in these share their trajectories.
+    The design does not depend on the plant, nor on the sections rig and geometry of the scenario.
+    Rows that differ only in these share their trajectories.
     """
     design = {"rig": Rig(), "plant": PlantSwitches(), "geometry": Geometry(), "renderer": "auto"}
     return _designed(setup.scenario.model_copy(update=design).to_toml(), seed)
@@ -378,13 +378,13 @@ def _designed(scenario_toml: str, seed: int) -> TrajectorySet:
 
 
 HELD = 5
-"""Number of arrays that a row holds at once, each the size of all poses' sensitivities."""
+"""Number of arrays in memory at once, each as large as the sensitivities of all poses."""
 
 
 def memory(setup: Setup, options: object) -> float:
     """Return the memory needed to identify from the records of a setup, bytes.
 
-    It was measured with up to 24,000 frames.
+    The formula was checked with up to 24,000 frames.
     """
     return HELD * 8.0 * 6 * len(setup.nominal.layout.names) * setup.sensor_plan.frames
 

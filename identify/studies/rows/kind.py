@@ -27,9 +27,9 @@ class Idle:
     keys : tuple of str
         Dotted paths, or sections.
     where : mapping of str to callable
-        Condition: for each dotted path a test of its value. All must hold.
+        Condition: a test of the value of each dotted path. All tests must hold.
     why : str
-        The condition in words that follow "where".
+        The condition as text for an error message, after "where".
     """
 
     keys: tuple[str, ...]
@@ -46,9 +46,9 @@ class Reads:
     keys : tuple of str
         Dotted paths, or sections that end in a dot.
     but : tuple of str
-        Exceptions from these.
+        Exceptions: keys in these sections that the kind does not read.
     idle : tuple of Idle
-        Keys that it does not always read.
+        Keys that have no effect under some conditions.
     """
 
     keys: tuple[str, ...]
@@ -56,7 +56,7 @@ class Reads:
     idle: tuple[Idle, ...] = ()
 
     def covers(self, path: str) -> bool:
-        """Tell whether the kind ever reads a dotted path."""
+        """Return whether the kind reads a dotted path under any condition."""
         return path.startswith("options.") or (among(path, self.keys) and not among(path, self.but))
 
     def __str__(self) -> str:
@@ -68,12 +68,12 @@ class Reads:
 
 
 def among(path: str, keys: tuple[str, ...]) -> bool:
-    """Tell whether a path is one of the keys, or in a section or table of them."""
+    """Return whether a path is one of the keys, or in a section or table that is one of them."""
     return any(path == key or path.startswith(f"{key.removesuffix('.')}.") for key in keys)
 
 
 def timing(*names: str) -> tuple[str, ...]:
-    """Return both paths of keys of a scenario's ``[timing]``: there, and in the sensor's file."""
+    """Return both paths of timing keys: in a scenario's ``[timing]``, and in a sensor file."""
     return tuple(
         path
         for name in names
@@ -90,17 +90,17 @@ SENSOR = (
     "sensor.platform.",
     "sensor.base.",
 )
-"""Keys of a sensor's file except timing, labels and renderer.
+"""Keys of a sensor file except timing, labels and renderer.
 
-The renderer is left out because a scenario always states its own.
+The renderer is left out because the scenario's renderer is always used.
 """
 
 PICTURES = ("scenario.sensor", "scenario.renderer", "scenario.pose_method", *SENSOR)
-"""Keys beside the timing on which pictures depend, and the poses measured in them."""
+"""Keys on which pictures and measured poses depend, beside the timing."""
 
 BOX = ("scenario.excitation.position_amplitude_m", "scenario.excitation.orientation_amplitude_rad")
 PATH = ("scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", *BOX)
-"""Keys by which a pose in the scenario's box is drawn, and a path in it."""
+"""Keys on which a random pose or path in the scenario's box depends."""
 
 LIMITS = (
     "scenario.excitation.travel_margin_rad",
@@ -115,7 +115,7 @@ LIMITS = (
 NOISE_OFF = Idle(
     tuple(f"sensor.camera.{name}" for name in ("dark_noise", "prnu", "dsnu", "pattern_seed")),
     {"sensor.camera.noise": lambda noise: not noise},
-    "sensor.camera.noise is false: pictures have no noise, and only what is stated of it would "
+    "sensor.camera.noise is false: pictures have no noise, and only its stated covariance would "
     "change",
 )
 
@@ -126,7 +126,7 @@ PLANT = (
             f"scenario.plant.{name}": lambda error: error == 0
             for name in ("geometry_error_m", "length_error_m", "axis_error_rad")
         },
-        "scenario.plant.geometry_error_m is 0, and so are its other errors of geometry",
+        "scenario.plant.geometry_error_m is 0, and so are the other geometry errors",
     ),
     Idle(
         ("scenario.plant.joint_damping_N_m_s_rad", "scenario.plant.motor_inertia_kg_m2"),
@@ -139,7 +139,7 @@ PLANT = (
         "scenario.plant.joint_stiffness_N_m is not given: the joints are rigid",
     ),
 )
-"""Keys without effect where the plant lacks the part to which they belong."""
+"""Keys without effect if the plant lacks the part to which they belong."""
 
 
 BESIDE = (
@@ -157,19 +157,18 @@ BESIDE = (
     "scenario.validation.duration_s",
     "scenario.rig.watch",
 )
-"""Keys that may stand among the changes of any kind.
+"""Keys that are allowed among the changes of any kind.
 
-They are labels, the renderer, who watches the cameras, and all that a scenario checks against its
-frame rate, because a change of that may need one of these.
+They are labels, the renderer, the drift watch, and all keys that a scenario checks against its
+frame rate, because a change of the frame rate can require a change of these keys.
 """
 
 
 def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) -> None:
     """Refuse factors, changes and options that rows never read, or that have no effect in any row.
 
-    This relies on what each kind states of itself, which costs nothing. What a row reads is known
-    only when it has been computed, in minutes, and a key that is read may still have no effect. To
-    see that, a row would have to be computed once more for each factor and each change.
+    The check uses the statements of each kind about its keys. Computing rows to find keys without
+    effect would take minutes per key.
 
     Parameters
     ----------
@@ -185,10 +184,11 @@ def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) 
     Raises
     ------
     StudyError
-        With all that the kind does read, or with the setting that leaves a key without effect.
+        A key is never read (the message names the keys that are), or has no effect (the message
+        names the setting that is the reason).
     """
     settings = {f"factors.{path}": path for path in study.factors}
-    # Changes may hold some keys that rows do not read, see BESIDE.
+    # Changes are allowed to hold some keys that rows do not read, see BESIDE.
     settings |= {f"changes.{path}": path for path in study.changes if not among(path, BESIDE)}
     settings |= {path: path for path in (f"options.{name}" for name in study.options)}
     for setting, path in settings.items():
@@ -209,11 +209,11 @@ def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) 
 def _always(
     holds: Callable[[Any], bool], path: str, study: Study, first: Scenario, options: BaseModel
 ) -> bool:
-    """Tell whether something holds of a path's value in all rows.
+    """Return whether a test holds for the value of a path in all rows.
 
-    It is false if another sensor of the study may state another value.
+    The result is False if another sensor of the study could have another value.
     """
-    # A key of the timing may stand in the scenario or in the sensor's file.
+    # A timing key can be in the scenario or in the sensor file.
     both = next((pair for pair in _SPELLINGS if path in pair), (path,))
     for one in both:
         if one in study.factors:
@@ -238,7 +238,7 @@ Row = dict[str, float]
 
 
 UNWATCHED = {"rig.watch": "none"}
-"""Setting that rows run with. No figure of a row depends on a watch of the cameras."""
+"""Setting of all rows: no drift watch of the cameras, because no figure depends on it."""
 
 
 @dataclass(frozen=True)
@@ -248,11 +248,11 @@ class Column:
     Attributes
     ----------
     unit : str
-        Its unit, "1" if it has none.
+        Unit, "1" for a number without unit.
     meaning : str
-        What it is, in words.
+        Description of the figure.
     main : bool
-        Whether a summary shows and draws it.
+        Whether summaries show and plot the figure.
     """
 
     unit: str
@@ -264,8 +264,8 @@ class Column:
 class Kind:
     """Kind of row of a study.
 
-    A user's own kind has only a name and a function. Its rows tell its figures, and it may take any
-    options, or none.
+    A user's own kind has only a name and a function. Its figures are known from its rows. It can
+    have any options, or none.
 
     Attributes
     ----------
@@ -275,7 +275,7 @@ class Kind:
         Function (scenario, seed, options) that returns a row's figures by name. The same arguments
         give the same row, whatever was computed before.
     what : str
-        What a row is, in words.
+        Description of a row.
     columns : mapping of str to Column
         Figures of a row.
     options : type or None
@@ -283,9 +283,10 @@ class Kind:
     reads : Reads or None
         Keys that rows read.
     takes_options : bool
-        Whether there may be options.
+        Whether options are allowed.
     memory : callable or None
-        Function (setup, options) that returns the bytes a row holds at once. None if few.
+        Function (setup, options) that returns the memory needed by a row, bytes. None means little
+        memory.
     """
 
     name: str
@@ -298,14 +299,14 @@ class Kind:
     memory: Callable[[Setup, Any], float] | None = None
 
     def checked(self, options: Mapping[str, Any]) -> Any:
-        """Return the options as `compute` takes them, with their defaults.
+        """Return the options for `compute`, with their defaults.
 
-        Raises StudyError with the valid names.
+        Raises StudyError for invalid options. The message has the valid names.
         """
         if options and not self.takes_options:
             raise StudyError(
-                f"kind {self.name!r} takes no options, got {', '.join(options)}; a function that "
-                "does is run(scenario, seed, options)"
+                f"kind {self.name!r} takes no options, got {', '.join(options)}; a function with "
+                "options is run(scenario, seed, options)"
             )
         if self.options is None:
             return options

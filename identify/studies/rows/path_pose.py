@@ -1,11 +1,11 @@
 """Rows of kind `path_pose`: the sensor alone follows a platform along a random path.
 
-The path is one of the scenario's excitation. Exposure, latency, its jitter and dropout act as the
-scenario states. A row is a short stretch from a random instant of the path. Its pictures are
-measured together: stickers are looked for where the path has them, as they move along it, and no
-picture is searched or tracked. A measured pose counts as that in the middle of its exposure. Beside
-its error a row gives that of the pose in use, the last one that has arrived, which is held until
-the next one arrives. Teaching is exact unless asked for otherwise.
+The path is a random trajectory with the scenario's settings of the excitation. Exposure, latency,
+its jitter and dropout have the scenario's values. A row is a short stretch of the path from a
+random instant on. Its pictures are measured together. Stickers are looked for at their true places
+on the path, without search and without tracking. A measured pose refers to the middle of its
+exposure. The row has the error of the measured poses, and the error of the pose in use, which is
+the last pose that has arrived. Teaching is exact by default.
 """
 
 import numpy as np
@@ -33,20 +33,22 @@ DRAWN_PATH = 0
 SENSOR = 1
 LATENCY = 2
 INSTANTS_PER_FRAME = 16
-"""Instants of a frame period at which the pose in use is compared with the true one."""
+"""Number of instants per frame period at which the pose in use is compared with the true pose."""
 
 COLUMNS = {
     "frames": Column("1", "stereo pictures taken"),
     "lost_frames": Column(
-        "1", "frames without a pose; they count in no other figure but the pose in use"
+        "1", "frames without a pose; of the other figures only the pose in use includes them"
     ),
     "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
     **POSE_COLUMNS,
     "used_position_rms_um": Column(
-        "um", "error of the position in use at all times, the last that had arrived", main=True
+        "um", "error of the position in use at all times, the last arrived position", main=True
     ),
     "used_orientation_rms_urad": Column(
-        "urad", "error of the orientation in use at all times, the last that had arrived", main=True
+        "urad",
+        "error of the orientation in use at all times, the last arrived orientation",
+        main=True,
     ),
 }
 
@@ -58,7 +60,8 @@ class PathPoseOptions(Section):
         0.5, gt=0, le=3600, description="time along the path, at least two frames"
     )
     teaching: Teaching = Field(
-        "exact", description="exact, or by the sensor itself, seeded by the row"
+        "exact",
+        description="exact: without error; sensor: the sensor teaches itself, seeded by the row",
     )
 
 
@@ -81,7 +84,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     eye = row_sensor(Setup(scenario).sensor_plan, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
     path = drawn_trajectory(rng, Chart("free", tuple(eye.sensor.home)), scenario.excitation)
-    # The path repeats itself after one period of the fundamental frequency.
+    # The path is periodic with the fundamental frequency.
     start = rng.uniform(0.0, 1.0 / scenario.excitation.fundamental_hz)
     frames = max(2, scenario.timing.frames(options.stretch_s))
     times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)
@@ -110,18 +113,18 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
 def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_s: float) -> Array:
     """Return the errors (m, 6) of the pose in use from the first arrival to the last.
 
-    Poses come into use in their order.
+    No pose comes into use before an earlier pose.
     """
     arrivals = np.maximum.accumulate(arrivals)
     count = max(1, round(INSTANTS_PER_FRAME * float(arrivals[-1] - arrivals[0]) / period_s))
-    # Instants are the middles of equal steps of time.
+    # Instants are the midpoints of equal time steps.
     instants = arrivals[0] + (np.arange(count) + 0.5) / count * (arrivals[-1] - arrivals[0])
     in_use = np.searchsorted(arrivals, instants, side="right") - 1
     return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
 
 
 FRAME = 4.3e3
-"""Bytes held for each frame, as measured with up to 1,800,000 frames."""
+"""Memory per frame, bytes, as measured with up to 1,800,000 frames."""
 
 
 def memory(setup: Setup, options: PathPoseOptions) -> float:

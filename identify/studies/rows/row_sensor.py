@@ -1,9 +1,9 @@
-"""Sensors of rows, and their figures.
+"""Sensors of rows, and figures of measured poses.
 
-A sensor is taught exactly or by itself, or has no images and draws its noise. One that is taught
-exactly is built once a process for each content of a sensor file. Its rows depend on nothing that
-other rows left behind, because every picture has a noise stream of its own, begun by `start_run`. A
-sensor from the cache thus gives the same numbers as a new one.
+A sensor is taught exactly, or teaches itself, or draws noise without images. An exactly taught
+sensor is built once per process for each content of a sensor file. `start_run` begins new noise
+streams, so rows do not depend on earlier rows. A sensor from the cache thus gives the same numbers
+as a new sensor.
 """
 
 from collections.abc import Mapping
@@ -23,19 +23,19 @@ from identify.experiment.sensor_in_loop import SensorPlan
 from identify.studies.rows.kind import Column, Row
 
 SENSORS_KEPT = 16
-"""Number of sensors that a process keeps. One takes about a megabyte."""
+"""Number of cached sensors per process. A sensor takes about a megabyte."""
 
 Teaching = Literal["exact", "sensor"]
 """Way of teaching.
 
 ``exact``: frames and sticker places have no error, so rows show observation noise alone.
-``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s a row).
+``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s per row).
 """
 
 
 @dataclass(frozen=True)
 class RowSensor:
-    """Sensor of a row, and facts that it cannot know.
+    """Sensor of a row, and true values for the comparison.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class RowSensor:
     middle : ndarray, shape (3,)
         Middle of the baseline in the base frame, m.
     rim : float
-        Radiance half-way between a sticker and its ring.
+        Mean radiance of a sticker and its ring.
     """
 
     sensor: cmmsim.Sensor
@@ -56,10 +56,7 @@ class RowSensor:
 
 
 def row_sensor(plan: SensorPlan, teaching: Teaching, seed: int) -> RowSensor:
-    """Return a sensor at the beginning of a run of its own.
-
-    The robot's links are not in its view.
-    """
+    """Return a sensor at the beginning of a new run. It does not see the links of the robot."""
     if teaching == "exact":
         built = exact_sensor(plan.file.model_dump_json(), plan.method, plan.renderer)
     else:
@@ -70,7 +67,7 @@ def row_sensor(plan: SensorPlan, teaching: Teaching, seed: int) -> RowSensor:
 
 @lru_cache(maxsize=SENSORS_KEPT)
 def exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
-    """Return the sensor of a file's content, taught exactly. A process keeps the last ones."""
+    """Return the exactly taught sensor for the content of a sensor file, from a cache."""
     file = SensorFile.model_validate_json(file_json)
     return _built(file, method, renderer, exactly_taught(file), 0)
 
@@ -84,9 +81,9 @@ def _built(
 
 
 class DrawnSensor:
-    """Stand-in for a `cmmsim.Sensor` without images: Gaussian noise and dropout.
+    """Sensor that adds Gaussian noise to true poses, without images, and drops frames at random.
 
-    It is fast and has known statistics. The covariance (6, 6) of the noise is in m and rad.
+    It replaces a `cmmsim.Sensor`. The covariance (6, 6) of the noise is in m and rad.
     """
 
     sees_bodies = False
@@ -98,7 +95,7 @@ class DrawnSensor:
         self.start_run(0)
 
     def start_run(self, seed: int) -> None:
-        """Begin a new run with noise of its own."""
+        """Begin a new run with a new noise stream."""
         self._rng = np.random.default_rng(seed)
 
     def measure(
@@ -107,8 +104,8 @@ class DrawnSensor:
         obstacles: Mapping[str, Array] | None = None,
         pose_rate: ArrayLike | None = None,
     ) -> cmmsim.Measurement:
-        """Return the pose (6,) with noise. Obstacles and speed make no difference."""
-        # The noise of a dropped frame is drawn as well, so that the next ones keep theirs.
+        """Return the pose (6,) with noise. Obstacles and speed have no effect."""
+        # Noise is also drawn for a dropped frame, so that dropout does not change later noise.
         noise = self._factor @ self._rng.standard_normal(6)
         dropped = self._rng.random() < self._dropout
         if dropped:
@@ -117,14 +114,14 @@ class DrawnSensor:
 
 
 def rms_um(errors: Array) -> float:
-    """Return the root mean square over all entries (per axis and frame) in 1e-6 of their unit."""
+    """Return the root mean square over all entries, in units of 1e-6 (um or urad)."""
     return 1e6 * float(np.sqrt(np.mean(np.square(errors))))
 
 
 def stated_um(covariances: Array) -> tuple[float, float]:
-    """Return the rms standard deviations per axis of covariances (n, 6, 6).
+    """Return the rms standard deviations per axis of position, um, and orientation, urad.
 
-    They are that of the position, um, and that of the orientation, urad.
+    covariances (n, 6, 6): covariances of poses, m and rad.
     """
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     return 1e6 * float(np.sqrt(variances[:, :3].mean())), 1e6 * float(
@@ -140,13 +137,13 @@ POSE_COLUMNS = {
         "urad", "error of the measured orientation, rms over pictures and axes", main=True
     ),
     "stated_position_rms_um": Column(
-        "um", "error of the measured position, as the sensor's covariance states it"
+        "um", "error of the measured position according to the sensor's covariance"
     ),
     "stated_orientation_rms_urad": Column(
-        "urad", "error of the measured orientation, as the sensor's covariance states it"
+        "urad", "error of the measured orientation according to the sensor's covariance"
     ),
 }
-"""Figures of every row with measured poses."""
+"""Figures of rows with measured poses."""
 
 
 def pose_figures(errors: Array, covariances: Array) -> Row:

@@ -1,10 +1,10 @@
 """Rows of kind `static_pose`: the sensor alone looks at a platform that stands still.
 
-Each row draws one pose (or several) in the scenario's excitation box around the sensor's home pose,
-and takes several pictures of it. Stickers are looked for where a tracker would expect them, a
-little beside the true place, and no picture is searched as a whole. The timing's dropout loses
-pictures, and changes nothing in the others. Teaching is exact unless asked for otherwise, so that
-rows show observation noise alone.
+Each row draws one or several poses in the scenario's excitation box around the sensor's home pose,
+and takes several pictures of each pose. Stickers are looked for near predicted places with random
+errors, as after the prediction of a tracker. No picture is searched as a whole. Dropout removes
+pictures without changing the others. Teaching is exact by default, so that rows show observation
+noise alone.
 """
 
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ SENSOR = 1
 DROPOUT = 2
 TOGETHER = 256  # pictures that are drawn and measured at once
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
-"""Standard deviation of the pose, m and rad, near which a picture's stickers are looked for.
+"""Standard deviation of the predicted pose, m and rad, near which stickers are looked for.
 
 It is the error of a tracker's prediction.
 """
@@ -55,7 +55,7 @@ It is the error of a tracker's prediction.
 COLUMNS = {
     "captures": Column("1", "stereo pictures taken"),
     "lost_frames": Column(
-        "1", "pictures in which no pose was found; they count in no other figure"
+        "1", "pictures in which no pose was found; the other figures exclude them"
     ),
     "stickers": Column("1", "stickers used, mean over the pictures"),
     "pixel_noise_grey": Column(
@@ -89,18 +89,19 @@ COLUMNS = {
 class StaticPoseOptions(Section):
     """Options of rows of kind `static_pose`."""
 
-    poses: int = Field(1, ge=1, le=10_000, description="poses drawn a row")
+    poses: int = Field(1, ge=1, le=10_000, description="number of poses drawn per row")
     captures: int = Field(
-        4, ge=1, le=100_000, description="pictures of each pose, where hold_s is not given"
+        4, ge=1, le=100_000, description="pictures of each pose, if hold_s is not given"
     )
     hold_s: float | None = Field(
         None,
         gt=0,
         le=3600,
-        description="time for which each pose is held: pictures at the frame rate, not `captures`",
+        description="time at each pose; it replaces captures by the frames in this time",
     )
     teaching: Teaching = Field(
-        "exact", description="exact, or by the sensor itself, seeded by the row"
+        "exact",
+        description="exact: without error; sensor: the sensor teaches itself, seeded by the row",
     )
 
 
@@ -125,7 +126,7 @@ READS = Reads(
 
 @dataclass(frozen=True)
 class _Seen:
-    """Result of a picture of a pose.
+    """Result of one picture of a pose.
 
     Attributes
     ----------
@@ -134,9 +135,9 @@ class _Seen:
     error : ndarray, shape (6,)
         Error of the measured pose.
     covariance : ndarray, shape (6, 6)
-        Its stated covariance.
+        Stated covariance of the measured pose.
     points, centres : ndarray
-        Errors of the stickers, see `_sticker_errors`.
+        Errors of the stickers, as `_sticker_errors` returns them.
     """
 
     pose: int
@@ -167,7 +168,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
     planned = _pictures(eye.sensor.home, box, (options.poses, captures), rng)
     while together := list(islice(planned, TOGETHER)):
         poses, near = (np.array(values) for values in list(zip(*together, strict=True))[1:])
-        # Pictures that drop out are measured too, so that the next ones keep their noise.
+        # Pictures that drop out are measured too, so that dropout does not change later noise.
         for (number, pose, _), measured in zip(
             together, eye.sensor.measure_each(poses, near), strict=True
         ):
@@ -190,8 +191,8 @@ def _pictures(
 ) -> Iterator[tuple[int, Array, Array]]:
     """Yield for each picture the number of its pose, the pose (6,), and the predicted pose (6,).
 
-    Stickers are looked for near the predicted pose. `count` holds the number of poses, and of
-    pictures of each.
+    Stickers are looked for near the predicted pose. `count` holds the number of poses, and the
+    number of pictures per pose.
     """
     for number in range(count[0]):
         pose = home + box * rng.uniform(-1.0, 1.0, 6)
@@ -200,10 +201,10 @@ def _pictures(
 
 
 def _sticker_errors(eye: RowSensor, seen: cmmsim.Measurement, pose: Array) -> tuple[Array, Array]:
-    """Return the errors of the stickers seen.
+    """Return the errors of the k stickers seen.
 
-    They are distance, error along the line of sight and error across it (k, 3), m, and the errors
-    of their centres in both images (2, k, 2), px.
+    The first array (k, 3) holds distance, error along the line of sight and error across it, m. The
+    second array (2, k, 2) holds the errors of the centres in both images, px.
     """
     estimator = eye.sensor.estimator
     index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))

@@ -1,8 +1,8 @@
-"""Rows of kind `tracking`: the plant follows unseen trajectories under a law that knows a model.
+"""Rows of kind `tracking`: the plant follows validation trajectories under a law with a model.
 
-Beside it the plant follows them under `pid`, the same motions with the same noise. The model is the
-starting one, one identified from a record of the row's own, or the true one. It may also be one
-between the truth and the starting model, or be wrong by a share in all parameters.
+For comparison, the plant also follows the same motions under `pid`, with the same noise. The model
+is the initial guess, a model identified from a record of this row, or the true model. It can also
+lie between the truth and the initial guess, or have a relative error in all parameters.
 """
 
 from dataclasses import replace
@@ -47,30 +47,35 @@ COLUMNS = {
     "orientation_rms_urad": Column(
         "urad", "deviation of the true from the desired orientation, rms", main=True
     ),
-    "pid_position_rms_um": Column("um", "position's deviation under the law pid, rms"),
-    "pid_orientation_rms_urad": Column("urad", "orientation's deviation under the law pid, rms"),
+    "pid_position_rms_um": Column("um", "deviation of the position under the law pid, rms"),
+    "pid_orientation_rms_urad": Column(
+        "urad", "deviation of the orientation under the law pid, rms"
+    ),
     "position_share_percent": Column(
-        "%", "position's deviation over that under the law pid", main=True
+        "%", "deviation of the position, relative to the law pid", main=True
     ),
     "orientation_share_percent": Column(
-        "%", "orientation's deviation over that under the law pid", main=True
+        "%", "deviation of the orientation, relative to the law pid", main=True
     ),
     "observer_normalised_error": Column(
-        "1", "mean squared error of the observer over the stated one"
+        "1", "mean squared error of the observer over the stated variance"
     ),
     "starting_position_excess_um": Column(
-        "um", "position's deviation with the starting model less that with the row's", main=True
+        "um",
+        "increase of the position's deviation with the initial guess in place of the row's model",
+        main=True,
     ),
     "starting_orientation_excess_urad": Column(
         "urad",
-        "orientation's deviation with the starting model less that with the row's",
+        "increase of the orientation's deviation with the initial guess in place of the row's "
+        "model",
         main=True,
     ),
     "true_position_ratio": Column(
-        "1", "position's deviation over that with the true model", main=True
+        "1", "deviation of the position, relative to the true model", main=True
     ),
     "true_orientation_ratio": Column(
-        "1", "orientation's deviation over that with the true model", main=True
+        "1", "deviation of the orientation, relative to the true model", main=True
     ),
     "effort_rms": Column("N m or N", "torque or force of the actuators, rms"),
     "lost_frames": Column("1", "frames that the sensor lost"),
@@ -84,23 +89,24 @@ class TrackingOptions(Section):
         "feedforward", description="pid, feedforward, computed_torque, or module:function"
     )
     model: Literal["initial", "identified", "true"] = Field(
-        "true", description="the model that the law knows"
+        "true", description="model that the law knows"
     )
     model_error: float | None = Field(
         None,
         ge=0,
-        description="instead: how far the model is from the truth, 1: as far as the starting one",
+        description="distance of the model from the truth, 1: as far as the initial guess; it "
+        "replaces the option model",
     )
     off: float = Field(
         0.0,
         ge=0,
         lt=1,
-        description="share by which each parameter is too large or too small, at random",
+        description="relative error of each parameter, with a random sign",
     )
     compared: bool = Field(
         False,
-        description="whether the same motions are followed with the starting and the true model, "
-        "too",
+        description="whether the same motions are also followed with the initial guess and with "
+        "the true model",
     )
     trajectory_seed: int = Field(
         0, ge=0, description="seed of the trajectory from which the model is identified"
@@ -142,7 +148,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
         model = replace(
             model, parameters=model.parameters * (1.0 + options.off * signs), doubt=VAGUE
         )
-    # A circle and a square follow the unseen trajectories, and do not count here.
+    # `motions` also returns a circle and a square, which are not used here.
     unseen = motions(setup.design, number)[: setup.design.unseen.count]
 
     def followed(law: str, known: KnownModel) -> list[Followed]:
@@ -187,7 +193,7 @@ def _against(done: list[Followed], start: list[Followed], truth: list[Followed])
     row: Row = {}
     for name, axes, unit in AXES:
         own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
-        # A coordinate that the platform lacks has no error, by which nothing could be divided.
+        # If the platform lacks a coordinate, its error is zero, and the ratio is left out.
         if with_truth:
             row |= {
                 f"starting_{name}_excess_{unit}": with_start - own,
@@ -210,7 +216,7 @@ def _figures(done: list[Followed], beside: list[Followed]) -> Row:
 TRACKING = Kind(
     "tracking",
     compute,
-    "unseen trajectories followed under a law with a model, and how far the robot is from them",
+    "the robot follows validation trajectories under a law with a model",
     COLUMNS,
     TrackingOptions,
     READS,
