@@ -88,7 +88,8 @@ def drawn(draw: Callable[[], Figure]) -> Figure:
         # Layout engines move the axes at every drawing, so that files would differ.
         if figure.get_layout_engine():
             figure.draw_without_rendering()
-            figure.set_layout_engine("none")
+            # The engine "none" would still have every file drawn twice.
+            figure.set_layout_engine(None)
         return figure
 
 
