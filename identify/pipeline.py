@@ -38,7 +38,7 @@ def run(
         setup, seconds = begin(planned, folder, progress)
     names = record_files(scenario.identification)
     if not all((folder / name).is_file() for name in names):
-        taught = record(folder, progress, workers, setup)
+        taught = record(folder, progress, setup)
     if not run_folder.result.is_file():
         identify(folder, progress)
     if "validation" not in load_result(run_folder.result):
@@ -46,12 +46,7 @@ def run(
     report(folder, progress, began, seconds)
 
 
-def record(
-    folder: Path,
-    progress: Progress,
-    workers: int | None = None,
-    setup: Setup | None = None,
-) -> cmmsim.Taught:
+def record(folder: Path, progress: Progress, setup: Setup | None = None) -> cmmsim.Taught:
     """Run the plant on the exciting trajectory, and return the taught frames of the sensor.
 
     Writes experiment.nc, and payload.nc if the scale anchor is a payload. setup: setup of the run

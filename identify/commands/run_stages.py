@@ -169,7 +169,6 @@ def excite(
 def record(
     context: typer.Context,
     out: RunFolderOption,
-    workers: Workers = None,
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
@@ -187,7 +186,7 @@ def record(
     """
     RunFolder(out).require("scenario.toml", "trajectories.json")
     context.with_resource(working_in(out))
-    _pipeline().record(out, terminal_progress(quiet), workers)
+    _pipeline().record(out, terminal_progress(quiet))
 
 
 def identify(
