@@ -1,4 +1,4 @@
-"""Places of the rods of a robot's legs, which a sensor in the loop asks for at every frame."""
+"""Positions of the rods of a robot's legs, which a sensor in the loop needs at every frame."""
 
 from dynamics.compiled.kernel import Array, Record, call, entry
 
@@ -14,12 +14,12 @@ def place_rods(
     room: Record,
     ends: Array,
 ) -> bool:
-    """Fill the ends (parts, 2, 3) of the drawn parts at a pose (6,), in the axes of the base, m.
+    """Compute the ends (parts, 2, 3) of the drawn parts at a pose (6,), m, in the axes of the base.
 
-    `kinematics` and `placements` are addresses of functions of the robot, and `drawn` and `room`
-    are `Drawn` and `Room`. `held` (6,) are entries that the chart holds, to within the slack, and
-    NaN for the others. Returns False where a leg does not reach the pose, or where the platform
-    cannot have it.
+    `kinematics` and `placements` are addresses of functions of the robot. `drawn` and `room` have
+    the fields of `Drawn` and `Room`. `held` (6,) has the value of each coordinate of the pose that
+    the chart fixes to within `slack`, and NaN for the others. Returns False if a leg does not reach
+    the pose, or if the pose differs from the fixed coordinates.
     """
     for i in range(6):
         # a comparison with NaN is never true

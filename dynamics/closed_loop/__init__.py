@@ -1,18 +1,18 @@
 """Sampled closed loop: visual servo (eq. 30), joint PID (eq. 31) and robot (eq. 40).
 
-A sensor measures the pose at every frame. The servo, logged commands or a controller then give the
-joints a command. It arrives after the latency and is held until the next one arrives. A run begins
-at rest at the first reference pose unless a start is given.
+A sensor measures the pose at every frame. The servo, logged commands or a controller then issue a
+joint command. The command arrives after the latency, and acts until the next one arrives. A run
+begins at rest at the first reference pose, unless a start state is given.
 
-Functions, one for each way to drive the joints
+Functions
 
     simulate_servo, simulate_commands, simulate_controller   one run
     differentiate_servo, differentiate_commands              one run with derivatives
-    repeat_servo, repeat_commands                            one run for each noise
+    repeat_servo, repeat_commands                            one run per noise
     simulate_batch                                           many runs of the servo on all cores
 
-The loop itself is written once, in modules named `*_kernels`. Numba compiles them, and they also
-run as plain Python. Plant and model run the same lines.
+The loop is implemented once, in modules named `*_kernels`. Numba compiles them, and they also run
+as plain Python. Plant and model use the same code.
 """
 
 from dynamics.closed_loop.drives import DriveName, Drives

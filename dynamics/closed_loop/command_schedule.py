@@ -1,9 +1,9 @@
 """Schedule of the joint commands: each is issued at its frame and arrives after a latency.
 
-Commands keep their order. A command that would overtake the one before it waits and arrives with
-that one. Of commands that arrive together, only the last acts. With the linear hold, a command
-ramps over one frame from the command before it, and then stays. A command that arrives before that
-ramp has ended starts where the ramp would have ended.
+Commands keep their order. A command that would overtake the one before it waits, and arrives
+together with it. If several commands arrive together, only the last one acts. With the linear hold,
+a command ramps over one frame period from the previous command and then remains constant. A command
+that arrives during the ramp of the previous one starts at the end value of that ramp.
 """
 
 from functools import lru_cache
@@ -16,16 +16,19 @@ import numpy as np
 from dynamics.closed_loop.problem import LoopProblem
 
 Instant = tuple[int, float]
-"""Frame, and time since that frame, s. Equal delays thus give equal spans in all frames."""
+"""Frame, and time since that frame, s.
+
+In this form, equal delays give equal spans in all frames.
+"""
 
 
 class CommandSchedule(NamedTuple):
-    """Spans of time in which one command acts. No span is longer than to the end of its frame.
+    """Spans of time in which one command acts. Each span ends with its frame at the latest.
 
-    The spans of frame k are first[k] to first[k + 1]. The other arrays have one entry a span.
-    `command` is the number of the frame that issued the command, negative before the start. `ramp`
-    is the share of the way from the command before that is done as the span begins, 1 for all of
-    it. `duration` is in s, and `steps` is the number of integration steps.
+    The spans of frame k are first[k] to first[k + 1]. The other arrays have one entry per span.
+    `command` is the number of the frame that issued the command; it is negative before the start.
+    `ramp` is the share of the way from the previous command that is done at the beginning of the
+    span; 1 is the whole way. `duration` is in s, and `steps` is the number of integration steps.
     """
 
     first: np.ndarray
@@ -36,9 +39,9 @@ class CommandSchedule(NamedTuple):
 
 
 def command_schedule(problem: LoopProblem) -> CommandSchedule:
-    """Spans of a run.
+    """Schedule of a run.
 
-    Commands that were issued before the run have the latencies of its start, or that of its timing.
+    Commands issued before the run have the latencies of the start state, or else of the timing.
     """
     timing = problem.settings.timing
     latencies = problem.latencies
@@ -63,7 +66,7 @@ def _schedule(
     steps_per_frame: int,
 ) -> CommandSchedule:
     earlier = [_delay(s, period) for s in before]
-    # so far back, a command that was issued before the run may still be on its way
+    # the oldest command from before the run that can still arrive during the run
     oldest = -max(whole for whole, _ in earlier) - 2
     delays = [earlier[max(0, len(earlier) + n)] for n in range(oldest, 0)]
     delays += (
@@ -74,7 +77,7 @@ def _schedule(
     issued = enumerate(delays, oldest)
     arrivals = _in_order([(frame + whole, rest) for frame, (whole, rest) in issued])
     ramp_ends = [(frame + 1, rest) for frame, rest in arrivals] if linear else []
-    # spans begin at frames, where the pose is measured, and where the command changes its course
+    # spans begin at frames, at arrivals of commands, and at ends of ramps
     begins = sorted(
         {(k, 0.0) for k in range(frames)} | {i for i in arrivals + ramp_ends if 0 <= i[0] < frames}
     )
@@ -83,7 +86,7 @@ def _schedule(
     duration = []
     newest = 0
     for begin, end in zip(begins, [*begins[1:], (frames, 0.0)], strict=True):
-        # of commands that arrive together only the last one acts
+        # if several commands arrive together, only the last one acts
         while newest + 1 < len(arrivals) and arrivals[newest + 1] <= begin:
             newest += 1
         command.append(oldest + newest)
@@ -91,7 +94,7 @@ def _schedule(
         under_way = linear and begin < (arrived[0] + 1, arrived[1])
         since = (begin[0] - arrived[0]) * period + (begin[1] - arrived[1])
         ramp.append(since / period if under_way else 1.0)
-        # a span to the end of its frame gets the rest of the period, so that all add up to it
+        # the last span of a frame is the rest of the period, so that the sum is exact
         duration.append(period - begin[1] if end[0] > begin[0] else end[1] - begin[1])
     return CommandSchedule(
         first=_fixed(
@@ -107,19 +110,21 @@ def _schedule(
 
 
 def acting_times(issued: np.ndarray, latencies: np.ndarray) -> np.ndarray:
-    """Times (frames,), s, at which commands act that are issued at given times (frames,), s."""
+    """Times (frames,), s, at which commands act, for the times (frames,), s, at which they are
+    issued.
+    """
     return np.array(_in_order((issued + latencies).tolist()), dtype=float)
 
 
 def _in_order(arrivals: list[Any]) -> list[Any]:
-    """Arrivals of commands, none of which is before that of the command before it."""
+    """Arrivals of commands in order: none is before the previous one."""
     return list(accumulate(arrivals, max))
 
 
 def _delay(latency: float, period: float) -> Instant:
-    """Latency, s, as whole frames and a rest in s.
+    """Latency, s, as a number of whole frames and a remainder, s.
 
-    The rest is rounded, so that commands that arrive together have equal instants.
+    The remainder is rounded, so that commands that arrive together have equal instants.
     """
     whole = floor(latency / period + 1e-9)
     return whole, max(0.0, round(latency - whole * period, 13))

@@ -1,12 +1,12 @@
 """Drives: the law by which each joint turns its command into a torque, and its largest torque.
 
 Let U be the command of a joint, theta its coordinate, and lp, li, ld the gains. The torque or force
-is, cut at the limit,
+is, up to the limit,
 
-    lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta
+    torque = lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta
 
-At the limit, li z - lx theta does not grow beyond the limit: the integrator waits until the error
-turns (conditional integration). The laws differ in the gains that they read, in c, and in lx:
+At the limit, li z - lx theta does not grow further: integration stops until the error changes its
+sign (conditional integration). The laws differ in the gains that they use, in c, and in lx:
 
     pid            c = 1, lx = 0                  law of the paper (eq. 31)
     pd             c = 1, lx = 0                  no li
@@ -18,10 +18,10 @@ The cascade is a proportional controller of the position around a PI controller 
 
     torque = kv (w - theta_dot) + ki integral(w - theta_dot),    w = kp (U - theta)
 
-The integral of theta_dot is theta but for a constant, which z takes. So kp = lp / ld, kv = ld and
-ki = lx. In every law, a factor common to lp, li and ld is a factor of the torque.
+The integral of theta_dot is theta except for a constant, which is a part of z. Hence kp = lp / ld,
+kv = ld and ki = lx. In every law, a common factor of lp, li and ld is a factor of the torque.
 
-A law without an integral holds a load by an error: at rest its command is the coordinate of the
+A law without an integral balances a load by an error: at rest, its command is the coordinate of the
 joint plus the torque over lp.
 """
 
@@ -47,7 +47,7 @@ READS: Mapping[str, tuple[str, ...]] = {
     "cascade": JOINT_PID,
     "pid_filtered": JOINT_PID,
 }
-"""Gains that each law reads."""
+"""Gains that each law uses."""
 
 ABOVE_ZERO: Mapping[str, tuple[str, ...]] = {
     "pid": ("li",),
@@ -56,16 +56,19 @@ ABOVE_ZERO: Mapping[str, tuple[str, ...]] = {
     "cascade": JOINT_PID,
     "pid_filtered": ("li",),
 }
-"""Gains that must be > 0, because the law holds no load without them, or is another law."""
+"""Gains that must be > 0.
+
+Without them, the law could not balance a load, or would be another law.
+"""
 
 
 class JointLaw(NamedTuple):
     """Law of a joint with its gains.
 
-    The gains lp, li and ld are 0 where the law does not read them. `lx` and `rate_weight` (c) are
-    those of the module's formula, and `lx_by` (3,) the derivatives of lx with respect to lp, li,
-    ld. `reads` (3,) is 1 for each gain that the law reads, else 0. `filter_time` is the time
-    constant of the filter of the rate, s, or 0.
+    The gains lp, li and ld are 0 if the law does not use them. `lx` and `rate_weight` (c) are as in
+    the formula of this module. `lx_by` (3,) has the derivatives of lx with respect to lp, li, ld.
+    `reads` (3,) is 1 for each gain that the law uses, else 0. `filter_time` is the time constant of
+    the filter of the rate, s, or 0.
     """
 
     lp: float
@@ -78,9 +81,7 @@ class JointLaw(NamedTuple):
     filter_time: float = 0.0
 
     def held(self, torque: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Command (n,) and integral z (n,) with which joints at rest at an angle (n,) give a torque
-        (n,).
-        """
+        """Command (n,) and integral z (n,) that hold joints at an angle (n,) with a torque (n,)."""
         if self.li:
             return angle, (torque + self.lx * angle) / self.li
         return angle + torque / self.lp, np.zeros_like(torque)
@@ -88,9 +89,10 @@ class JointLaw(NamedTuple):
     def held_by_parameters(
         self, torque: np.ndarray, angle: np.ndarray, by_dynamic: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives (n, p) of command and integral of `held` with respect to all parameters.
+        """Derivatives (n, p) of the command and the integral of `held` with respect to all
+        parameters.
 
-        `by_dynamic` are derivatives of the torque with respect to the dynamic parameters.
+        `by_dynamic` has the derivatives of the torque with respect to the dynamic parameters.
         """
         command, integral = self.held(torque, angle)
         none = np.zeros((len(torque), len(JOINT_PID)))
@@ -160,11 +162,11 @@ class Drives:
 
 
 PID = Drives()
-"""Drives of the paper, without a limit."""
+"""Drives of the paper, without a torque limit."""
 
 
 def joint_law(name: DriveName, gains: np.ndarray, filter_time: float | None = None) -> JointLaw:
-    """Law of a name with the gains lp, li, ld (3,), and with the time constant of its filter, s."""
+    """Law `name` with the gains lp, li, ld (3,) and the time constant of its filter, s."""
     reads = np.array([float(gain in READS[name]) for gain in JOINT_PID])
     lp, li, ld = (float(gain) if read else 0.0 for gain, read in zip(gains, reads, strict=True))
     if name != "cascade":
@@ -174,8 +176,9 @@ def joint_law(name: DriveName, gains: np.ndarray, filter_time: float | None = No
 
 
 class CascadeGains(NamedTuple):
-    """Gains of the cascade as drives name them: kp (1/s), kv (N m s/rad or N s/m), ki (N m/rad or
-    N/m).
+    """Gains of the cascade in the form usual for drives.
+
+    The units are 1/s for kp, N m s/rad or N s/m for kv, and N m/rad or N/m for ki.
     """
 
     kp: float
@@ -184,9 +187,7 @@ class CascadeGains(NamedTuple):
 
 
 def cascade_gains(gains: np.ndarray) -> tuple[CascadeGains, np.ndarray]:
-    """Gains of the cascade from lp, li, ld (3,), and their derivatives (3, 3) with respect to
-    these.
-    """
+    """Gains of the cascade for lp, li, ld (3,), and their derivatives (3, 3)."""
     lp, li, ld = gains
     by_gains = np.array(
         [[1 / ld, 0.0, -lp / ld**2], [0.0, 0.0, 1.0], [-li * ld / lp**2, ld / lp, li / lp]],

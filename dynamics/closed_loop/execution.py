@@ -1,8 +1,8 @@
-"""Execution of a run: its problem is put into the memory of the kernels, which do its frames.
+"""Execution of a run: the kernels process its frames in the memory that is set up here.
 
-The same lines run compiled and, as the oracle of that, as plain Python. Sensors and controllers of
-a user are Python, so that the kernels then do one frame at a time. A run that ends early says what
-the kernels found to be the reason.
+The same code runs compiled and as plain Python, with which tests compare it. If a sensor or a
+controller is a Python function, the kernels process one frame at a time. The error of a run that
+ends early states the reason that the kernels found.
 """
 
 from dataclasses import replace
@@ -39,31 +39,31 @@ MACHINE_CODE = (
     *("equation_of_motion", "free_acceleration", "response", "rate_map_derivative"),
     *("stage_derivatives", "stop_derivatives", "slope_derivative"),
 )
-"""Names of the functions of a robot that kernels call."""
+"""Names of the robot's functions that kernels call."""
 
 CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, stop_tangent)
-"""Kernels that other kernels call by their addresses."""
+"""Kernels that other kernels call by address."""
 UNSTABLE = " (the loop is unstable)"
 FAILURES = {
     LEFT_REACH: f"the robot left the reachable set{UNSTABLE}:",
     SINGULAR_MASS: "the mass matrix is not positive definite: masses or inertias are zero or "
     "overflow",
     TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
-    MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; "
-    "there",
+    MEASURED_OUT_OF_REACH: "the measured pose is out of reach, and the servo has no command; there",
 }
 
 
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     """Do one run and return its record. Raises LoopFailure."""
     frames = problem.frames
-    # a controller writes its commands here frame by frame, and the kernels take them as given ones
+    # commands of a controller are written here frame by frame; the kernels read them like given
+    # commands
     commands = problem.commands
     if commands is None:
         commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
     memory, record, plan, *_held = _set_up(problem, commands, compiled)
     do = chosen(run_frames, compiled)
-    # arrays and not records, because a record takes Numba 8 us at every frame
+    # arrays instead of records, because passing a record costs Numba 8 us at every frame
     arrays = [part if part.ndim else part.base for part in memory]
     measured = np.full((frames, 6), np.nan)
     for first, last in [(k, k + 1) for k in range(frames)] if problem.asked else [(0, frames)]:
@@ -73,7 +73,7 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
             except DynamicsError as error:
                 raise stopped(problem, first, record, str(error)) from error
             except Exception as error:
-                # the exception of a user's function goes on as it is, with the frame as a note
+                # the exception of a user's function is raised unchanged, with the frame as a note
                 error.add_note(f"at frame {first} of the closed loop")
                 raise
         status, frame = do(*arrays, plan, record, first, last)
@@ -95,12 +95,12 @@ def run_repeats(
 def _run_together(
     problem: LoopProblem, noises: np.ndarray, compiled: bool
 ) -> list[ClosedLoopRun | LoopFailure]:
-    """Do runs that differ in their noise (runs, frames, 6), one in each lane."""
+    """Do runs that differ in their noise (runs, frames, 6), with one run per lane."""
     sizes = problem.sizes
     frames = problem.frames
     runs = len(noises)
     commands = np.zeros((0, sizes.joints)) if problem.commands is None else problem.commands
-    # the noises of all runs are one array, of which each run reads its own rows
+    # the noise of all runs is in one array, of which each run reads its own rows
     every = _with_noise(problem, noises.reshape(-1, 6))
     memory, record, plan, own, *_held = _set_up(every, commands, compiled, runs)
     for name in ("motion_in_lanes", "acceleration_in_lanes"):
@@ -110,7 +110,7 @@ def _run_together(
     now = np.repeat(memory.now.reshape(1), runs).view(np.recarray)
     now["first_row"] = frames * np.arange(runs)
     lanes.shared = memory.now.known.inputs[2 * sizes.coordinates :]
-    # lanes without a run compute the first state, so that no number in them is invalid
+    # lanes without a run use the first state, so that their numbers are valid
     lanes.states = np.tile(memory.now.state[: 2 * sizes.coordinates], (LANES, 1)).T
     chosen(run_lanes, compiled)(memory.task, now, at, memory.tangent, plan, record, lanes)
     found: list[ClosedLoopRun | LoopFailure] = []
@@ -129,9 +129,10 @@ def _run_together(
 def _set_up(
     problem: LoopProblem, commands: np.ndarray, compiled: bool, runs: int = 1
 ) -> tuple[Any, ...]:
-    """Memory, record and plan of runs, and the functions of robot and servo.
+    """Memory, record and plan of runs, and the functions of the robot and of the servo's robot.
 
-    The caller holds the functions, because code that nobody holds is freed.
+    The caller must keep a reference to the functions, because their machine code is freed with
+    them.
     """
     memory = empty_memory(problem.sizes)
     own = problem.robot.functions
@@ -141,7 +142,7 @@ def _set_up(
 
 
 def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -> ClosedLoopRun:
-    """Record of a run that came to its end."""
+    """Record of a run that was completed."""
     found: dict[str, Any] = {
         name: array if array.size else None for name, array in record._asdict().items()
     }
@@ -152,7 +153,7 @@ def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -
 
 
 def _poses(problem: LoopProblem, found: dict[str, Any], measured: np.ndarray) -> dict[str, Any]:
-    """Poses of the coordinates that the kernels have recorded."""
+    """Poses for the coordinates that the kernels have recorded."""
     chart = problem.robot.geometry.chart
     poses = {
         "pose": chart.pose(found["pose"]),
@@ -182,7 +183,7 @@ def _consult(
     commands: np.ndarray,
     measured: np.ndarray,
 ) -> None:
-    """Ask a user's sensor for the measured pose of a frame, and a controller for the command."""
+    """Call the sensor for the measured pose of a frame, and the controller for the command."""
     sensor = problem.sensor
     size = problem.sizes.coordinates
     time = frame * problem.period
@@ -191,7 +192,7 @@ def _consult(
         plain(measure_ideally)(now, plan, record, frame)
         measured[frame] = chart.pose(record.measured[frame])
     else:
-        # an attribute of a record takes five times as long as an item
+        # access to an attribute of a record takes five times as long as access to an item
         state = now["state"]
         pose = chart.pose(state[:size])
         rate = chart.lifted(state[size : 2 * size]).copy()
@@ -201,7 +202,7 @@ def _consult(
             else sensor(frame, time, pose)
         )
         record.measured_ok[frame] = given is not None
-        what = "what the pose sensor returned"
+        what = "value returned by the pose sensor"
         measured[frame] = (
             np.nan if given is None else floats(what, given, (6,), error=SimulationError)
         )
@@ -219,12 +220,12 @@ def _consult(
         )
     else:
         return
-    what = "what the controller returned"
+    what = "value returned by the controller"
     commands[frame] = floats(what, command, (problem.sizes.joints,), error=SimulationError)
 
 
 def _with_noise(problem: LoopProblem, noise: np.ndarray) -> LoopProblem:
-    """Problem whose ideal sensor has another noise (rows, 6)."""
+    """Problem with another noise (rows, 6) of its ideal sensor."""
     ideal = problem.ideal or IDEAL
     return replace(problem, sensor=IdealSensor(ideal.lost, noise))
 
@@ -251,7 +252,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "start_command_sensitivity": by_command[:, problem.columns],
     }
     views = {name: np.ascontiguousarray(array).view() for name, array in given.items()}
-    # kernels are compiled for each kind of array that they are given, so all are of one
+    # Numba compiles kernels for each array type, so all arrays have the same type: read-only
     for view in views.values():
         view.flags.writeable = False
     return Plan(**views, spans=command_schedule(problem))
@@ -260,7 +261,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
 def _servo_sensitivity(problem: LoopProblem, by_command: np.ndarray) -> np.ndarray:
     """Derivatives (m, p) of the servo integral at rest.
 
-    They follow from the derivatives (n, p) of the command that the integral makes.
+    They follow from the derivatives (n, p) of the command, which the integral determines.
     """
     ki = problem.settings.servo.ki
     size = problem.sizes.coordinates
@@ -308,10 +309,9 @@ def _fill(
         task.stiffness = settings.elasticity.stiffness
         task.damping = settings.elasticity.damping
         task.motor_inertia = settings.elasticity.motor_inertia
-    # the mass of elastic joints is beyond the springs, so that the parameters change before
-    # they are written
+    # with elastic joints, these exclude the inertia of the motors
     task.rigid = rigid
-    # only these parameters of the rigid bodies have columns of derivatives
+    # indices of the parameters of rigid bodies that have a column of derivatives
     columns = problem.columns
     shown = len(problem.columns) - 2 * sizes.joints - len(gains)
     task.shown = shown
@@ -335,9 +335,9 @@ def _fill(
     )
     now.servo_integral = start.servo_integral
     now.last_measured = chart.coordinates(start.last_measured)
-    # a feedforward commands the joints where they are, so that the servo has added nothing yet
+    # a feedforward commands the joint coordinates, and the servo has added nothing yet
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0
-    # a servo that knows the robot can use the Jacobian that the motion has computed
+    # with the same geometry, the servo can use the Jacobian computed for the motion
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
     # the last inputs of a function are parameters and geometric numbers, which never change
     for inputs, function, fixed in (
@@ -356,7 +356,7 @@ def _fill(
     now.parameters = len(columns)
     now.start_moves = problem.start_sensitivities
     now.step_column = len(columns) + (sizes.start if problem.start_sensitivities else 0)
-    # kernels work on whole vectors of columns, of which the last ones may be unused
+    # kernels work on whole vectors of columns; the last columns can be unused
     now.width = plain(whole_vectors)(int(now.step_column))
 
 
@@ -373,7 +373,7 @@ def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
 
 
 def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any) -> LoopFailure:
-    """Error of a run that ended early, with the leg that is to blame for a pose out of reach."""
+    """Error of a run that ended early. If a pose is out of reach, it names the leg."""
     why = FAILURES[status]
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
         last = now.known.inputs[: problem.sizes.coordinates]
@@ -385,12 +385,14 @@ def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any
 
 
 def stopped(problem: LoopProblem, frame: int, record: Any, why: str) -> LoopFailure:
-    """Error of a run that ended early, with the frames at which actuators were at their limit."""
+    """Error of a run that ended early, with the number of frames in which actuators were at the
+    limit.
+    """
     limit = problem.settings.drives.torque_limit
     unit = problem.robot.layout.unit("joint1.coulomb")
     saturated = saturated_frames(record.torque[:frame], limit)
     when = f"t = {frame * problem.period:.3f} s"
-    # weak actuators make a robot leave the reach of a loop that is stable
+    # with weak actuators, the robot can leave its reach although the loop is stable
     if saturated:
         why = why.replace(UNSTABLE, "")
         when += f", saturated in {saturated} of {frame} frames, limit {limit:g} {unit}"

@@ -1,9 +1,10 @@
-"""Frames of a run: measurement, visual servo (eq. 30), commands on their way, and the record.
+"""Kernels for the frames of a run: measurement, visual servo (eq. 30), command and record.
 
 The servo is U = J_theta [kp e + kd e_dot + ki integral(e)], with the error e at the time of
-exposure. The pose rate is the difference of the last two good measurements; before the first one,
-the start names the last. The integral is the sum of the errors times the frame period. Lost frames
-leave both alone. A feedforward is added at lost frames, too.
+exposure. The pose rate is the difference of the last two good measurements over the time between
+them. Before the first measurement, the start state provides the last one. The integral is the sum
+of the errors times the frame period. At a lost frame, measurement, integral and command stay as
+they are. The feedforward is added at every frame.
 """
 
 import numpy as np
@@ -36,7 +37,7 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
     count = len(now.mode)
     copy(now.state[:], at[0].state[:])
     now.span = -1
-    # where it fails, the first frame does and says so
+    # a failure is not reported here, because the first frame fails in the same way
     status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
     for i in range(count):
         velocity = at[0].velocity[i]
@@ -45,7 +46,7 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
         copy_rows(plan.start_integral_sensitivity, d.x[2 * size :], now.parameters)
         copy_rows(plan.start_servo_sensitivity, d.integral[:], now.parameters)
         copy_rows(plan.start_command_sensitivity, d.issued[len(d.issued) - 1], now.parameters)
-        # a start at rest holds the command that the servo's integral makes
+        # at a start at rest, the command comes from the integral of the servo
         if len(plan.commands) == 0 and len(plan.feedforward) == 0:
             copy_rows(plan.start_command_sensitivity, d.last_command[:], now.parameters)
     if now.start_moves:
@@ -58,7 +59,7 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
 
 @kernel
 def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> None:
-    """Write the state at a frame, before it is measured, into the record."""
+    """Record the state at a frame, before it is measured."""
     size = len(now.servo_integral)
     count = len(now.mode)
     row = now.first_row + k
@@ -87,7 +88,7 @@ def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> 
 
 @kernel
 def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -> None:
-    """Write the columns of the parameters, and those of the start state if wanted."""
+    """Record the columns of the parameters, and the columns of the start state if it has any."""
     copy_rows(rows, by_parameters, now.parameters)
     copy_rows(rows[:, now.parameters :], by_start, by_start.shape[1])
 
@@ -110,8 +111,8 @@ def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
 def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k: int) -> None:
     """Compute the command of the servo at a good frame, and its derivatives.
 
-    The servo knows a Jacobian at the measured pose. It is often the one of the motion, which is
-    known.
+    The servo needs the Jacobian at the measured pose. If that is the true pose, the Jacobian of the
+    motion is used, which is already known.
     """
     size = len(measured)
     known = now.known
@@ -140,7 +141,7 @@ def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k
 
 @kernel
 def serve_tangent(task: Record, now: Record, d: Record, measured: Array, jacobian: Array) -> None:
-    """Differentiate the command of the servo, given the derivatives of the measured pose."""
+    """Differentiate the command of the servo. The derivatives of the measured pose are in `d.x`."""
     width = now.width
     velocity_by_pose(task, now, measured, now.demand[:])
     for i in range(len(now.demand)):
@@ -159,7 +160,7 @@ def serve_tangent(task: Record, now: Record, d: Record, measured: Array, jacobia
 def issue_command(
     task: Record, now: Record, d: Record, plan: Record, record: Record, k: int
 ) -> int:
-    """Measure, unless that has been done, and record the command that follows."""
+    """Measure the pose, unless that has been done, and record the command that follows from it."""
     if not task.measured:
         measure_ideally(now, plan, record, k)
     now.elapsed += task.period
@@ -178,7 +179,7 @@ def issue_command(
 
 @kernel
 def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
-    """Command of a joint by its number. Negative numbers are those of the start."""
+    """Command of a joint by number. Negative numbers are commands from before the start."""
     return commands[number, joint] if number >= 0 else start[max(0, len(start) + number), joint]
 
 
@@ -186,9 +187,10 @@ def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
 def apply_command(
     task: Record, now: Record, d: Record, start: Array, commands: Array, number: int, ramp: float
 ) -> None:
-    """Let a command act of which a share `ramp` of the way from the one before is done.
+    """Let a command act.
 
-    A share of 1 is all of it.
+    `ramp` is the share of the way from the previous command to this one that is already done. A
+    share of 1 is the whole way.
     """
     now.ramping = ramp < 1
     for i in range(len(now.command)):
@@ -200,7 +202,7 @@ def apply_command(
         now.command_slope[i] = now.command_rate[i] if now.ramping else 0.0
     if not task.sensitivities:
         return
-    # the last one is that of the commands of the start
+    # the last entry has the derivatives of the commands from before the start
     rows = len(d.issued) - 1
     newer = d.issued[number % rows if number >= 0 else rows]
     older = d.issued[(number - 1) % rows if number > 0 else rows]
@@ -217,7 +219,7 @@ def apply_command(
 def next_span(
     task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record
 ) -> int:
-    """Go on to the next span of a frame, or measure and go on to the next frame."""
+    """Go on to the next span of a frame, or to the next frame, which begins with a measurement."""
     spans = plan.spans
     k = now.frame
     last = now.frame + 2 == len(plan.spans.first)
@@ -261,10 +263,11 @@ def run_frames(
     first: int,
     last: int,
 ) -> tuple[int, int]:
-    """Do the frames from `first` to `last`, without `last`. Return the status and its frame.
+    """Run the frames from `first` up to, but not including, `last`. Return the status and its
+    frame.
 
-    The memory comes as arrays of one record each. To take a record from Python costs Numba 8 us,
-    and a run that is measured in Python comes here at every frame.
+    The memory is passed as arrays of one record each. Passing a record from Python costs Numba 8
+    us, and a run that Python measures calls this function at every frame.
     """
     task = tasks[0]
     now = nows[0]

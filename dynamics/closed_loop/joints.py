@@ -12,9 +12,9 @@ they turn the cranks, and theta(q) the crank angles. Then
     M q_ddot + b = J_theta^T spring torque
     motor inertia phi_ddot = motor torque - friction(phi_dot) - spring torque
 
-Encoder, joint PID and friction sit at the motor. The inertia of the motor is taken out of the Izz
-of the crank, or out of the mass of the slider. The rigid robot of the same parameters is thus the
-limit of stiff springs.
+Encoder, joint PID and friction act at the motor. The inertia of the motor is subtracted from the
+Izz of the crank, or from the mass of the slider. In the limit of stiff springs, the robot is thus
+the rigid robot with the same parameters.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ FRICTION = np.dtype(
         ],
     )
 )
-"""Type of a friction law as kernels read it. The law is its place in `LawName`."""
+"""Type of a friction law as kernels read it. `law` is the position of its name in `LawName`."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,9 @@ class FrictionLaw:
             )
 
     def level(self, velocity: np.ndarray) -> np.ndarray:
-        """Ratio of dry friction to the Coulomb torque at joint velocities, rad/s or m/s. It is 0 at
-        rest.
+        """Ratio of dry friction to the Coulomb torque at joint velocities, rad/s or m/s.
+
+        It is 0 at rest.
         """
         if self.name == "smoothed":
             return np.asarray(np.tanh(velocity / self.smoothing_velocity))
@@ -122,7 +123,7 @@ class FrictionLaw:
 
     @property
     def record(self) -> np.record:
-        """Law in the form that kernels read."""
+        """Friction law in the form that kernels read."""
         constants = (
             self.smoothing_velocity or 0.0,
             self.static_ratio or 1.0,
@@ -132,7 +133,7 @@ class FrictionLaw:
 
 
 LARGEST_STEP = 1.0
-"""Largest product of eigenvalue and step of the Runge-Kutta method, which is unstable from 2.8."""
+"""Largest product of eigenvalue and step length. The Runge-Kutta method is unstable from 2.8 on."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ class JointElasticity:
     stiffness : float
         Stiffness of each spring, N m/rad, or N/m for actuators that slide.
     motor_inertia : float
-        Inertia of each motor as its joint feels it, kg m^2 or kg.
+        Inertia of each motor, referred to its joint, kg m^2 or kg.
     damping : float
         Damping of each spring, N m s/rad or N s/m.
 
@@ -169,16 +170,16 @@ class JointElasticity:
         real("joint damping", self.damping, SimulationError, least=0, unit=" N m s/rad")
 
     def beyond_the_springs(self, layout: ParameterLayout, rigid: np.ndarray) -> np.ndarray:
-        """Parameters of the rigid bodies that the springs carry, which exclude the motors.
+        """Parameters of the rigid bodies behind the springs, without the inertia of the motors.
 
-        Raises SimulationError for a robot with a leg whose actuator does not drive a body alone.
+        Raises SimulationError if the actuator of a leg drives more than one body.
         """
         carried = np.array(rigid)
         for leg, row in enumerate(layout.of_leg):
             body = layout.kinds[row[0]]
             if body.driven is None:
                 raise SimulationError(
-                    f"joints cannot be elastic: the actuator of leg {leg + 1} does not drive just "
+                    f"joints cannot be elastic: the actuator of leg {leg + 1} drives more than "
                     "one body"
                 )
             layout.bodies_of(carried)[row[0], INERTIAL.index(body.driven)] -= self.motor_inertia
@@ -192,11 +193,11 @@ class JointElasticity:
         frame_period: float,
         friction: FrictionLaw,
     ) -> int:
-        """Integration steps per frame that follow the fastest motion near a pose (6,).
+        """Integration steps per frame that resolve the fastest motion near a pose (6,).
 
-        The fastest motion is that of the largest eigenvalue of joints and motors under joint PID
-        and friction, linearised at rest. Raises SimulationError where a motor has more inertia than
-        its crank.
+        The fastest motion has the largest eigenvalue of joints and motors under joint PID and
+        friction, linearised at rest. Raises SimulationError if a motor has more inertia than its
+        crank.
         """
         self._check_motors(robot, parameters)
         free = robot.geometry.chart.basis
@@ -208,7 +209,7 @@ class JointElasticity:
         per_inertia[:n, :n] = jacobian @ np.linalg.solve(carried, jacobian.T)
         per_inertia[n:, n:] = np.eye(n) / self.motor_inertia
         _, coulomb, viscous, (lp, _, ld) = robot.layout.split(parameters)
-        # slope of dry friction at rest
+        # slope of dry friction at rest, over the Coulomb torque
         slope = 1 / friction.smoothing_velocity if friction.smoothing_velocity else 0.0
         stiffness = _coupled(self.stiffness, np.full(n, lp))
         damping = _coupled(self.damping, ld + viscous + coulomb * slope)
@@ -235,11 +236,14 @@ class JointElasticity:
             unit = "kg" if layout.prismatic else "kg m^2"
             raise SimulationError(
                 f"motor inertia is {self.motor_inertia:g} {unit}, must be below the "
-                f"{driven[least]:.3g} {unit} of {name} about its axis, which contains it"
+                f"{driven[least]:.3g} {unit} of {name} about its axis, which include it"
             )
 
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
-    """Matrix (2 n, 2 n) of springs between bodies and motors, with `at_motor` (n,) to the base."""
+    """Matrix (2 n, 2 n) of the springs between bodies and motors.
+
+    `at_motor` (n,) are the springs between the motors and the base.
+    """
     one = spring * np.eye(len(at_motor))
     return np.block([[one, -one], [-one, one + np.diag(at_motor)]])

@@ -1,7 +1,7 @@
-"""Several runs of one model at once, one in each lane, which differ in what they measure.
+"""Kernels for several runs of one model at once. Each run is one lane, with its own measurements.
 
-Every run goes its own way, with its own modes, events and steps. All of them ask for the equation
-of motion time and again, which is computed for all lanes together.
+Every run has its own modes, events and steps. The equation of motion, which all runs need again and
+again, is computed for all lanes together.
 """
 
 import numpy as np
@@ -26,10 +26,10 @@ from dynamics.parameters import LANES
 def evaluate_lanes(
     task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array, k: int
 ) -> None:
-    """Do what `evaluate` does at stage `k` of the lanes that ask for it.
+    """Do the same as `evaluate` at stage `k`, for the lanes in `asked`.
 
-    Within a step in which no joint sticks, only the slope is needed. What is known at the end of a
-    step is needed again.
+    Within a step in which no joint sticks, only the slope is needed. The other results are stored
+    at the end of a step, where they are needed again.
     """
     size = len(at[0, 0].bias)
     count = len(at[0, 0].angle)
@@ -43,7 +43,7 @@ def evaluate_lanes(
         if own.status != OK:
             continue
         stuck = count_stuck(own)
-        # what is known of the platform is copied only where it will be read again
+        # the terms of the equation of motion are copied only if they will be read again
         if task.stiffness == 0 and (
             stuck > 1 or (k == END and (stuck > 0 or own.purpose >= BRACKET))
         ):
@@ -73,13 +73,13 @@ def evaluate_lanes(
             hold_stuck(task, own, stage, 1)
         else:
             own.known.valid = False
-            # the plain way says what is wrong
+            # the evaluation of a single run finds the status of the failure
             own.status = invoke(task.evaluate, task, own, stage, d, 0)
 
 
 @kernel
 def has_factor(lanes: Record, lane: int) -> bool:
-    """Return True where the mass matrix of a lane is positive definite and finite."""
+    """Return True if the mass matrix of a lane is positive definite and finite."""
     has = True
     for i in range(lanes.factor.shape[0]):
         has = has and 0 < lanes.factor[i, i, lane] < np.inf
@@ -88,7 +88,7 @@ def has_factor(lanes: Record, lane: int) -> bool:
 
 @kernel
 def take_lane(lanes: Record, lane: int, into: Record) -> None:
-    """Copy what is known of the platform in one lane."""
+    """Copy the terms of the equation of motion of one lane."""
     count, size = into.jacobian.shape
     for i in range(size):
         into.bias[i] = lanes.bias[i, lane]
@@ -104,7 +104,7 @@ def take_lane(lanes: Record, lane: int, into: Record) -> None:
 
 @kernel
 def know_lane(now: Record, at: Record, lanes: Record, lane: int) -> None:
-    """Keep what is known of the platform at the end of a span, where the next one begins."""
+    """Store the terms at the end of a span, where the next span begins."""
     known = now.known
     size = len(at.bias)
     copy(at.state[: 2 * size], known.inputs[: 2 * size])
@@ -116,7 +116,7 @@ def know_lane(now: Record, at: Record, lanes: Record, lane: int) -> None:
 def try_steps(
     task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array
 ) -> None:
-    """Do the steps that lanes ask for."""
+    """Do the steps that the lanes in `asked` request."""
     for lane in asked:
         now[lane].status = begin_step(task, now[lane], at[lane], d)
     for k in range(1, END + 1):
@@ -129,10 +129,10 @@ def try_steps(
 def run_lanes(
     task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record, lanes: Record
 ) -> None:
-    """Do all frames of runs, one in each lane.
+    """Run all frames of several runs, one in each lane.
 
-    The rows of the runs in plan and record follow each other. Each run has its own status and
-    frame.
+    The rows of consecutive runs in `plan` and `record` follow each other. Each run has its own
+    status and frame.
     """
     frames = len(plan.spans.first) - 1
     asked = lanes.asked

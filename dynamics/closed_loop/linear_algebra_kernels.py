@@ -1,6 +1,6 @@
 """Small dense linear algebra, for vectors and for rows of derivatives.
 
-A row of derivatives belongs to one unknown, and its columns to the variables.
+A row of derivatives belongs to one unknown, and each of its columns to one variable.
 """
 
 from dynamics.compiled.kernel import Array, add_row, kernel, part
@@ -41,28 +41,28 @@ def dot(row: Array, vector: Array) -> float:
 
 @part
 def copy(source: Array, into: Array) -> None:
-    """Copy a vector. Numba would take a second to compile the assignment of a slice."""
+    """Copy a vector. The loop compiles a second faster than the assignment of a slice."""
     for k in range(len(source)):
         into[k] = source[k]
 
 
 @part
 def fill(into: Array, value: float) -> None:
-    """Set all entries of a vector."""
+    """Set all entries of a vector to a value."""
     for k in range(len(into)):
         into[k] = value
 
 
 @part
 def add(source: Array, into: Array) -> None:
-    """Add a vector to another."""
+    """Add a vector to another vector."""
     for k in range(len(source)):
         into[k] += source[k]
 
 
 @part
 def clear(rows: Array, width: int) -> None:
-    """Set the columns in use of some rows to zero."""
+    """Set the columns in use to zero in all rows."""
     for i in range(len(rows)):
         for k in range(width):
             rows[i, k] = 0.0
@@ -70,7 +70,7 @@ def clear(rows: Array, width: int) -> None:
 
 @part
 def copy_rows(source: Array, into: Array, width: int) -> None:
-    """Copy the columns in use of some rows."""
+    """Copy the columns in use of all rows."""
     for i in range(len(source)):
         for k in range(width):
             into[i, k] = source[i, k]

@@ -16,7 +16,7 @@ MAX_STEPS_PER_FRAME = 10_000
 
 Hold = Literal["zero", "linear"]
 
-# (frame index, time s, true pose (6,)) -> measured pose (6,), or None where it is lost
+# (frame index, time s, true pose (6,)) -> measured pose (6,), or None if it is lost
 PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
 
 # (frame index, time s, measured pose (6,), desired pose (6,), desired pose rate (6,)) -> joint
@@ -26,13 +26,13 @@ Controller = Callable[[int, float, np.ndarray, np.ndarray, np.ndarray], np.ndarr
 
 @dataclass(frozen=True)
 class RateSensor:
-    """Pose sensor that depends on the motion.
+    """Pose sensor whose measurement depends on the pose rate.
 
     Parameters
     ----------
     measure : callable
         Function (frame, time s, true pose (6,), true pose rate (6,)) -> measured pose (6,), or None
-        where the measurement is lost.
+        if the measurement is lost.
 
     Examples
     --------
@@ -72,7 +72,7 @@ Sensor = IdealSensor | PoseSensor | RateSensor
 
 @dataclass(frozen=True)
 class EveryFrame:
-    """Controller that is called at every frame, also where the measurement is lost.
+    """Controller that is called at every frame, even if the measurement is lost.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class ServoGains:
     Parameters
     ----------
     kp, kd, ki : float
-        Gains of the error (1), of its rate (s) and of its integral (1/s), each >= 0.
+        Gains of the error (no unit), of its rate (s) and of its integral (1/s), each >= 0.
 
     Raises
     ------
@@ -120,8 +120,8 @@ class ServoGains:
 class FrameTiming:
     """Timing of the frames and of the joint commands.
 
-    In both holds the joint PID takes the difference of the last two commands over the frame period
-    for U_dot.
+    With either hold, U_dot in the joint PID is the difference of the last two commands divided by
+    the frame period.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class LoopSettings:
     friction : FrictionLaw
         Law of joint friction.
     steps_per_frame : int
-        Number of Runge-Kutta steps a frame.
+        Number of Runge-Kutta steps per frame.
     elasticity : JointElasticity, optional
         Springs of the joints. The default is rigid joints.
     drives : Drives
@@ -182,7 +182,7 @@ class LoopSettings:
     Raises
     ------
     SimulationError
-        If an argument is of another type, or if the number of steps is out of range.
+        If an argument has a wrong type, or if the number of steps is out of range.
 
     Examples
     --------
@@ -226,12 +226,12 @@ class Reference:
     Parameters
     ----------
     poses, rates : array_like, shape (frames, 6)
-        Poses and pose rates, of at least two frames.
+        Poses and pose rates at at least two frames.
 
     Raises
     ------
     SimulationError
-        If the arrays have other shapes, or entries that are not finite.
+        If the arrays have wrong shapes, or entries that are not finite.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Many closed-loop runs at once: repeats with other noise, batches on all cores, compilation."""
+"""Many closed-loop runs at once: repeats with different noise, and batches on all cores."""
 
 import os
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ def repeat_servo(
     Returns
     -------
     list of ClosedLoopRun or LoopFailure
-        A run that leaves the reach of the robot gives its LoopFailure.
+        One entry per noise. A run that leaves the reach of the robot is a LoopFailure.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def repeat_commands(
 ) -> list[ClosedLoopRun | LoopFailure]:
     """Run the robot under given commands once for each noise of the ideal sensor.
 
-    The noise is in the measured poses alone, so that all runs have the same motion.
+    The noise affects only the measured poses: all runs have the same motion.
 
     Parameters
     ----------
@@ -144,19 +144,20 @@ def simulate_batch(
     robot : Robot
         Robot that moves.
     parameters : ndarray, shape (p,) or (N, p)
-        Parameters of all runs or of each, as for `closed_loop.simulate_servo`.
+        Parameters of all runs, or of each run, as for `closed_loop.simulate_servo`.
     references : Reference or sequence of Reference
-        Desired motion of all runs or of each.
+        Desired motion of all runs, or of each run.
     settings : LoopSettings
         Settings of all runs.
     starts : StartState or sequence of StartState, optional
-        State at the first frame, of all runs or of each. The default is rest.
+        State at the first frame, of all runs or of each run. The default is rest.
     sensitivities : bool
-        True returns derivatives by the parameters, as `closed_loop.differentiate_servo` does.
+        True returns derivatives with respect to the parameters, as
+        `closed_loop.differentiate_servo` does.
     start_sensitivities : bool
-        True returns these and the derivatives by the start state.
+        True returns these and the derivatives with respect to the start state.
     workers : int, optional
-        Number of threads. The default is one a core. Results do not depend on it.
+        Number of threads. The default is one per core. Results do not depend on it.
 
     Returns
     -------
@@ -166,7 +167,7 @@ def simulate_batch(
     Raises
     ------
     LoopFailure
-        Of the first run that leaves the reach of the robot.
+        For the first run that leaves the reach of the robot.
     UnreachablePoseError, SingularPoseError, ParameterError, SimulationError
         As for `closed_loop.simulate_servo`.
 
@@ -196,8 +197,8 @@ def simulate_batch(
     if not set(lengths) <= {1, count}:
         of_starts = "" if starts is None else f" and {len(begins)} start states"
         raise SimulationError(
-            f"{len(vectors)} parameter vectors and {len(given)} references{of_starts} do not pair "
-            "up"
+            f"{len(vectors)} parameter vectors and {len(given)} references{of_starts} must have "
+            "the same number or be single"
         )
 
     def one(index: int) -> ClosedLoopRun:
@@ -210,7 +211,7 @@ def simulate_batch(
             )
         return simulate_servo(robot, vector, reference, settings, start=start)
 
-    # the compiled loop runs without Python's lock, so that threads use all cores
+    # the compiled loop releases Python's global lock, and threads can use all cores
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(one, range(count)))
 

@@ -1,8 +1,9 @@
-"""Equation of motion at a state, for joints that slip one way (mode +1 or -1) or stick (mode 0).
+"""Kernels for the equation of motion at a state.
 
-The drives give the torque of each joint for its command; see `drives` for the formula. Stuck joints
-carry the friction torque that keeps their acceleration zero. Which joints stick at rest is a
-problem of friction torques with bounds. For friction and elastic joints see `joints`.
+Each joint slips in one direction (mode +1 or -1) or sticks (mode 0). The drives give the torque of
+each joint for its command; see `drives` for the formula. A stuck joint has the friction torque that
+makes its acceleration zero. Which joints at rest stick follows from a problem of bounded friction
+torques. For friction and elastic joints see `joints`.
 """
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from dynamics.closed_loop.linear_algebra_kernels import copy, dot, factorise, fill, solve
 from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 
-# places of the laws in `joints.LawName`
+# positions of the friction laws in `joints.LawName`
 SMOOTHED = 1
 STRIBECK = 2
 OK, LEFT_REACH, SINGULAR_MASS, TOO_MANY_EVENTS, MEASURED_OUT_OF_REACH = range(5)
@@ -18,7 +19,7 @@ OK, LEFT_REACH, SINGULAR_MASS, TOO_MANY_EVENTS, MEASURED_OUT_OF_REACH = range(5)
 
 @kernel
 def drive(task: Record, now: Record, at: Record) -> None:
-    """Compute the torques of the drives at an evaluation, where angles and velocities are known."""
+    """Compute the torques of the drives at an evaluation, whose angles and velocities are known."""
     state = at.state
     count = len(at.angle)
     first = 2 * len(at.bias)
@@ -28,7 +29,7 @@ def drive(task: Record, now: Record, at: Record) -> None:
     ld = task.ld
     for i in range(count):
         if task.stiffness > 0:
-            # from here on the motors stand for the cranks in what joint PID and friction feel
+            # joint PID and friction act on the motors: their angles replace those of the cranks
             motor = state[len(state) - 2 * count + i]
             motor_rate = state[len(state) - count + i]
             wound = motor - at.angle[i]
@@ -44,18 +45,18 @@ def drive(task: Record, now: Record, at: Record) -> None:
         at.torque[i] = lp * error + damped + li * state[first + i]
         if task.lx > 0:
             at.torque[i] -= task.lx * at.angle[i]
-        # A law that sets torques replaces the joint PID, and its error is never integrated.
+        # A law that commands torques replaces the joint PID, whose error is then not integrated.
         if task.torques:
             at.torque[i] = now.command[i] + now.command_slope[i] * time
             at.error[i] = 0.0
-        # The limit comes last: a drive cannot tell what asks for its torque.
+        # The limit comes last, because it applies to the torque of any law.
         if task.torque_limit > 0:
             at.torque[i] = min(max(at.torque[i], -task.torque_limit), task.torque_limit)
 
 
 @kernel
 def follows_law(task: Record, at: Record, joint: int) -> float:
-    """Return 1 where the law gives the torque, and 0 where it is commanded or at its limit."""
+    """Return 1 if the torque of a joint follows its PID, 0 if it is commanded or at its limit."""
     if task.torques or (task.torque_limit > 0 and abs(at.torque[joint]) >= task.torque_limit):
         return 0.0
     return 1.0
@@ -63,9 +64,9 @@ def follows_law(task: Record, at: Record, joint: int) -> float:
 
 @kernel
 def winds_up(task: Record, at: Record, joint: int) -> bool:
-    """Return True where a drive at its limit would integrate on.
+    """Return True if the integral of a drive would grow further while the drive is at its limit.
 
-    Its integrator then holds (conditional integration).
+    The integral is then held (conditional integration).
     """
     if task.torques or follows_law(task, at, joint) > 0:
         return False
@@ -74,7 +75,7 @@ def winds_up(task: Record, at: Record, joint: int) -> bool:
 
 @kernel
 def dry_level(friction: Record, velocity: float, mode: int) -> float:
-    """Ratio of dry friction to the Coulomb torque of a joint that slips at a velocity, rad/s."""
+    """Ratio of dry friction to the Coulomb torque of a slipping joint at a velocity, rad/s."""
     if friction.law == SMOOTHED:
         return np.tanh(velocity / friction.smoothing_velocity)
     if friction.law == STRIBECK:
@@ -98,19 +99,19 @@ def dry_slope(friction: Record, velocity: float, mode: int) -> float:
 
 @kernel
 def has_events(task: Record, joint: int) -> bool:
-    """Return True where a joint can stick."""
+    """Return True if a joint can stick."""
     return task.friction.law != SMOOTHED and task.coulomb[joint] > 0
 
 
 @kernel
 def breakaway(task: Record, joint: int) -> float:
-    """Largest torque, N m, that friction carries in a joint at rest."""
+    """Largest friction torque, N m, of a joint at rest."""
     return task.friction.static_level * task.coulomb[joint]
 
 
 @kernel
 def slip_friction(task: Record, joint: int, velocity: float, mode: int) -> float:
-    """Friction torque, N m, of a joint that slips towards `mode`."""
+    """Friction torque, N m, of a joint that slips in the direction `mode`."""
     return (
         task.coulomb[joint] * dry_level(task.friction, velocity, mode)
         + task.viscous[joint] * velocity
@@ -119,7 +120,7 @@ def slip_friction(task: Record, joint: int, velocity: float, mode: int) -> float
 
 @kernel
 def count_stuck(now: Record) -> int:
-    """Number of joints that stick. They are the first ones in `now.stuck`."""
+    """Count the joints that stick, and list them at the beginning of `now.stuck`."""
     count = 0
     for i in range(len(now.mode)):
         if now.mode[i] == 0:
@@ -130,7 +131,7 @@ def count_stuck(now: Record) -> int:
 
 @kernel
 def all_finite(matrix: Array) -> bool:
-    """Return True where no entry is infinite or NaN."""
+    """Return True if no entry is infinite or NaN."""
     finite = True
     for row in matrix:
         for value in row:
@@ -140,9 +141,9 @@ def all_finite(matrix: Array) -> bool:
 
 @kernel
 def know_motion(task: Record, known: Record, state: Array) -> int:
-    """Compute the equation of motion at coordinates and rates, unless it is known there.
+    """Compute the equation of motion at coordinates and rates, unless it is already known there.
 
-    Steps and frames share their ends, so that it often is.
+    It is often known, because consecutive steps and frames share a state.
     """
     size = len(known.bias)
     same = known.valid
@@ -157,13 +158,13 @@ def know_motion(task: Record, known: Record, state: Array) -> int:
         known.valid = known.valid and 0 < known.factor[i, i] < np.inf
     if known.valid:
         return OK
-    # entries are NaN out of reach; finite entries mean that masses or inertias are wrong
+    # out of reach, entries are NaN; if they are finite, masses or inertias are wrong
     return SINGULAR_MASS if all_finite(known.mass) else LEFT_REACH
 
 
 @entry
 def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Compute everything at the state and time of an evaluation that modes do not change."""
+    """Compute all terms at the state and time of an evaluation that do not depend on the modes."""
     status = know_motion(task, now.known, at.state[:])
     if status == OK:
         take_known(now.known, at)
@@ -173,7 +174,7 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
 
 @kernel
 def take_known(known: Record, at: Record) -> None:
-    """Copy what is known of the platform into an evaluation."""
+    """Copy the known terms of the equation of motion into an evaluation."""
     count, size = known.jacobian.shape
     for i in range(size):
         at.bias[i] = known.bias[i]
@@ -187,11 +188,10 @@ def take_known(known: Record, at: Record) -> None:
 
 @kernel
 def hold_compliance(task: Record, at: Record, joints: Array, known: int) -> None:
-    """Compute the response of the platform to torques at some joints, and of these joints to each
-    other.
+    """Compute the response of the platform and of some joints to torques at these joints.
 
-    The response M^-1 J^T has a row (m,) for each joint. Its first `known` rows are known already.
-    The compliance J M^-1 J^T is factorised.
+    The response M^-1 J^T of the platform has a row (m,) for each joint. Its first `known` rows have
+    been computed before. The compliance J M^-1 J^T of the joints is factorised.
     """
     for s in range(len(joints)):
         if s >= known:
@@ -212,9 +212,9 @@ def accelerate_freely(task: Record, at: Record, torque: Array, acceleration: Arr
 
 @kernel
 def push(task: Record, now: Record, at: Record) -> None:
-    """Compute net torques in the present modes, without those that hold stuck joints.
+    """Compute the net torques in the present modes, without the torques that stop stuck joints.
 
-    The slope of the state is filled except for the acceleration that these torques give.
+    All entries of the slope of the state are set, except for the acceleration of the platform.
     """
     size = len(at.bias)
     count = len(at.angle)
@@ -239,7 +239,7 @@ def push(task: Record, now: Record, at: Record) -> None:
         for i in range(count):
             left = at.net_torque[i] - at.spring[i]
             at.slope[motors + count + i] = left / task.motor_inertia if now.mode[i] != 0 else 0.0
-            # a stuck motor does not turn, and its friction takes what is left of its torque
+            # a stuck motor does not turn, because its friction balances the remaining torque
             if now.mode[i] == 0:
                 at.stick_force[i] = left
                 at.net_torque[i] -= left
@@ -247,9 +247,10 @@ def push(task: Record, now: Record, at: Record) -> None:
 
 @kernel
 def hold_stuck(task: Record, now: Record, at: Record, known: int) -> None:
-    """Give stuck rigid joints the torque that keeps them at rest.
+    """Compute the friction torques that keep stuck rigid joints at rest.
 
-    The slope has the free acceleration before. For `known` see `hold_compliance`.
+    Before the call, the slope has the acceleration without these torques. For `known` see
+    `hold_compliance`.
     """
     size = len(at.bias)
     stuck = now.stuck[: count_stuck(now)]
@@ -257,7 +258,7 @@ def hold_stuck(task: Record, now: Record, at: Record, known: int) -> None:
         return
     acceleration = at.slope[size : 2 * size]
     hold_compliance(task, at, stuck, known)
-    # the torques of stuck joints make their accelerations zero, all of them together
+    # together, the torques of all stuck joints make the accelerations of these joints zero
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], acceleration) + at.bias_acceleration[stuck[s]]
     solve(at.stuck_factor, len(stuck), at.force)
@@ -267,7 +268,7 @@ def hold_stuck(task: Record, now: Record, at: Record, known: int) -> None:
         for j in range(size):
             acceleration[j] -= at.response[s, j] * at.force[s]
     if len(stuck) == size:
-        # a robot that stands still stands still: rounding must not make it creep
+        # no joint moves, and rounding must not make the robot creep
         fill(acceleration, 0.0)
 
 
@@ -284,7 +285,7 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
 
 @entry
 def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Compute everything at the state and time of an evaluation, in the present modes."""
+    """Compute all terms at the state and time of an evaluation, in the present modes."""
     status = invoke(task.evaluate_terms, task, now, at, d, 0)
     if status == OK:
         accelerate(task, now, at)
@@ -293,9 +294,9 @@ def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
 
 @kernel
 def follow_frictionless(task: Record, now: Record, at: Record) -> bool:
-    """Set the modes of joints without dry friction to the direction in which they move.
+    """Set the modes of joints without dry friction to their directions of motion.
 
-    Returns True where one of them has turned.
+    Returns True if one of these joints has reversed.
     """
     turns = False
     for i in range(len(now.mode)):
@@ -308,7 +309,7 @@ def follow_frictionless(task: Record, now: Record, at: Record) -> bool:
 
 @kernel
 def all_hold(task: Record, now: Record, at: Record) -> bool:
-    """Return True where no stuck joint is at its breakaway torque."""
+    """Return True if no stuck joint has reached its breakaway torque."""
     holds = True
     for i in range(len(now.mode)):
         holds = holds and (now.mode[i] != 0 or abs(at.stick_force[i]) < breakaway(task, i))
@@ -317,12 +318,12 @@ def all_hold(task: Record, now: Record, at: Record) -> bool:
 
 @entry
 def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Decide which of the joints at rest (mode 0) stick, and which way the others start.
+    """Decide which of the joints at rest (mode 0) stick, and in which direction the others start.
 
     The friction torques are found by projected Gauss-Seidel iterations.
     """
     joints = now.stuck[: count_stuck(now)]
-    # motors at rest do not feel each other
+    # the motors of elastic joints are not coupled
     if task.stiffness > 0:
         for i in joints:
             left = at.torque[i] - at.spring[i]
@@ -345,7 +346,7 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
             push = dot(at.jacobian[joints[s]], free) + at.bias_acceleration[joints[s]]
             for r in range(len(joints)):
                 push -= at.compliance[s, r] * at.force[r]
-            # each joint takes the friction that would stop it, as far as it has that
+            # each joint gets the friction torque that would stop it, up to its limit
             limit = breakaway(task, joints[s])
             wanted = min(max(at.force[s] + push / at.compliance[s, s], -limit), limit)
             change = max(change, abs(wanted - at.force[s]))
@@ -360,9 +361,9 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
 @kernel
 def mode_margin(task: Record, now: Record, at: Record) -> tuple[float, int]:
-    """Compute the margin of the modes, and the joint that has it, or -1.
+    """Return the margin of the modes, and the joint with this margin, or -1.
 
-    The margin is >= 0 while all modes hold.
+    The margin is >= 0 as long as all modes hold.
     """
     least = 1.0
     joint = -1
@@ -371,7 +372,7 @@ def mode_margin(task: Record, now: Record, at: Record) -> tuple[float, int]:
             continue
         margin = now.mode[i] * at.velocity[i]
         if now.mode[i] == 0:
-            # a share of the breakaway torque, which is comparable between joints
+            # relative to the breakaway torque, so that joints can be compared
             margin = 1 - abs(at.stick_force[i]) / breakaway(task, i)
         if margin < least:
             least = margin

@@ -1,4 +1,4 @@
-"""Checks of what a closed-loop run is given, and the problem that they make of it."""
+"""Closed-loop problem: the checked arguments of a run."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -33,10 +33,10 @@ from dynamics.robot import Robot
 class Sizes:
     """Sizes for which kernels are compiled.
 
-    `joints` and `coordinates` are those of the robot, and `rigid` is the number of parameters of
-    the rigid bodies. `geometry` is room for geometric numbers, which are the last inputs of
-    functions (see `Robot.moved`); it is the same for most robots. `filters` is the number of joints
-    whose drives filter a rate.
+    `joints` and `coordinates` are the numbers of joints and coordinates of the robot, and `rigid`
+    is the number of parameters of the rigid bodies. `geometry` is the space for geometric numbers,
+    which are the last inputs of functions (see `Robot.moved`); it is the same for most robots.
+    `filters` is the number of joints whose drives filter a rate.
     """
 
     joints: int
@@ -58,7 +58,7 @@ class Sizes:
 
 @dataclass(frozen=True)
 class LoopProblem:
-    """Checked arguments of one run, with the state that it starts from."""
+    """Checked arguments of one run, with its start state."""
 
     robot: Robot
     parameters: np.ndarray
@@ -77,7 +77,7 @@ class LoopProblem:
 
     @property
     def columns(self) -> np.ndarray:
-        """Indices (k,) of the parameters that derivatives are taken with respect to."""
+        """Indices (k,) of the parameters with respect to which derivatives are computed."""
         rigid = np.arange(self.sizes.rigid) if self.groups is None else self.groups.pivots
         return np.concatenate([rigid, np.arange(self.sizes.rigid, self.sizes.parameters)])
 
@@ -93,12 +93,12 @@ class LoopProblem:
 
     @property
     def ideal(self) -> IdealSensor | None:
-        """Ideal sensor of the run, or None where it has another one."""
+        """Ideal sensor of the run, or None for another sensor."""
         return self.sensor if isinstance(self.sensor, IdealSensor) else None
 
     @property
     def asked(self) -> bool:
-        """True where Python is asked at every frame, by a sensor or a controller."""
+        """True if a sensor or a controller in Python is called at every frame."""
         return self.ideal is None or self.controller is not None
 
     @cached_property
@@ -129,7 +129,10 @@ def servo_problem(
     feedforward: np.ndarray | None,
     latencies: np.ndarray | None,
 ) -> LoopProblem:
-    """Problem of a run under the servo. Raises what `simulate_servo` raises before the run."""
+    """Problem of a run under the servo.
+
+    Raises the same errors as `simulate_servo` before the run.
+    """
     given = robot, parameters, reference, settings, sensor, start, latencies
     problem = _problem(*given, servo_robot, feedforward)
     if settings.drives.torques:
@@ -149,7 +152,10 @@ def commands_problem(
     start: StartState | None,
     latencies: np.ndarray | None,
 ) -> LoopProblem:
-    """Problem of a run under commands. Raises what `simulate_commands` raises before the run."""
+    """Problem of a run under commands.
+
+    Raises the same errors as `simulate_commands` before the run.
+    """
     problem = _problem(robot, parameters, reference, settings, sensor, start, latencies)
     shape = problem.frames, robot.layout.joints
     return dataclasses.replace(problem, commands=_rows("commands", commands, shape))
@@ -165,7 +171,10 @@ def controller_problem(
     start: StartState | None,
     latencies: np.ndarray | None,
 ) -> LoopProblem:
-    """Problem of a run under a law. Raises what `simulate_controller` raises before the run."""
+    """Problem of a run under a control law.
+
+    Raises the same errors as `simulate_controller` before the run.
+    """
     if not callable(controller) and not isinstance(controller, EveryFrame):
         raise SimulationError(f"controller must be a function, got {shown(controller)}")
     problem = _problem(robot, parameters, reference, settings, sensor, start, latencies)
@@ -175,12 +184,12 @@ def controller_problem(
 def with_derivatives(
     problem: LoopProblem, by_start: object, groups: RigidGroups | None
 ) -> LoopProblem:
-    """Ask a problem of rigid joints for derivatives. Raises SimulationError."""
+    """Problem with derivatives. Raises SimulationError for elastic joints."""
     if groups is not None:
         check_type("groups", groups, RigidGroups, SimulationError)
     if problem.settings.elasticity is not None:
         raise SimulationError(
-            "derivatives are those of rigid joints: pass settings with elasticity=None"
+            "derivatives exist only for rigid joints: pass settings with elasticity=None"
         )
     return dataclasses.replace(
         problem,
@@ -201,7 +210,7 @@ def _problem(
     servo_robot: Robot | None = None,
     feedforward: np.ndarray | None = None,
 ) -> LoopProblem:
-    """Check the arguments that all ways to drive a loop share."""
+    """Check the arguments that all ways to drive the joints have in common."""
     check_type("robot", robot, Robot, SimulationError)
     check_type("reference", reference, Reference, SimulationError)
     check_type("settings", settings, LoopSettings, SimulationError)
@@ -216,7 +225,7 @@ def _problem(
         latencies = floats("latencies", latencies, (frames,), error=SimulationError)
         _check_latencies(settings.timing, "latency of frame", latencies)
     if start is None:
-        # bytes, because arrays are no keys of a cache
+        # bytes, because arrays cannot be keys of a cache
         known = parameters.tobytes(), reference.poses[0].tobytes()
         start = _at_rest(robot, *known, settings, servo_robot, feedforward is not None)
     else:
@@ -237,7 +246,7 @@ def _problem(
 
 
 def _checked_sensor(sensor: Sensor, frames: int) -> Sensor:
-    """Sensor of a run with a number of frames. Raises SimulationError."""
+    """Check the sensor of a run with a number of frames. Raises SimulationError."""
     if isinstance(sensor, IdealSensor):
         lost = sensor.lost
         return IdealSensor(
@@ -261,7 +270,10 @@ def _at_rest(
     servo_robot: Robot | None,
     fed_forward: bool,
 ) -> StartState:
-    """State of rest at a pose (6,), computed once for the runs of a model, with frozen arrays."""
+    """State of rest at a pose (6,).
+
+    It is cached, with read-only arrays, for further runs of a model.
+    """
     values = np.frombuffer(parameters)
     start = equilibrium(
         robot,
@@ -274,7 +286,7 @@ def _at_rest(
         settings.drives,
     )
     if settings.drives.torques:
-        # drives that take torques hold the robot by the command itself
+        # if the drives take torques, the command at rest is the torque that holds the robot
         torque = robot.static_torque(start.pose, values[robot.layout.dynamic])
         start = dataclasses.replace(start, commands=torque[None])
     for part in vars(start).values():
@@ -286,7 +298,7 @@ def _at_rest(
 def _check_start(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, start: StartState
 ) -> None:
-    """Raise the error that says why a run cannot start from a state."""
+    """Raise an error if a run cannot start from a state."""
     check_type("start", start, StartState, SimulationError)
     start.check_sizes(robot)
     check_start_pose(robot, parameters, start.pose)
@@ -295,12 +307,12 @@ def _check_start(
 
 @lru_cache(maxsize=64)
 def _check_reach(robot: Robot, reference: Reference) -> None:
-    """Raise UnreachablePoseError, with frame and leg, for a pose out of the robot's reach."""
+    """Raise UnreachablePoseError, with frame and leg, for a pose that the robot cannot reach."""
     robot.check_reach(reference.poses, "reference pose", "frame")
 
 
 def _check_coordinates(robot: Robot, servo_robot: Robot) -> None:
-    """Raise SimulationError where two robots have other coordinates."""
+    """Raise SimulationError if two robots have different coordinates."""
     if servo_robot.geometry.chart != robot.geometry.chart:
         raise SimulationError(
             f"servo_robot {servo_robot.name} has other coordinates than {robot.name}"
@@ -308,20 +320,20 @@ def _check_coordinates(robot: Robot, servo_robot: Robot) -> None:
 
 
 def _check_latencies(timing: FrameTiming, name: str, latencies: np.ndarray | None) -> None:
-    """Raise SimulationError for a latency that no run can have."""
+    """Raise SimulationError for a latency that is out of range."""
     for number, latency in enumerate([] if latencies is None else latencies.tolist()):
         timing.check_latency(f"{name} {number}", latency)
 
 
 def _rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray | None:
-    """Rows of a shape as C doubles, or None. Raises SimulationError."""
+    """Contiguous array of a shape, or None. Raises SimulationError."""
     if rows is None:
         return None
     return np.ascontiguousarray(floats(name, rows, shape, error=SimulationError))
 
 
 def _check_elasticity(problem: LoopProblem) -> None:
-    """Raise SimulationError for elastic joints without motors, or with steps too long for them."""
+    """Raise SimulationError for elastic joints without motor states, or with too long steps."""
     settings = problem.settings
     elasticity = settings.elasticity
     start = problem.start

@@ -12,10 +12,10 @@ from dynamics.errors import SimulationError
 
 @dataclass(frozen=True)
 class ClosedLoopRun:
-    """Record of a run, one row a frame.
+    """Record of a run, one row per frame.
 
     The robot has n joints, m coordinates and p parameters (rss6: 6, 6, 67). The start state has s =
-    3 m + n entries, in the order of `StartState`. Fields that a run does not have are None.
+    3 m + n entries, in the order of `StartState`. Fields without a value in this run are None.
 
     Attributes
     ----------
@@ -28,13 +28,13 @@ class ClosedLoopRun:
     command : ndarray, shape (frames, n)
         Command that was issued, rad or m, or torque.
     measured : ndarray, shape (frames, 6)
-        Measured pose, NaN where lost.
+        Measured pose, NaN if the measurement was lost.
     measured_ok : ndarray of bool, shape (frames,)
-        False where the measurement was lost.
+        False if the measurement was lost.
     joint_integral : ndarray, shape (frames, n)
-        Integral of the drives as the frame begins.
+        Integral of the drives at the beginning of the frame.
     servo_integral : ndarray, shape (frames, m)
-        Integral of the servo as the frame begins.
+        Integral of the servo at the beginning of the frame.
     pose_sensitivity : ndarray, shape (frames, 6, p)
         Derivatives of the poses with respect to the parameters.
     start_sensitivity : ndarray, shape (frames, 6, s)
@@ -44,7 +44,7 @@ class ClosedLoopRun:
     motor_angle, motor_rate : ndarray, shape (frames, n)
         Angle and rate of the motors of elastic joints.
     filtered_rate : ndarray, shape (frames, n)
-        Rates of the errors in drives that filter them.
+        Filtered rates of the errors in drives with a filter.
     events : int
         Number of stick-slip events.
     start : StartState
@@ -90,9 +90,9 @@ class ClosedLoopRun:
         )
 
     def state_at(self, frame: int) -> StartState:
-        """State at a frame, from which another run repeats the rest of this one.
+        """State at a frame. A run that starts from it repeats the remaining frames of this run.
 
-        Where latencies differ, the new run also needs those of the commands before. Raises
+        If latencies differ, the new run also needs the latencies of the earlier commands. Raises
         SimulationError for a frame that the run does not have, or that follows a lost measurement.
         """
         frame = whole("frame", frame, SimulationError, least=0, most=len(self.time) - 1)
@@ -100,9 +100,10 @@ class ClosedLoopRun:
             return self.start
         if not self.measured_ok[frame - 1]:
             raise SimulationError(
-                f"frame {frame} follows a lost measurement: the servo's last one is older"
+                f"frame {frame} follows a lost measurement: no run can start there, because the "
+                "last measured pose is more than one frame old"
             )
-        # older commands have arrived, because no latency is more than so many frames
+        # older commands have arrived, because no latency exceeds this number of frames
         commands = np.vstack([self.start.commands, self.command[:frame]])[-MAX_DELAY_FRAMES - 2 :]
         return StartState(
             self.pose[frame],
@@ -120,7 +121,7 @@ class ClosedLoopRun:
 class LoopFailure(SimulationError):
     """Early end of a run at a frame.
 
-    `saturated` is the number of frames before it at which an actuator gave its largest torque.
+    `saturated` is the number of earlier frames in which an actuator was at its largest torque.
     """
 
     def __init__(self, message: str, frame: int, saturated: int = 0) -> None:
@@ -130,6 +131,6 @@ class LoopFailure(SimulationError):
 
 
 def saturated_frames(torque: np.ndarray, limit: float | None) -> int:
-    """Number of frames with a torque (frames, n) at its limit, N m or N. None is no limit."""
-    # the kernels cut torques at the limit, but for rounding
+    """Number of frames with a torque (frames, n) at the limit, N m or N. None means no limit."""
+    # the kernels limit torques up to rounding errors
     return 0 if limit is None else int((np.abs(torque) >= limit * (1 - 1e-12)).any(axis=1).sum())

@@ -1,14 +1,14 @@
-"""Memory of a closed-loop run, as its kernels see it.
+"""Memory of a closed-loop run, in the form that its kernels use.
 
-A run allocates nothing. All that its kernels work on lies in four records that are made before it:
-NumPy structured scalars whose fields are numbers, arrays of fixed size, and further records. Numba
-compiles a kernel for the types of its arguments, so that the type of a record holds all sizes of
-the robot: one set of compiled kernels then serves every robot of the same sizes, whatever its
-numbers, and the compiler knows every length. `LAYOUT` lists the fields, `_lengths` says how long
-each dimension is, and `record_type` makes a NumPy type of both.
+A run allocates no memory. Its kernels work on four records that are made before the run: NumPy
+structured scalars, whose fields are numbers, arrays of fixed size, and further records. Numba
+compiles a kernel for the types of its arguments, and the type of a record includes all sizes of the
+robot. The same compiled kernels thus serve every robot of the same sizes, and the compiler knows
+every length. `LAYOUT` lists the fields, `_lengths` gives the length of each dimension, and
+`record_type` makes a NumPy type from both.
 
-The order of fields matters where a comment says so: a function of a robot (`robot.functions`)
-writes its outputs one after the other, straight into the fields of a record.
+The order of fields matters where a comment states it: a function of a robot (`robot.functions`)
+writes its outputs one after the other, directly into the fields of a record.
 """
 
 from functools import lru_cache
@@ -23,11 +23,14 @@ from dynamics.closed_loop.problem import LoopProblem, Sizes
 from dynamics.parameters import LANES, room_for_derivatives
 
 LINE = 64
-"""Bytes in a line of a processor's cache."""
+"""Bytes in a line of the processor's cache."""
 
 
 class Plan(NamedTuple):
-    """Arrays that a run reads at its frames, one row each. They have no rows where not given."""
+    """Arrays that a run reads at its frames, with one row per frame.
+
+    Arrays that are not given have no rows.
+    """
 
     reference: np.ndarray
     reference_rate: np.ndarray
@@ -43,7 +46,7 @@ class Plan(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Arrays that a run writes, as `ClosedLoopRun` describes them, with poses as coordinates."""
+    """Arrays that a run writes, as in `ClosedLoopRun`, with coordinates in place of poses."""
 
     pose: np.ndarray
     pose_rate: np.ndarray
@@ -63,7 +66,10 @@ class Record(NamedTuple):
 
 
 def empty_record(problem: LoopProblem, runs: int = 1) -> Record:
-    """Record of runs, one after the other. What is not asked for has no rows or no columns."""
+    """Record of several runs, one after the other.
+
+    Arrays of results that are not requested have no rows or no columns.
+    """
     sizes = problem.sizes
     frames = runs * problem.frames
     joints = sizes.joints
@@ -94,11 +100,11 @@ def empty_record(problem: LoopProblem, runs: int = 1) -> Record:
 class Memory(NamedTuple):
     """Records of one run.
 
-    `task` does not change during a run: addresses of compiled functions, laws, parameters and
-    gains. `now` is the state of the integrator. `evaluations` (5,) hold everything known at the
-    stages of a step and at its end, where rows of stuck joints come in the order of `now.stuck`.
-    `tangent` holds derivatives, with a row for each unknown, and columns for the parameters, for
-    the start state, and for the length of a step that an event cuts.
+    `task` does not change during a run; it has addresses of compiled functions, laws, parameters
+    and gains. `now` is the state of the integrator. `evaluations` (5,) have all computed values at
+    the stages of a step and at its end. Rows of stuck joints are in the order of `now.stuck`.
+    `tangent` has derivatives: a row for each unknown, and columns for the parameters, for the start
+    state, and for the length of a step that an event cuts.
     """
 
     task: Any
@@ -108,7 +114,7 @@ class Memory(NamedTuple):
 
 
 class Fields(NamedTuple):
-    """Neighbouring fields of a record that have the same type and dimensions."""
+    """Consecutive fields of a record with the same type and dimensions."""
 
     names: str
     kind: str
@@ -116,17 +122,17 @@ class Fields(NamedTuple):
 
 
 def reals(names: str, *dimensions: str) -> Fields:
-    """Fields of real numbers, single ones where there are no dimensions."""
+    """Fields of real numbers. Without dimensions, each field is a single number."""
     return Fields(names, "f8", dimensions)
 
 
 def integers(names: str, *dimensions: str) -> Fields:
-    """Fields of integers, single ones where there are no dimensions."""
+    """Fields of integers. Without dimensions, each field is a single number."""
     return Fields(names, "i8", dimensions)
 
 
 def part(name: str) -> Fields:
-    """Field that is a record of its own, with the layout of its name."""
+    """Field that is itself a record, with the layout of its name."""
     return Fields(name, "record", ())
 
 
@@ -137,7 +143,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         integers("response stage_derivatives stop_derivatives rate_map_derivative"),
         integers("slope_derivative servo_jacobian"),
         integers("evaluate_terms evaluate decide_modes stop_joints slope_tangent stop_tangent"),
-        # what is asked for
+        # what the run computes, and who measures
         integers("sensitivities servo_knows measured"),
         # law of the drives, with its gains
         reals("lp li ld lx rate_weight"),
@@ -146,7 +152,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         reals("kp kd ki stiffness damping motor_inertia period"),
         integers("torques"),
         reals("torque_limit filter_time"),
-        # parameters of the robot, and the places of those that derivatives are shown for
+        # parameters of the robot, and the indices of those with a column of derivatives
         integers("shown"),
         integers("pivots", "rigid"),
         reals("rigid", "rigid"),
@@ -158,7 +164,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         part("known"),
         part("served"),
         part("stopping"),
-        # joints: -1, 0 (stuck) or 1 for the direction of slip; the numbers of stuck ones
+        # joints: -1, 0 (stuck) or 1 for the direction of slip; the numbers of the stuck joints
         integers("mode stuck", "joint"),
         # counters and switches
         integers("ramping moved events events_left start_moves time_moves length_moves"),
@@ -170,7 +176,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         reals("last_measured servo_integral demand change", "coordinate"),
         reals("pose_and_rate", "rate map input"),
         reals("rate_map", "joint", "coordinate"),
-        # place of the integrator: frame, span, step
+        # progress of the integrator: frame, span, step
         integers("first_row status unknowns frame span steps grid"),
         reals("duration target"),
         integers("purpose"),
@@ -199,7 +205,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         reals("by_pose by_rate", "coordinate", "coordinate", "stage"),
         reals("columns", "coordinate", "rigid", "stage"),
         reals("crank_by_pose crank_by_rate", "joint", "coordinate", "stage"),
-        # then what else the columns of `slope_derivative` have in common
+        # then the other values that all columns of `slope_derivative` have in common
         reals("jacobian pushing", "joint", "coordinate", "stage"),
         reals("factor", "coordinate", "coordinate", "stage"),
         reals("damping by_error by_integral by_command_rate", "joint", "stage"),
@@ -221,10 +227,10 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         # state and its time derivative
         reals("state slope", "state"),
         reals("time"),
-        # joints; angle and velocity of elastic ones are those of their motors
+        # joints; for elastic joints, angle and velocity are those of the motors
         reals("bias_acceleration angle velocity spring error torque net_torque", "joint"),
         reals("stick_force force", "joint"),
-        # answer of the stuck joints to forces at each other
+        # response of the platform and of the stuck joints to torques at stuck joints
         reals("response", "joint", "coordinate"),
         reals("compliance stuck_factor", "joint", "joint"),
     ),
@@ -252,14 +258,14 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         # derivatives of the state, and of filtered rates in a trial
         reals("x", "unknown", "column"),
         reals("filtered", "filtered row", "column"),
-        # derivatives of commands on their way; the last entry is for those of the start
+        # derivatives of issued commands; the last entry is for the commands of the start
         reals("issued", "command on its way", "joint", "column"),
         reals("time length stage_time margin", "column"),
         reals("command command_slope last_command force", "joint", "column"),
         reals("last_measured integral demand moved", "coordinate", "column"),
     ),
 }
-"""Fields of each record. The mass matrix is kept as its Cholesky factor, `factor`."""
+"""Fields of each record. `factor` is the L D L^T factorisation of the mass matrix."""
 
 
 def _lengths(sizes: Sizes) -> dict[str, int]:
@@ -282,11 +288,11 @@ def _lengths(sizes: Sizes) -> dict[str, int]:
         "lane": LANES,
         # coordinates, rates, integrals, filtered rates, motor angles, motor rates
         "state": moving + filters + 2 * joints,
-        # those that have derivatives, which are of rigid joints
+        # unknowns that have derivatives; joints are then rigid
         "unknown": moving + filters,
         "trial row": moving,
         "filtered row": max(filters, 1),
-        # slopes of coordinates' rates, joints' integrals and filtered rates, and the torques
+        # slopes of the pose, the pose rate, joint integrals and filtered rates; torques
         "stage row": moving + joints + filters,
         "column": room_for_derivatives(sizes.parameters, sizes.start),
         "command on its way": MAX_DELAY_FRAMES + 3,
@@ -303,7 +309,7 @@ def _lengths(sizes: Sizes) -> dict[str, int]:
 
 @lru_cache(maxsize=64)
 def record_type(name: str, sizes: Sizes) -> np.dtype:
-    """NumPy type of a record of a robot with given sizes."""
+    """NumPy type of a record, for a robot of given sizes."""
     length = _lengths(sizes)
     fields: list[Any] = []
     for names, kind, dimensions in LAYOUT[name]:
@@ -316,15 +322,16 @@ def record_type(name: str, sizes: Sizes) -> np.dtype:
 
 
 def empty_memory(sizes: Sizes) -> Memory:
-    """Memory for one run of a robot with given sizes, filled with zeros."""
+    """Memory for one run of a robot of given sizes, filled with zeros."""
     evaluations = np.zeros(5, record_type("evaluation", sizes))
     return Memory(empty("task", sizes), empty("now", sizes), evaluations, empty("tangent", sizes))
 
 
 def empty(name: str, sizes: Sizes) -> Any:
-    """Record filled with zeros, at an address where a line of the processor's cache begins.
+    """Record filled with zeros that begins at the beginning of a cache line.
 
-    Vector instructions on its fields then touch one line of the cache and not two.
+    A vector instruction on its fields then accesses one line of the processor's cache instead of
+    two.
     """
     kind = record_type(name, sizes)
     room = np.zeros(kind.itemsize + LINE, np.uint8)

@@ -1,12 +1,13 @@
-"""Sensitivities over the steps of the integrator: the exact derivative of what it computes.
+"""Kernels for sensitivities: exact derivatives of what the integrator computes.
 
-Derivatives are rows over columns. The columns are the parameters, the start state if wanted, and
-the length of a step that an event cuts while that length is unknown. Of the parameters of rigid
-bodies only those have a column that stand for all. A Runge-Kutta step is differentiated stage by
-stage, and the equation of motion at each stage implicitly. A step that an event cuts has the length
-at which a margin vanishes at its end. The derivative of the margin gives that of the length, and
-the step that follows is shorter by it. The impulse that stops joints is differentiated implicitly,
-too.
+Each derivative is a row whose columns belong to variables. The variables are the parameters, the
+start state if wanted, and, while it is unknown, the length of a step that an event cuts. Of the
+parameters of rigid bodies, only the base parameters have a column.
+
+A Runge-Kutta step is differentiated stage by stage, and the equation of motion at each stage is
+differentiated implicitly. A step that an event cuts ends where a margin vanishes. The derivative of
+its length follows from the derivative of the margin. The next step becomes shorter by as much as
+this step becomes longer. The impulse that stops joints is differentiated implicitly, too.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import (
@@ -42,7 +43,7 @@ from dynamics.parameters import LANES
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 END = 4
-# an event that approaches more slowly, rad/s^2 or N m/s, has no derivative
+# rate of the margin, rad/s^2 or N m/s, below which the time of an event has no derivative
 NO_APPROACH = 1e-9
 
 
@@ -61,16 +62,13 @@ def ask_derivatives(now: Record, at: Record, k: int) -> None:
 
 @kernel
 def differentiate_stages(task: Record, now: Record) -> None:
-    """Differentiate the equation of motion at all stages together.
-
-    Accelerations and net joint torques are fixed.
-    """
+    """Differentiate the motion at all stages, at fixed accelerations and net joint torques."""
     call(task.stage_derivatives, now.stages.inputs, now.stages.by_pose)
 
 
 @kernel
 def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
-    """Copy what the columns of a slope have in common beside the equation of motion."""
+    """Copy the values, beside the equation of motion, that all columns of a slope need."""
     known = now.stages
     size = len(at.bias)
     for i in range(size):
@@ -96,10 +94,10 @@ def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
 
 @kernel
 def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage: int) -> None:
-    """Compute the effect of the parameters at a fixed state.
+    """Differentiate with respect to the parameters at a fixed state.
 
-    It is that on -M q_ddot - b (`d.push`), and that on the torque of each joint without the
-    friction that holds it (`d.direct`).
+    `d.push` is the derivative of -M q_ddot - b. `d.direct` is the derivative of the torque of each
+    joint, without the friction torque of a stuck joint.
     """
     count = len(now.mode)
     first = 2 * len(at.bias)
@@ -115,7 +113,7 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage:
         rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
         if task.lx > 0 or task.filter_time > 0:
             fill(row, 0.0)
-            # with lx added to lp, the derivative is that of the error less the command
+            # `by_error` has lp + lx, but lx does not act on the command: subtract that effect
             add_row(-law * task.lx, d.acting[i], row, now.width)
         if task.filter_time > 0:
             rate = at.state[first + count + i]
@@ -134,7 +132,7 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage:
 
 @kernel
 def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Differentiate the slopes of filtered rates, which are before the torques in `d.k[k]`."""
+    """Differentiate the slopes of filtered rates, which precede the torques in `d.k[k]`."""
     size = len(at.bias)
     count = len(now.mode)
     width = now.width
@@ -159,7 +157,7 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
 
 @kernel
 def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Differentiate the slopes of integrals that a drive at its limit holds: lx / li velocity."""
+    """Differentiate the slopes lx / li * velocity of integrals of drives at their limit."""
     size = len(at.bias)
     width = now.width
     known = now.stages
@@ -179,10 +177,11 @@ def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> No
 
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Differentiate the slope and the net torques at one state, into `d.k[k]`.
+    """Differentiate the slope and the net torques at one state, and write them into `d.k[k]`.
 
-    State, filtered rates and time move as in `d.trial`, `d.filtered` and `d.stage_time`. The
-    derivatives of the equation of motion are known. See `slope_derivative`.
+    The derivatives of state, filtered rates and time are `d.trial`, `d.filtered` and
+    `d.stage_time`. The derivatives of the equation of motion must have been computed. See
+    `slope_derivative`.
     """
     size = len(at.bias)
     count = len(now.mode)
@@ -221,7 +220,7 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
 
 @kernel
 def give_back(at: Record, d: Record, stuck: int, rows: Array, width: int) -> None:
-    """Solve for the torques of stuck joints (`d.force`), and take their effect out of the rows."""
+    """Solve for the torques of stuck joints (`d.force`), and subtract their effect from rows."""
     solve_rows(at.stuck_factor, stuck, d.force[:], width)
     for s in range(stuck):
         for j in range(len(rows)):
@@ -239,7 +238,7 @@ def move_tangent(
     moved: Array,
     first: int,
 ) -> None:
-    """Add fraction (h d_slope + d_length slope) at a stage to rows of unknowns, from `first` on."""
+    """Add fraction * (h * d_slope + d_length * slope) of a stage to unknowns from `first` on."""
     for i in range(len(moved)):
         add_row(fraction * h, d.k[stage, first + i], moved[i], now.width)
         if now.length_moves:
@@ -248,7 +247,7 @@ def move_tangent(
 
 @kernel
 def try_tangent(now: Record, d: Record) -> None:
-    """Begin a trial at the derivatives as they are."""
+    """Set the derivatives of a stage to those at the start of the step."""
     count = len(d.trial)
     copy_rows(d.x[:count], d.trial[:], now.width)
     copy_rows(d.x[count:], d.filtered[:], now.width)
@@ -256,7 +255,7 @@ def try_tangent(now: Record, d: Record) -> None:
 
 @kernel
 def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> None:
-    """Compute d(J_theta rate)/d(pose) (n, m), into `now.rate_map`."""
+    """Compute d(J_theta rate)/d(pose) (n, m), and write it into `now.rate_map`."""
     copy(pose, now.pose_and_rate[: len(pose)])
     copy(rate, now.pose_and_rate[len(pose) :])
     call(task.rate_map_derivative, now.pose_and_rate, now.rate_map)
@@ -266,8 +265,8 @@ def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> Non
 def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
     """Differentiate the length of a step that an event cuts.
 
-    The length is the one at which margin(end of the step, length) = 0. The margin is that of a
-    velocity, or of the torque that holds a stuck joint.
+    At this length, margin(end of the step, length) = 0. The margin is the velocity of a slipping
+    joint, or follows from the torque that holds a stuck joint.
     """
     size = len(end.bias)
     width = now.width
@@ -292,19 +291,19 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
         d.margin[task.shown + joint] -= task.friction.static_level
     approach = d.margin[column]
     fill(d.length[:], 0.0)
-    # an event that hardly approaches has no derivative of its length that means anything
+    # if the margin hardly changes, the derivative of the length is meaningless
     if abs(approach) > NO_APPROACH:
         add_row(-1 / approach, d.margin[:], d.length[:], width)
     d.length[column] = 0.0
     for i in range(len(d.x)):
-        # the length is no variable any more: its column goes into those of all others
+        # the length is no longer a variable: its column is added to all other columns
         add_row(d.x[i, column], d.length[:], d.x[i], width)
         d.x[i, column] = 0.0
 
 
 @kernel
 def whole_vectors(columns: int) -> int:
-    """Round a number of columns up to whole vectors. The added columns are zero."""
+    """Round a number of columns up to whole vectors. The additional columns are zero."""
     return -(-columns // LANES) * LANES
 
 
@@ -312,19 +311,18 @@ def whole_vectors(columns: int) -> int:
 def step_tangent(
     task: Record, now: Record, at: Record, d: Record, h: float, event: bool, cut: bool
 ) -> None:
-    """Differentiate the step that is stored.
+    """Differentiate the step whose stages are in `at`.
 
-    A step that ends on the grid is shorter by as much as its start is later. A step that is `cut`
-    by an event has the length that the event sets. Until that is known, the length is one more
-    variable.
+    A step that ends on the grid becomes shorter if its start becomes later. A step that is `cut` by
+    an event has the length that the event determines. Until the derivative of this length is known,
+    the length is a variable of its own.
     """
     fill(d.length[:], 0.0)
     if cut:
-        # the length of the step is a variable of its own until the event has set it
         now.width = whole_vectors(now.step_column + 1)
         d.length[now.step_column] = 1.0
     if not event:
-        # the step ends on the grid, so that a later start makes it shorter
+        # the step ends on the grid, and a later start makes it shorter
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
     for k in range(END):
@@ -350,10 +348,9 @@ def step_tangent(
 
 @entry
 def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Differentiate the stop of joints that changed the pose rate by `now.change`.
+    """Differentiate the stop of joints, which changed the pose rate by `now.change`.
 
-    M change = -J^T impulse (`at.force`) and J rate = 0 hold in these joints, and both are
-    differentiated implicitly.
+    At them M change = -J^T impulse (`at.force`) and J rate = 0 hold, which are differentiated.
     """
     size = len(at.bias)
     width = now.width
@@ -388,7 +385,7 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
 @kernel
 def rest_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
-    """Project a start state that moves at stuck joints: their velocities are lost at once."""
+    """Differentiate the loss of velocity at joints that are stuck at the start."""
     size = len(at.bias)
     stuck = now.stuck[: count_stuck(now)]
     if len(stuck) == size:

@@ -1,8 +1,8 @@
 """Closed-loop runs, with one function for each way to drive the joints.
 
-`simulate_servo` lets the visual servo command the joints, `simulate_commands` replays commands that
-were logged, and `simulate_controller` asks a control law at every frame. `differentiate_servo` and
-`differentiate_commands` do the same runs with the ideal sensor and also return derivatives.
+In `simulate_servo` the visual servo commands the joints, `simulate_commands` replays logged
+commands, and `simulate_controller` calls a control law at every frame. `differentiate_servo` and
+`differentiate_commands` do the same runs with the ideal sensor, and also return derivatives.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def simulate_servo(
     parameters : ndarray, shape (p,)
         Dynamic parameters of the robot, then lp, li, ld of its drives.
     reference : Reference
-        Desired motion, one row a frame.
+        Desired motion, one row per frame.
     settings : LoopSettings
         Servo, timing, friction law, integration and drives.
     sensor : IdealSensor, PoseSensor or RateSensor
@@ -65,17 +65,17 @@ def simulate_servo(
     start : StartState, optional
         State at the first frame. The default is rest at the first reference pose.
     feedforward : ndarray, shape (frames, n), optional
-        Joint commands, rad or m, to which the servo adds its own. At rest they are where the
-        joints are.
+        Joint commands, rad or m, to which the servo adds its own commands. At rest they are equal
+        to the joint coordinates.
     latencies : ndarray, shape (frames,), optional
-        Latency of each frame's command, s. The default is that of the timing.
+        Latency of each frame's command, s. The default is the latency of the timing.
     compiled : bool
-        False runs the same lines in plain Python, thousands of times slower.
+        False runs the same code in plain Python, thousands of times slower.
 
     Returns
     -------
     ClosedLoopRun
-        One row a frame of what happened.
+        Record of the run, with one row per frame.
 
     Raises
     ------
@@ -116,19 +116,19 @@ def simulate_commands(
     latencies: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
-    """Run the robot under given commands. The measured poses are recorded and steer nothing.
+    """Run the robot under given commands. Measured poses are recorded but have no effect.
 
     Parameters
     ----------
     robot, parameters, reference, settings, sensor, start, latencies, compiled
-        As for `simulate_servo`. The reference gives the number of frames and the pose of rest.
+        As for `simulate_servo`. The reference determines the number of frames and the pose at rest.
     commands : ndarray, shape (frames, n)
-        Command of each frame: rad or m, or N m or N where the drives take torques.
+        Command of each frame: rad or m, or N m or N if the drives take torques.
 
     Returns
     -------
     ClosedLoopRun
-        One row a frame of what happened.
+        Record of the run, with one row per frame.
 
     Raises
     ------
@@ -169,12 +169,12 @@ def simulate_controller(
     controller : Controller or EveryFrame
         Function (frame, time s, measured pose (6,), desired pose (6,), desired rate (6,)) ->
         command (n,), called at every frame that is measured. An `EveryFrame` is called at lost
-        frames, too. Commands are rad or m, or N m or N where the drives take torques.
+        frames, too. Commands are in rad or m, or in N m or N if the drives take torques.
 
     Returns
     -------
     ClosedLoopRun
-        One row a frame of what happened.
+        Record of the run, with one row per frame.
 
     Raises
     ------
@@ -219,20 +219,20 @@ def differentiate_servo(
     robot, parameters, reference, settings, start, feedforward, latencies, compiled
         As for `simulate_servo`. The joints must be rigid.
     sensor : IdealSensor
-        The poses that it measures move with the parameters.
+        Ideal sensor. Its measured poses depend on the parameters, which is differentiated, too.
     by_start : bool
         True returns derivatives with respect to the start state, too.
     groups : RigidGroups, optional
-        Combinations of the inertial parameters on which the motion depends. Derivatives are then
-        those with respect to their pivots and to all other parameters, which takes less time.
-        `groups.of_all` extends them to all parameters, unless a start is given whose own
-        sensitivities do not follow the groups.
+        Groups of inertial parameters on which the motion depends. Derivatives are then computed
+        only for the pivots of the groups and for all other parameters, which is faster.
+        `groups.of_all` extends them to all parameters. This is not valid with a start whose own
+        sensitivities do not depend on the groups alone.
 
     Returns
     -------
     ClosedLoopRun
-        Its fields `pose_sensitivity` and `end_sensitivity` are filled, and those of the start
-        where `by_start` is True.
+        Its fields `pose_sensitivity` and `end_sensitivity` are set, and if `by_start` is True, also
+        the sensitivities with respect to the start.
 
     Raises
     ------
@@ -268,7 +268,7 @@ def differentiate_commands(
     groups: RigidGroups | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
-    """Run the robot under given commands with derivatives as `differentiate_servo` returns them.
+    """Run the robot under given commands, with derivatives like those of `differentiate_servo`.
 
     Parameters
     ----------

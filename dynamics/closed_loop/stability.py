@@ -1,10 +1,10 @@
-"""Stability of the sampled loop near rest, by the linear map of its state from frame to frame.
+"""Stability of the sampled loop near rest, from the linear map of its state from frame to frame.
 
-Small deviations of the robot under its joint PID (eq. 31) follow a linear differential equation.
-The matrix exponential is its exact solution while a command acts. The servo (eq. 30) and the
-commands on their way close the loop once a frame. The loop is stable where all eigenvalues of the
-map are inside the unit circle. Dry friction, which only helps at rest, and elasticity of the joints
-are left out.
+Small deviations of the robot under its joint PID (eq. 31) obey a linear differential equation.
+While a command acts, the matrix exponential is its exact solution. The servo (eq. 30), with the
+latency of its commands, closes the loop once per frame. The loop is stable if all eigenvalues of
+the map are inside the unit circle. Dry friction and elasticity of the joints are neglected. Near
+rest, dry friction only makes the loop more stable.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from dynamics.closed_loop.start_state import check_start_pose, checked_loop_para
 from dynamics.robot import Robot
 
 SLOWEST_HZ = 0.5
-"""Slowest frame rate that is searched for a limit of stability."""
+"""Lowest frame rate, Hz, in the search for the limit of stability."""
 
 MOST_GAIN = 100.0
-"""Largest factor of the gains that is searched for a limit of stability."""
+"""Largest factor of the gains in the search for the limit of stability."""
 
 STEP = 1.1
-"""Ratio of neighbours in these searches, between which the limit is bisected."""
+"""Ratio of consecutive values in these searches. The limit is then found by bisection."""
 
 
 def frame_map(
@@ -37,9 +37,9 @@ def frame_map(
 ) -> np.ndarray:
     """Map (s, s) of small deviations from rest at a pose (6,), from frame to frame.
 
-    The state has coordinates, their rates, joint integrals, coordinates measured at the last frame,
-    servo integrals, and the commands on their way, of which the latest is first. Raises what
-    `closed_loop.equilibrium` raises.
+    The state consists of the coordinates, their rates, the joint integrals, the coordinates
+    measured at the last frame, the servo integrals, and the commands that have not yet arrived, the
+    latest first. Raises the same errors as `closed_loop.equilibrium`.
     """
     return _frame_map(_near_rest(robot, parameters, pose, settings.drives), settings)
 
@@ -47,10 +47,11 @@ def frame_map(
 def pose_response(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> Callable[[float], np.ndarray]:
-    """Response of the coordinates to small oscillations of the desired ones about a pose (6,).
+    """Response of the coordinates to small oscillations of the desired coordinates about a pose
+    (6,).
 
-    Returns a function of the angular frequency, rad/s, that gives the matrix (m, m) from the
-    desired to the true coordinates at the frames. Raises what `closed_loop.equilibrium` raises.
+    Returns a function of the angular frequency, rad/s. It gives the matrix (m, m) from the desired
+    to the true coordinates at the frames. Raises the same errors as `closed_loop.equilibrium`.
     """
     near = _near_rest(robot, parameters, pose, settings.drives)
     size = near.jacobian.shape[1]
@@ -69,7 +70,7 @@ def _frame_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
 
 
 def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
-    """Frame map (s, s), and the effect (s, m) of the desired coordinates of the frame."""
+    """Frame map (s, s), and the effect (s, m) of the desired coordinates at the frame."""
     joints, size = robot.jacobian.shape
     timing = settings.timing
     period = 1 / timing.frame_rate_hz
@@ -85,12 +86,12 @@ def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
     coordinates = start[:size] - desired
     integral = start[inner + size : inner + 2 * size]
     seen = np.vstack([coordinates, start[inner : inner + size], integral])
-    # without an integral the servo demands nothing at rest, which then does not turn
+    # without an integral, the demand of the servo at rest is zero, and so is its derivative
     turning = robot.turning if settings.servo.ki else 0 * robot.turning
     turned = turning @ start[:size]
     commands = [servo @ seen + turned, *np.split(start[inner + 2 * size :], kept)]
     state = start[:inner]
-    # within a frame, the older command acts until the newer one arrives after the rest
+    # within a frame, the older command acts until the newer one arrives after `rest`
     for age, begin, end in ((whole + 1, 0.0, rest), (whole, rest, period)):
         newer = commands[age]
         older = commands[age + 1] if age + 1 <= kept else commands[age]
@@ -118,7 +119,7 @@ def spectral_radius(
 def gain_margin(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> float:
-    """Factor of the servo's gains at which the loop is just stable."""
+    """Factor of the servo gains at the limit of stability."""
     near = _near_rest(robot, parameters, pose, settings.drives)
 
     def radius(factor: float) -> float:
@@ -134,8 +135,8 @@ def lowest_frame_rate(
 ) -> float:
     """Lowest frame rate, Hz, at which the loop is stable, with the same latency in s.
 
-    It is above the rate of the settings where the loop is not stable there, and NaN where no rate
-    makes it stable.
+    If the loop is unstable at the rate of the settings, the result is above that rate. It is NaN if
+    the loop is stable at no rate.
     """
     rate = settings.timing.frame_rate_hz
     near = _near_rest(robot, parameters, pose, settings.drives)
@@ -144,7 +145,7 @@ def lowest_frame_rate(
         timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
         return _radius(near, replace(settings, timing=timing))
 
-    # The map holds the commands of all frames of the latency, of which fifty are enough.
+    # The size of the map grows with the number of frames in the latency; fifty are enough.
     fastest = min(
         100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf
     )
@@ -152,26 +153,27 @@ def lowest_frame_rate(
 
 
 def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
-    """Text for a run that was lost: the largest eigenvalue, and a frame rate that is stable."""
+    """Text on a run that ended early: the largest eigenvalue, and a frame rate that is stable."""
     arguments = robot, parameters, settings, pose
     radius = spectral_radius(*arguments)
     hz = settings.timing.frame_rate_hz
     said = (
-        f"its largest eigenvalue from frame to frame near the start is {radius:.4g}, and must be "
+        f"its largest eigenvalue from frame to frame near the start is {radius:.4g}, must be "
         "below 1"
     )
     if radius < 1:
-        return f"{said}: it is lost far from there"
+        return f"{said}: it is stable near the start, and becomes unstable far from it"
     rate = lowest_frame_rate(*arguments)
-    instead = f"from {rate:.3g} Hz on it is" if rate > 0 else "no frame rate makes it so"
-    return f"{said}: {instead}, at {hz:g} Hz it is not"
+    instead = f"stable from {rate:.3g} Hz on" if rate > 0 else "stable at no frame rate"
+    return f"{said}: the loop is unstable at {hz:g} Hz, and {instead}"
 
 
 class _NearRest(NamedTuple):
     """Robot near rest, without the gains and the timing of the servo.
 
-    `motion` is that of `_joint_loop`. `jacobian` (n, m) is that of the joints with respect to the
-    coordinates, and `turning` (n, m) its derivative times the demand that holds the joints.
+    `motion` is the matrix of `_joint_loop`. `jacobian` (n, m) is the Jacobian of the joints with
+    respect to the coordinates. `turning` (n, m) is the derivative, with respect to the coordinates,
+    of the Jacobian times the demand that holds the joints.
     """
 
     motion: np.ndarray
@@ -199,9 +201,9 @@ def _joint_loop(
 ) -> np.ndarray:
     """Matrix of the linear differential equation of the joints under their drives.
 
-    The state has q, q_dot, joint integrals, filtered rates if there are any, the command, its
-    slope, and U_dot. The command changes with its slope, which need not be what the drive takes for
-    U_dot. An integral that no law reads dies out.
+    The state consists of q, q_dot, joint integrals, filtered rates if there are any, the command,
+    its slope, and U_dot. The command changes with its slope, which can differ from the U_dot in the
+    law of the drive. An integral that the law does not use decays.
     """
     q = robot.coordinates(pose)
     joints = robot.layout.joints
@@ -247,8 +249,8 @@ def _joint_loop(
 def _servo(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
     """Command of a frame as a matrix of the servo's inputs.
 
-    The inputs are the coordinates less the desired ones, those of the frame before, and the servo
-    integral before.
+    The inputs are the errors of the coordinates at this frame and at the previous frame, and the
+    servo integral before this frame.
     """
     gains = settings.servo
     period = 1 / settings.timing.frame_rate_hz
@@ -260,10 +262,10 @@ def _servo(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
 def torque_motion(
     robot: Robot, parameters: np.ndarray, pose: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Linear motion near rest at a pose (6,) of a robot whose drives hold torques.
+    """Linear motion near rest at a pose (6,), for drives that take torques.
 
-    Returns the matrix (2 m, 2 m) of coordinates and rates, and the accelerations (m, n) of torques
-    beside those that hold the robot.
+    Returns the matrix (2 m, 2 m) of coordinates and rates, and the accelerations (m, n) due to
+    torques beyond those that hold the robot.
     """
     q = robot.coordinates(pose)
     rest = np.zeros(len(robot.coordinate_names))
@@ -286,9 +288,9 @@ def last_stable(
 ) -> float:
     """Limit of stability on the way from a start to one of two ends.
 
-    It is where the radius first passes 1. If the loop is stable at the start, the way is to
-    `stable_end`, which is returned if the loop is stable all the way. Else the way is to
-    `other_end`, and NaN is returned if the loop is nowhere stable.
+    It is the first value at which the radius passes 1. If the loop is stable at the start, the
+    search goes to `stable_end`, and returns it if the loop is stable all the way. Otherwise, it
+    goes to `other_end`, and returns NaN if the loop is stable nowhere.
     """
     stable = radius(start) < 1
     value = start

@@ -1,4 +1,4 @@
-"""State from which a closed-loop run starts, and the state of rest."""
+"""Start state of a closed-loop run, and the state of rest."""
 
 from dataclasses import dataclass
 
@@ -27,8 +27,8 @@ OPTIONAL = (
 class StartState:
     """State of the loop at the first frame, before that frame is measured.
 
-    The robot has n joints, m coordinates and p parameters. The first four entries, with poses as
-    coordinates, are those of which `start_sensitivity` has the derivatives.
+    The robot has n joints, m coordinates and p parameters. `start_sensitivity` has the derivatives
+    with respect to the first four entries, in which coordinates replace poses.
 
     Parameters
     ----------
@@ -39,24 +39,25 @@ class StartState:
     servo_integral : array_like, shape (m,)
         Integral of the servo, m s and rad s.
     commands : array_like, shape (k, n)
-        Commands that were issued before, rad or m. The oldest is first, and acted before, too.
+        Commands issued before this frame, rad or m. The oldest is first. It also stands for all
+        earlier commands.
     last_measured : array_like, shape (6,)
-        Pose that was measured one frame before.
+        Pose measured one frame before.
     joint_integral_sensitivity, command_sensitivity : array_like, shape (n, p), optional
         Derivatives of the joint integral and of the commands with respect to the parameters. The
-        default is none. The servo integral follows the commands.
+        default is zero. The derivatives of the servo integral follow from those of the commands.
     motor_angle, motor_rate : array_like, shape (n,), optional
         State of the motors of elastic joints.
     filtered_rate : array_like, shape (n,), optional
-        Rates of the errors in drives that filter them. The default is zero.
+        Filtered rates of the errors in drives with a filter. The default is zero.
     latencies : array_like, shape (k,), optional
-        Latencies of the commands before, s. The default is that of the timing.
+        Latencies of the commands issued before, s. The default is the latency of the timing.
 
     Raises
     ------
     SimulationError
-        If an array has another shape, or entries that are not finite. The sizes of the robot are
-        checked when a run begins.
+        If an array has another shape, or entries that are not finite. Whether n, m and p are those
+        of the robot is checked when a run begins.
 
     Examples
     --------
@@ -97,9 +98,7 @@ class StartState:
             raise SimulationError("start commands must have at least 1 row, got 0")
 
     def check_sizes(self, robot: Robot) -> None:
-        """Raise SimulationError, with the name of the part, for a size that is not that of the
-        robot.
-        """
+        """Raise SimulationError, with the name of the array, if a shape does not fit the robot."""
         joints = robot.layout.joints
         parameters = len(robot.layout.names)
         wanted: dict[str, tuple[int, ...]] = dict.fromkeys(
@@ -124,9 +123,9 @@ class StartState:
 def checked_loop_parameters(
     robot: Robot, parameters: object, drive: DriveName = "pid"
 ) -> np.ndarray:
-    """Dynamic parameters of a robot and lp, li, ld, as the law of its drives needs them.
+    """Dynamic parameters of a robot, then lp, li, ld, checked for the law of its drives.
 
-    Raises ParameterError for a dynamic parameter and SimulationError for everything else.
+    Raises ParameterError for a dynamic parameter, and SimulationError for everything else.
     """
     layout = robot.layout
     values = floats(
@@ -143,8 +142,8 @@ def checked_loop_parameters(
 
 
 def check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
-    """Raise UnreachablePoseError or SingularPoseError for a pose (6,) where no run can start."""
-    # Both calls raise the error. The second one is for Euler angles at their singularity.
+    """Raise UnreachablePoseError or SingularPoseError for a pose (6,) at which no run can start."""
+    # Both calls can raise an error. The second one raises it for singular Euler angles.
     robot.static_torque(pose, parameters[robot.layout.dynamic])
     robot.pose_rate(pose, np.zeros(6))
 
@@ -159,10 +158,9 @@ def equilibrium(
     fed_forward: bool = False,
     drives: Drives = PID,
 ) -> StartState:
-    """State of rest at a pose, with friction unloaded.
+    """State of rest at a pose, without friction torques.
 
-    The torque that holds the robot is linear in the dynamic parameters, so that the state has
-    derivatives with respect to them.
+    The state includes its derivatives with respect to the parameters.
 
     Parameters
     ----------
@@ -173,13 +171,13 @@ def equilibrium(
     pose : array_like, shape (6,)
         Pose of the platform.
     servo : ServoGains
-        Gains of the servo, whose integral holds the command.
+        Gains of the servo, whose integral gives the command.
     servo_robot : Robot, optional
         Robot whose kinematics the servo uses. The default is `robot`.
     elasticity : JointElasticity, optional
         Springs of the joints.
     fed_forward : bool
-        True where a feedforward commands the joints where they are, so that the servo adds nothing.
+        True if a feedforward commands the joint coordinates, so that the servo adds nothing.
     drives : Drives
         Law of the drives.
 
@@ -216,7 +214,7 @@ def equilibrium(
     )
     torque = torque_map @ parameters[robot.layout.dynamic]
     motors = {}
-    # elastic joints are turned by the torque that their springs hold
+    # the springs of elastic joints are deflected by the torque
     if elasticity is not None:
         angles = angles + torque / elasticity.stiffness
         motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
@@ -224,7 +222,7 @@ def equilibrium(
     by_command, by_integral = law.held_by_parameters(torque, angles, torque_map)
     known = servo_robot or robot
     servo_integral = np.zeros(len(chart.freedoms))
-    # the servo's integral holds the command, unless a feedforward does
+    # the command comes from the servo's integral, unless it comes from a feedforward
     if servo.ki and not fed_forward:
         servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), command) / servo.ki
     moving = by_command if by_command.any() else None

@@ -1,8 +1,8 @@
-"""Motion with dry joint friction over a span of constant command.
+"""Kernels for motion with dry joint friction over a span of time with one command.
 
 Between changes of the modes the motion is smooth, and the classical Runge-Kutta method integrates
-it. A mode ends where a slipping joint comes to rest, or where a stuck joint reaches its breakaway
-torque (eq. 24). The step is cut there, to rounding.
+it. A mode ends when a slipping joint comes to rest, or when a stuck joint reaches its breakaway
+torque (eq. 24). The step is cut at this event, to rounding.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import clear, copy, dot, fill, solve
@@ -26,36 +26,37 @@ from dynamics.closed_loop.sensitivity_kernels import (
 from dynamics.compiled.kernel import Record, entry, invoke, kernel
 
 MAX_EVENTS_PER_SEGMENT = 400
-# rad/s, or share of the breakaway torque
+# margin that counts as zero, in rad/s or as a share of the breakaway torque
 NO_MARGIN = 1e-12
-# share of the breakaway torque that rounding hides
+# rounding error of the margin of a stuck joint, as a share of the breakaway torque
 LITTLE_SHARE = 1e-13
 
 
 TAKEN, WHOLE, HALF, AGAIN, BRACKET, CROSSING = range(6)
-"""Purposes of the step that is tried.
+"""Purposes of the step that is being tried.
 
-TAKEN: none is tried, the last one was taken. WHOLE: the step is to be taken. HALF: half of it, to
-see whether modes are broken in between. AGAIN: the whole again, where they are not. BRACKET: a step
-to the beginning of an event's bracket. CROSSING: a step that ends at the event.
+TAKEN: the last step was accepted, and no step is being tried. WHOLE: the step may be accepted.
+HALF: half the step, to see whether modes are broken in between. AGAIN: the whole step again, after
+half of it broke no mode. BRACKET: a step to the beginning of the bracket of an event. CROSSING: a
+step that ends at the estimated event.
 """
 
 
 @kernel
 def ask(now: Record, purpose: int, length: float) -> None:
-    """Ask for a step of a length, s, to be tried."""
+    """Request a step of a length, s."""
     now.purpose = purpose
     now.length = length
 
 
 @kernel
 def set_stage(now: Record, at: Record, k: int) -> None:
-    """Set state and time of stage `k` of the step that is tried, or of its end."""
+    """Set the state and time of stage `k` of the step that is being tried, or of its end."""
     start = at[0]
     stage = at[k]
     h = now.length
     if k < END:
-        # Classical Runge-Kutta: a stage needs the slope of the one before it alone.
+        # Classical Runge-Kutta: a stage needs only the slope of the stage before it.
         before = at[k - 1]
         for i in range(now.unknowns):
             stage.state[i] = start.state[i] + FRACTION[k] * h * before.slope[i]
@@ -71,7 +72,7 @@ def set_stage(now: Record, at: Record, k: int) -> None:
 
 @kernel
 def begin_step(task: Record, now: Record, at: Record, d: Record) -> int:
-    """Evaluate the state that the integrator has reached, unless the step before has done so."""
+    """Evaluate the state at the beginning of a step, unless the previous step has done so."""
     if not now.moved:
         return OK
     now.moved = 0
@@ -80,9 +81,9 @@ def begin_step(task: Record, now: Record, at: Record, d: Record) -> int:
 
 @kernel
 def try_step(task: Record, now: Record, at: Record, d: Record) -> int:
-    """Do the Runge-Kutta step that is asked for, with fixed modes.
+    """Do the requested Runge-Kutta step with fixed modes.
 
-    It begins at the evaluation `at[0]` and fills its stages and its end.
+    It begins at the evaluation `at[0]` and computes the stages and the end of the step.
     """
     status = begin_step(task, now, at, d)
     if status != OK:
@@ -97,16 +98,16 @@ def try_step(task: Record, now: Record, at: Record, d: Record) -> int:
 
 @kernel
 def crossing(now: Record, count: int) -> float:
-    """Length of the step at which the margin would be zero.
+    """Step length at which the margin is estimated to be zero.
 
-    It is the polynomial of length over margin through the last `count` steps that were tried.
+    It comes from the polynomial of length over margin through the last `count` steps tried.
     """
     length = now.tried
     margin = now.tried_margin
     found = now.tried_crossing
     for i in range(count):
         found[i] = length[i]
-    # Neville's scheme, at a margin of zero.
+    # Neville's scheme evaluates the polynomial at a margin of zero.
     for order in range(1, count):
         for i in range(count - order):
             apart = margin[i] - margin[i + order]
@@ -116,7 +117,7 @@ def crossing(now: Record, count: int) -> float:
 
 @kernel
 def remember(now: Record, h: float, margin: float) -> None:
-    """Put a step that was tried, and the margin at its end, before the earlier ones."""
+    """Store a step that was tried, with the margin at its end, as the most recent one."""
     for i in range(len(now.tried) - 1, 0, -1):
         now.tried[i] = now.tried[i - 1]
         now.tried_margin[i] = now.tried_margin[i - 1]
@@ -126,12 +127,12 @@ def remember(now: Record, h: float, margin: float) -> None:
 
 @kernel
 def locate_event(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Search for the step at which the modes stop to hold, up to the last one tried.
+    """Search for the step length at which the modes cease to hold, up to the last length tried.
 
-    The margin, which is that of the last step here, crosses zero there. The search uses inverse
-    interpolation, and halves the bracket where that leads out of it. The first guess uses the stage
-    at half the step. A joint that has just started from rest has no margin yet, so that its bracket
-    is found by halving.
+    `margin` is the margin at the end of the last step. It crosses zero at the length that is
+    searched for. The search uses inverse interpolation, and halves the bracket if the interpolation
+    leaves it. The first guess uses the stage at half the step. A joint that has just started from
+    rest has no margin yet; the beginning of its bracket is found by halving.
     """
     now.events_left -= 1
     if now.events_left < 0:
@@ -148,9 +149,9 @@ def locate_event(task: Record, now: Record, at: Record, d: Record, margin: float
 
 @kernel
 def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
-    """Ask for the next step of the search for an event, once its bracket begins with a margin.
+    """Request the next step of the search for an event, once its bracket begins with a margin.
 
-    The last step tried is taken where 40 halvings have not found such a bracket.
+    If 40 halvings have found no such bracket, the last step tried is accepted.
     """
     if now.low_margin < NO_MARGIN and now.trials < 40:
         ask(now, BRACKET, now.high / 2)
@@ -167,9 +168,9 @@ def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
 
 @kernel
 def ask_between(now: Record, length: float) -> None:
-    """Ask for a step where the event seems to be.
+    """Request a step to the estimated event.
 
-    It is in the middle of the bracket where the guess is outside, or where the search is slow.
+    If the estimate is outside the bracket, or if the search is slow, the step goes to the middle.
     """
     if now.trials > 43 or not now.low < length < now.high:
         length = 0.5 * (now.low + now.high)
@@ -178,7 +179,9 @@ def ask_between(now: Record, length: float) -> None:
 
 @kernel
 def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Begin or end the bracket at the step that was tried, half as long as the bracket."""
+    """Use the step that was tried, half as long as the bracket, as the beginning or end of the
+    bracket.
+    """
     now.trials += 1
     if margin > 0:
         now.low = now.length
@@ -192,7 +195,7 @@ def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: floa
 
 @kernel
 def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Take a step to where an event seems to be, once no better one is known."""
+    """Accept a step to the estimated event, or request another one if the estimate improves."""
     tried = now.length
     if margin > 0:
         now.low = tried
@@ -202,7 +205,7 @@ def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: flo
     better = crossing(now, min(now.trials, len(now.tried)))
     holds = now.mode[mode_margin(task, now, at[END])[1]] == 0
     little = LITTLE_SHARE if holds else 0.0
-    # rounding keeps a bracket from becoming shorter than this
+    # because of rounding, a bracket cannot become shorter than this
     near = min(abs(better - tried), now.high - now.low) <= 1e-15 + 1e-13 * now.cut
     now.trials += 1
     if abs(margin) <= little or near or now.trials == 83:
@@ -213,10 +216,10 @@ def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: flo
 
 @kernel
 def judge(task: Record, now: Record, at: Record, d: Record) -> int:
-    """Decide what follows from a step that was tried: it is taken, or another one is asked for.
+    """Decide what follows the step that was tried: it is accepted, or another step is requested.
 
-    Modes that hold at both ends of a step may be broken in between, when a joint reverses twice.
-    The stages give a hint of that, which a step of half the length confirms.
+    Modes that hold at both ends of a step may be broken in between, if a joint reverses twice. The
+    stages can indicate this, and a step of half the length then checks it.
     """
     margin = mode_margin(task, now, at[END])[0]
     if now.purpose == BRACKET:
@@ -225,7 +228,7 @@ def judge(task: Record, now: Record, at: Record, d: Record) -> int:
         return judge_crossing(task, now, at, d, margin)
     if now.purpose != AGAIN and margin < 0:
         return locate_event(task, now, at, d, margin)
-    # half a step has held its modes, so that the whole step can be taken
+    # the modes have held for half the step, so that the whole step can be accepted
     if now.purpose == HALF:
         ask(now, AGAIN, 2 * now.length)
     elif now.purpose == AGAIN or (
@@ -239,21 +242,21 @@ def judge(task: Record, now: Record, at: Record, d: Record) -> int:
 
 @entry
 def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Take the velocities of stuck joints out of the state, as an impulse would.
+    """Remove the velocities of stuck joints from the state, as an impulse would.
 
-    The compliance of the joints is known.
+    The compliance of the joints must have been computed.
     """
     size = len(at.bias)
     stuck = now.stuck[: count_stuck(now)]
     rate = now.state[size : 2 * size]
     if task.stiffness > 0:
-        # elastic joints are stopped one by one, because their motors do not feel each other
+        # elastic joints are stopped one by one, because their motors are not coupled
         for i in stuck:
             now.state[2 * size + 2 * len(now.mode) + i] = 0.0
         return OK
     if len(stuck) == 0:
         return OK
-    # with as many stuck joints as coordinates nothing moves, and rounding must not let it
+    # with as many stuck joints as coordinates nothing moves, not even by rounding
     if len(stuck) == size:
         fill(rate, 0.0)
         clear(d.x[size : 2 * size], now.width)
@@ -276,11 +279,11 @@ def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int
 def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) -> int:
     """Change the modes after an event.
 
-    `held` is False where a joint that starts from rest turns back at once, and sticks.
+    `held` is False for a joint that starts from rest, turns back at once, and sticks.
     """
     end = at[END]
     joint = mode_margin(task, now, end)[1]
-    # a stuck joint breaks away in the direction of the torque that it carried
+    # a stuck joint breaks away in the direction of the torque that its friction balanced
     if now.mode[joint] == 0:
         now.mode[joint] = 1 if end.stick_force[joint] > 0 else -1
         return OK
@@ -290,7 +293,7 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
     invoke(task.stop_joints, task, now, end, d, 0)
     copy(now.state[:], end.state[:])
     status = invoke(task.evaluate_terms, task, now, end, d, 0)
-    # the impulse that stops a joint may break others away, so that modes are decided anew
+    # the impulse that stops a joint can break other joints away, so modes are decided again
     if status == OK and held:
         invoke(task.decide_modes, task, now, end, d, 0)
     return status
@@ -298,9 +301,9 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
 
 @kernel
 def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, held: bool) -> int:
-    """Take the step that was tried, which ends at its target or where an event cuts it.
+    """Accept the step that was tried, which ends at its target or is cut by an event.
 
-    `held` is as in `after_event`.
+    For `held` see `after_event`.
     """
     time = now.target
     now.purpose = TAKEN
@@ -331,9 +334,9 @@ def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, hel
 def begin_span(
     task: Record, now: Record, at: Record, d: Record, duration: float, steps: int
 ) -> None:
-    """Begin a time, s, with one command, whose torques are known.
+    """Begin a span of a duration, s, with one command, whose torques have been computed.
 
-    The modes are decided anew at its start, where torques jump, unless all stuck joints hold.
+    Torques jump at its start. The modes are therefore decided again, unless all stuck joints hold.
     """
     start = at[0]
     now.moved = 0
@@ -352,7 +355,7 @@ def begin_span(
 
 @kernel
 def next_step(now: Record, at: Record) -> bool:
-    """Ask for the next step of the span, unless one is being tried. Return False at its end."""
+    """Request the next step of the span, unless a step is being tried. Return False at its end."""
     if now.purpose != TAKEN:
         return True
     while at[0].time >= now.target:

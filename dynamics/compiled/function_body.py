@@ -1,4 +1,4 @@
-"""Lines of LLVM text for one CasADi function, in which each value is assigned once."""
+"""LLVM code of one CasADi function, in static single-assignment form."""
 
 from collections.abc import Callable
 
@@ -31,7 +31,7 @@ AnyFunction = ca.Function | PartedFunction | ColumnFunction
 
 
 def shapes(function: AnyFunction) -> tuple[list[int], list[tuple[int, int]]]:
-    """Sizes of the inputs of a function, and shapes of its outputs."""
+    """Number of entries of each input of a function, and shapes of its outputs."""
     last = _last(function)
     return (
         [last.nnz_in(k) for k in range(_inputs(function))],
@@ -40,19 +40,19 @@ def shapes(function: AnyFunction) -> tuple[list[int], list[tuple[int, int]]]:
 
 
 def _last(function: AnyFunction) -> ca.Function:
-    """Function that makes the outputs."""
+    """CasADi function that computes the outputs."""
     if isinstance(function, ColumnFunction):
         return function.function
     return function.end if isinstance(function, PartedFunction) else function
 
 
 def _inputs(function: AnyFunction) -> int:
-    """Number of inputs, without the columns of parts."""
+    """Number of inputs, not counting the columns of parts."""
     return int(function.inputs if isinstance(function, PartedFunction) else _last(function).n_in())
 
 
 class FunctionBody:
-    """Lines of one function, and the functions that they call."""
+    """LLVM lines of one function, and the functions that they call."""
 
     def __init__(self, function: AnyFunction, quick: bool = False) -> None:
         last = _last(function)
@@ -71,22 +71,23 @@ class FunctionBody:
         self._count = 0
         self._vectors = dict[tuple[str, ...], str]()
         self._lines: list[str] = []
-        # bits of the numbers that are a condition
+        # name of the bit (i1) for each number that is a condition
         self._truth: dict[str, str] = {}
         self.called: set[str] = set()
         parts = self._parts(function) if isinstance(function, PartedFunction) else []
         self._write(self._quickened(graph_of(last)), parts)
 
     def text(self) -> str:
-        """Text of the function, and of the one that calls it for many rows."""
+        """Code of the function, and of the function that calls it for many rows."""
         lines = "\n".join(self._lines)
         signature = "(ptr noalias readonly %inputs, ptr noalias %outputs)"
         body = f"define void @{self._name}{signature} nounwind {{\n{lines}\nret void\n}}\n"
         return body + (_rows(self._name, *self._sizes) if self._beside == 1 else "")
 
     def _write(self, graph: Graph, parts: list[list[str]]) -> None:
-        """Write the values of a graph and its outputs; `parts` are columns of what is known of the
-        last input.
+        """Write the values of a graph and its outputs.
+
+        `parts` are the columns of the parts, which are the last inputs of the graph.
         """
         values = GraphValues(self, graph, parts)
         for places, nodes in zip(self._outputs, graph.outputs, strict=True):
@@ -112,7 +113,7 @@ class FunctionBody:
         return columns
 
     def _group(self, group: Group, values: "GraphValues", width: int) -> list[str]:
-        """Outputs of parts that are alike, as vectors."""
+        """Outputs of a group of parts, as vectors."""
         steps: list[str] = []
 
         def operand(of: int | tuple[int, ...]) -> str:
@@ -127,7 +128,10 @@ class FunctionBody:
         return [operand(of) for of in group.outputs]
 
     def result(self, operation: str, operands: list[str], lanes: int = 1, width: int = 1) -> str:
-        """Result of an operation on numbers, or on vectors with a number of lanes in use."""
+        """Write an operation on numbers, or on vectors of which `lanes` lanes are in use.
+
+        Returns the name of the result.
+        """
         if operation == "ASSIGN":
             return operands[0]
         lanes = lanes * self._beside
@@ -164,12 +168,15 @@ class FunctionBody:
         return last
 
     def _call(self, name: str, operands: list[str], kind: str) -> str:
-        """Result of a call."""
+        """Write a call, and return the name of its result."""
         self.called.add(f"{kind} @{name}({', '.join([kind] * len(operands))})")
         return self.new(f"call {kind} @{name}({', '.join(f'{kind} {of}' for of in operands)})")
 
     def _vector(self, entries: list[str], width: int) -> str:
-        """Vector of numbers, or of several side by side. Unused lanes repeat the first number."""
+        """Vector of numbers, or of several numbers side by side for each entry.
+
+        Unused lanes repeat the first entry.
+        """
         if self._beside == 1:
             return self._of_lanes(entries, width)
         joined = entries + entries[:1] * (width - len(entries))
@@ -186,13 +193,13 @@ class FunctionBody:
         return joined[0]
 
     def _once(self, text: str) -> str:
-        """Value of a line, or the one that the same line has made before."""
+        """Name of the value of a line. A line that has been written before is not written again."""
         if (known := self._vectors.get((text,))) is None:
             known = self._vectors[(text,)] = self.new(text)
         return known
 
     def _of_lanes(self, entries: list[str], width: int) -> str:
-        """Vector of numbers. Unused lanes repeat the first one."""
+        """Vector of numbers. Unused lanes repeat the first number."""
         if width == 1:
             return entries[0]
         filled = entries + entries[:1] * (width - len(entries))
@@ -214,7 +221,7 @@ class FunctionBody:
         return known
 
     def _entry(self, vector: str, part: int, width: int) -> str:
-        """Number of a part in a vector, or its several numbers side by side."""
+        """Number of a part in a vector, or its numbers side by side."""
         if width == 1 or self._beside == 1:
             return self._lane(vector, part, width)
         kind = type_name(width * self._beside)
@@ -231,14 +238,14 @@ class FunctionBody:
         )
 
     def input(self, number: int, entry: int) -> str:
-        """Entry of an input."""
+        """Load an entry of an input."""
         place = self.new(
             f"getelementptr double, ptr %inputs, i64 {self._inputs[number][entry] * self._apart()}"
         )
         return self.new(f"load {self._number}, ptr {place}, align 8")
 
     def _apart(self) -> int:
-        """Distance of the entries of inputs."""
+        """Distance between consecutive entries of the inputs, in numbers."""
         return self._beside
 
     def constant(self, value: float) -> str:
@@ -246,14 +253,14 @@ class FunctionBody:
         return constant([value] * self._beside)
 
     def new(self, text: str) -> str:
-        """New value of a line."""
+        """Write a line that assigns a new value, and return the name of the value."""
         self._count += 1
         self._lines.append(f"%v{self._count} = {text}")
         return f"%v{self._count}"
 
 
 class GraphValues:
-    """Values of a graph. Each is written once, where it is needed first."""
+    """Values of a graph. Each is written once, before its first use."""
 
     def __init__(self, body: FunctionBody, graph: Graph, parts: list[list[str]]) -> None:
         self._body = body
@@ -262,7 +269,7 @@ class GraphValues:
         self._parts = parts
 
     def of(self, node: int) -> str:
-        """Name of a value."""
+        """Name of the value of a node."""
         asked = [node]
         while asked:
             missing = [k for k in self._nodes[asked[-1]].operands if k not in self._known]
@@ -287,16 +294,16 @@ class GraphValues:
 
 
 def _places(name: str, sparsities: list[ca.Sparsity]) -> list[list[int]]:
-    """Places of the entries of each matrix, row by row.
+    """Positions of the entries of each matrix in memory, where matrices are stored by rows.
 
-    The entries are in the order of CasADi, which is by columns.
+    The positions are listed in CasADi's order of entries, which is by columns.
     """
     places = []
     first = 0
     for sparsity in sparsities:
         if not sparsity.is_dense():
             raise DynamicsError(
-                f"only dense matrices become machine code: {name} has one of {sparsity.dim(True)}"
+                f"only dense matrices become machine code: {name} has {sparsity.dim(True)}"
             )
         rows, columns = sparsity.shape
         places.append(
@@ -307,7 +314,7 @@ def _places(name: str, sparsities: list[ca.Sparsity]) -> list[list[int]]:
 
 
 def _rows(name: str, inputs: list[int], outputs: list[tuple[int, int]]) -> str:
-    """Text of the function that calls another for many inputs."""
+    """Code of the function that calls another function for many sets of inputs."""
     return f"""define void @{name}.rows(i64 %count, ptr %inputs, ptr %outputs) nounwind {{
 entry:
   br label %ask

@@ -1,16 +1,18 @@
-"""Kernels: functions of numbers, arrays and records that Numba compiles on their first call.
+"""Kernels: functions of numbers, arrays and records that Numba compiles at their first call.
 
-Modules called ``*_kernels`` hold them. They are imported where they are first needed, because
-importing Numba takes time. This module adds to Numba what it does not do by itself:
+They are in the modules called ``*_kernels``. These are imported at their first use, because
+importing Numba takes time. This module adds to Numba what it lacks:
 
-- `kernel`, `part` and `entry` set the options of the compiler, the same for all kernels. An entry
-  is kept in a file of the user's cache, named by everything that its machine code depends on.
-- `address` and `invoke` call a kernel by its address. Numba would otherwise copy the callee into
-  each of its callers, and a kernel that many call would be compiled many times.
-- `call`, `call_columns` and `add_row` are LLVM code for three calls that Numba cannot express:
-  a function of the robot, one for many columns, and a multiply-add of vectors.
-- `_record_symbol` replaces how Numba names the type of a record in the symbols of machine code.
-- `plain` makes the ordinary Python function of a kernel, as the oracle of the compiled one.
+- `kernel`, `part` and `entry` set the same compiler options for all kernels. The machine code of an
+  entry is saved in the user's cache, under a digest of everything that it depends on.
+- `address` and `invoke` call a kernel by its address. Otherwise, Numba would copy the called kernel
+  into each of its callers, and a kernel with many callers would be compiled many times.
+- `call`, `call_columns` and `add_row` are LLVM code for three calls that Numba cannot express: a
+  function of the robot, a function of many columns, and a multiply-add of vectors.
+- `_record_symbol` replaces the way in which Numba names record types in the symbols of machine
+  code.
+- `plain` makes an ordinary Python function from a kernel. Tests compare the compiled kernel with
+  it.
 """
 
 import ctypes
@@ -35,19 +37,21 @@ from numba.extending import intrinsic
 from dynamics.compiled.object_files import cache_folder, load_object, save_object
 from dynamics.compiled.operations import MOST_LANES
 
-Array = np.ndarray  # of any type and shape, which docstrings state
-Record = Any  # a numpy.record, whose fields are those of its type
+Array = np.ndarray  # of any type and shape; docstrings state them
+Record = Any  # a numpy.record
 
 
 def _record_symbol(record: Any) -> tuple[str, tuple[str]]:
-    """Name of a record's type in the symbols of kernels: a digest of its fields.
+    """Name of a record type in the symbols of kernels: a digest of its fields.
 
-    Numba counts the types of records instead, in the order in which a process meets them. A kernel
-    for a robot of six joints in one process could then have the symbol of a kernel for a robot of
-    three in another. When both come from the cache into a third process, LLVM would link one in
-    place of the other, and it would read memory with the wrong layout. A digest of the fields is
-    the same in every process, and another one for every layout. Numba has no option for it, so
-    that the property of its class is replaced, once, before any kernel is compiled.
+    By default, Numba numbers record types in the order in which a process meets them. A kernel for
+    a robot of six joints in one process could then have the same symbol as a kernel for a robot of
+    three joints in another. If a third process loaded both from the cache, LLVM would link one in
+    place of the other, and the code would read memory with the wrong layout. A digest of the fields
+    is the same in every process, and differs between layouts.
+
+    Numba has no option for this. The property of its class is therefore replaced, once, before any
+    kernel is compiled.
     """
     return "Record", (hashlib.sha256(record.name.encode()).hexdigest()[:16],)
 
@@ -56,19 +60,19 @@ types.Record.mangling_args = property(_record_symbol)  # type: ignore[method-ass
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Make a kernel that only kernels call. It is compiled with each of them."""
+    """Make a kernel that only other kernels call. It is compiled with each of its callers."""
     function.kernel = True  # type: ignore[attr-defined]
     return njit(**_ARITHMETIC, **_ONLY_KERNELS)(function)
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Make a kernel of a few operations that is inlined, because a call would cost as much."""
+    """Make a small kernel that is inlined into its callers, because a call would take as long."""
     function.kernel = True  # type: ignore[attr-defined]
     return njit(forceinline=True, **_ARITHMETIC, **_ONLY_KERNELS)(function)
 
 
-# Kernels allocate nothing. References to arrays are not counted, because their owners hold them
-# and counting took a twelfth of a run.
+# Kernels allocate no memory. References to arrays are not counted: the arrays outlive the kernels,
+# and counting took a twelfth of the time of a run.
 _ARITHMETIC: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 # Numba's stubs do not know these options.
 _ONLY_KERNELS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -77,11 +81,11 @@ _ONLY_KERNELS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper":
 def entry(function: Callable[..., Any]) -> Any:
     """Make a kernel that Python calls, or that kernels call by its address.
 
-    Its machine code is kept in the user's cache together with all kernels that it calls.
+    Its machine code, with all kernels that it calls, is saved in the user's cache.
     """
     function.kernel = True  # type: ignore[attr-defined]
     compiled: Any = njit(**_ARITHMETIC)(function)
-    # NUMBA_DISABLE_JIT leaves the function as it is
+    # with NUMBA_DISABLE_JIT, njit returns the function unchanged
     if isinstance(compiled, Dispatcher):
         compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
     return compiled
@@ -90,9 +94,9 @@ def entry(function: Callable[..., Any]) -> Any:
 class _KernelCache:
     """Cache of an entry, with the methods that Numba calls.
 
-    Numba's own cache loads a file whoever wrote it, and renews it only when the file of the entry
-    itself has changed. This one loads files that only the user can have written, and renews them
-    when any kernel has changed.
+    Numba's own cache loads a file whoever wrote it, and renews the file only if the module of the
+    entry has changed. This cache loads only files that nobody but the user can have written, and
+    renews them if any kernel has changed.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -106,13 +110,13 @@ class _KernelCache:
         return str(cache_folder())
 
     def load_overload(self, signature: object, context: Any) -> object | None:
-        """Return what was compiled for a signature on this kind of processor, or None."""
+        """Return the code compiled for a signature on this kind of processor, or None."""
         context.refresh()
         found = load_object(self._file(signature, context.codegen()))
         return None if found is None else CompileResult._rebuild(context, *pickle.loads(found))
 
     def save_overload(self, signature: object, result: Any) -> None:
-        """Write what was compiled for a signature."""
+        """Save the code compiled for a signature."""
         save_object(self._file(signature, result.codegen), dumps(result._reduce()))
 
     def _file(self, signature: object, codegen: Any) -> str:
@@ -124,10 +128,10 @@ _at_address: dict[int, Any] = {}
 
 
 def address(compiled: Any, *arguments: object) -> int:
-    """Address of an entry's machine code for arguments of these types, for `invoke`.
+    """Address of an entry's machine code for arguments of these types, for use with `invoke`.
 
-    The entry is compiled unless that has been done. The lines of `plain` get a number that serves
-    `invoke` in the same way.
+    The entry is compiled at the first call. For a function made by `plain`, the result is a number
+    that `invoke` accepts in the same way.
     """
     found = id(compiled)
     if isinstance(compiled, Dispatcher):
@@ -139,8 +143,8 @@ def address(compiled: Any, *arguments: object) -> int:
     return found
 
 
-# The functions that follow are in the form that `numba.extending.intrinsic` wants: they take the
-# types of the arguments and return a signature, with a function that writes LLVM code.
+# The following functions have the form that `numba.extending.intrinsic` requires: they take the
+# types of the arguments, and return a signature and a function that writes LLVM code.
 
 
 def _invoke(context: Any, address: Any, task: Any, now: Any, at: Any, d: Any, number: Any) -> Any:
@@ -211,18 +215,21 @@ def _add_row(context: Any, factor: Any, row: Any, into: Any, width: Any) -> Any:
 
 
 call: Any = intrinsic(_call)
-"""Calls a `MachineFunction` by its address with the memory of its inputs and of its outputs."""
+"""Calls a `MachineFunction` by its address, with the memory of its inputs and outputs."""
 
 
 call_columns: Any = intrinsic(_call_columns)
 """Calls a `ColumnFunction` by its address.
 
-The arguments are what all columns have in common, the first row of inputs, the first row of
-outputs, and the number of columns.
+The arguments are the address, the inputs common to all columns, the first row of the other inputs,
+the first row of outputs, and the number of columns.
 """
 
 add_row: Any = intrinsic(_add_row)
-"""Adds a factor times a row to another row. The number of columns fills whole vectors."""
+"""Adds a factor times a row to another row.
+
+The number of columns must be a multiple of the vector length.
+"""
 
 
 def _invoke_plain(address: int, *arguments: Any) -> int:
@@ -249,14 +256,17 @@ def _add_row_plain(factor: float, row: np.ndarray, into: np.ndarray, width: int)
 
 @lru_cache(maxsize=1)
 def _stamp() -> str:
-    """Digest of all files of kernels. It changes when any kernel changes."""
+    """Digest of all kernel files. It changes if any kernel changes."""
     files = sorted(Path(__file__).parent.parent.rglob("*kernel*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 @cache
 def plain(compiled: Any) -> Callable[..., Any]:
-    """Ordinary Python function with the lines of a kernel. It calls other kernels in this form."""
+    """Ordinary Python function with the code of a kernel.
+
+    It calls other kernels in the same form.
+    """
     source = getattr(compiled, "py_func", compiled)
     names = {
         name: source.__globals__[name]
@@ -278,9 +288,12 @@ def plain(compiled: Any) -> Callable[..., Any]:
 
 
 def chosen(kernel: Any, compiled: bool) -> Callable[..., Any]:
-    """Kernel to be called from Python: compiled, or plain if so wanted or if Numba is off."""
+    """Function to call from Python: the compiled kernel, or the plain one.
+
+    The plain one is returned if `compiled` is False or Numba's compiler is switched off.
+    """
     if compiled and isinstance(kernel, Dispatcher):
         return kernel
-    # compiled code does not warn either
+    # compiled code gives no floating-point warnings either
     lines: Callable[..., Any] = np.errstate(all="ignore")(plain(kernel))
     return lines

@@ -1,10 +1,11 @@
-"""Parts of a function that are alike, computed as one stream of operations on vectors.
+"""Parts of a function that are alike, computed together by operations on vectors.
 
-Each part has a lane of the vectors. The legs of a robot are such parts: they have the same
-expression with different numbers. Lanes are found in the instructions themselves. Values that all
-parts need are computed once, before them. The rest of each part is put into the order in which its
-outputs ask for it, and parts with the same operations in that order become lanes of one group. The
-result is that of the parts one by one, bit for bit. Legs of several kinds become several groups.
+Each part has one lane of the vectors. The legs of a robot are such parts: they have the same
+expression with different numbers. The parts that are alike are found by comparing their
+instructions. Values that all parts need are computed once, before the parts. The remaining
+instructions of each part are sorted into the order in which its outputs need them. Parts with the
+same operations in the same order form a group, and are its lanes. Legs of several kinds form
+several groups. The result is bit for bit the same as if the parts were computed one by one.
 """
 
 from collections.abc import Iterable
@@ -17,20 +18,21 @@ import casadi as ca
 import numpy as np
 
 NAMES = {getattr(ca, name): name.removeprefix("OP_") for name in dir(ca) if name.startswith("OP_")}
-"""Names of CasADi's operations by their numbers."""
+"""Names of CasADi's operations, by number."""
 
 LEAVES = ("CONST", "INPUT")
 
 
 @dataclass(frozen=True)
 class PartedFunction:
-    """Function that is given by its parts.
+    """Function that is composed of parts.
 
-    `parts` maps inputs and constants to a column for each part, all of the same length. `end` maps
-    inputs and the columns of the parts to outputs, under the function's name. `constants` (c,) are
-    numbers, such as a sign, that CasADi would simplify away, which would make parts unlike.
-    `side_by_side` is the number of input sets that are computed at once; each entry of inputs and
-    outputs is then a row of so many numbers.
+    `parts` maps inputs and constants to one column per part, all of the same length. `end` maps
+    inputs and these columns to outputs; its name is the function's name.
+
+    `constants` (c,) are numbers, such as signs. CasADi would simplify them away if they were part
+    of the expressions, and the parts would then differ. `side_by_side` is the number of input sets
+    that are computed at once. Each entry of inputs and outputs is then a row of this many numbers.
     """
 
     parts: ca.Function
@@ -40,7 +42,7 @@ class PartedFunction:
 
     @property
     def inputs(self) -> int:
-        """Number of inputs."""
+        """Number of inputs, without the constants."""
         return int(self.parts.n_in()) - 1
 
     def name(self) -> str:
@@ -49,7 +51,7 @@ class PartedFunction:
 
     @property
     def whole(self) -> ca.Function:
-        """The same function as one function of CasADi."""
+        """The same function as a single CasADi function."""
         inputs = self.end.sx_in()[: self.inputs]
         columns = self.parts.call([*inputs, ca.SX(ca.DM(self.constants))])
         return ca.Function(self.name(), inputs, self.end.call([*inputs, *columns]))
@@ -64,12 +66,12 @@ class PartedFunction:
 
 @dataclass(frozen=True)
 class ColumnFunction:
-    """Function of columns.
+    """Function that is evaluated for many columns.
 
     The first `common` inputs are the same for all columns. The other inputs and the outputs have a
-    row for each entry, with `room` for so many columns. `lanes` columns are computed at once, so
-    that memory behind the last column is overwritten up to a whole number of lanes. `apart` is the
-    distance of the entries of the first inputs.
+    row for each entry, and each row has memory for `room` columns. `lanes` columns are computed at
+    once, so that memory behind the last column is overwritten up to a whole number of lanes.
+    `apart` is the distance between consecutive entries of the common inputs.
     """
 
     function: ca.Function
@@ -84,9 +86,10 @@ class ColumnFunction:
 
 
 class Node(NamedTuple):
-    """One value: the name of the operation that makes it, and the values that go into it.
+    """Value in a graph: the operation that computes it, and the numbers of its operands.
 
-    A constant has a `value`, and an input an `entry`: its number, and the place in it.
+    A constant has a `value`. An input has an `entry`: the number of the input, and the position in
+    it.
     """
 
     operation: str
@@ -97,9 +100,9 @@ class Node(NamedTuple):
 
 @dataclass(frozen=True)
 class Graph:
-    """Values of an SX function, each after those that go into it.
+    """Values of an SX function. Each value comes after its operands.
 
-    `outputs` are the places of the outputs among the values, by their entries.
+    `outputs` lists, for each output, the numbers of the values of its entries.
     """
 
     nodes: list[Node]
@@ -107,14 +110,14 @@ class Graph:
 
 
 Operand = int | tuple[int, ...]
-"""Number of a step of the same group, or values from outside, one for each lane."""
+"""Number of a step in the same group, or numbers of values outside it, one for each lane."""
 
 
 class Group(NamedTuple):
     """Parts that are alike.
 
-    It has the numbers of the parts, the operations that each part has in their order, and the
-    places of their outputs.
+    `lanes` are the numbers of the parts. `steps` are the operations of each part in order, with
+    their operands. `outputs` are the operands that are the outputs of the parts.
     """
 
     lanes: tuple[int, ...]
@@ -138,9 +141,9 @@ class Group(NamedTuple):
 
 
 def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Graph:
-    """Values of an SX function, whose own instructions reuse places in memory.
+    """Values of an SX function, of which each has its own number.
 
-    `constants` are the values of its last input.
+    CasADi's own instructions reuse memory. `constants` are the values of the last input, if given.
     """
     nodes: list[Node] = []
     held: dict[int, int] = {}
@@ -179,7 +182,7 @@ def lane_groups(graph: Graph) -> list[Group]:
 
 
 def _needed_by(graph: Graph) -> list[bool]:
-    """List that is True for each value that all parts need."""
+    """List with True for each value that all parts need."""
     needed = [0] * len(graph.nodes)
     for part, outputs in enumerate(graph.outputs):
         for node in outputs:
@@ -239,6 +242,6 @@ def _together(group: list[tuple[int, Group]]) -> Group:
 
 
 def _across(operands: Iterable[list[Operand]]) -> list[Operand]:
-    """Operands of a group from those of its lanes."""
+    """Operands of a group, joined from the operands of its lanes."""
     columns = zip(*operands, strict=True)
     return [of[0] if isinstance(of[0], int) else sum(of, ()) for of in columns]

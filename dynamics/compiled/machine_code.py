@@ -1,10 +1,10 @@
-"""CasADi functions as machine code, which LLVM compiles once for the user's cache folder.
+"""CasADi functions as machine code, which LLVM compiles once and the user's cache stores.
 
-A function is translated to one straight line of arithmetic that assigns each value once. It is
-`void name(const double *inputs, double *outputs)`. Its inputs are dense matrices in one array, one
-after the other, row by row, and so are its outputs. Beside it there is `void name.rows(long count,
-const double *inputs, double *outputs)` for many inputs in a row. Parts of a function that are alike
-are computed in vectors, one lane each (`lanes`), with the same numbers.
+A function is translated to arithmetic without branches that assigns each value once. Its signature
+is `void name(const double *inputs, double *outputs)`. The inputs are dense matrices stored by rows
+in one array, one after the other, and so are the outputs. A second function, `void name.rows(long
+count, const double *inputs, double *outputs)`, evaluates many rows of inputs. Parts of a function
+that are alike are computed in vectors, one lane each (see `lanes`), with the same results.
 """
 
 import ctypes
@@ -31,22 +31,23 @@ from dynamics.compiled.operations import type_name
 class MachineFunction:
     """Compiled function.
 
-    `address` is that of the code for a single call (see `llvm_text`), valid as long as the function
-    lives. `constants` (c,) are values of the last argument, which callers leave out.
+    `address` is the address of the code for a single evaluation (see `llvm_text`). It is valid as
+    long as the object exists. `constants` (c,) are the values of the last argument, which callers
+    omit.
     """
 
     inputs: list[int]
     outputs: list[tuple[int, int]]
     address: int
     over_rows: Callable[[int, int, int], None]
-    # the code lives as long as its engine
+    # the machine code exists as long as its engine
     engine: Any
     constants: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __call__(self, *batches: np.ndarray) -> list[np.ndarray]:
         """Compute all outputs (N, rows, columns) for batches (N or 1, columns) of the arguments.
 
-        NaN is returned as any other number.
+        NaN in the outputs raises no error.
         """
         count = max((len(batch) for batch in batches if len(batch) != 1), default=1)
         if len(self.constants):
@@ -68,7 +69,7 @@ class MachineFunction:
     def bound_to(self, inputs: np.ndarray, outputs: np.ndarray) -> Callable[[], None]:
         """Function without arguments that computes from `inputs` into `outputs`.
 
-        The constants are part of the inputs. The caller keeps both arrays alive.
+        The constants are part of the inputs. The caller must keep both arrays alive.
         """
         single = ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(self.address)
         single.engine = self.engine  # type: ignore[attr-defined]
@@ -82,9 +83,10 @@ def compiled_functions(
 ) -> dict[str, MachineFunction]:
     """Compile the functions that `build()` returns, or load them from the cache, by name.
 
-    `content` is what they depend on besides this package. `hot` are names of functions that inner
-    loops evaluate, which are optimised further and may round otherwise than CasADi does. Compiling
-    takes some seconds. Raises DynamicsError for an operation that has no translation.
+    `content` identifies everything that the functions depend on besides this package. `hot` names
+    functions that inner loops evaluate. They are optimised further, and their rounding may differ
+    from CasADi's. Compiling takes some seconds. Raises DynamicsError for an operation that has no
+    translation.
     """
     digest = sha256(_package_digest() + content)
     versions = (ca.CasadiMeta.version(), llvmlite.__version__, llvm.get_process_triple())
@@ -100,9 +102,9 @@ def compiled_functions(
 def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     """Line of JSON with the shapes of inputs and outputs of each function, then the machine code.
 
-    LLVM's passes find pairs of equal operations, which gains a seventh in speed. In a loop over
-    columns they would lose time: what all columns share is computed before the loop, and registers
-    have no room for it.
+    LLVM's passes vectorise pairs of equal operations, which makes functions a seventh faster.
+    Column functions would become slower: their common values are computed before the loop, and
+    there are not enough registers for them.
     """
     module = llvm.parse_assembly(llvm_text(functions, hot))
     module.verify()
@@ -118,7 +120,7 @@ def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
 
 
 def _load(compiled: bytes) -> dict[str, MachineFunction]:
-    """Load functions from what `_compile` has returned."""
+    """Load functions from the bytes that `_compile` returned."""
     shapes, _, code = compiled.partition(b"\n")
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
@@ -129,7 +131,7 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
             inputs,
             [(rows, columns) for rows, columns in outputs],
             engine.get_function_address(name),
-            # a function of columns has no code for rows, and its address is 0
+            # a column function has no function for rows, and the address is 0
             over_rows(engine.get_function_address(f"{name}.rows")),
             engine,
         )
@@ -140,7 +142,7 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
 def _machine() -> llvm.TargetMachine:
     """Description of this processor for LLVM.
 
-    Nothing is fused or reordered, so that a seed gives the same numbers on every processor.
+    LLVM fuses and reorders nothing, so that a seed gives the same numbers on every processor.
     """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
@@ -158,7 +160,7 @@ def _features() -> str:
 
 @cache
 def _package_digest() -> bytes:
-    """Digest of everything in this package that the code depends on."""
+    """Digest of all files of this package that the code depends on."""
     digest = sha256()
     package = Path(__file__).parent.parent
     rooms = [package / "expressions.py", package / "parameters.py"]
@@ -172,8 +174,8 @@ def _package_digest() -> bytes:
 def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
     """LLVM text of SX functions.
 
-    `hot` are names of functions that may round otherwise where that is quicker (see
-    `quick_arithmetic`). Raises DynamicsError with the name of an operation that has no translation.
+    `hot` names functions whose rounding may differ for speed (see `quick_arithmetic`). Raises
+    DynamicsError with the name of an operation that has no translation.
     """
     bodies = [_body(one, one.name() in hot) for one in functions]
     declared = sorted({called for body in bodies for called in body.called})
@@ -183,7 +185,6 @@ def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
 
 
 def _body(function: AnyFunction, quick: bool) -> FunctionBody:
-    """Body of a function."""
     return (
         _ColumnBody(function, quick)
         if isinstance(function, ColumnFunction)
@@ -192,16 +193,17 @@ def _body(function: AnyFunction, quick: bool) -> FunctionBody:
 
 
 class _ColumnBody(FunctionBody):
-    """Lines of a function of columns: what all columns share, then a loop over the columns."""
+    """LLVM lines of a column function: the common values, then a loop over the columns."""
 
     def __init__(self, given: ColumnFunction, quick: bool = False) -> None:
         self._given = given
         super().__init__(given.function, quick)
 
     def text(self) -> str:
-        """Text of the function.
+        """Code of the function.
 
-        It is `void name(const double *common, const double *rows, double *into, long width)`.
+        Its signature is `void name(const double *common, const double *rows, double *into, long
+        width)`.
         """
         lines = "\n".join(self._lines)
         signature = (
@@ -258,6 +260,6 @@ class _ColumnBody(FunctionBody):
         return self._given.apart
 
     def _place(self, name: str, row: int) -> str:
-        """Place of the present columns of a row."""
+        """Address of the present columns of a row."""
         begin = self.new(f"getelementptr double, ptr %{name}, i64 {row * self._given.room}")
         return self.new(f"getelementptr double, ptr {begin}, i64 %k")

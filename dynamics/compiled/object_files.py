@@ -12,26 +12,29 @@ from pathlib import Path
 
 import platformdirs
 
-# bytes at the beginning of a file: the digest of its key and of what follows
+# number of bytes at the beginning of a file: a digest of its name and of its content
 DIGEST = sha256().digest_size
 
 DAY = 24 * 3600.0  # s
 UNUSED = 60 * DAY
-"""Age in seconds since its last use from which on a file is removed."""
+"""Time since the last use, s, after which a file is removed."""
 
 KINDS = (".kernel", ".robot", ".half")
-"""Endings of the files that this cache makes; one written by halves ends in the last."""
+"""Endings of the files in this cache. Files with the last ending are not yet complete."""
 
 AT_ONCE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-"""Flags with which files are opened. A pipe would otherwise wait for somebody to write into it."""
+"""Flags with which files are opened.
+
+Without O_NONBLOCK, opening a pipe would wait for a writer.
+"""
 
 
 class CacheWarning(UserWarning):
-    """Warning, given once, that machine code cannot be kept."""
+    """Warning that machine code cannot be saved. It is given once."""
 
 
 def cache_folder() -> Path:
-    """Folder of machine code: CMMSIM_CACHE if that is set, else the user's cache folder."""
+    """Folder of machine code: CMMSIM_CACHE if it is set, else the user's cache folder."""
     chosen = os.environ.get("CMMSIM_CACHE")
     return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("cmmsim")) / "compiled"
 
@@ -39,7 +42,7 @@ def cache_folder() -> Path:
 def load_object(name: str) -> bytes | None:
     """Content that was saved under a name.
 
-    None if there is no such file, if it is damaged, or if somebody else may have written it.
+    None if there is no such file, if it is damaged, or if another user may have written it.
     """
     path = cache_folder() / name
     try:
@@ -55,17 +58,17 @@ def load_object(name: str) -> bytes | None:
 
 
 def save_object(name: str, content: bytes) -> None:
-    """Save content under a name, in place of what was there.
+    """Save content under a name, and replace earlier content.
 
-    The file is built beside its place and then renamed. A process that breaks off, or another one
-    that compiles the same, thus never leaves half a file. Gives one warning where nothing can be
-    written. Files that no process used for two months are removed.
+    The file is written under a temporary name and then renamed. It is thus never incomplete, even
+    if a process is killed or another process saves the same content. Warns once if nothing can be
+    written. Files that no process has used for two months are removed.
     """
     path = cache_folder() / name
     missing: list[Path] = []
     beside = None
     try:
-        # in a folder that may not be looked into this is an error, too
+        # `exists` raises an error, too, if the folder may not be read
         missing = [folder for folder in path.parents if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         # readable and writable by its owner alone
@@ -77,34 +80,34 @@ def save_object(name: str, content: bytes) -> None:
     except OSError as error:
         if beside is not None:
             Path(beside).unlink(missing_ok=True)
-        with suppress(OSError):  # one into which another process has written meanwhile stays
+        with suppress(OSError):  # a folder into which another process has written remains
             for folder in missing:
                 folder.rmdir()
         text = (
-            f"machine code cannot be kept in {path.parent} ({error.strerror}), so that every "
-            "process compiles anew"
+            f"machine code cannot be saved in {path.parent} ({error.strerror}), so that every "
+            "process compiles it again"
         )
-        _warn_once(f"{text}; name another folder with CMMSIM_CACHE")
+        _warn_once(f"{text}; set CMMSIM_CACHE to another folder")
 
 
 def _note_use(path: Path, changed: float) -> None:
-    """Note once a day, in a file's time of change, that the file is used.
+    """Set a file's time of change to now, at most once a day, to note that the file is used.
 
-    Many disks keep no time of access.
+    Many file systems do not store the time of access.
     """
     if time.time() - changed > DAY:
-        with suppress(OSError):  # a cache that cannot be written to serves as well
+        with suppress(OSError):  # a read-only cache can be used as well
             os.utime(path)
 
 
 @cache
 def _remove_unused(folder: Path) -> None:
-    """Remove what no process used for two months: code of sources that have changed since.
+    """Remove files that no process has used for two months.
 
-    Done once by a process.
+    Their sources have usually changed. Each process does this once.
     """
     oldest = time.time() - UNUSED
-    with suppress(OSError):  # what is left is removed by the next process
+    with suppress(OSError):  # the next process removes the remaining files
         for path in folder.iterdir():
             if path.suffix in KINDS and path.lstat().st_mtime < oldest:
                 path.unlink(missing_ok=True)
@@ -112,14 +115,14 @@ def _remove_unused(folder: Path) -> None:
 
 @cache
 def _warn_once(text: str) -> None:
-    """Give a warning once."""
+    """Give a warning, once for each text."""
     warnings.warn(text, CacheWarning, stacklevel=3)
 
 
 def _ours_alone(status: os.stat_result) -> bool:
-    """Return True for a file that only the user can have written.
+    """Return True for a file that nobody but the user can have written.
 
-    Windows itself keeps others out of the folders of a user.
+    Windows itself protects the folders of a user.
     """
     if not stat.S_ISREG(status.st_mode):
         return False

@@ -1,9 +1,9 @@
-"""CasADi's operations in LLVM, for numbers and for vectors."""
+"""LLVM instructions for CasADi's operations, on numbers and on vectors."""
 
 import numpy as np
 
 MOST_LANES = 8
-"""Number of doubles in a register of present processors."""
+"""Number of doubles in the widest register of present processors."""
 
 TRUTH = "uitofp {i1} {last} to {double}"
 MEANING: dict[str, tuple[str, ...]] = {
@@ -31,15 +31,16 @@ MEANING: dict[str, tuple[str, ...]] = {
         "select {i1} {last}, {double} {minus}, {double} {before}",
     ),
 }
-"""Instructions of LLVM by the names of CasADi's operations. {last} and {before} are results
-above.
+"""LLVM instructions for each CasADi operation.
+
+{last} is the result of the instruction before, and {before} is the result of the one before that.
 """
 
 OF_TRUTH: dict[str, tuple[str, ...]] = {
     "NOT": ("xor {i1} {last}, {true}", TRUTH),
     "IF_ELSE_ZERO": MEANING["IF_ELSE_ZERO"][1:],
 }
-"""Instructions for a first operand that is a bit, {last}."""
+"""LLVM instructions for operations whose first operand is a bit, {last}."""
 
 OF_VECTORS = {
     **{name: f"llvm.{name.lower()}" for name in ("SQRT", "FABS", "FLOOR", "CEIL")},
@@ -47,9 +48,10 @@ OF_VECTORS = {
     "FMAX": "llvm.maxnum",
     "FMA": "llvm.fma",
 }
-"""Functions of LLVM that processors have for vectors, too.
+"""LLVM functions that also exist for vectors.
 
-FMA, a product and a sum that are rounded once, is not an operation of CasADi.
+FMA (fused multiply-add) computes a product and a sum with one rounding. CasADi has no such
+operation.
 """
 
 CALLED = {
@@ -61,7 +63,7 @@ CALLED = {
     },
     "CONSTPOW": "llvm.pow.f64",
 }
-"""Functions of LLVM and of the C library that operations call."""
+"""Functions of LLVM and of the C library, by operation."""
 
 
 def type_name(width: int, of: str = "double") -> str:
@@ -70,11 +72,14 @@ def type_name(width: int, of: str = "double") -> str:
 
 
 def lanes_for(lanes: int) -> int:
-    """Width of a vector that holds a number of lanes: a power of two."""
+    """Width of a vector for a number of lanes: the next power of two."""
     return 1 << (lanes - 1).bit_length()
 
 
 def constant(values: list[float]) -> str:
-    """Constants as an operand, written by their bits, because decimals may be rounded."""
+    """Constants as an operand.
+
+    They are written by their bits, because decimals could be rounded.
+    """
     bits = [f"0x{np.float64(value).view(np.uint64):016X}" for value in values]
     return bits[0] if len(bits) == 1 else f"<{', '.join(f'double {one}' for one in bits)}>"

@@ -1,14 +1,14 @@
-"""Faster arithmetic for inner loops, with results that differ by rounding alone.
+"""Faster arithmetic for inner loops. Its results differ only by rounding.
 
-Sine, cosine and arctangent become arithmetic, so that lanes, and instructions side by side, compute
-several at once. Each is a rational approximation on a small interval, to which the argument is
-reduced (Moshier, Cephes Mathematical Library, sin.c and atan.c). Sine and cosine are correct to
-3e-16 up to a hundred thousand radians, beyond which they lose digits. The arctangent is correct to
-3e-16 of the angle, and has no value where both arguments are zero.
+Sine, cosine and arctangent are replaced by arithmetic, so that vectors and parallel instructions
+compute several at once. The argument is reduced to a small interval, on which the function is a
+rational approximation (Moshier, Cephes Mathematical Library, sin.c and atan.c). Sine and cosine are
+correct to 3e-16 up to a hundred thousand radians, and lose digits beyond. The arctangent is correct
+to 3e-16 relative to the angle, and undefined if both arguments are zero.
 
-Several quotients by one number become products with its reciprocal, because a division takes as
-long as five products. A product and a sum are rounded once. Processors since 2013 do both in one
-instruction; older ones take long.
+Several quotients with the same divisor become products with its reciprocal, because a division
+takes as long as five products. A product and a sum are fused and rounded once. Processors since
+2013 have an instruction for this; older processors are much slower.
 """
 
 from collections import Counter
@@ -25,7 +25,7 @@ HALF_PI = (
     2 * 3.77489470793079817668e-8,
     2 * 2.69515142907905952645e-15,
 )
-"""Parts of pi / 2. Whole multiples of the first two have no rounding error."""
+"""Parts of pi / 2. Whole multiples of the first two parts have no rounding error."""
 
 SINE = (
     *(-1.66666666666666307295e-1, 8.33333333332211858878e-3, -1.98412698295895385996e-4),
@@ -43,23 +43,21 @@ OVER = (
     *(1.945506571482613964425e2, 4.853903996359136964868e2, 4.328810604912902668951e2),
     *(1.650270098316988542046e2, 2.485846490142306297962e1, 1.0),
 )
-"""Coefficients of polynomials in the square of the reduced argument. The constant is first."""
+"""Coefficients of polynomials in the square of the reduced argument, beginning with the constant.
+"""
 
 LEAST_TURNED = 0.66
-"""Tangent above which an angle is reduced by an eighth of a turn."""
+"""Tangent above which pi / 4 is subtracted from the angle."""
 
 
 def quickened(graph: Graph) -> Graph:
-    """The same values, but for rounding, in less time."""
+    """Graph with the same values except for rounding, which is faster to compute."""
     return _once_each(_fused(_with_reciprocals(_with_approximations(graph))))
 
 
 @cache
 def _approximations() -> dict[str, tuple[ca.Function, int]]:
-    """Functions that replace operations, by CasADi's names of the operations.
-
-    Each comes with the number of its output.
-    """
+    """Functions that replace CasADi's operations, with the number of the output to use."""
     turning = _sine_and_cosine()
     tangent = _arctangent()
     return {"SIN": (turning, 0), "COS": (turning, 1), "ATAN2": (tangent, 0)}
@@ -85,7 +83,7 @@ def _with_approximations(graph: Graph) -> Graph:
 
 
 def _inlined(nodes: list[Node], function: Graph, operands: tuple[int, ...]) -> list[int]:
-    """Append the values of a function to nodes, and return its outputs."""
+    """Append the values of a function to `nodes`, and return the numbers of its outputs."""
     placed: list[int] = []
     for node in function.nodes:
         if node.operation == "INPUT":
@@ -97,7 +95,7 @@ def _inlined(nodes: list[Node], function: Graph, operands: tuple[int, ...]) -> l
 
 
 def _with_reciprocals(graph: Graph) -> Graph:
-    """Replace quotients by one number by products with its reciprocal."""
+    """Replace quotients with the same divisor by products with its reciprocal."""
     divisors = Counter(
         node.operands[-1] for node in graph.nodes if node.operation in ("DIV", "INV")
     )
@@ -122,9 +120,10 @@ def _with_reciprocals(graph: Graph) -> Graph:
 
 
 def _fused(graph: Graph) -> Graph:
-    """Fuse every sum with a product in it.
+    """Fuse each sum with a product that is one of its terms.
 
-    It does so also where others need the product, so that parts that are alike stay alike.
+    The product is fused even if other values need it, too, so that parts that are alike remain
+    alike.
     """
     nodes: list[Node] = []
     placed: list[int] = []
@@ -156,7 +155,7 @@ def _fused(graph: Graph) -> Graph:
 
 
 def _once_each(graph: Graph) -> Graph:
-    """Keep every value once, however often it is needed."""
+    """Merge nodes that compute the same value."""
     nodes: dict[Node, int] = {}
     placed: list[int] = []
     for node in graph.nodes:
@@ -173,13 +172,13 @@ def _sine_and_cosine() -> ca.Function:
     x = ca.SX.sym("x")
     turns = ca.floor(x * (2 / np.pi) + 0.5)
     reduced = x
-    # One part after the other, so that the difference keeps its digits (Cody and Waite).
+    # Subtract one part after the other, so that no digits are lost (Cody and Waite).
     for part in HALF_PI:
         reduced = reduced - turns * part
     square = reduced * reduced
     sine = reduced + reduced * square * _polynomial(SINE, square)
     cosine = 1 - 0.5 * square + square * square * _polynomial(COSINE, square)
-    # Of four quarter turns, the sine is negative in the last two, the cosine in the middle two.
+    # The sine is negative in the last two of the four quarter turns, the cosine in the middle two.
     half = 0.5 * turns
     odd = 2 * (half - ca.floor(half))
     back = 2 * (0.5 * half - ca.floor(0.5 * half)) >= 1
@@ -203,7 +202,7 @@ def _arctangent() -> ca.Function:
     steep = height > width
     opposite = ca.if_else(steep, width, height)
     adjacent = ca.if_else(steep, height, width)
-    # tan(a - pi/4) = (y - x) / (y + x) brings large tangents close to zero.
+    # tan(a - pi/4) = (y - x) / (y + x) is small where the tangent is near 1.
     turned = opposite > LEAST_TURNED * adjacent
     tangent = ca.if_else(turned, opposite - adjacent, opposite) / ca.if_else(
         turned, opposite + adjacent, adjacent
@@ -219,7 +218,7 @@ def _arctangent() -> ca.Function:
 
 
 def _polynomial(coefficients: Sequence[float], x: ca.SX) -> ca.SX:
-    """Value of a polynomial with pairs of terms side by side (Estrin), without a long chain."""
+    """Value of a polynomial by Estrin's scheme, which computes pairs of terms in parallel."""
     terms: list[ca.SX] = [ca.SX(one) for one in coefficients]
     while len(terms) > 1:
         last = terms[-1:] if len(terms) % 2 else []

@@ -1,9 +1,9 @@
-"""Control laws that know a model of the robot, and their gains by design.
+"""Control laws that use a model of the robot, and the design of their gains.
 
-A law takes an `Assignment`: a motion, a model and the settings of the loop. It returns a
-`LawInLoop`: a feedforward of joint commands for the servo, or a controller. Each law is one file,
-and `law` holds what they have in common. The drives, which close the loop of each joint below
-them, are in `dynamics.closed_loop.drives`.
+A law is given an `Assignment`: a motion, a model and the settings of the loop. It returns a
+`LawInLoop`: a feedforward of joint commands for the servo, or a controller. Each law has its own
+file, and `law` has what they share. The law of each joint's drive is in
+`dynamics.closed_loop.drives`.
 """
 
 from dynamics.control.inverse_dynamics import Model, Motion

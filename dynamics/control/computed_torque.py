@@ -1,18 +1,18 @@
-"""Law `computed_torque`: torques of the inverse dynamics in pose space, closed by vision.
+"""Law `computed_torque`: torques of the inverse dynamics, with feedback of the measured pose.
 
     torque = mean over a frame of ID(p, p_dot, p_ddot),   p = r - e,   e_ddot + Kd e_dot + Kp e = 0
     Kp = bandwidth^2, Kd = 2 damping bandwidth
 
-Here p is the way back from where the robot is into the desired motion r. The mean over a frame
-counts, because a torque acts for one frame.
+Here p is the way back: the motion from the present pose of the robot into the desired motion r. The
+torque is the mean over a frame period, because it acts for that time.
 
-With an observer, the way back begins where the robot will be as the torque arrives. The disturbance
-that the observer finds is taken off. Dry friction is that of the way back: near rest, joints often
-turn the other way than those of the desired motion, and their torque would be wrong by twice the
-Coulomb torque.
+With an observer, the way back begins at the state predicted for the arrival of the torque. The
+estimated disturbance is subtracted. Dry friction has the signs of the way back: near rest, joints
+often move in the opposite direction to the desired motion, and with its signs the torque would be
+wrong by twice the Coulomb torque.
 
-Without an observer, the way back begins at the last measured pose, with the difference of the last
-two as its rate. An integral takes the place of the disturbance. Dry friction is that of the desired
+Without an observer, the way back begins at the last measured pose. Its rate is the difference of
+the last two poses. An integral replaces the disturbance. Dry friction has the signs of the desired
 motion, because the sign of a rate that is half a frame old chatters.
 """
 
@@ -33,8 +33,9 @@ INTEGRAL = 0.2
 """Factor of the gain Ki = INTEGRAL bandwidth^3 without an observer."""
 
 FOLLOWED = 1.0
-"""Rate at which the disturbance is taken off, over the bandwidth. Faster noise only shakes the
-robot.
+"""Rate at which the subtracted disturbance follows the estimate, over the bandwidth.
+
+Following faster would mainly pass noise on to the robot.
 """
 
 Command = Callable[[int, float, np.ndarray | None], np.ndarray]
@@ -50,10 +51,10 @@ def error_map(feedback: Feedback) -> np.ndarray:
 
 @dataclass(frozen=True)
 class WayBack:
-    """Motion along which errors (m,) die out.
+    """Motion along which errors (m,) decay.
 
-    `error` and `rate` are errors and their rates at the time `begin`, s. `beside` is an
-    acceleration (m,) that is added.
+    `error` and `rate` are the errors and their rates at the time `begin`, s. `beside` is an
+    additional acceleration (m,).
     """
 
     desired: Motion
@@ -86,8 +87,9 @@ class WayBack:
 
 
 def computed_torque(assignment: Assignment) -> LawInLoop:
-    """Law for drives that take torques. Its controller raises what `Robot.inverse_dynamics`
-    raises.
+    """Law for drives that take torques.
+
+    Its controller raises the same errors as `Robot.inverse_dynamics`.
     """
     drives = replace(assignment.settings.drives, torques=True)
     expected: list[Estimate] = []
@@ -128,7 +130,7 @@ def _measured(assignment: Assignment) -> Command:
     before = chart.coordinates(pose)
     elapsed = 0.0
     integral = np.zeros(len(chart.freedoms))
-    # a wrong model of the torque at rest is known from the start, where the robot stands
+    # error of the modelled torque at rest, which is known from the torque at the start
     at_rest = assignment.holding - assignment.model.robot.static_torque(
         pose, assignment.model.dynamic
     )
@@ -164,9 +166,10 @@ def _way_back(
 def _torque(
     assignment: Assignment, way: WayBack, dry: Motion, viscous: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Mean torque (n,) over the first frame of a way back, with the dry friction of a motion.
+    """Mean torque (n,) over the first frame of a way back, with the dry friction of the motion
+    `dry`.
 
-    `viscous` (n,) is friction that the model does not know.
+    `viscous` (n,) is friction that the model does not include.
     """
     along = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
     return np.asarray(

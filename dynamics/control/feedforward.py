@@ -1,16 +1,16 @@
-"""Law `feedforward`: joint commands for which the joint PID gives the torque of the motion.
+"""Law `feedforward`: joint commands for which the joint PID produces the torque of the motion.
 
-The law needs no access to torques. While a command U acts, the torque of a drive (eq. 31) is
+The drives need not accept torques. While a command U acts, the torque of a drive (eq. 31) is
 
     lp (U - theta) + ld (c U_dot - theta_dot) + li z - lx theta,    z_dot = U - theta
 
-as in `closed_loop.drives`. Everything but U is known along the desired motion, so that each command
-follows from the one before. With commands that are held, the mean torque of the drive over the time
-of a command is that of the inverse dynamics. With commands that ramp, it is the torque at the end
-of the ramp. The servo adds its correction.
+as in `closed_loop.drives`. Along the desired motion, everything except U is known, and each command
+follows from the previous one. With the zero hold, the mean torque of the drive during a command is
+the torque of the inverse dynamics. With the linear hold, the torque at the end of the ramp is that
+torque. The servo adds its correction.
 
-Before the motion the robot is in equilibrium, and the integral z holds the torque that the model
-gives at rest. Of an error of the holding torque, only its change along the motion is felt.
+Before the motion, the robot is in equilibrium, and the integral z provides the torque of the model
+at rest. An error of the torque at rest has an effect only by its change along the motion.
 """
 
 from dataclasses import replace
@@ -29,8 +29,8 @@ def joint_commands(
 ) -> np.ndarray:
     """Commands (frames, n), rad or m, for a motion that starts from rest at time 0.
 
-    Each command is for the time from its arrival, after the latency, to the arrival of the next.
-    Raises what `Robot.inverse_dynamics` raises where the motion leaves the reach.
+    Each command acts from its arrival, after the latency, to the arrival of the next command.
+    Raises the same errors as `Robot.inverse_dynamics` if the motion leaves the reach.
     """
     period = 1 / timing.frame_rate_hz
     along = spans(model, motion, np.arange(frames) * period + timing.latency_s, period)
@@ -47,7 +47,8 @@ def joint_commands(
         moved = along.end[k] - along.begin[k]
         mean = along.mean[k]
         by_before = ld * (c * before + moved) / period
-        # The drive's torque, solved for the command: its mean over a held one, its end of a ramp.
+        # The torque of the drive, solved for the command: the mean torque during a constant
+        # command, or the torque at the end of a ramp.
         if held:
             left = (
                 along.torque[k]
@@ -73,8 +74,8 @@ def joint_commands(
 def feedforward(assignment: Assignment) -> LawInLoop:
     """Law of the servo around these commands.
 
-    With an observer, the servo corrects the pose at the time when its correction arrives. Raises
-    what `joint_commands` raises.
+    With an observer, the servo corrects the pose predicted for the arrival of its correction.
+    Raises the same errors as `joint_commands`.
     """
     settings = assignment.settings
     model = assignment.model

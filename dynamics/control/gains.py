@@ -1,8 +1,8 @@
-"""Design of gains: bandwidth and damping of a loop near rest, and gains that give wanted ones.
+"""Design of gains: bandwidth and damping of a loop near rest, and gains for desired values.
 
 The bandwidth, rad/s, is the lowest frequency at which the error of an oscillating desired pose
-reaches 1/sqrt(2) of that pose, in the worst direction. The damping is the least damping ratio of
-the eigenvalues of the map from frame to frame. Both are those of the linear loop
+reaches 1/sqrt(2) of that pose, in the worst direction. The damping is the smallest damping ratio of
+the eigenvalues of the map from frame to frame. Both are computed for the linear loop
 (`closed_loop.stability`), without dry friction.
 """
 
@@ -22,19 +22,19 @@ from dynamics.errors import SimulationError
 
 HALF_POWER = 2**-0.5
 AT_ONCE = 1e-3
-"""Magnitude of eigenvalues below which a motion has died within a frame."""
+"""Magnitude of eigenvalues below which a motion has decayed within a frame."""
 SLOWEST = 1e-2
-"""Lowest frequency, rad/s, that is searched for a bandwidth."""
+"""Lowest frequency, rad/s, in the search for a bandwidth."""
 MET = 0.02
-"""Share by which a designed loop may miss the wanted figures."""
+"""Relative tolerance of a designed loop for the desired bandwidth and damping."""
 
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """Figures of a loop near rest.
+    """Characteristic values of a loop near rest.
 
     `bandwidth` is in rad/s, and `damping` has no unit. `radius` is the largest magnitude of an
-    eigenvalue, and `gain_margin` the factor by which the gains may grow.
+    eigenvalue. `gain_margin` is the factor of the gains at the limit of stability.
     """
 
     bandwidth: float
@@ -44,9 +44,9 @@ class LoopFigures:
 
 
 def servo_figures(model: Model, settings: LoopSettings, pose: np.ndarray) -> LoopFigures:
-    """Figures of the visual servo near rest at a pose (6,), for the laws pid and feedforward.
+    """Characteristic values of the visual servo near rest at a pose (6,).
 
-    Raises what `closed_loop.equilibrium` raises.
+    They apply to the laws pid and feedforward. Raises the same errors as `closed_loop.equilibrium`.
     """
     arguments = model.robot, model.parameters, settings, pose
     map_ = stability.frame_map(*arguments)
@@ -61,9 +61,9 @@ def servo_figures(model: Model, settings: LoopSettings, pose: np.ndarray) -> Loo
 def design_servo(
     model: Model, settings: LoopSettings, pose: np.ndarray, bandwidth: float, damping: float
 ) -> ServoGains:
-    """Gains of the visual servo for a bandwidth, rad/s, and at least a damping, at a pose (6,).
+    """Gains of the visual servo for a bandwidth, rad/s, and a minimum damping, at a pose (6,).
 
-    Raises SimulationError where there are none, with the best that can be had.
+    Raises SimulationError, with the best values found, if there are no such gains.
     """
 
     def servo(logs: np.ndarray) -> ServoGains:
@@ -78,7 +78,7 @@ def design_servo(
 
     def cost(logs: np.ndarray) -> float:
         share, damped = figures(logs)
-        # the last term chooses one of the many gains that meet both wishes
+        # the last term selects one of the many gains that meet both requirements
         return (
             100 * (share / HALF_POWER - 1) ** 2
             + 100 * max(damping - damped, 0.0)
@@ -86,7 +86,7 @@ def design_servo(
         )
 
     period = 1 / settings.timing.frame_rate_hz
-    # from a servo that is stable on most robots, with logarithms because gains are positive
+    # a servo that is stable on most robots, in logarithms because gains are positive
     start = np.log([0.3, 0.06 * period, bandwidth])
     found = minimize(
         cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8, "maxfev": 600}
@@ -95,9 +95,9 @@ def design_servo(
     if abs(share / HALF_POWER - 1) > MET or damped < damping - MET:
         raise SimulationError(
             f"no gains of the servo give {model.robot.name} a bandwidth of {bandwidth:g} rad/s "
-            f"with a damping of {damping:g} at {settings.timing.frame_rate_hz:g} Hz: found were a "
-            f"damping of {damped:.3g} and an error of {share:.3g} of the motion there, "
-            f"{HALF_POWER:.3g} is wanted"
+            f"with a damping of {damping:g} at {settings.timing.frame_rate_hz:g} Hz: the best gains"
+            f" have a damping of {damped:.3g} and an error of {share:.3g} of the motion, must be "
+            f"{HALF_POWER:.3g}"
         )
     return servo(found.x)
 
@@ -105,10 +105,10 @@ def design_servo(
 def torque_figures(
     model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback
 ) -> LoopFigures:
-    """Figures of the law computed_torque near rest at a pose (6,).
+    """Characteristic values of the law computed_torque near rest at a pose (6,).
 
-    With an observer, which foresees the latency, they are those of the feedback of what it
-    foresees. The bandwidth is then the one asked for.
+    An observer compensates the latency by prediction. The values are then those of the feedback of
+    its prediction, without latency. The bandwidth is always the desired one.
     """
     period, delay = _times(settings, feedback)
 
@@ -131,8 +131,8 @@ def largest_bandwidth(
 ) -> float:
     """Largest bandwidth, rad/s, at which the law computed_torque is stable near rest.
 
-    The search begins at the bandwidth of the feedback and ends at half the frame rate, beyond which
-    one command a frame shows no motion. NaN where the law is stable with no bandwidth.
+    The search begins at the bandwidth of the feedback and ends at half the frame rate, because one
+    command per frame cannot follow faster motions. The result is NaN if no bandwidth is stable.
     """
 
     def radius(bandwidth: float) -> float:
@@ -145,10 +145,10 @@ def largest_bandwidth(
 def check_torque_gains(
     model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback
 ) -> None:
-    """Raise SimulationError, with eigenvalue and limit, for a law computed_torque that is too fast.
+    """Raise SimulationError if the law computed_torque is too fast. The error states the limit.
 
-    It is too fast where it is unstable near rest, or faster than frames can show. A torque that
-    acts for a frame then stops the platform and hardly brings it back.
+    The law is too fast if it is unstable near rest, or if its bandwidth exceeds half the frame
+    rate. A torque that acts for a whole frame then stops the platform, but hardly brings it back.
     """
     rate = settings.timing.frame_rate_hz
     radius = torque_radius(model, settings, pose, feedback)
@@ -158,22 +158,22 @@ def check_torque_gains(
     )
     if radius >= 1:
         limit = largest_bandwidth(model, settings, pose, feedback)
-        mend = f"it is up to {limit:.3g} rad/s" if limit > 0 else "no bandwidth makes it so"
+        mend = f"stable up to {limit:.3g} rad/s" if limit > 0 else "stable at no bandwidth"
         raise SimulationError(
             f"{asked} is unstable with this model at {rate:g} Hz: its largest eigenvalue from "
-            f"frame to frame is {radius:.4g}, must be below 1; {mend}"
+            f"frame to frame is {radius:.4g}, must be below 1; the law is {mend}"
         )
     if feedback.bandwidth > np.pi * rate:
         wanted = np.exp(np.linalg.eigvals(error_map(feedback)).real.max() / rate)
         raise SimulationError(
-            f"{asked} is too fast for {rate:g} Hz, half of which is {np.pi * rate:.3g} rad/s: its "
-            f"largest eigenvalue from frame to frame is {radius:.4g}, and {wanted:.3g} was asked "
-            "for"
+            f"{asked} is too fast for {rate:g} Hz: the bandwidth must be at most half the frame "
+            f"rate, {np.pi * rate:.3g} rad/s; the largest eigenvalue from frame to frame is "
+            f"{radius:.4g} instead of {wanted:.3g}"
         )
 
 
 def _times(settings: LoopSettings, feedback: Feedback) -> tuple[float, float]:
-    """Time between two frames, s, and the latency that no observer foresees, s."""
+    """Time between two frames, s, and the latency that is not compensated by an observer, s."""
     return (
         1 / settings.timing.frame_rate_hz,
         0.0 if feedback.observer else settings.timing.latency_s,
@@ -190,8 +190,8 @@ def _torque_map(
 ) -> np.ndarray:
     """Map of the law computed_torque from frame to frame.
 
-    The state has coordinates and rates. Without an observer it also has those measured before, the
-    integral of the error, and the torques on their way.
+    The state has coordinates and rates. Without an observer, it also has the previously measured
+    coordinates, the integral of the error, and the torques that have not yet arrived.
     """
     motion, push = stability.torque_motion(model.robot, model.parameters, pose)
     size = len(motion) // 2
@@ -202,13 +202,13 @@ def _torque_map(
     stiff = motion[size:, :size]
     damp = motion[size:, size:]
     inverse = np.linalg.pinv(push)
-    # the acceleration of the way back, over a frame
+    # the mean acceleration along the way back over a frame
     mean = np.linalg.solve(map_, expm(map_ * period) - np.eye(2)) / period
     by_place, by_rate = (
         inverse @ (factor * (map_[1] @ along) * one - along[0] * stiff - along[1] * damp)
         for along in mean.T
     )
-    # Held torques are part of the state, so that one exponential has their exact effect.
+    # Constant torques are part of the state, so that one exponential has their exact effect.
     inner = np.zeros((2 * size + joints, 2 * size + joints))
     inner[: 2 * size, : 2 * size] = motion
     inner[size : 2 * size, 2 * size :] = push
@@ -242,9 +242,10 @@ def _torque_map(
 
 
 def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float:
-    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`, at most that of Nyquist."""
-    # The error need not rise everywhere: a grid finds the first crossing, Brent's method its
-    # digits.
+    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`, at most the Nyquist
+    frequency.
+    """
+    # The error may not be monotonic: a grid finds the first crossing, which Brent's method refines.
     places = np.geomspace(1e-2, np.pi * rate_hz, 60)
     beyond = [_error_share(response(w)) > HALF_POWER for w in places]
     first = int(np.argmax(beyond))
@@ -265,9 +266,9 @@ def _error_share(response: np.ndarray) -> float:
 
 
 def _damping(map_: np.ndarray) -> float:
-    """Least damping ratio of the eigenvalues of a map."""
+    """Smallest damping ratio of the eigenvalues of a map."""
     values = np.linalg.eigvals(map_).astype(complex)
-    # Poles in units of the frame rate. States with an eigenvalue of about zero settle at once.
+    # Poles in units of the frame rate. States with an eigenvalue of about zero decay at once.
     poles = np.log(values[np.abs(values) > AT_ONCE])
-    # a state that stands still has no damping
+    # a pole at zero has no damping
     return float(np.min(-poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)))

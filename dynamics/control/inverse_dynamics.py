@@ -1,4 +1,4 @@
-"""Model of a robot as a law knows it: joint coordinates and torques along a motion."""
+"""Model of a robot for control laws: joint coordinates and torques along a motion."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,25 +10,28 @@ from dynamics.closed_loop.joints import FrictionLaw
 from dynamics.robot import Robot
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
-"""Gauss-Legendre quadrature. Friction that turns within a span is met to some eighth of it."""
+"""Gauss-Legendre quadrature.
+
+A reversal of friction within a span is resolved to about an eighth.
+"""
 
 
 VAGUE = 0.2
-"""Doubt of a model that is a guess, 1/s. See `Model`."""
+"""Value of `Model.doubt` for a guessed model, 1/s."""
 
 FITTED = 4e-4
-"""Doubt of a model that fits what was measured, 1/s.
+"""Value of `Model.doubt` for a model that fits measured data, 1/s.
 
 The covariances of identified parameters give 3.3e-4 to 5.4e-4 for three robots, at 29 and 60 Hz,
-along unseen motions without reversals.
+along validation motions without reversals.
 """
 
 
 class Motion(Protocol):
-    """Desired motion of the platform, as a law asks for it.
+    """Desired motion of the platform, in the form that a law requires.
 
-    Any object with these three methods is a motion. They take times (N,), s, and return arrays (N,
-    6).
+    Any object with these three methods is a motion. The methods take times (N,), s, and return
+    arrays (N, 6).
 
     Examples
     --------
@@ -57,7 +60,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True)
 class Model:
-    """Robot as a law knows it.
+    """Model of a robot that a law uses.
 
     Parameters
     ----------
@@ -68,8 +71,8 @@ class Model:
     friction : FrictionLaw
         Law of joint friction.
     doubt : float
-        Rate, 1/s, at which the errors of the torques change before a run has told, over the
-        torque at rest.
+        Rate, 1/s, at which the errors of the torques are expected to change before a run, relative
+        to the torque at rest.
 
     Examples
     --------
@@ -87,13 +90,13 @@ class Model:
 
     @property
     def dynamic(self) -> np.ndarray:
-        """Parameters without those of the joint PID."""
+        """Dynamic parameters, without the gains of the joint PID."""
         return self.parameters[self.robot.layout.dynamic]
 
     def held(self, pose: np.ndarray, drives: Drives) -> tuple[np.ndarray, np.ndarray]:
         """Joint commands (n,) and integrals (n,) of the drives at rest at a pose (6,).
 
-        Friction is unloaded.
+        Friction torques are zero.
         """
         law = drives.joint_law(self.parameters[self.robot.layout.joint_pid])
         rest = np.zeros((1, 6))
@@ -108,8 +111,8 @@ class Model:
     ) -> np.ndarray:
         """Actuator torques (N, n), N m or N, for pose rates and accelerations (N, 6) (eq. 17, 23).
 
-        Dry friction has the signs of the joint velocities `dry_along` (N, n), instead of those of
-        the motion. Raises what `Robot.inverse_dynamics` raises.
+        If joint velocities `dry_along` (N, n) are given, dry friction has their signs instead of
+        the signs of the motion. Raises the same errors as `Robot.inverse_dynamics`.
         """
         robot = self.robot
         parameters = self.dynamic.copy()
@@ -128,11 +131,11 @@ class Model:
 
 @dataclass(frozen=True)
 class Spans:
-    """Joints and torques of a motion over spans of time of one length.
+    """Joint coordinates and torques of a motion over spans of time of equal length.
 
-    `begin` and `end` (N, n) are joint coordinates at the ends, and `mean` (N, n) their mean.
-    `mean_integral` (N, n) is the mean of their integral since the beginning. `torque` (N, n) is the
-    mean torque.
+    `begin` and `end` (N, n) are joint coordinates at the ends of a span, and `mean` (N, n) is their
+    mean over it. `mean_integral` (N, n) is the mean of their integral since the beginning of the
+    span. `torque` (N, n) is the mean torque.
     """
 
     begin: np.ndarray
@@ -145,10 +148,10 @@ class Spans:
 def spans(
     model: Model, motion: Motion, begins: np.ndarray, length: float, dry: Motion | None = None
 ) -> Spans:
-    """Joints and torques of a motion over the spans that begin at times (N,), s.
+    """Joint coordinates and torques of a motion over the spans that begin at times (N,), s.
 
-    The joints of the motion `dry`, if not of this one, have the signs of dry friction. Raises what
-    `Robot.inverse_dynamics` raises.
+    Dry friction has the signs of the joint velocities of the motion `dry`, if given. Raises the
+    same errors as `Robot.inverse_dynamics`.
     """
     share = (NODES + 1) / 2
     weight = WEIGHTS / 2

@@ -1,7 +1,7 @@
-"""Interface of the control laws: the assignment that a law takes, and what it returns for a run.
+"""Interface of the control laws: the assignment of a law, and its result for a run.
 
-These laws move the platform. The law of a joint's drive, the paper's PID among them, stands in
-`dynamics.closed_loop.drives`.
+These laws control the platform. The laws of the joints' drives, including the PID of the paper, are
+in `dynamics.closed_loop.drives`.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from dynamics.control.observer import Estimate, Observer
 
 @dataclass(frozen=True)
 class Feedback:
-    """Wanted feedback of a law that sets torques.
+    """Desired feedback of a law that commands torques.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class Feedback:
     damping : float
         Damping ratio.
     observer : bool
-        True where an observer predicts the pose.
+        True if an observer predicts the pose.
 
     Examples
     --------
@@ -42,7 +42,7 @@ class Feedback:
 
 @dataclass(frozen=True)
 class Assignment:
-    """Task of a law: to make a robot follow a motion for some frames.
+    """Task of a law: to make a robot follow a motion for a number of frames.
 
     Parameters
     ----------
@@ -55,11 +55,12 @@ class Assignment:
     settings : LoopSettings
         Settings of the loop. The law decides whether the drives take torques.
     feedback : Feedback
-        Wanted bandwidth and damping.
+        Desired bandwidth and damping.
     holding : ndarray, shape (n,)
-        Torque at rest at the start, as drives that take torques report it.
+        Torque at rest at the start, as reported by drives that take torques.
     latencies : ndarray, shape (frames,)
-        Latency of each frame's command, s. A law may use those of frames that have come.
+        Latency of each frame's command, s. A law is only allowed to use the latencies of the
+        present frame and of earlier frames.
     noise : callable
         Function frame -> covariance (6, 6) of the measured pose.
     common : ndarray, shape (6, 6)
@@ -106,7 +107,7 @@ class Assignment:
         return motion.pose(at)[0], motion.pose_rate(at)[0], motion.pose_acceleration(at)[0]
 
     def watched(self, drives: Drives) -> Observer:
-        """Observer of the run, for drives of a kind."""
+        """Observer of the run, for given drives."""
         holding = (
             self.holding if drives.torques else self.model.held(self.desired(0.0)[0], drives)[0]
         )
@@ -119,20 +120,20 @@ class Assignment:
 
 @dataclass(frozen=True)
 class LawInLoop:
-    """Answer of a law: a feedforward for the servo, or a controller.
+    """Result of a law: a feedforward for the servo, or a controller.
 
     Parameters
     ----------
     feedforward : ndarray, shape (frames, n), optional
-        Joint commands, to which the servo adds its own.
+        Joint commands, to which the servo adds its own commands.
     controller : Controller or EveryFrame, optional
-        Function that takes the place of the servo.
+        Controller that replaces the servo.
     drives : Drives
         Drives of the run. The law decides whether they take torques.
     expected : list of Estimate
         Estimates of the law's observer, one for each frame, filled during the run.
     by_servo : bool
-        True for a controller that corrects by the gains of the servo.
+        True for a controller that uses the gains of the servo.
 
     Examples
     --------
@@ -152,5 +153,5 @@ Law = Callable[[Assignment], LawInLoop]
 
 
 def pid(assignment: Assignment) -> LawInLoop:
-    """Law `pid`: the paper's visual servo around the drives, without a model."""
+    """Law `pid`: the visual servo of the paper around the drives, without a model."""
     return LawInLoop(drives=assignment.settings.drives)

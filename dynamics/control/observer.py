@@ -1,13 +1,14 @@
-"""Observer of the robot: an extended Kalman filter of its motion in its drives.
+"""Observer of the robot: an extended Kalman filter of its motion with its drives.
 
-Between two frames the state follows the model under the commands that have arrived (`prediction`).
-A lost frame only makes the state less certain. Three errors are part of the state: a torque at each
-joint, which walks at random; viscous friction, which stays; and the offset that all measured poses
-have in common. No pose tells that offset, but it is not forgotten.
+Between two frames, the state follows the model under the commands that have arrived (`prediction`).
+At a lost frame, the state only becomes more uncertain. Three kinds of errors are part of the state:
+a torque at each joint, which is a random walk; viscous friction, which is constant; and an offset
+that all measured poses have in common. The measurements do not determine this offset, but its
+uncertainty is included.
 
-The observer learns on the way how fast the torque walks, and how the noise of the sensor differs
-from what the sensor states. The scales of both covariances climb the likelihood of the innovations,
-by its exact gradient.
+During the run, the observer estimates the rate of the random walk, and the ratio of the sensor's
+noise to its stated noise. Both are scales of covariances. They follow the exact gradient of the
+likelihood of the innovations.
 """
 
 from collections.abc import Callable
@@ -22,37 +23,37 @@ from dynamics.control.prediction import Prediction
 from dynamics.errors import SimulationError
 
 STEP = 3e-3
-"""Longest step of the prediction, s. Dry friction turns a joint back within milliseconds."""
+"""Longest step of the prediction, s. Dry friction can reverse a joint within milliseconds."""
 
 PLACE_DOUBT = 1e-4
 """Standard deviation of the coordinates at the start, m and rad."""
 
 RATE_DOUBT = 1e-5
-"""Standard deviation of their rates at the start, m/s and rad/s."""
+"""Standard deviation of the rates of the coordinates at the start, m/s and rad/s."""
 
 TORQUE_DOUBT = 1e-3
-"""Standard deviation of the unknown torque at the start, over the torque at rest."""
+"""Standard deviation of the unknown torque at the start, relative to the torque at rest."""
 
 VISCOUS_DOUBT = 5.0
-"""Standard deviation of the unknown viscous friction over the inertia at the joint, 1/s."""
+"""Standard deviation of the unknown viscous friction, divided by the inertia at the joint, 1/s."""
 
 SCALE_FELT = 2.0
-"""Ratio of the model error that torques meet to the one that joint commands meet.
+"""Ratio of the model error with torque commands to the model error with joint commands.
 
-Torques also meet the error of the factor that all parameters have in common.
+With torque commands, the error of the common factor of all parameters has an effect, too.
 """
 
 MEMORY = 2.0
-"""Time, s, over which what innovations said of the scales fades.
+"""Time constant, s, with which information from earlier innovations about the scales fades.
 
-Far from the truth the slope is another one, and what was learnt there would hold the scales back.
+The gradient differs far from the solution, and early information would slow down convergence.
 """
 
 KNOWN_BEFORE = (0.3, 200.0)
-"""Information about the logarithms of the scales of walk and noise before the run."""
+"""Prior information about the logarithms of the scales of the walk and of the noise."""
 
 SAME_TIME = 1e-9
-"""Largest distance, in frames, of two instants that are taken for one."""
+"""Difference, in frame periods, below which two instants count as the same."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,14 @@ class Estimate:
 class Observer:
     """Observer of one run. All times are in s.
 
-    At each frame, `see` takes the measured pose, `ahead` predicts, and `issue` notes the command.
+    At each frame, `see` processes the measured pose, `ahead` predicts, and `issue` stores the
+    command.
 
-    `model` is the robot as the law knows it. `pose` (6,) is the pose of rest at the start, held by
-    the command `holding` (n,). `latencies` (frames,) are those of the commands, known as they are
-    issued. `noise(frame)` is the covariance (6, 6) of a measured pose, and `common` (6, 6) that of
-    what all measured poses have in common.
+    `model` is the robot as the law knows it. `pose` (6,) is the pose at rest at the start, which
+    the command `holding` (n,) holds. `latencies` (frames,) are the latencies of the commands. Each
+    is used from the time at which its command is issued. `noise(frame)` is the covariance (6, 6) of
+    a measured pose, and `common` (6, 6) is the covariance of the error that all measured poses have
+    in common.
     """
 
     def __init__(
@@ -112,8 +115,7 @@ class Observer:
         else:
             self._state[at.integral] = self._model.held(pose, self._drives)[1]
         scale = np.abs(torque).mean()
-        # In a frame the walk changes by as much as the error of a model, which is smooth along a
-        # motion.
+        # In a frame period, the walk changes by as much as the smooth error of a model does.
         walk = np.zeros(at.size)
         doubt = np.zeros(at.size)
         felt_scale = SCALE_FELT if self._drives.torques else 1.0
@@ -121,7 +123,7 @@ class Observer:
         self._walk = np.diag(walk**2)
         jacobian = robot.coordinate_jacobian(pose)
         mass = free.T @ robot.mass_matrix(pose, self._model.dynamic) @ free
-        # Inertia that each joint feels while the others are free.
+        # Inertia at each joint while the other joints are free.
         felt = 1 / np.diag(jacobian @ np.linalg.solve(mass, jacobian.T))
         doubt[at.coordinates] = PLACE_DOUBT
         doubt[at.rates] = RATE_DOUBT
@@ -138,23 +140,23 @@ class Observer:
 
     @property
     def scales(self) -> np.ndarray:
-        """Learnt factors (2,) of the covariances of the walk and of the sensor's noise."""
+        """Estimated factors (2,) of the covariances of the walk and of the sensor's noise."""
         return np.exp(self._scale)
 
     @property
     def disturbance(self) -> np.ndarray:
-        """Torque (n,) at the joints that the model does not know."""
+        """Estimated torque (n,) at the joints that the model does not include."""
         return self._state[self._prediction.blocks.torque].copy()
 
     @property
     def viscous(self) -> np.ndarray:
-        """Viscous friction (n,) of the joints that the model does not know."""
+        """Estimated viscous friction (n,) of the joints that the model does not include."""
         return self._state[self._prediction.blocks.viscous].copy()
 
     def see(self, frame: int, pose: np.ndarray | None) -> Estimate:
-        """Go on to a frame and learn from its measured pose (6,), unless it is lost (None).
+        """Go on to a frame, and update the state by its measured pose (6,), or None if it is lost.
 
-        Returns what was expected before that.
+        Returns the estimate before the update.
         """
         time = frame * self._period
         self._state, self._covariance = self._moved(
@@ -167,22 +169,22 @@ class Observer:
         return expected
 
     def arrival(self, frame: int) -> float:
-        """Time at which the command of a frame acts, s."""
+        """Time at which the command of a frame arrives, s."""
         return float(self._arrival[frame])
 
     def ahead(self, time: float) -> Estimate:
-        """Predict the state at a later time, s, with the commands that are on their way."""
+        """Predict the state at a later time, s, with the commands that have been issued."""
         return self._estimate(*self._moved(time, self._state, self._covariance, None))
 
     def issue(self, frame: int, command: np.ndarray) -> None:
-        """Note the command (n,) of a frame."""
+        """Store the command (n,) of a frame."""
         self._arrivals.append(self.arrival(frame))
         self._commands.append(np.array(command))
-        # Commands that act no more are dropped, so that a long run takes no more time for a frame.
+        # Old commands are removed, so that the time per frame does not grow during a run.
         del self._arrivals[: -self._kept()], self._commands[: -self._kept()]
 
     def _kept(self) -> int:
-        """Number of commands that may still act."""
+        """Number of stored commands that can still act."""
         return 4 + sum(1 for arrival in self._arrivals if arrival > self._time - 2 * self._period)
 
     def _estimate(self, state: np.ndarray, covariance: np.ndarray) -> Estimate:
@@ -191,7 +193,7 @@ class Observer:
         return Estimate(state[at.coordinates].copy(), state[at.rates].copy(), place.copy())
 
     def _learn(self, measured: np.ndarray, noise: np.ndarray) -> None:
-        """Update state, covariance and scales by measured coordinates (m,)."""
+        """Update the state, the covariance and the scales by measured coordinates (m,)."""
         seen = self._seen
         free = self._model.robot.geometry.chart.basis
         noise = np.exp(self._scale[1]) * free.T @ noise @ free
@@ -201,18 +203,18 @@ class Observer:
         by_scale[1] += noise
         told = inverse @ innovation
         shares = inverse @ by_scale
-        # gradient of the log likelihood of the innovation by the logarithms of the scales
+        # gradient of the log likelihood with respect to the logarithms of the scales
         gradient = 0.5 * (
             np.einsum("i,kij,j->k", told, by_scale, told) - np.trace(shares, axis1=1, axis2=2)
         )
         before = np.diag(KNOWN_BEFORE)
-        # what the innovations said before fades towards what was known before the run
+        # information from earlier innovations fades towards the prior information
         self._information = before + np.exp(-self._period / MEMORY) * (self._information - before)
         self._information += 0.5 * np.einsum("aij,bji->ab", shares, shares)
         gain = self._covariance @ seen.T @ inverse
         self._state = self._state + gain @ innovation
         kept = np.eye(len(gain)) - gain @ seen
-        # the Joseph form keeps the covariance positive where rounding would not
+        # the Joseph form keeps the covariance positive definite in spite of rounding
         self._covariance = kept @ self._covariance @ kept.T + gain @ noise @ gain.T
         self._by_scale = kept @ self._by_scale @ kept.T
         self._by_scale[1] += gain @ noise @ gain.T
@@ -224,11 +226,11 @@ class Observer:
     ) -> tuple[np.ndarray, np.ndarray]:
         """State and covariance at a later time, s.
 
-        The derivatives of the covariance with respect to the scales move in place.
+        The derivatives of the covariance with respect to the scales are updated in place.
         """
         at = self._time
         while at < time - SAME_TIME * self._period:
-            # a command acts from its arrival, and a ramp ends one period later
+            # a command acts from its arrival on, and a ramp ends one period later
             begins = [*self._arrivals, *(arrival + self._period for arrival in self._arrivals)]
             later = [begin for begin in begins if at + SAME_TIME * self._period < begin < time]
             until = min([time, *later])
@@ -244,12 +246,12 @@ class Observer:
             at = end
         if not np.isfinite(state).all():
             raise SimulationError(
-                f"the observer has lost the robot: its prediction for {time:.3f} s is not finite"
+                f"the observer has diverged: its prediction for {time:.3f} s is not finite"
             )
         return state, covariance
 
     def _acting(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Command at a time, s, and its rate as the joint PID takes it."""
+        """Command at a time, s, and its rate as the joint PID uses it."""
         newest = max(k for k, arrival in enumerate(self._arrivals) if arrival <= time)
         before = self._commands[max(newest - 1, 0)]
         change = self._commands[newest] - before

@@ -1,15 +1,15 @@
-"""One step of a robot in its drives, with the covariance of its state.
+"""One time step of a robot with its drives, and of the covariance of its state.
 
 The state has coordinates q (m,), their rates (m,) and the integral of the joint PID (n,). It also
-has values that stay as they are: a torque (n,) and viscous friction (n,) at each joint that the
-model does not know, and an offset of the sensor (m,) that all measured poses have in common.
+has constant values: a torque (n,) and viscous friction (n,) of each joint that the model does not
+include, and an offset of the sensor (m,) that all measured poses have in common.
 
-Without dry friction a step is exponential, which is exact for linear motion. Dry friction is then
-taken in implicitly, as time stepping does for contacts (Moreau, Unilateral contact and dry friction
-in finite freedom dynamics, 1988). Let u be the velocity with which a joint would end the step, with
-the friction of the other joints, and b the change that its Coulomb torque can make in a step. The
-joint keeps what is beyond b, and rests otherwise. The velocity is not known exactly, so that the
-torque is the expectation, over normal u, of
+Without dry friction, a step uses the matrix exponential, which is exact for linear motion. Dry
+friction is then added implicitly, like contacts in time-stepping methods (Moreau, Unilateral
+contact and dry friction in finite freedom dynamics, 1988). Let u be the velocity of a joint at the
+end of the step without its own dry friction, and b the largest change of this velocity by its
+Coulomb torque. If |u| > b, the joint slips and loses b; otherwise, it comes to rest. Since u is
+uncertain, the torque is the expectation, over normally distributed u, of
 
     torque = coulomb sat(u / b),    sat(x) = min(1, max(-1, x))
 """
@@ -28,20 +28,23 @@ ROUNDS = 12
 """Largest number of iterations of Newton's method over the joints."""
 
 SETTLED = 1e-6
-"""Error of a saturation at which these iterations end."""
+"""Error of a saturation below which these iterations end."""
 
 LEAST_WIDTH = 1e-9
-"""Least standard deviation of a joint's velocity, rad/s or m/s: it is never known exactly."""
+"""Smallest standard deviation of a joint's velocity, rad/s or m/s. It is never known exactly."""
 
 SHORTEST = 1.5e-3
-"""Time, s, that is not halved where a joint turns."""
+"""Length, s, below which a step in which a joint reverses is not halved."""
 
 LEAST_REACH = 1e-3
-"""Least change by dry friction in a step, over the deviation. Zero would be divided by."""
+"""Smallest velocity change by dry friction in a step, over the standard deviation of the velocity.
+
+It is above zero because it is a divisor.
+"""
 
 
 class Blocks(NamedTuple):
-    """Places of the parts of a state: those that move, then those that stay as they are."""
+    """Slices of the parts of a state: first the parts that move, then the constant parts."""
 
     coordinates: slice
     rates: slice
@@ -58,7 +61,7 @@ class Blocks(NamedTuple):
 
     @property
     def moving(self) -> slice:
-        """Place of what moves: coordinates, rates, integral."""
+        """Slice of the parts that move: coordinates, rates, integral."""
         return slice(0, self.integral.stop)
 
     @property
@@ -68,7 +71,7 @@ class Blocks(NamedTuple):
 
 
 class Prediction:
-    """Steps of a robot in its drives, as a model has it."""
+    """Time steps of a robot with its drives, according to a model."""
 
     def __init__(self, model: Model, settings: LoopSettings) -> None:
         robot = model.robot
@@ -89,11 +92,12 @@ class Prediction:
         command_rate: np.ndarray,
         length: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """State after a time, s, in which a command (n,) and its rate act, and the map of errors.
+        """State after a time, s, during which a command (n,) and its rate act, and the map of
+        errors.
 
-        The covariance (size, size) of the state says how well the velocities of joints are known. A
-        time in which a joint comes to rest or breaks away is halved until that changes its velocity
-        by less than is known of it.
+        The covariance (size, size) of the state determines how well the velocities of joints are
+        known. A step in which a joint comes to rest or breaks away is halved until this changes its
+        velocity by less than the standard deviation of the velocity.
         """
         after, errors, turns = self._once(state, covariance, command, command_rate, length)
         if not turns or length < SHORTEST:
@@ -112,9 +116,10 @@ class Prediction:
         command_rate: np.ndarray,
         length: float,
     ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """State and map of errors after one step, and True where the step is too long.
+        """State and map of errors after one step, and True if the step is too long.
 
-        It is too long where a joint comes to rest or breaks away by more than is known of it.
+        It is too long if a joint that comes to rest or breaks away changes its velocity by more
+        than the standard deviation of the velocity.
         """
         at = self.blocks
         free, errors, jacobian = self._without_dry_friction(state, command, command_rate, length)
@@ -128,19 +133,21 @@ class Prediction:
         width = np.sqrt(np.einsum("ij,jk,ik->i", by_rates, covariance, by_rates) + LEAST_WIDTH**2)
         largest, smooth = self._dry(velocity)
         level, kept = expected_dry_friction(velocity, width, turned, largest, smooth)
-        # friction at one joint changes the velocities of the others, which change their friction
+        # friction at one joint changes the velocities, and thus the friction, of the others
         gain = np.linalg.solve(
             np.eye(len(level)) + kept[:, None] * (turned - np.diag(np.diag(turned))), np.diag(kept)
         )
         free[at.moving] -= pushed @ level
         errors[at.moving] -= pushed @ gain @ by_rates
         moved = np.maximum(np.abs(jacobian @ state[at.rates]), np.abs(jacobian @ free[at.rates]))
-        # velocity that more friction could take
+        # velocity that additional friction could remove
         unused = np.diag(turned) * (largest - np.abs(level))
         return free, errors, bool((np.minimum(moved, unused) > width).any())
 
     def _dry(self, velocity: np.ndarray) -> tuple[np.ndarray, float]:
-        """Largest dry friction (n,) at joint velocities, and the velocity over which it turns."""
+        """Largest dry friction (n,) at joint velocities, and the velocity over which it
+        changes its sign.
+        """
         law = self._friction
         largest = self._coulomb
         if law.name == "stribeck":
@@ -171,9 +178,10 @@ class Prediction:
     def _slope(
         self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Time derivative of what moves, its derivatives, and the Jacobian of the joints (n, m).
+        """Time derivative of the moving parts, its derivatives, and the Jacobian of the joints (n,
+        m).
 
-        The derivatives are those with respect to the state without the offset.
+        The derivatives are with respect to the state without the offset.
         """
         at = self.blocks
         law = self._law
@@ -193,7 +201,7 @@ class Prediction:
         limit = self._drives.torque_limit
         growing = error
         if limit is not None:
-            # conditional integration, as the drives do it
+            # conditional integration, as in the drives
             further = (np.abs(torque) >= limit) & ((li * error - law.lx * velocity) * torque > 0)
             growing = np.where(further, law.lx * velocity / (li or 1.0), error)
             torque = np.clip(torque, -limit, limit)
@@ -204,7 +212,7 @@ class Prediction:
         acceleration = push @ net - falling
         given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
         by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*given))
-        # the derivative of the joint velocities by the pose rate is 2 J_theta_dot
+        # the derivative of the joint accelerations with respect to the rates is 2 J_theta_dot
         damping = (ld * pid + viscous)[:, None]
         by_state = np.zeros((at.moving.stop, at.offset.start))
         by_state[at.coordinates, at.rates] = np.eye(len(rate))
@@ -226,18 +234,20 @@ def expected_dry_friction(
     largest: np.ndarray,
     smooth: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Expected dry friction (n,) over a step, and its gain on errors of each joint's velocity (n,).
+    """Expected dry friction (n,) over a step, and its gain (n,) for errors of the joint velocities.
 
-    `velocity` (n,) is the velocity after the step without dry friction, with normal errors of
+    `velocity` (n,) is the velocity after the step without dry friction. Its errors are normal, with
     standard deviations `width` (n,). `turned` (n, n) is the change of the velocities by a torque
-    over the step, and `largest` (n,) the largest torque. The torque turns over the velocity
-    `smooth`. The gain passes errors on such that their variance is that after dry friction, which
-    stops some of the drawn joints. A line through the torque would give another variance.
+    over the step, and `largest` (n,) is the largest torque. The torque changes its sign over the
+    velocity `smooth`.
+
+    With this gain, propagated errors have the variance of the velocity after dry friction, which
+    stops a part of the distribution. The slope of the expected torque would give another variance.
     """
     own = np.diag(turned)
     reach = np.maximum(own * largest + smooth, LEAST_REACH * width)
     others = turned - np.diag(own)
-    # Newton's method from a guess in which each joint slips or rests as it would alone
+    # Newton's method; in its initial guess, each joint slips or rests as if it were alone
     level = largest * np.sign(velocity) * (np.abs(velocity) > reach)
     for _ in range(ROUNDS):
         share, slope, _ = expected_saturation(velocity - others @ level, width, reach)
@@ -249,7 +259,7 @@ def expected_dry_friction(
             break
     _, slope, variance = expected_saturation(velocity - others @ level, width, reach)
     change = own * largest
-    # share of the variance of a velocity that is left after dry friction
+    # share of the variance of a velocity that remains after dry friction
     passed = 1 - 2 * change * slope + (change / width) ** 2 * variance
     return np.clip(level, -largest, largest), (1 - np.sqrt(np.clip(passed, 0.0, 1.0))) / own
 
@@ -259,7 +269,7 @@ def expected_saturation(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Expectation of sat(u / reach) over normal u, its derivative by the mean, and its variance.
 
-    Arrays have any shape. deviation and reach are > 0.
+    Arrays have any shape. `deviation` and `reach` are > 0.
     """
     low = (-reach - mean) / deviation
     high = (reach - mean) / deviation

@@ -1,1 +1,1 @@
-"""Robots in other multibody engines, and from their files."""
+"""Export of robots to MuJoCo, and import of robots from MJCF and URDF files."""

@@ -1,7 +1,7 @@
-"""Mechanism in a file of another program: bodies at home, their connections, and legs as chains.
+"""Mechanism that another program's file describes: its bodies and joints at home, and its legs.
 
 Bodies that are welded together become one body. Joints that meet in a body without mass become one
-joint: two hinges become a universal joint, three a ball.
+joint: two hinges become a universal joint, and three become a ball joint.
 """
 
 from collections.abc import Iterator
@@ -14,21 +14,21 @@ from dynamics.errors import RobotFileError
 from dynamics.legs.chain import SAME, Chain
 
 BASE = 0
-"""Number of the body that stands still."""
+"""Number of the body that is fixed to the ground."""
 
 SHARE_OF_HUB = 1e-4
-"""Share of all mass below which a body between two hinges is a part of their joint.
+"""Share of the total mass below which a body between two hinges counts as part of a joint.
 
-Engines ask for some mass.
+Such a body has a small mass only because engines require one.
 """
 
 
 @dataclass(frozen=True)
 class Solid:
-    """Body at home, in the axes of the base.
+    """Rigid body at home. All vectors are in the axes of the base.
 
-    Mass, kg; centre of mass (3,), m; inertia about it (3, 3), kg m^2; its own axes (3, 3) as
-    columns; and length and radius of a rod that is drawn of it.
+    It has its mass, kg; its centre of mass (3,), m; its inertia about that centre (3, 3), kg m^2;
+    its own axes as columns (3, 3); and the length and radius, m, of the rod that draws it.
     """
 
     name: str
@@ -42,9 +42,9 @@ class Solid:
 class Freedom(NamedTuple):
     """Elementary joint between two bodies.
 
-    Its kind is "hinge", "slide" or "ball". It is at a point (3,), m, about or along an axis (3,),
-    in the axes of the base. `coordinate` is that at home, `friction` is dry and viscous, and
-    `actuator` its number, or None.
+    Its kind is "hinge", "slide" or "ball". Its point (3,), m, and its axis (3,) are in the axes of
+    the base. `coordinate` is the joint coordinate at home, `friction` is the dry and the viscous
+    friction, and `actuator` is the number of its actuator, or None.
     """
 
     kind: str
@@ -58,9 +58,10 @@ class Freedom(NamedTuple):
 
 @dataclass(frozen=True)
 class Connection:
-    """Connection of two bodies, by their numbers.
+    """Connection of two bodies, which are given by their numbers.
 
-    Its elementary joints are in the order from the first body. A weld has none.
+    `freedoms` are its elementary joints in the order from the first body to the second. A weld has
+    no elementary joints.
     """
 
     first: int
@@ -72,9 +73,9 @@ class Connection:
         return self.second if body == self.first else self.first
 
     def seen_from(self, body: int) -> tuple[Freedom, ...]:
-        """Joints in the order from a body.
+        """Elementary joints in the order from the given body to the other one.
 
-        Their axes are those about which, or along which, the other body moves.
+        The signs of the axes are those of the motion of the other body.
         """
         if body == self.first:
             return self.freedoms
@@ -83,10 +84,11 @@ class Connection:
 
 @dataclass(frozen=True)
 class Mechanism:
-    """Bodies, with the base first, and their connections.
+    """Bodies, of which the base is the first, and their connections.
 
-    `gravity` (3,) is in m/s^2, and `travel_limit` in rad or m. `ranges` are those of joints by
-    name, where the file has them, `gains` are lp, li, ld (3,), and `notes` are remarks on the file.
+    `gravity` (3,) is in m/s^2, and `travel_limit` in rad or m. `ranges` holds the range of each
+    joint by name if the file states it. `gains` (3,) are lp, li, ld. `notes` are remarks on the
+    file.
     """
 
     name: str
@@ -100,9 +102,9 @@ class Mechanism:
 
 
 class MechanismLeg(NamedTuple):
-    """Leg: its chain of joints, its actuated joint, and its bodies from the base.
+    """Leg: its chain of joints, its actuated joint, and its bodies in order from the base.
 
-    A body is a list of the bars that it consists of.
+    Each body is given as a list of the parallel bars that form it.
     """
 
     chain: Chain
@@ -111,7 +113,7 @@ class MechanismLeg(NamedTuple):
 
 
 def simplified(mechanism: Mechanism) -> Mechanism:
-    """Mechanism with welded bodies as one, and without bodies that are only part of a joint."""
+    """Merge welded bodies, and replace bodies that are only part of a joint by that joint."""
     solids = list(mechanism.solids)
     connections = list(mechanism.connections)
     while weld := next((one for one in connections if not one.freedoms), None):
@@ -134,9 +136,9 @@ def simplified(mechanism: Mechanism) -> Mechanism:
 
 
 def platform_of(mechanism: Mechanism) -> int:
-    """Number of the body at which the legs come together.
+    """Number of the platform, which is the body with the most joints.
 
-    Raises RobotFileError where there is none.
+    Raises RobotFileError if several bodies have the most joints, or if no body has two.
     """
     count = dict.fromkeys(range(1, len(mechanism.solids)), 0)
     for one in mechanism.connections:
@@ -147,7 +149,7 @@ def platform_of(mechanism: Mechanism) -> int:
     if most < 2 or len(found) > 1:
         names = ", ".join(mechanism.solids[body].name for body in found) or "none"
         raise RobotFileError(
-            f"no body is the platform, where all legs meet: most joints ({most}) have {names}"
+            f"no single body can be the platform: the most joints ({most}) belong to {names}"
         )
     return found[0]
 
@@ -155,10 +157,11 @@ def platform_of(mechanism: Mechanism) -> int:
 def legs_of(
     mechanism: Mechanism, platform: int, from_platform: np.ndarray
 ) -> Iterator[MechanismLeg]:
-    """Legs of a simplified mechanism, each a chain from the base to the platform.
+    """Legs of a simplified mechanism, each as a chain from the base to the platform.
 
-    A chain may have two bars. `from_platform` (3, 4) holds platform axes and origin at home. Raises
-    RobotFileError, with leg and bodies, for any other mechanism.
+    A chain may consist of two parallel chains of equal bars. The columns of `from_platform` (3, 4)
+    are the axes and the origin of the platform at home. Raises RobotFileError, with the leg and its
+    bodies, for a mechanism of any other form.
     """
     left = [body for body in range(1, len(mechanism.solids)) if body != platform]
     number = 0
@@ -178,20 +181,20 @@ def legs_of(
 def _leg(
     mechanism: Mechanism, members: set[int], platform: int, from_platform: np.ndarray
 ) -> MechanismLeg:
-    """Leg of its member bodies."""
+    """Leg that consists of the member bodies."""
     joined = sum(bool({one.first, one.second} & members) for one in mechanism.connections)
-    # more loops would have ways without number
+    # with more loops, the number of ways would grow without limit
     if joined > len(members) + 2:
         raise RobotFileError(
-            f"{joined} joints hold its {len(members)} bodies, at most {len(members) + 2} make one "
-            "way from the base to the platform, or two equal bars"
+            f"it has {joined} joints and {len(members)} bodies; one way from the base to the "
+            f"platform, or two with equal bars, needs at most {len(members) + 2} joints"
         )
     paths = list(_paths(mechanism, BASE, platform, members, []))
     solids = mechanism.solids
     if not paths or len(paths) > 2 or len({len(path) for path in paths}) > 1:
         raise RobotFileError(
-            f"it has {len(paths)} ways from the base to the platform, must have one, or two equal "
-            "bars"
+            f"it has {len(paths)} ways from the base to the platform, must have one, or two of "
+            "equal bars"
         )
     for body in sorted(members - {body for path in paths for body, _ in path}):
         raise RobotFileError(f"{solids[body].name} is on no way from the base to the platform")
@@ -249,9 +252,9 @@ def _paths(
     members: set[int],
     behind: list[tuple[int, Connection]],
 ) -> Iterator[list[tuple[int, Connection]]]:
-    """Ways from a body to the end through members, as steps.
+    """Ways from a body to the end body that pass only through members.
 
-    A step is the body that it begins at, and its connection.
+    A way is a list of steps. A step is a body and the connection by which the way leaves it.
     """
     for connection in mechanism.connections:
         if body not in (connection.first, connection.second):
@@ -265,12 +268,11 @@ def _paths(
 
 
 def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
-    """Kind of joint that elementary ones make, its place (3,), and its axes (2, 3)."""
+    """Kind of the joint that elementary joints form, its point (3,), and its axes (2, 3)."""
     for one in freedoms:
         if one.actuator is None and any(one.friction):
             raise RobotFileError(
-                f"{one.name} has friction {max(one.friction):g}; joints without actuator have none "
-                "here"
+                f"{one.name} has friction {max(one.friction):g}, must have none without an actuator"
             )
     kinds = [one.kind for one in freedoms]
     axes = np.array([one.axis for one in freedoms] + [np.full(3, np.nan)])[:2]
@@ -285,24 +287,26 @@ def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
     apart = max(float(np.linalg.norm(np.cross(one.axis, point - one.point))) for one in freedoms)
     names = ", ".join(one.name for one in freedoms)
     if apart > SAME:
-        raise RobotFileError(f"the hinges {names} pass each other at {2 * apart:.3g} m, must meet")
+        raise RobotFileError(
+            f"the axes of the hinges {names} are {2 * apart:.3g} m apart, must meet in a point"
+        )
     if len(kinds) == 2:
         lean = abs(float(directions[0] @ directions[1]))
         if lean > SAME:
             raise RobotFileError(
-                f"the hinges {names} are {np.degrees(np.arcsin(lean)):.3g} deg from normal to each "
-                "other"
+                f"the hinges {names} are {np.degrees(np.arcsin(lean)):.3g} deg from perpendicular "
+                "to each other"
             )
         return "universal", point, axes
     if abs(np.linalg.det(directions)) < 1e-3:
         raise RobotFileError(
-            f"the hinges {names} are in one plane at home, and make no ball joint there"
+            f"the axes of the hinges {names} are in one plane at home, and form no ball joint there"
         )
     return "ball", point, axes
 
 
 def _reached(mechanism: Mechanism, start: int, walls: set[int]) -> set[int]:
-    """Bodies that are reached from a start without passing walls."""
+    """Bodies that are connected to `start` without passing through the bodies in `walls`."""
     found = {start}
     left = [start]
     while left:
@@ -317,9 +321,9 @@ def _reached(mechanism: Mechanism, start: int, walls: set[int]) -> set[int]:
 def _hub(
     solids: list[Solid], connections: list[Connection], limit: float
 ) -> tuple[int, tuple[Connection, Connection]] | None:
-    """Body that is only part of a joint, or None.
+    """Number and connections of a body that is only part of a joint, or None.
 
-    It has nearly no mass, and two connections of hinges in one point.
+    Such a body has nearly no mass and two connections, which consist of hinges.
     """
     for body in range(1, len(solids)):
         own = [one for one in connections if body in (one.first, one.second)]
@@ -333,7 +337,7 @@ def _hub(
 
 
 def _moved(connections: list[Connection], gone: Connection, old: int, new: int) -> list[Connection]:
-    """Connections without one of them, with those of one body now at another."""
+    """Connections without `gone`, in which body `new` replaces body `old`."""
     left = [one for one in connections if one is not gone]
     names = {old: new}
     return [
@@ -343,7 +347,7 @@ def _moved(connections: list[Connection], gone: Connection, old: int, new: int) 
 
 
 def _together(a: Solid, b: Solid) -> Solid:
-    """Two connections as one."""
+    """Merge two bodies into one."""
     mass = a.mass + b.mass
     centre = (a.mass * a.centre + b.mass * b.centre) / mass if mass else a.centre
     inertia = np.zeros((3, 3))

@@ -1,14 +1,15 @@
-"""MJCF of a robot, the text of a model that MuJoCo loads: a closed chain of its bodies at home.
+"""MJCF of a robot: the text of a model that MuJoCo loads, with all bodies at home.
 
 The platform flies freely. The bodies of each leg hang on the base and on each other by the joints
-that the segments of the leg name. A `connect` equality holds the end of each leg at the platform,
-which thus keeps the freedoms that the legs leave it. Joint coordinates are those of
-`inverse_kinematics`. Motors act on the actuated joints. Joint damping is the viscous friction, and
-joint friction loss the Coulomb friction. A link that is two equal bars is written as two.
+that the segments of the leg name. A `connect` equality joins the end of each leg to the platform,
+and the platform thus has only the degrees of freedom that the legs allow. Joint coordinates are
+those of `inverse_kinematics`. Motors act on the actuated joints. The viscous friction is written as
+joint damping, and the Coulomb friction as friction loss. A link that is two equal bars is written
+as two bodies.
 
-MuJoCo's ball joints leave bodies free to spin about their own axes, which eq. 12 excludes. Nothing
-drives that spin as long as Ixx = Iyy, so that it stays zero. Damping it would damp the other two
-axes of the ball joint, too, and the export adds none.
+MuJoCo's ball joints let bodies spin freely about their own axes, which eq. 12 excludes. No torque
+causes this spin as long as Ixx = Iyy, and it stays zero. The export adds no damping against it,
+because damping would also act on the other two axes of the ball joint.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from dynamics.inertia import BodyInertias, grouped, physical_inertias
 from dynamics.kinematics.platform import base_from_platform
 from dynamics.robot import Robot
 
-# MuJoCo silently lowers larger values.
+# MuJoCo lowers larger values to this without a warning.
 MAX_IMPEDANCE = 0.9999
 
 # XML has no way to write these: control characters, halves of surrogate pairs (undecodable file
@@ -40,10 +41,10 @@ NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 Integrator = Literal["implicitfast", "RK4"]
 
 CHANGED_INERTIAS = (
-    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments that "
-    "do no work in its",
-    "leg, as of a crank that turns about z alone and of a link that does not spin, do not alter "
-    "the motion; others do.",
+    "Inertias that no rigid body can have were changed to the nearest that MuJoCo accepts. A "
+    "moment that does no work in its",
+    "leg does not alter the motion, as with a crank that turns only about z or a link that does "
+    "not spin; other moments do.",
 )
 
 
@@ -51,14 +52,17 @@ CHANGED_INERTIAS = (
 class MjcfSolver:
     """Integration of the exported model by MuJoCo.
 
-    Its loops are springs, which are never exactly closed, so that they are made stiff. Stiff
-    springs need short steps `timestep_s`: at 0.25 ms the loops of rss6 stay closed to some
-    nanometres in the motions of `cmmsim verify-model`. `time_constant_steps` is the time constant
-    of the spring of a loop, in steps, of which MuJoCo allows 2 or more. `impedance` is the share of
-    the force of a loop that the solver enforces at once; the springs bring the rest. The integrator
-    implicitfast takes joint damping implicitly, which is stable for any viscous friction, at one
-    evaluation a step. RK4 is of fourth order, for comparisons with other engines, at four
-    evaluations.
+    MuJoCo closes loops by stiff springs, so that a small gap remains. Stiff springs need short
+    steps `timestep_s`: at 0.25 ms the loops of rss6 stay closed to some nanometres in the motions
+    of `cmmsim verify-model`.
+
+    `time_constant_steps` is the time constant of the springs in steps; MuJoCo requires at least 2.
+    `impedance` is the share of the constraint force that the solver enforces at once; the springs
+    provide the remainder.
+
+    The integrator implicitfast treats joint damping implicitly. It is stable for any viscous
+    friction and needs one evaluation per step. RK4 is of fourth order, for comparisons with other
+    engines, and needs four evaluations per step.
     """
 
     timestep_s: float = 2.5e-4
@@ -87,9 +91,11 @@ def mjcf_text(
 ) -> str:
     """MJCF of a robot with dynamic parameters (p,), by default the nominal ones.
 
-    `coulomb` writes the dry friction; without it the joints only damp. `source` says in the file
-    where the parameters come from. Raises ParameterError, and its subclass UnphysicalInertiaError
-    for a body that breaks Ix + Iy >= Iz where `allow_unphysical_inertia` is False.
+    If `coulomb` is False, the dry friction is left out and joints have only their damping. `source`
+    is a text for the header of the file that states where the parameters come from.
+
+    Raises ParameterError for wrong parameters. Raises its subclass UnphysicalInertiaError for a
+    body that breaks Ix + Iy >= Iz, unless `allow_unphysical_inertia` is True.
     """
     check_type("robot", robot, Robot, DynamicsError)
     check_type("source", source, str, DynamicsError)
@@ -134,8 +140,8 @@ def mjcf_text(
 class _Chain:
     """Parts of a robot at home.
 
-    It also has the points (3,) of the platform that the last parts are joined to, in platform axes,
-    m, by part.
+    `ends` maps the number of each last part to the point (3,) of the platform that it is joined to,
+    m, in the axes of the platform.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -153,9 +159,7 @@ class _Chain:
 
 
 def end_names(part: Part) -> dict[str, str]:
-    """Names of the two sites that a loop holds together: at a leg's last part, and at the
-    platform.
-    """
+    """Names of the two sites that a loop joins: on a leg's last part, and on the platform."""
     tail = part.name.lstrip("abcdefghijklmnopqrstuvwxyz_")
     return {"site1": f"link_end{tail}", "site2": f"platform_joint{tail}"}
 
@@ -169,10 +173,10 @@ def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source:
     """Add name and comments."""
     lines = [
         f"Parallel robot {robot.name}, {source}; exported by cmmsim. Units: m, kg, s, rad, N, N m.",
-        "Keyframe home, and as written: all actuated joints at their home coordinates, platform at "
-        "rest.",
-        "Links on ball joints may spin about their own axes; no force makes them as long as Ixx = "
-        "Iyy.",
+        "The model as written, and its keyframe home: all actuated joints at their home "
+        "coordinates, platform at rest.",
+        "Links on ball joints can spin about their own axes; no torque makes them spin as long as "
+        "Ixx = Iyy.",
     ]
     if inertias.changes:
         lines += [*CHANGED_INERTIAS, *grouped(inertias.changes)]
@@ -181,7 +185,6 @@ def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source:
 
 
 def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int) -> None:
-    """Add the settings of the integration."""
     _add_comment(
         root, f"Newton solves the {3 * loops} stiff loop equations exactly in a step or two."
     )
@@ -207,7 +210,8 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int
     Xml.SubElement(default, "equality", stiff)
     _add_comment(
         default,
-        "Dry friction is a soft constraint too: as stiff, so that a resting joint creeps least.",
+        "Dry friction is a soft constraint, too. It is as stiff, so that a resting joint creeps "
+        "least.",
     )
     Xml.SubElement(default, "joint", solreffriction=stiff["solref"], solimpfriction=stiff["solimp"])
     Xml.SubElement(default, "geom", contype="0", conaffinity="0", group="1")
@@ -215,7 +219,6 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int
 
 
 def _add_platform(world: Xml.Element, chain: _Chain, inertia: np.ndarray) -> None:
-    """Add the platform."""
     pose = chain.robot.home_pose
     joints = chain.robot.geometry.platform_joints
     turned = _numbers(quaternion(base_from_platform(pose)))
@@ -236,9 +239,9 @@ def _add_platform(world: Xml.Element, chain: _Chain, inertia: np.ndarray) -> Non
 def _add_part(
     parent: Xml.Element, chain: _Chain, number: int, inertia: np.ndarray, friction: dict[str, str]
 ) -> tuple[Xml.Element, list[float]]:
-    """Add a part to the body before.
+    """Add a part as a child of the part before it.
 
-    Returns the part, and the coordinates of its joint at home.
+    Returns the new element, and the coordinates of its joint at home.
     """
     part = chain.parts[number]
     home = chain.home
@@ -266,9 +269,9 @@ def _add_part(
 def _add_joint(
     body: Xml.Element, part: Part, axis: np.ndarray, coordinate: float, friction: dict[str, str]
 ) -> list[float]:
-    """Add the joint of a part and return its coordinates at home.
+    """Add the joint of a part, and return its coordinates at home.
 
-    A universal joint is two hinges. The first is the one in the body before.
+    A universal joint is written as two hinges. The axis of the first is fixed in the body before.
     """
     if part.segment.joint == "ball":
         Xml.SubElement(body, "joint", name=part.name, type="ball")
@@ -287,17 +290,19 @@ def _add_joint(
 
 
 def part_axis(part: Part, frames: Frames, number: int) -> np.ndarray:
-    """Axis (3,) of the joint of a part, in its own axes."""
+    """Axis (3,) of the joint of a part, in the axes of the part."""
     return _cleaned(frames.axes[number].T @ frames.axes[part.before] @ part.segment.axis)
 
 
 def _cleaned(values: np.ndarray) -> np.ndarray:
-    """Values of order one, m or without unit, without the rounding that stands for zeros."""
+    """Values with rounding errors about zero replaced by zero.
+
+    The values are of order one, in m or without unit.
+    """
     return np.where(np.abs(values) < 2e-15, 0.0, values)
 
 
 def _add_inertia(body: Xml.Element, centre: np.ndarray, inertia: np.ndarray) -> None:
-    """Add mass, centre and inertia of a body."""
     Xml.SubElement(
         body,
         "inertial",
@@ -308,7 +313,6 @@ def _add_inertia(body: Xml.Element, centre: np.ndarray, inertia: np.ndarray) -> 
 
 
 def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
-    """Add closed loops and motors."""
     equality = Xml.SubElement(root, "equality")
     actuator = Xml.SubElement(root, "actuator")
     for number in chain.ends:
@@ -321,7 +325,7 @@ def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
 
 
 def _add_comment(parent: Xml.Element, text: str) -> None:
-    """Add a comment. XML allows no two hyphens side by side in it, nor some characters."""
+    """Add a comment, without two hyphens side by side and characters that XML does not allow."""
     parent.append(Xml.Comment(f" {re.sub('-(?=-)', '- ', NOT_IN_XML.sub('?', text))} "))
 
 
@@ -330,7 +334,7 @@ def _numbers(values: ArrayLike) -> str:
     return " ".join(repr(float(value)) for value in np.atleast_1d(np.asarray(values, dtype=float)))
 
 
-# What the exported robot looks like: geoms without mass or contact, so that a viewer shows it.
+# Appearance of the exported robot in a viewer: geoms without mass and contact.
 BALL_RADIUS = 0.009
 PLATE_THICKNESS = 0.012
 COLOURS = {
@@ -357,10 +361,10 @@ def add_assets(root: Xml.Element, geometry: RobotGeometry) -> None:
 
 
 def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
-    """Add the looks of the base.
+    """Add geoms that show the base.
 
-    They are a plate behind the legs, seen from the platform, a motor on each hinge of the base, and
-    a rail below each slide.
+    They are a plate behind the legs, as seen from the platform, a motor on each hinge of the base,
+    and a rail below each slide.
     """
     centre, radius = _disc(geometry.base_joints)
     behind = np.array([0.0, 0.0, -1.0 if geometry.home_pose[2] >= centre[2] else 1.0])
@@ -378,7 +382,7 @@ def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
 
 
 def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius of a disc behind points."""
+    """Centre (3,) and radius of a disc that covers points."""
     centre = points.mean(axis=0)
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
@@ -386,13 +390,11 @@ def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
 def _rod(
     parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radius: float, material: str
 ) -> None:
-    """Add a rod."""
     ends = _numbers(np.concatenate([start, end]))
     Xml.SubElement(parent, "geom", type=kind, fromto=ends, size=_numbers(radius), material=material)
 
 
 def _ball(parent: Xml.Element, centre: np.ndarray, radius: float) -> None:
-    """Add a ball."""
     Xml.SubElement(
         parent, "geom", type="sphere", pos=_numbers(centre), size=_numbers(radius), material="link"
     )

@@ -1,8 +1,8 @@
-"""Robot from MJCF, a model of any program that MuJoCo compiles.
+"""Import of a robot from an MJCF file of any program.
 
-Its loops are `connect` or `weld` equalities. Home is the keyframe `home`, else the first one, else
-the model as it is written. The platform may fly freely or hang on a leg. What the exporter adds
-(`numeric` joint_pid and travel_limit) is read back.
+Loops are `connect` or `weld` equalities. Home is the keyframe `home`, else the first keyframe, else
+the model as it is written. The platform may fly freely or hang on a leg. The `numeric` elements
+joint_pid and travel_limit, which the exporter writes, are read back.
 """
 
 from pathlib import Path
@@ -26,11 +26,11 @@ MOST = 120
 def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
     """Robot in an MJCF file, and remarks on the file.
 
-    MuJoCo makes a model of any size of a small file. A file whose author one does not trust is
-    better read by ``cmmsim import mjcf``, which limits time and memory.
+    MuJoCo can make a model of any size from a small file. For a file from an untrusted author, use
+    ``cmmsim import mjcf``, which limits time and memory.
 
-    Raises RobotFileError where MuJoCo refuses the file, or where its mechanism has legs of no known
-    kind. Raises MujocoMissingError.
+    Raises RobotFileError if MuJoCo refuses the file, or if its mechanism has legs of no known kind.
+    Raises MujocoMissingError if MuJoCo is not installed.
     """
     mujoco = import_mujoco()
     _refuse_large(Path(path))
@@ -45,9 +45,10 @@ def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
 
 
 def _refuse_large(path: Path, above: tuple[Path, ...] = ()) -> int:
-    """Count the bodies of a file and of those that it includes.
+    """Count the bodies of a file and of the files that it includes.
 
-    Raises RobotFileError for more bodies than a robot has, and for what would read other folders.
+    Raises RobotFileError if the file has more bodies than a robot, or includes a file of another
+    folder.
     """
     content = read_bytes(path, str(path), RobotFileError, LARGEST_XML)
     bodies = 0
@@ -58,7 +59,8 @@ def _refuse_large(path: Path, above: tuple[Path, ...] = ()) -> int:
             further = path.parent / name
             if name.is_absolute() or ".." in name.parts or further in above or len(above) > 8:
                 raise RobotFileError(
-                    f"{path} includes {shown(str(name))}, must be files of its folder, each once"
+                    f"{path} includes {shown(str(name))}; it may only include files of its own "
+                    "folder, and each of them once"
                 )
             bodies += _refuse_large(further, (*above, path, further))
     if bodies > MOST:
@@ -136,7 +138,7 @@ def _freedom(mujoco: Any, model: Any, data: Any, joint: int, actuator: int | Non
         ("armature", model.dof_armature[dof]),
     ):
         if value:
-            raise RobotFileError(f"{name} has {what} {value:g}, which no joint has here")
+            raise RobotFileError(f"{name} has {what} {value:g}, which cannot be imported")
     return Freedom(
         kind,
         name,
@@ -154,9 +156,9 @@ def _joint_name(model: Any, joint: int) -> str:
 
 
 def _loop(mujoco: Any, model: Any, data: Any, equality: int) -> Connection:
-    """Loop of two sites or two bodies, as a ball joint or a weld.
+    """Connection that closes a loop between two sites or two bodies, as a ball joint or a weld.
 
-    Raises RobotFileError where it is open at home.
+    Raises RobotFileError if the loop is open at home.
     """
     first, second = (int(ids[equality]) for ids in (model.eq_obj1id, model.eq_obj2id))
     name = model.equality(equality).name or f"equality {equality}"
@@ -182,15 +184,13 @@ def _loop(mujoco: Any, model: Any, data: Any, equality: int) -> Connection:
 
 
 def _refuse_others(mujoco: Any, model: Any) -> None:
-    """Raise RobotFileError for loops that close, or joints that move, in another way."""
+    """Raise RobotFileError for loops, tendons or actuators that cannot be imported."""
     known = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
     for k in range(model.neq):
         if model.eq_active0[k] and model.eq_type[k] not in known:
             kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
             name = model.equality(k).name or k
-            raise RobotFileError(
-                f"equality {name} is of the kind {kind}; loops are connect or weld here"
-            )
+            raise RobotFileError(f"equality {name} is of the kind {kind}, must be connect or weld")
     if model.ntendon:
         raise RobotFileError(f"it has {model.ntendon} tendons, which no kind of leg has")
     for k in range(model.nu):
@@ -199,7 +199,10 @@ def _refuse_others(mujoco: Any, model: Any) -> None:
 
 
 def _numeric(model: Any, name: str, count: int) -> np.ndarray | None:
-    """Numbers that the file has under a name, or None."""
+    """Numbers of the element `numeric` with a name.
+
+    None if the file has no such element, or one with another count of numbers.
+    """
     try:
         found = np.array(model.numeric(name).data, dtype=float)
     except KeyError:

@@ -1,4 +1,4 @@
-"""Robot in MuJoCo, which is put into any state of the closed chain and stepped.
+"""Simulation of a robot in MuJoCo, from any state of its closed chain.
 
 This is the only module that imports MuJoCo.
 """
@@ -19,19 +19,21 @@ X = np.array([1.0, 0.0, 0.0])
 
 
 class MujocoMissingError(DynamicsError):
-    """MuJoCo, which is an optional extra, is not installed."""
+    """MuJoCo, an optional dependency, is not installed."""
 
 
 class MujocoError(DynamicsError):
-    """Model that MuJoCo refuses, or state at which it gave up."""
+    """MuJoCo does not load or refuses a model, or a value for it is invalid."""
 
 
 def import_mujoco() -> Any:
     """Import MuJoCo and return the module.
 
-    MuJoCo sets up its renderer at import. With MUJOCO_GL=egl that fails on the PyOpenGL that
-    pyrender asks for. Raises MujocoMissingError with the way to install it, or MujocoError where it
-    does not load.
+    MuJoCo sets up its renderer at import, which can fail with MUJOCO_GL=egl: pyrender requires a
+    version of PyOpenGL that does not support it.
+
+    Raises MujocoMissingError, with the command that installs MuJoCo, or MujocoError if it does not
+    load.
     """
     try:
         import mujoco
@@ -41,7 +43,7 @@ def import_mujoco() -> Any:
         ) from None
     except AttributeError as error:
         raise MujocoError(
-            f"MuJoCo does not load ({error}): unset MUJOCO_GL, no picture is needed here"
+            f"MuJoCo does not load ({error}): unset MUJOCO_GL, because nothing is rendered here"
         ) from error
     return mujoco
 
@@ -112,7 +114,7 @@ class MujocoRobot:
     def link_spin(self) -> float:
         """Largest angular velocity of a body on a ball joint about its own axis, rad/s.
 
-        It is zero without such bodies.
+        It is zero if the robot has no such body.
         """
         spins = [0.0]
         for part, body in zip(self._parts.all, self._bodies, strict=True):
@@ -124,9 +126,9 @@ class MujocoRobot:
         return max(spins)
 
     def put(self, pose: np.ndarray, twist: np.ndarray) -> None:
-        """Put all bodies where the robot has them at a pose (6,) with a twist (6,).
+        """Set the state of all bodies to a pose (6,) and a twist (6,) of the platform.
 
-        No link spins (eq. 12).
+        Links do not spin about their own axes (eq. 12).
         """
         pose = floats("pose", pose, (6,))
         twist = floats("twist", twist, (6,))
@@ -159,7 +161,7 @@ class MujocoRobot:
                 data.qpos[at] = Rotation.from_matrix(turned).as_rotvec() @ resting
                 data.qvel[rate] = spin @ axis
                 continue
-            # a universal joint turns about the axis of the part before, then about x
+            # a universal joint turns about an axis of the part before it, then about x
             moved = turned[:, 0]
             angle = np.arctan2(np.cross(resting, X) @ moved, moved[0])
             about_x = Rotation.from_rotvec(-angle * resting).as_matrix() @ turned
@@ -168,9 +170,9 @@ class MujocoRobot:
         self._mujoco.mj_forward(self.model, data)
 
     def twist_dot(self, torque: np.ndarray) -> np.ndarray:
-        """Acceleration [h_ddot, omega_dot] (6,) in the present state, in the axes of the base.
+        """Acceleration [h_ddot, omega_dot] (6,) under joint torques or forces (n,).
 
-        It is that under torques or forces (n,).
+        It is that of the present state, in the axes of the base.
         """
         self.data.ctrl[:] = floats("torque", torque, (len(self._joint),))
         self._mujoco.mj_forward(self.model, self.data)
@@ -178,7 +180,9 @@ class MujocoRobot:
         return np.concatenate([self.data.qacc[:3], platform @ self.data.qacc[3:6]])
 
     def feed_back(self, stiffness: float, damping: float) -> None:
-        """Add -stiffness coordinate - damping rate to every control inside MuJoCo's integrator."""
+        """Add -stiffness * coordinate - damping * rate to every control, inside MuJoCo's
+        integrator.
+        """
         self.model.actuator_biastype[:] = self._mujoco.mjtBias.mjBIAS_AFFINE
         stiffness = real("stiffness", stiffness, MujocoError, least=0)
         damping = real("damping", damping, MujocoError, least=0)

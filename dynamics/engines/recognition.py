@@ -1,8 +1,8 @@
-"""Robot of a mechanism from another program, where its legs are of known kinds.
+"""Recognition of a mechanism from another program as a robot with legs of known kinds.
 
-The frame of the platform is at its centre of mass. Its axes are those of the file if the inertia of
-the platform is diagonal in them, else principal axes. If these tilt too far for the angles of a
-pose, they are renamed to lie nearest those of the base.
+The origin of the platform's frame is its centre of mass. The frame has the axes of the file if the
+inertia of the platform is diagonal in them, else its principal axes. If these tilt too far for the
+angles of a pose, they are reordered to be as near as possible to the axes of the base.
 """
 
 from collections import Counter
@@ -33,32 +33,36 @@ from dynamics.robot_file import ParameterSet, RobotDescription, parsed_robot
 from dynamics.robot_text import robot_text
 
 DIAGONAL = 1e-9
-"""Share of the largest moment below which products of inertia are rounding."""
+"""Share of the largest moment below which products of inertia count as rounding errors."""
 
 MOST_TILT = 0.9
 """Largest sin(beta) at home.
 
-Near 1 the angles are singular: alpha and gamma turn about the same axis. A platform beyond it
-gets the axes nearest to those of the base.
+Near 1 the angles are singular, because alpha and gamma turn about the same axis. If the platform is
+tilted further, its axes are reordered to be nearest to those of the base.
 """
 
 OWN_RATE = 2 * np.pi * 3
-"""Natural frequency of a joint PID where a file has none, rad/s, at the joint of least inertia."""
+"""Natural frequency of the chosen joint PID, rad/s, at the joint with the least inertia.
+
+It is used for a file that states no joint PID.
+"""
 
 OWN_DAMPING = 0.7
-"""Damping ratio of such a joint PID."""
+"""Damping ratio of the chosen joint PID."""
 
 TRAVEL = 0.5
-"""Travel beyond the home coordinates where a file has no ranges, rad."""
+"""Travel beyond the home coordinates if a file states no joint ranges, rad."""
 
 TRAVEL_SHARE = 0.1
-"""Travel of actuators that slide, as a share of the distance from B to A."""
+"""Travel of sliding actuators if a file states no ranges, as a share of the distance from B to A.
+"""
 
 
 def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
-    """Robot of a mechanism, with one parameter set `initial`, and remarks on its file.
+    """Robot of a mechanism, with one parameter set `initial`, and remarks on the file.
 
-    Raises RobotFileError, with leg and body, for a mechanism with legs of no known kind.
+    Raises RobotFileError, with the leg and body, if a leg is of no known kind.
     """
     plain = simplified(mechanism)
     notes = list(plain.notes)
@@ -66,13 +70,13 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     platform = plain.solids[number]
     axes, moments = _principal(platform)
     if not np.array_equal(axes, platform.axes):
-        notes.append(f"the platform's axes are not those of {platform.name}, but principal ones")
+        notes.append(f"the platform has principal axes instead of the axes of {platform.name}")
     found = list(legs_of(plain, number, np.column_stack([axes, platform.centre])))
     legs = [_leg(one, k) for k, one in enumerate(found, 1)]
     if not legs:
         raise RobotFileError(
-            f"it has no legs: no body is between the base and {platform.name}, where most joints "
-            "meet"
+            f"it has no legs: no body is between the base and {platform.name}, which has the most "
+            "joints"
         )
     charts = Counter(leg.chart for leg in legs)
     home = (*platform.centre.tolist(), *(Rotation.from_matrix(axes).as_euler("XYZ") + 0.0).tolist())
@@ -100,8 +104,8 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     gains = _gains(geometry, dynamic[layout.rigid]) if plain.gains is None else plain.gains
     if plain.gains is None:
         notes.append(
-            "the file has no joint PID: its gains are chosen for 3 Hz at the joint that feels "
-            "the least inertia"
+            "the file has no joint PID: gains are chosen for a natural frequency of 3 Hz at the "
+            "joint with the least inertia"
         )
     robot = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
     parsed_robot(robot_text(robot), "the robot")  # raises if a number is out of range
@@ -109,7 +113,7 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
 
 
 def _leg(one: MechanismLeg, number: int) -> Leg:
-    """Leg of a kind, from a leg of the mechanism."""
+    """Leg of a known kind for a leg of the mechanism."""
     try:
         return leg_of(one.chain)
     except RobotFileError as error:
@@ -125,12 +129,12 @@ def _numbers(place: Placement) -> tuple[np.ndarray, np.ndarray]:
 def _inertia(
     body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid], ways: np.ndarray
 ) -> list[float]:
-    """Mass and moments of a body of a leg, in the axes of its kind.
+    """Mass and moments of inertia of a leg's body, in the axes that its kind of leg defines.
 
-    The body may consist of several equal bars. Its centre of mass is checked only along `ways`
-    (3, n), the directions in which the platform can move, and only if the body turns: elsewhere it
-    has no effect. Raises RobotFileError for a centre of mass elsewhere, and for
-    products of inertia that would do work.
+    The body may consist of several equal bars. The centre of mass is checked only if the body
+    turns, and only along `ways` (3, n), the directions in which the platform can move, because it
+    has no effect otherwise. Raises RobotFileError for a wrong centre of mass, and for products of
+    inertia that would do work.
     """
     centre, axes = place
     name = " and ".join(bar.name for bar in bars)
@@ -142,8 +146,8 @@ def _inertia(
     off = float(np.linalg.norm((np.mean([bar.centre for bar in bars], axis=0) - centre) @ ways))
     if body.moments and off > SAME:
         raise RobotFileError(
-            f"the centre of mass of {name} is {off:.4g} m from where its kind has it "
-            f"({body.name}), {np.array2string(centre, precision=6)} at home"
+            f"the centre of mass of {name} is {off:.4g} m from its place in a {body.name}, "
+            f"{np.array2string(centre, precision=6)} at home"
         )
     inertia = sum(axes.T @ bar.inertia @ axes for bar in bars)
     moments = np.diagonal(inertia)
@@ -152,15 +156,15 @@ def _inertia(
     products = np.abs(block - np.diag(np.diagonal(block))).max(initial=0.0)
     if products > SAME * moments.max():
         raise RobotFileError(
-            f"{name} has a product of inertia of {products:.3g} kg m^2 in the axes of its kind "
-            f"({body.name}), must have moments alone "
+            f"{name} has a product of inertia of {products:.3g} kg m^2 in the axes of a "
+            f"{body.name}, must have only moments "
             f"({', '.join(f'{moment:.3g}' for moment in moments)})"
         )
     return [mass, *moments]
 
 
 def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (3, 3) of the platform, and its moments about them (3,)."""
+    """Axes (3, 3) of the platform's frame, and the moments of inertia (3,) about them."""
     own = platform.axes.T @ platform.inertia @ platform.axes
     axes = platform.axes
     if np.abs(own - np.diag(np.diagonal(own))).max() > DIAGONAL * np.abs(own).max():
@@ -171,9 +175,9 @@ def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(axes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Axes (3, 3) in the order and with the signs that are nearest to others.
+    """Reorder and reverse axes (3, 3) so that they are nearest to the wanted axes.
 
-    They are right-handed.
+    The result is right-handed.
     """
     cosines = wanted.T @ axes
     order = linear_sum_assignment(-np.abs(cosines))[1]
@@ -185,18 +189,21 @@ def _nearest(axes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Chart:
-    """Chart of a planar robot. Raises RobotFileError unless it is in the plane of x and y."""
+    """Chart of a planar robot.
+
+    Raises RobotFileError unless the robot moves in the plane of x and y.
+    """
     for number, leg in enumerate(legs, 1):
         lean = np.linalg.norm(leg.segments()[0].axis[:2])
         if lean > SAME:
             raise RobotFileError(
-                f"leg {number} turns about {np.round(leg.segments()[0].axis, 6).tolist()}; those "
-                "of planar robots turn about z"
+                f"leg {number} turns about {np.round(leg.segments()[0].axis, 6).tolist()}; the "
+                "legs of a planar robot must turn about z"
             )
     if np.linalg.norm(axes[:2, 2]) > SAME:
         raise RobotFileError(
-            f"the platform's z is {np.round(axes[:, 2], 6).tolist()}; of planar robots it is along "
-            "z"
+            f"the z axis of the platform is {np.round(axes[:, 2], 6).tolist()}; on a planar robot "
+            "it must be along z"
         )
     return Chart("planar", home)
 
@@ -204,7 +211,7 @@ def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Char
 def _travel(
     plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes: list[str]
 ) -> float:
-    """Travel limit from the ranges of the file, else a chosen distance about home."""
+    """Travel limit from the ranges in the file, or a default about home."""
     limits = []
     for one in found:
         at_home = one.actuated.coordinate
@@ -213,8 +220,8 @@ def _travel(
             limits.append(min(-span[0], span[1]))
             if limits[-1] <= abs(at_home):
                 raise RobotFileError(
-                    f"{one.actuated.name} has the range {span[0]:g} to {span[1]:g}, which needs "
-                    f"zero and home ({at_home:g}) well inside"
+                    f"{one.actuated.name} has the range {span[0]:g} to {span[1]:g}; zero and "
+                    f"home ({at_home:g}) must be well inside"
                 )
     if limits:
         return float(min(limits))
@@ -225,7 +232,7 @@ def _travel(
 
 
 def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:
-    """Gains lp, li, ld for the smallest inertia that any joint feels at home."""
+    """Gains lp, li, ld for the smallest inertia of any joint at home."""
     home = ca.SX(geometry.home_pose)
     free = geometry.chart.basis
     jacobian = np.array(ca.evalf(joint_jacobian(geometry, home))) @ free

@@ -1,16 +1,16 @@
-"""Robot from URDF, and from a YAML file of what URDF cannot say.
+"""Import of a robot from a URDF file, and a YAML file with its closed loops.
 
-The convention is that of the public example-parallel-robots. URDF has a tree, whose root stands
-still. The YAML file has these keys:
+The convention is that of the public example-parallel-robots. A URDF file describes a tree, whose
+root is the fixed base. The YAML file has these keys:
 
-- closed_loop: pairs of frames that coincide. A frame is the name of a link, or of a joint, which is
-  at the frame of its child.
-- type: for each pair, "3d" where the points coincide, or "6d" where the axes do, too.
+- closed_loop: pairs of frames that coincide. A frame is named by a link, or by a joint, which
+  stands for the frame of its child.
+- type: for each pair, "3d" if only the points coincide, or "6d" if the axes coincide, too.
 - name_mot: the actuated joints.
-- joint_name and joint_type: joints that are something else than URDF says: SPHERICAL, FIXED, or
+- joint_name and joint_type: joints with another type than in the URDF file: SPHERICAL, FIXED, or
   UJOINT_XY (hinges about x, then y, of the frame of the joint).
 
-Home is a closed position near all coordinates zero.
+Home is the position near zero coordinates in which the loops are closed.
 """
 
 from collections import Counter
@@ -35,13 +35,13 @@ from dynamics.robot_file import RobotDescription
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
 MOST = 120
-"""Largest number of links, and of joints, of a robot. The largest one here has some forty."""
+"""Largest number of links, and of joints, of a robot. The largest example has about forty."""
 
 MOST_COORDINATES = 90
-"""Largest number of coordinates of all joints. The time to close the loops grows as its square."""
+"""Largest number of all joint coordinates. The time to close loops grows with its square."""
 
 STEPS = 60
-"""Largest number of steps to close the loops. Loops that can be closed take some ten."""
+"""Largest number of iterations to close the loops. About ten are usual."""
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -55,12 +55,16 @@ KINDS = {
     "fixed": "weld",
     "floating": "floating",
 }
-"""Kinds of joints by their URDF type."""
+"""Kinds of joints for each joint type of URDF."""
 
 
 @dataclass(frozen=True)
 class _Joint:
-    """Joint of the tree: its frame in that of the parent (4, 4), and axes (2, 3) in its own."""
+    """Joint of the tree.
+
+    `place` (4, 4) is its frame in the frame of the parent, and `axes` (2, 3) are its axes in its
+    own frame.
+    """
 
     name: str
     kind: str
@@ -72,7 +76,7 @@ class _Joint:
     span: tuple[float, float] | None
 
     def moved(self, q: np.ndarray) -> np.ndarray:
-        """Frame of the child in that of the parent (4, 4) at the joint's coordinates."""
+        """Frame (4, 4) of the child in the frame of the parent, at coordinates of the joint."""
         own = np.eye(4)
         if self.kind in ("ball", "floating"):
             own[:3, :3] = Rotation.from_rotvec(q[-3:]).as_matrix()
@@ -86,7 +90,7 @@ class _Joint:
 
 
 def robot_of_urdf(path: str | Path, closures: str | Path) -> tuple[RobotDescription, list[str]]:
-    """Robot in a URDF file and a YAML file of its closures, and remarks on the files.
+    """Robot in a URDF file and a YAML file with its closed loops, and remarks on the files.
 
     Raises RobotFileError for a file that cannot be read, for loops that do not close, and for legs
     of no known kind.
@@ -101,7 +105,7 @@ def robot_of_urdf(path: str | Path, closures: str | Path) -> tuple[RobotDescript
 
 
 def _closures(path: str | Path) -> dict[str, list[Any]]:
-    """Settings of the YAML file. Raises RobotFileError."""
+    """Settings in the YAML file. Raises RobotFileError if they are invalid."""
     data = read_bytes(path, str(path), RobotFileError, LARGEST_YAML)
     content = parse_yaml(data, str(path), RobotFileError)
     if (
@@ -138,7 +142,6 @@ def _require_once(names: list[str], what: str) -> None:
 
 
 def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
-    """Mechanism of the files."""
     elements = {kind: root.findall(kind) for kind in ("link", "joint")}
     for kind, found in elements.items():
         if len(found) > MOST:
@@ -190,7 +193,7 @@ def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
 
 
 def _joint(element: Xml.Element, other: str | None) -> _Joint:
-    """Joint of an element."""
+    """Joint of an XML element. `other` is the type that the YAML file gives the joint, or None."""
     name = str(element.get("name"))
     kind = str(element.get("type"))
     if kind not in KINDS or element.find("mimic") is not None:
@@ -231,9 +234,9 @@ def _joint(element: Xml.Element, other: str | None) -> _Joint:
 
 
 def _from_the_root(links: Mapping[str, Xml.Element], joints: list[_Joint]) -> list[_Joint]:
-    """Joints in an order in which each is after that of its parent.
+    """Sort joints so that each follows the joint of its parent.
 
-    Raises RobotFileError where they make no tree.
+    Raises RobotFileError if they form no tree.
     """
     children = [joint.child for joint in joints]
     roots = [name for name in links if name not in children]
@@ -249,7 +252,7 @@ def _from_the_root(links: Mapping[str, Xml.Element], joints: list[_Joint]) -> li
     for k, joint in enumerate(joints):
         below.setdefault(joint.parent, []).append(k)
     ordered: list[_Joint] = []
-    # a heap, so that of the joints that can come next, the first one in the file does
+    # a heap, so that the next joint is the first in the file among all that can follow
     next_ones = list(below.get(roots[0], ()))
     while next_ones:
         joint = joints[heappop(next_ones)]
@@ -257,7 +260,7 @@ def _from_the_root(links: Mapping[str, Xml.Element], joints: list[_Joint]) -> li
         for k in below.get(joint.child, ()):
             heappush(next_ones, k)
     if len(ordered) < len(joints):
-        raise RobotFileError("the URDF is no tree: some links hang on themselves")
+        raise RobotFileError("the URDF is no tree: some links form a loop")
     return ordered
 
 
@@ -271,7 +274,6 @@ def _placed(base: str, joints: list[_Joint], q: np.ndarray) -> dict[str, np.ndar
 
 
 def _slices(joints: list[_Joint]) -> dict[str, slice]:
-    """Places of the coordinates of each joint."""
     ends = np.cumsum([COORDINATES[joint.kind] for joint in joints]).tolist()
     return {
         joint.name: slice(end - COORDINATES[joint.kind], end)
@@ -280,7 +282,10 @@ def _slices(joints: list[_Joint]) -> dict[str, slice]:
 
 
 def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]]) -> np.ndarray:
-    """Coordinates at which all loops are closed. Raises RobotFileError, with the gap."""
+    """Coordinates at which all loops are closed.
+
+    Raises RobotFileError, with the gap that remains.
+    """
 
     def gaps(q: np.ndarray) -> np.ndarray:
         place = _placed(base, joints, q)
@@ -303,7 +308,7 @@ def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]])
     worst = float(np.abs(gaps(q)).max())
     if worst > SAME:
         raise RobotFileError(
-            f"the loops do not close: {worst:.3g} m or rad are left, must be below {SAME:g}"
+            f"the loops do not close: a gap of {worst:.3g} m or rad remains, must be below {SAME:g}"
         )
     return q
 
@@ -311,7 +316,10 @@ def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]])
 def _freedoms(
     joint: _Joint, at: np.ndarray, q: np.ndarray, actuator: int | None
 ) -> tuple[Freedom, ...]:
-    """Elementary joints of a joint whose frame is at (4, 4) in the base, at its coordinates."""
+    """Elementary joints of a joint at its coordinates `q`.
+
+    `at` (4, 4) is the frame of the joint in the base.
+    """
     point = at[:3, 3]
     turn = at[:3, :3]
     first = turn @ joint.axes[0]
@@ -330,9 +338,9 @@ def _freedoms(
 
 
 def _solid(link: Xml.Element, place: np.ndarray) -> Solid:
-    """Body of a link. A link without inertial has no mass.
+    """Body of a link. A link without an inertial element has no mass.
 
-    What is drawn of it is the first cylinder among its visuals.
+    The rod that draws the body is the first cylinder among its visuals.
     """
     name = str(link.get("name"))
     axes = place[:3, :3]
@@ -351,7 +359,6 @@ def _solid(link: Xml.Element, place: np.ndarray) -> Solid:
 
 
 def _origin(element: Xml.Element) -> np.ndarray:
-    """Frame (4, 4) of an origin."""
     place = np.eye(4)
     turn = Rotation.from_euler("xyz", _numbers(element, "origin", "rpy", (0.0, 0.0, 0.0)))
     place[:3, :3] = turn.as_matrix()
@@ -360,7 +367,6 @@ def _origin(element: Xml.Element) -> np.ndarray:
 
 
 def _numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...]) -> np.ndarray:
-    """Numbers of an attribute."""
     found = element.find(tag)
     text = None if found is None else found.get(key)
     if text is None:
@@ -377,13 +383,12 @@ def _numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...
 
 
 def _number(element: Xml.Element, tag: str, key: str) -> float:
-    """Number of an attribute."""
     found = element.find(tag)
     return 0.0 if found is None else _float(found, key)
 
 
 def _float(element: Xml.Element, key: str) -> float:
-    """Finite number of a text. Raises RobotFileError."""
+    """Number in an attribute. Raises RobotFileError if it is not finite."""
     text = element.get(key, "0")
     try:
         number = float(text)

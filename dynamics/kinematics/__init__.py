@@ -1,1 +1,1 @@
-"""Kinematics of the platform: coordinates and their rates, motion of its joints, closed loops."""
+"""Kinematics of the platform: its coordinates and rates, the motion of its joints, closed loops."""

@@ -1,8 +1,8 @@
 """Forward kinematics: Newton's method on the closure of the loops, for all rows of a batch at once.
 
-The gaps of the loops are smooth in the pose, whether or not a leg can reach it, so that no step can
-leave their domain. A pose that is found may have a leg in another assembly. The closed-form inverse
-kinematics has the last word.
+The gaps of the loops are smooth functions of the pose, even if a leg cannot reach it. Hence no step
+can leave their domain. In the pose that is found, a leg can have another assembly than at home. The
+closed-form inverse kinematics therefore checks the result.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,21 +16,22 @@ from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import ConvergenceError, ShapeError
 from dynamics.kinematics.platform import Chart
 
-# Smaller steps end the iteration. Smaller residuals, rad or m, count as solved.
+# A smaller step ends the iteration. A smaller residual, rad or m, counts as solved.
 STEP_TOLERANCE = 1e-12
 ANGLE_TOLERANCE = 1e-12
 MAX_ITERATIONS = 50
 HALVINGS = 20
 
-# A gap of squared lengths, in m^2, that is rounding.
+# Gap, m^2, below which a loop is closed up to rounding errors.
 CLOSED = 1e-14
 
-# Poses nearer than this share of the radius of the search, and as near in rotation, are one.
+# Two poses are the same if their positions differ by less than this share of the radius of the
+# search, and the entries of their rotation matrices by less than this.
 SAME = 1e-5
 
 
 Functions = Mapping[str, MachineFunction]
-"""Compiled functions of a robot, of which `loop_closure` and `inverse_kinematics` are needed."""
+"""Compiled functions of a robot. `loop_closure` and `inverse_kinematics` are needed."""
 
 Closure = Callable[[np.ndarray, np.ndarray], Sequence[np.ndarray]]
 """Function of poses (N, 6) and joint coordinates (N, n).
@@ -44,9 +45,9 @@ coordinates of the platform.
 class ForwardSolution:
     """Result of a search.
 
-    `pose` (6,) or (N, 6) is the pose that the search ended with, after `iterations` () or (N,) of
-    Newton's method. `residual` (n,) or (N, n) is the difference of wanted joint coordinates from
-    those of the pose, rad or m, and NaN where a leg cannot reach.
+    `pose` (6,) or (N, 6) is the final pose, after `iterations` () or (N,) of Newton's method.
+    `residual` (n,) or (N, n) is the difference between the given joint coordinates and those of the
+    pose, rad or m. It is NaN if a leg cannot reach the pose.
     """
 
     pose: np.ndarray
@@ -55,9 +56,7 @@ class ForwardSolution:
 
     @property
     def converged(self) -> np.ndarray:
-        """True for each row () or (N,) that has the wanted joint coordinates, to
-        ANGLE_TOLERANCE.
-        """
+        """True for each row () or (N,) whose residual is below ANGLE_TOLERANCE."""
         return np.asarray((self.residual < ANGLE_TOLERANCE).all(axis=-1))
 
 
@@ -66,7 +65,7 @@ def solve(
 ) -> ForwardSolution:
     """Poses with joint coordinates theta (n,) or (N, n), searched from a start (6,) or (N, 6).
 
-    Raises ConvergenceError with row, leg and residual where no pose near the start has them.
+    Raises ConvergenceError, with row, leg and residual, if no pose is found.
     """
     angles = np.atleast_2d(theta)
     if (start.ndim == 2 and start.shape[0] not in (1, len(angles))) or start.ndim > theta.ndim:
@@ -93,8 +92,8 @@ def assembly_modes(
 ) -> np.ndarray:
     """Distinct poses (k, 6) with joint coordinates theta (n,), found from random starts.
 
-    The starts are within `radius`, m, of `centre` (3,), and turned in all directions that the chart
-    allows. Each pose is checked by the inverse kinematics. The one nearest to home is first.
+    The starts are within `radius`, m, of `centre` (3,), with any orientation that the chart allows.
+    Each pose is checked by the inverse kinematics. The pose nearest to home is the first.
     """
     rng = np.random.default_rng(seed)
     turns = Rotation.random(starts, random_state=rng).as_euler("XYZ")
@@ -104,7 +103,7 @@ def assembly_modes(
     )
     found = ended.pose[ended.converged]
     turned = Rotation.from_euler("XYZ", found[:, 3:])
-    # the same rotation has several Euler angles, of which these are the principal ones
+    # a rotation has several sets of Euler angles; use the principal ones
     found = np.hstack([found[:, :3], turned.as_euler("XYZ")])
     order = np.argsort(
         np.linalg.norm(found[:, :3] - np.array(chart.home)[:3], axis=1), kind="stable"
@@ -122,7 +121,7 @@ def assembly_modes(
 def search(
     functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray
 ) -> ForwardSolution:
-    """Best poses (N, 6) for joint coordinates (N, n) from starts (N, 6)."""
+    """Best poses (N, 6) found for joint coordinates (N, n) from starts (N, 6)."""
     poses, iterations = close_loops(functions["loop_closure"], chart, theta, start)
     found = functions["inverse_kinematics"](poses)[0][..., 0]
     return ForwardSolution(poses, iterations, np.abs(theta - found))
@@ -134,8 +133,8 @@ def close_loops(
     """Poses (N, 6) that close the loops best for joint coordinates (N, n), and numbers of steps
     (N,).
 
-    Newton's iteration halves steps that do not help. A row is done when its step, or what that
-    gains, is nil.
+    Newton's method halves steps that do not reduce the gaps. A row is finished when its step is
+    negligible or reduces its gaps no further.
     """
     poses = np.array(start)
     active = np.arange(len(theta))
@@ -149,7 +148,7 @@ def close_loops(
         poses[active] = trials
         iterations[active] += 1
         going = better & (np.abs(steps).max(axis=1) > STEP_TOLERANCE)
-        # rows that are done keep their pose, and are not computed any more
+        # finished rows are not computed any more
         active = active[going]
         gaps = gaps[going]
         jacobians = jacobians[going]
@@ -161,10 +160,10 @@ def close_loops(
 def _damped(
     closure: Closure, theta: np.ndarray, poses: np.ndarray, steps: np.ndarray, gaps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Poses, gaps and Jacobians after a damped step, and the rows for which there is one.
+    """Poses, gaps and Jacobians after a damped step, and the rows for which a step was found.
 
-    The step is the first of the full one and its halves that narrows the gaps. A last full step
-    that rounding keeps from a gain is taken.
+    The step is the full step, or the first of its halves that reduces the gaps. A negligible step
+    is accepted even if rounding keeps it from reducing the gaps.
     """
     before = np.linalg.norm(gaps[..., 0], axis=1)
     scale = np.ones(len(poses))
@@ -182,13 +181,13 @@ def _damped(
 def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solutions (N, 6, 1) of linear systems.
 
-    A singular matrix gives the shortest solution of least squares, and one that has overflowed
-    gives NaN.
+    For a singular matrix, it is the least-squares solution of minimum norm. For a matrix that has
+    overflowed, it is NaN.
     """
     try:
         return np.linalg.solve(matrices, right)
     except np.linalg.LinAlgError:
-        # NumPy refuses all rows for one that is singular
+        # NumPy refuses all matrices if one of them is singular
         finite = np.isfinite(matrices).all(axis=(1, 2))
         solutions = np.full(right.shape, np.nan)
         solutions[finite] = np.linalg.pinv(matrices[finite]) @ right[finite]
@@ -205,13 +204,13 @@ def _check(functions: Functions, theta: np.ndarray, found: ForwardSolution) -> N
     gap = np.abs(
         functions["loop_closure"](found.pose[row : row + 1], theta[row : row + 1])[0]
     ).max()
-    why = f"its loops stay open by {gap:.3g} m^2 of squared length"
+    why = f"its loops have a gap of {gap:.3g} m^2 in squared length"
     if gap < CLOSED:
-        why = f"it closes the loops with leg {leg + 1} folded the other way than at home"
+        why = f"it closes the loops, but leg {leg + 1} is folded the other way than at home"
     there = f"joint {leg + 1} is off by {lacking:.3g}, limit {ANGLE_TOLERANCE:.0e}"
     if np.isnan(lacking):
         there = f"leg {leg + 1} cannot reach it"
     raise ConvergenceError(
         f"forward kinematics found no pose with joint coordinates {row_text(theta[row], 4)} (row "
-        f"{row}) in {found.iterations[row]} steps: of the nearest, {why}; {there}"
+        f"{row}) in {found.iterations[row]} steps: of the nearest pose, {why}; {there}"
     )

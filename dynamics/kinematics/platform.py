@@ -1,9 +1,9 @@
-"""Platform: its coordinates, and its motion in CasADi with the joints A of the legs.
+"""Platform: its coordinates, and its motion with the joints A of the legs, in CasADi.
 
-The pose has the six entries [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta) Rz(gamma) (eq. 1)
-for every robot. The coordinates of a platform with fewer freedoms are the entries that it can
-change. The others stay as they are at home. Eq. 2, 29 and 38 turn rates of the pose into a twist
-[h_dot, omega]. Vectors are in the axes of the base, in SI units.
+For every robot, the pose has the six entries [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta)
+Rz(gamma) (eq. 1). The coordinates of a platform with fewer degrees of freedom are the entries that
+it can change. The other entries have their values at home. Eq. 2, 29 and 38 relate rates of the
+pose to a twist [h_dot, omega]. Vectors are in the axes of the base, in SI units.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 POSE_NAMES = ("x", "y", "z", "alpha", "beta", "gamma")
 POSE_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 FREEDOMS = {"free": (0, 1, 2, 3, 4, 5), "translation": (0, 1, 2), "planar": (0, 1, 5)}
-"""Entries of the pose that a platform can change, by the names of the charts."""
+"""Entries of the pose that a platform can change, for each name of a chart."""
 
 
 def rotation_matrix(angles: ca.SX) -> ca.SX:
@@ -36,7 +36,7 @@ def rotation_matrix(angles: ca.SX) -> ca.SX:
 
 
 def pose_rate_to_twist(pose: ca.SX) -> ca.SX:
-    """Matrix T (6, 6) of eq. 29, with twist = T pose_dot and J_e of eq. 2."""
+    """Matrix T (6, 6) of eq. 29, with twist = T pose_dot. It includes J_e of eq. 2."""
     alpha = pose[3]
     beta = pose[4]
     euler_rate_jacobian = ca.vertcat(
@@ -48,7 +48,7 @@ def pose_rate_to_twist(pose: ca.SX) -> ca.SX:
 
 
 def twist_bias(pose: ca.SX, pose_rate: ca.SX) -> ca.SX:
-    """Vector T_dot pose_dot (6,), which is twist_dot at a pose acceleration of zero (eq. 38)."""
+    """Vector T_dot pose_dot (6,): the twist_dot of a motion without pose acceleration (eq. 38)."""
     ca_ = ca.cos(pose[3])
     cb = ca.cos(pose[4])
     sa = ca.sin(pose[3])
@@ -65,8 +65,9 @@ def twist_bias(pose: ca.SX, pose_rate: ca.SX) -> ca.SX:
 
 
 def joint_motion(arm: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Velocity and acceleration (3,) of a platform joint A at `arm` (3,) from the platform
-    origin.
+    """Velocity and acceleration (3,) of a platform joint A.
+
+    `arm` (3,) is the vector from the platform origin to A.
     """
     omega = twist[3:6]
     omega_dot = twist_dot[3:6]
@@ -77,12 +78,13 @@ def joint_motion(arm: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> tuple[ca.SX, ca.
 
 
 class PlatformJointMotion:
-    """Motion of the joints A (N, 3), m, platform axes, for a pose q, rate and acceleration (6,).
+    """Motion of the joints A (N, 3), m, platform axes, for a pose q, its rate and acceleration
+    (6,).
 
-    Lists over the legs: position, velocity, acceleration (3,). gradient dA/dq = d(velocity)/d(rate)
-    (3, 6). gradient_rate d(velocity)/dq (3, 6). acceleration_by_pose d(acceleration)/dq (3, 6). The
-    derivative d(acceleration)/d(rate) is twice gradient_rate. Pose, rate and acceleration (`gain`)
-    are symbols.
+    The attributes are lists with one entry for each leg: `position`, `velocity` and `acceleration`
+    (3,); `gradient`, dA/dq = d(velocity)/d(rate) (3, 6); `gradient_rate`, d(velocity)/dq (3, 6);
+    and `acceleration_by_pose`, d(acceleration)/dq (3, 6). The derivative d(acceleration)/d(rate) is
+    twice `gradient_rate`. Pose, rate and acceleration (`gain`) are symbols.
     """
 
     def __init__(
@@ -119,8 +121,8 @@ class PlatformJointMotion:
         return self.position[leg], self.velocity[leg], self.acceleration[leg]
 
     def curvature(self, leg: int, force: ca.SX) -> ca.SX:
-        """Derivative d(gradient^T force)/dq (6, 6) for a constant force (3,) at the joint of a
-        leg.
+        """Derivative d(gradient^T force)/dq (6, 6) for a constant force (3,) at the joint
+        of a leg.
         """
         arm = self._arms[leg]
         rows = [
@@ -139,13 +141,16 @@ def _combine(matrices: list[ca.SX], weights: ca.SX) -> ca.SX:
 
 
 def base_from_platform(pose: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) of a pose (6,), as numbers (eq. 1)."""
+    """Rotation matrix (3, 3) of a pose (6,), as numbers (eq. 1)."""
     return Rotation.from_euler("XYZ", pose[3:6]).as_matrix()
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Chart of a name, for a robot whose pose at home is `home` (six numbers)."""
+    """Chart of a platform: the entries of its pose that are coordinates.
+
+    `name` is a key of FREEDOMS, and `home` the pose at home (six numbers).
+    """
 
     name: str
     home: tuple[float, ...]
@@ -174,7 +179,7 @@ class Chart:
         return np.eye(6)[:, list(self.freedoms)]
 
     def pose(self, coordinates: ArrayLike) -> np.ndarray:
-        """Poses (6,) or (N, 6) of coordinates (n,) or (N, n)."""
+        """Poses (6,) or (N, 6) for coordinates (n,) or (N, n)."""
         values = np.asarray(coordinates, dtype=float)
         poses = np.empty((*values.shape[:-1], len(POSE_NAMES)))
         if len(self.freedoms) == len(POSE_NAMES):
@@ -197,16 +202,16 @@ class Chart:
         )
 
     def projected(self, rows: np.ndarray) -> np.ndarray:
-        """Rows (..., n, k) of the coordinates from rows (..., 6, k) of the twist: basis.T @ rows.
+        """Rows (..., n, k) for the coordinates from rows (..., 6, k) for the twist: basis.T @ rows.
 
-        The same array if n is 6.
+        If n is 6, the array itself is returned.
         """
         return rows if len(self.freedoms) == len(POSE_NAMES) else rows[..., list(self.freedoms), :]
 
     def lifted(self, values: np.ndarray, axis: int = -1) -> np.ndarray:
-        """Values of poses from values of coordinates, along an axis of length m.
+        """Rates or derivatives of poses from those of coordinates, along an axis of length m.
 
-        Values are rates or derivatives. The same array if m is 6.
+        If m is 6, the array itself is returned.
         """
         if len(self.freedoms) == len(POSE_NAMES):
             return values
@@ -216,7 +221,9 @@ class Chart:
         return np.moveaxis(lifted, -1, axis)
 
     def forbidden(self, pose: ArrayLike) -> np.ndarray:
-        """Part of poses (N, 6) that the platform cannot have, in each entry, m and rad."""
+        """Deviation of each entry of poses (N, 6) from the poses that the platform can have, m and
+        rad.
+        """
         values = np.asarray(pose, dtype=float)
         if len(self.freedoms) == len(POSE_NAMES):
             return np.zeros(values.shape)

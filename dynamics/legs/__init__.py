@@ -1,8 +1,8 @@
-"""Kinds of legs, as functions of the motion of their platform joint A alone.
+"""Kinds of legs, as functions of the motion of their platform joint A.
 
-A kind has its geometry and the kinematics of its bodies, from which its dynamics follow
-(`leg.Leg`). RSS is the kind of the paper's robot. Everything that depends on the kind of a leg is
-in this room and in robot files.
+A kind of leg has its geometry and the kinematics of its bodies, from which its dynamics follow
+(`leg.Leg`). RSS is the kind in the paper. All code that depends on the kind of a leg is in this
+folder and in robot files.
 """
 
 from dynamics.legs.leg import Leg

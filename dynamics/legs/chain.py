@@ -1,4 +1,4 @@
-"""Kind of leg of a chain of joints at home, as other programs describe it, from the base to A."""
+"""Kind of a leg from its chain of joints at home, as another program describes it."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,18 +15,22 @@ from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg, RusLeg
 from dynamics.legs.ups import UpsLeg
 
 SAME = 1e-6
-"""Angles, rad, and distances, m, below which numbers with few digits are equal."""
+"""Difference of angles, rad, and distances, m, below which they count as equal.
+
+It allows for numbers that are written with few digits.
+"""
 
 
 class Chain(NamedTuple):
-    """Joints of a leg at home, in the axes of the base, m.
+    """Joints of a leg at home, in order from the base to A. Vectors are in the axes of the base, m.
 
-    `joints` are their kinds (k), "hinge", "slide", "universal" or "ball", with * after the actuated
-    one. `points` (k, 3) are their places; the last one is A, or the middle of two bars side by
-    side. `axes` (k, 2, 3) hold the axis, and the second axis of a universal joint. `coordinate` is
-    that of the actuated joint. `platform_joint` is A in platform axes. `across` (3,) leads from the
-    first of two bars to the second, or is zero. `centres` (k - 1, 3) are centres of mass of the
-    bodies. `rods` are length and radius that are drawn of them, or None.
+    `joints` are their kinds (k): "hinge", "slide", "universal" or "ball", with * after the actuated
+    joint. `points` (k, 3) are their positions; the last one is A, or the point midway between two
+    parallel bars. `axes` (k, 2, 3) are the axis of each joint, and the second axis of a universal
+    joint. `coordinate` is the coordinate of the actuated joint. `platform_joint` is A in the axes
+    of the platform. `across` (3,) is the vector from the first of two bars to the second, or zero.
+    `centres` (k - 1, 3) are the centres of mass of the bodies. `rods` are the lengths and radii of
+    the rods that draw the bodies, or None.
     """
 
     joints: tuple[str, ...]
@@ -46,17 +50,17 @@ class Chain(NamedTuple):
 
 
 def leg_of(chain: Chain) -> Leg:
-    """Leg with these joints, in the assembly that they are in.
+    """Leg with these joints, in its present assembly.
 
-    Raises RobotFileError, with the kinds that there are, for joints that make no kind. Raises it
-    with the number for joints that do not stand as they do in their kind.
+    Raises RobotFileError, with the valid kinds, if the joints form no kind of leg. Raises it, with
+    the number, if the joints are not placed as their kind requires.
     """
     if chain.signature not in SIGNATURES:
         kinds = ", ".join(
             f"{one.model_fields['type'].default} = {text}" for text, (one, _) in SIGNATURES.items()
         )
         raise RobotFileError(
-            f"its joints, {chain.signature}, make no kind of leg (*: actuated); kinds: {kinds}"
+            f"its joints, {chain.signature}, make no kind of leg (*: actuated); valid: {kinds}"
         )
     kind, fields = SIGNATURES[chain.signature]
     try:
@@ -74,14 +78,14 @@ def leg_of(chain: Chain) -> Leg:
     best = int(np.argmin(np.nan_to_num(np.abs(off), nan=np.inf)))
     if not abs(off[best]) < SAME:
         raise RobotFileError(
-            f"its coordinate at home, {chain.coordinate:g}, is {off[best]:.3g} from what it should "
-            "be"
+            f"its coordinate at home is {chain.coordinate:g}, but its geometry gives "
+            f"{chain.coordinate + off[best]:g}"
         )
     return branches[best]
 
 
 def _cranked(chain: Chain) -> dict[str, Any]:
-    """Fields of a crank with a link that begins at its tip."""
+    """Fields of a crank, and of a link that begins at its tip."""
     tip = chain.points[1]
     axis = chain.axes[0, 0]
     base = chain.points[0] + ((tip - chain.points[0]) @ axis) * axis
@@ -103,7 +107,7 @@ def _cranked(chain: Chain) -> dict[str, Any]:
 
 
 def _with_universal_joint(chain: Chain) -> dict[str, Any]:
-    """Fields of a crank with a link on a universal joint."""
+    """Fields of a crank, and of a link on a universal joint."""
     _same_line(
         "the first axis of its universal joint", chain.axes[1, 0], "the crank's", chain.axes[0, 0]
     )
@@ -112,13 +116,13 @@ def _with_universal_joint(chain: Chain) -> dict[str, Any]:
 
 
 def _parallelogram(chain: Chain) -> dict[str, Any]:
-    """Fields of a crank with two bars."""
+    """Fields of a crank, and of a link of two bars."""
     _same_line("the line from bar to bar", chain.across, "the crank's axis", chain.axes[0, 0])
     return _cranked(chain) | {"bar_distance": float(np.linalg.norm(chain.across))}
 
 
 def _planar(chain: Chain) -> dict[str, Any]:
-    """Fields of hinges along one direction. Their places along their axes do not matter."""
+    """Fields of a chain of parallel hinges. Their positions along their axes have no effect."""
     axis = chain.axes[0, 0]
     for joint, name in enumerate(chain.joints):
         if name == "hinge":
@@ -130,7 +134,7 @@ def _planar(chain: Chain) -> dict[str, Any]:
 
 
 def _sliding(chain: Chain) -> dict[str, Any]:
-    """Fields of a slider with a link."""
+    """Fields of a slider and a link."""
     slider, end = chain.points[1:3]
     fields = {
         "base_joint": slider - chain.coordinate * chain.axes[0, 0],
@@ -147,9 +151,9 @@ def _sliding(chain: Chain) -> dict[str, Any]:
 
 
 def _telescopic(chain: Chain) -> dict[str, Any]:
-    """Fields of a cylinder with its rod.
+    """Fields of a cylinder and its rod.
 
-    Where the file has no lengths, home is at mid-stroke of two equal ones.
+    If the file has no lengths, both get the same length, such that home is at mid-stroke.
     """
     base, _, end = chain.points
     length = float(np.linalg.norm(end - base))
@@ -157,7 +161,7 @@ def _telescopic(chain: Chain) -> dict[str, Any]:
     _second_axis_across(chain, 0)
     if chain.axes[1, 0] @ (end - base) < 0:
         raise RobotFileError(
-            "its coordinate grows as it gets shorter: turn the axis of its slide round"
+            "its coordinate grows as it gets shorter: reverse the axis of its slide"
         )
     lengths = [length / 1.5 if rod is None else rod[0] for rod in chain.rods]
     along = (end - base) / length
@@ -174,7 +178,7 @@ def _telescopic(chain: Chain) -> dict[str, Any]:
 
 
 def _drawn(chain: Chain, *names: str) -> dict[str, float]:
-    """Radii of what is drawn."""
+    """Radii of the rods that draw the bodies."""
     return {
         f"{name}_radius": rod[1]
         for name, rod in zip(names, chain.rods, strict=True)
@@ -183,20 +187,18 @@ def _drawn(chain: Chain, *names: str) -> dict[str, float]:
 
 
 def _second_axis_across(chain: Chain, joint: int) -> None:
-    """Raise RobotFileError unless the second axis of a joint is normal to the length of its
-    body.
-    """
+    """Raise RobotFileError unless the second axis of a joint is perpendicular to its body."""
     along = chain.points[-1] - chain.points[joint]
     off = float(np.arcsin(np.abs(chain.axes[joint, 1] @ along) / np.linalg.norm(along)))
     if off > SAME:
         raise RobotFileError(
-            f"the second axis of its universal joint is {np.degrees(off):.3g} deg from normal to "
-            "the body on it"
+            f"the second axis of its universal joint is {np.degrees(off):.3g} deg from "
+            "perpendicular to the body on it"
         )
 
 
 def _same_line(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> None:
-    """Raise RobotFileError unless two directions agree."""
+    """Raise RobotFileError unless two directions are parallel."""
     sine = float(
         np.linalg.norm(np.cross(direction, other))
         / np.linalg.norm(direction)
@@ -204,8 +206,7 @@ def _same_line(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> 
     )
     if sine > SAME:
         raise RobotFileError(
-            f"{what} is {np.degrees(np.arcsin(min(sine, 1.0))):.3g} deg from {of}, must be along "
-            "that"
+            f"{what} is {np.degrees(np.arcsin(min(sine, 1.0))):.3g} deg from {of}, must be parallel"
         )
 
 
@@ -219,4 +220,4 @@ SIGNATURES: dict[str, tuple[type[Leg], Callable[[Chain], dict[str, Any]]]] = {
     "hinge* hinge hinge": (RrrLeg, _planar),
     "hinge* hinge ball": (RrrLeg, _planar),
 }
-"""Kinds of legs by their joints from the base, with the function that gives their fields."""
+"""Kinds of legs by their joints from the base on, each with the function that gives its fields."""

@@ -1,10 +1,12 @@
-"""Geometric numbers of a leg: those that decide where it lets its platform joint A be.
+"""Geometric numbers of a leg: the numbers that determine its kinematics.
 
-Each kind names its own (`Leg.numbers`): coordinates of its joints and lengths, m, and small turns
-of its axis, rad. A turn is counted from the leg itself, about its own directions. `u` and `v` are
-across the axis; for a crank they are along its zero direction and across it. `crank_zero` is about
-the axis. The numbers of a leg are thus those of another leg plus a vector of deviations. Deviations
-may be symbols, which gives a leg with derivatives.
+Each kind of leg lists its own (`Leg.numbers`): coordinates of its joints, and lengths, m, and small
+rotations of its axis, rad. Rotations are measured from the leg itself, about its own directions.
+`u` and `v` are perpendicular to the axis. On a crank, `u` is along its zero direction. `crank_zero`
+is about the axis.
+
+The numbers of a leg are thus the numbers of another leg plus a vector of deviations. The deviations
+can be symbols, and the leg then has derivatives with respect to them.
 """
 
 from typing import Any, TypeVar
@@ -29,15 +31,14 @@ def unit_of(number: str) -> str:
 
 
 def values(leg: Leg) -> np.ndarray:
-    """Numbers (k,) of a leg, m. Its turns are zero."""
+    """Geometric numbers (k,) of a leg, m. Its rotations are zero."""
     return np.array([_value(leg, name) for name in leg.numbers])
 
 
 def moved(leg: AnyKind, deviations: ArrayLike | ca.SX) -> AnyKind:
-    """Leg with numbers that are changed by deviations (k,), m and rad.
+    """Leg whose geometric numbers are changed by deviations (k,), m and rad.
 
-    Deviations that are symbols give a leg of symbols. Its expressions have derivatives, and nothing
-    else of it works.
+    If the deviations are symbols, only the expressions of the leg work, and have derivatives.
     """
     by = (
         deviations
@@ -65,11 +66,14 @@ def moved(leg: AnyKind, deviations: ArrayLike | ca.SX) -> AnyKind:
 
 
 def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
-    """Deviations (k,) of a leg from a nominal one of its kind, m and rad. They undo `moved`."""
+    """Deviations (k,) of a leg from a nominal leg of the same kind, m and rad.
+
+    This is the inverse of `moved`.
+    """
     off = dict(zip(leg.numbers, values(leg) - values(nominal), strict=True))
     if leg.turned:
         between = _frame(nominal).T @ _frame(leg)
-        # a leg that turns its axis alone: Rx(u) Ry(v) z
+        # only the axis of this leg is rotated: Rx(u) Ry(v) z
         if len(leg.turned) == 1:
             x, y, z = between[:, 2]
             turns = [np.arctan2(-y, z), np.arcsin(x), 0.0]
@@ -80,12 +84,12 @@ def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
 
 
 def _turns(leg: Leg) -> tuple[str, str, str]:
-    """Turns of a leg."""
+    """Names of the rotations of a leg."""
     return f"{leg.turned[0]}.u", f"{leg.turned[0]}.v", "crank_zero"
 
 
 def _is_turn(number: str) -> bool:
-    """Return True for a number that is a turn."""
+    """Return True for a number that is a rotation."""
     return number == "crank_zero" or number.endswith((".u", ".v"))
 
 
@@ -101,7 +105,7 @@ def _value(leg: Leg, number: str) -> float:
 def _frame(leg: Leg) -> np.ndarray:
     """Right-handed axes (3, 3) of a leg, as columns.
 
-    The last one is the axis of the leg. The first one is its zero direction, if it has one.
+    The last column is the axis of the leg. The first is its zero direction, if it has one.
     """
     axis = getattr(leg, leg.turned[0])
     if len(leg.turned) == 2:
@@ -113,7 +117,10 @@ def _frame(leg: Leg) -> np.ndarray:
 
 
 def _number(value: ca.SX) -> Any:
-    """Number of an expression without symbols."""
+    """Number or array of an expression without symbols.
+
+    Any other expression is returned unchanged.
+    """
     if not value.is_constant():
         return value
     array = np.array(ca.DM(value)).ravel()

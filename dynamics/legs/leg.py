@@ -1,14 +1,14 @@
-"""Leg of any kind in CasADi, as a function of the motion of its platform joint A alone.
+"""Leg of any kind in CasADi, as a function of the motion of its platform joint A.
 
-The bodies of a leg move as A makes them move (eq. 5-16). Each leg therefore adds a force F at A,
-and the wrench of the robot is the sum of the platform's own wrench and [F; a x F] over the legs.
-This is the virtual-work model of eq. 23, with Jacobians with respect to the velocity of A (3
-columns) and not to the twist (6 columns), at a fraction of the operations.
+The motion of A determines the motion of the bodies of a leg (eq. 5-16). Each leg therefore adds a
+force F at A. The wrench on the robot is the wrench of the platform itself plus the sum of [F; a x
+F] over the legs. This is the virtual-work model of eq. 23, with Jacobians with respect to the
+velocity of A (3 columns) instead of the twist (6 columns). It needs a fraction of the operations.
 
-A kind of leg says where its bodies are and how they turn, and their forces follow by virtual work.
-A kind whose closed form is faster may give that. Vectors are in the axes of the base, and A is a
-position (3,) in them. Units are SI, and the actuated coordinate is rad where the actuator turns and
-m where it slides.
+A kind of leg defines the positions and rotations of its bodies; their forces follow by virtual
+work. A kind can also define closed forms that are faster. Vectors are in the axes of the base, and
+A is given by its position (3,) in them. Units are SI. The actuated coordinate is in rad for a
+rotating actuator, and in m for a sliding one.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def _vector(value: object) -> np.ndarray:
 ROUNDED = 1e-4
 """Largest error of the length of a direction, or of a right angle.
 
-Directions may be written with four decimals or more.
+Directions can thus be written with four decimals or more.
 """
 EXACT = 1e-12
-"""Errors below this are not corrected."""
+"""Largest error that is not corrected."""
 
 
 def _direction(value: object) -> np.ndarray:
@@ -62,9 +62,9 @@ def _direction(value: object) -> np.ndarray:
 
 
 MOST_TURNING = 1e6
-"""Largest turning of a body, rad/m.
+"""Largest rotation of a body per motion of A, rad/m.
 
-No machine turns more. Rounding gives 1e15 where the limit is infinite.
+No real machine exceeds it. In a singular pose, rounding gives about 1e15 instead of infinity.
 """
 
 _NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
@@ -76,8 +76,9 @@ Direction = Annotated[np.ndarray, PlainValidator(_direction), WithJsonSchema(_NU
 class Body:
     """Kind of a body of a leg.
 
-    `moments` are those that do work as it moves. `driven` is the inertial parameter of a body that
-    an actuator moves alone, in which the motor has a share, or None.
+    `moments` are the moments of inertia that do work when the body moves. `driven` is the inertial
+    parameter that includes the inertia of the motor, if an actuator drives this body alone, or
+    None.
     """
 
     name: str
@@ -86,8 +87,9 @@ class Body:
 
 
 class Placement(NamedTuple):
-    """Place of a body: centre of mass (3,), and axes (3, 3) as columns, in which its moments
-    are.
+    """Placement of a body: its centre of mass (3,), and its axes (3, 3) as columns.
+
+    The moments of inertia are in these axes.
     """
 
     centre: ca.SX
@@ -95,17 +97,21 @@ class Placement(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Body in the chain from the base to A, as other engines build it and as it is drawn.
+    """Body in the chain from the base to A, for other engines and for drawing.
 
-    `joint` leads to the body before, or to the base: "hinge" about `axis`, "slide" along it,
-    "universal" about `axis` and then about x of this body, or "ball". `axis` (3,) is in the axes of
-    the body before, and `origin` (3,) leads there from the joint of the body before to this joint.
-    The frame of the body is at its joint, with the axes of its `Placement`. In that frame are
-    `centre` (3,), the centre of mass; `rod` (2, 3), the ends of what is drawn, m, with a radius;
-    and `end`, which is A for the last body. `actuated` is True where the coordinate of the leg is
-    that of this joint. `copies` are offsets (bars, 3) of the joints of several equal bars from
-    `origin`, in the same axes. The bars share the parameters of the body, and in the last body each
-    of them ends as far from A.
+    `joint` connects it with the body before it, or with the base. It is "hinge" about `axis`,
+    "slide" along `axis`, "universal" about `axis` and then about x of this body, or "ball". `axis`
+    (3,) is in the axes of the body before. `origin` (3,) is the vector from the joint of the body
+    before to this joint, in the same axes.
+
+    The frame of the body is at its joint, with the axes of its `Placement`. In this frame are
+    `centre` (3,), the centre of mass; `rod` (2, 3), the ends of the rod that draws the body, m,
+    with its radius; and `end`, which is A on the last body.
+
+    `actuated` is True if the coordinate of this joint is the coordinate of the leg. `copies` are
+    the offsets (bars, 3) of the joints of several equal bars from `origin`, in the same axes. The
+    bars share the parameters of the body. On the last body, the ends of the bars have the same
+    offsets from A.
     """
 
     joint: str
@@ -120,12 +126,11 @@ class Segment(NamedTuple):
 
 
 class Leg(BaseModel, ABC):
-    """Leg with a base joint B, where it starts, and a platform joint A in platform axes, (3,) each,
-    m.
+    """Leg with a base joint B and a platform joint A.
 
-    `branch`, +1 or -1, names one of two solutions of its inverse kinematics. The default is the one
-    whose coordinate at home is nearest to zero. Raises pydantic's ValidationError for numbers that
-    make no leg.
+    B (3,) is in the axes of the base, and A (3,) in the axes of the platform, m. `branch`, +1 or
+    -1, selects one of two solutions of the inverse kinematics. The default is the solution whose
+    coordinate at home is nearest to zero. Raises pydantic's ValidationError for invalid numbers.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -133,35 +138,31 @@ class Leg(BaseModel, ABC):
     bodies: ClassVar[tuple[Body, ...]]
     prismatic: ClassVar[bool]
     chart: ClassVar[str] = "free"
-    """What the platform's freedoms have to be for this leg to work."""
+    """Chart that a platform must have for this kind of leg."""
     numbers: ClassVar[tuple[str, ...]]
-    """What decides where the leg lets A be: entries of its joints, lengths, turns; see
-    `legs.geometric_numbers`.
-    """
+    """Names of the geometric numbers of the leg. See `legs.geometric_numbers`."""
     turned: ClassVar[tuple[str, ...]] = ()
-    """The fields that turns change: an axis, and a direction across it where the coordinate is
-    zero.
-    """
+    """Fields that rotations change: an axis, and the zero direction perpendicular to it, if any."""
 
-    base_joint: Point = Field(description="B, where the leg starts on the base; base axes, m")
-    platform_joint: Point = Field(description="A, where it ends on the platform; platform axes, m")
+    base_joint: Point = Field(description="joint B on the base; base axes, m")
+    platform_joint: Point = Field(description="joint A on the platform; platform axes, m")
     branch: Literal[-1, 1] | None = Field(
         None,
-        description="+1 or -1: which solution of the inverse kinematics; default: nearest to zero "
-        "at home",
+        description="+1 or -1: solution of the inverse kinematics; default: the one with the "
+        "coordinate nearest to zero at home",
     )
 
     @property
     def side(self) -> float | ca.SX:
-        """Sign of the root that the branch takes, +1 or -1. It is +1 while no branch is chosen."""
+        """Sign of the square root on the branch, +1 or -1. It is +1 if no branch is selected."""
         return 1.0 if self.branch is None else self.branch
 
     def assembled(self, joint: np.ndarray, number: int) -> Self:
-        """Leg with its branch chosen for the position (3,) of A at home.
+        """Leg whose branch is selected for the position (3,) of A at home.
 
-        Raises RobotFileError, with the number of the leg, reach and lengths, where the leg cannot
-        reach. Raises it also for a body that lies along an axis from which its turning is counted,
-        such as one of a universal joint.
+        Raises RobotFileError, with the number of the leg, reach and lengths, if the leg cannot
+        reach A. Raises it also for a body that is parallel to the axis from which its rotation is
+        measured, such as the axis of a universal joint.
         """
         margin = float(self.reach(ca.SX(joint)))
         if not margin > 0:
@@ -183,7 +184,7 @@ class Leg(BaseModel, ABC):
         return found
 
     def _turning(self, joint: np.ndarray) -> np.ndarray:
-        """Turning of each body as A moves, rad/m. NaN for bodies whose axes are not known."""
+        """Rotation of each body per motion of A, rad/m. NaN for bodies whose axes are undefined."""
         at = ca.SX.sym("position", 3)
         moving = ca.SX.sym("velocity", 3)
         turns = [
@@ -197,50 +198,54 @@ class Leg(BaseModel, ABC):
 
     @abstractmethod
     def lengths(self) -> str:
-        """Lengths of the leg, for messages."""
+        """Text with the lengths of the leg, for messages."""
 
     def zeroed(self, joint: np.ndarray) -> Self:
-        """Leg whose coordinate is zero where A is at `joint` (3,)."""
+        """Leg whose coordinate is zero if A is at `joint` (3,)."""
         return self.shifted(float(self.coordinate(ca.SX(joint))))
 
     @abstractmethod
     def shifted(self, by: float) -> Self:
-        """Leg whose coordinate reads less by a value, rad or m."""
+        """Leg whose coordinate is smaller by a value, rad or m."""
 
     @abstractmethod
     def coordinate(self, position: ca.SX) -> ca.SX:
-        """Actuated coordinate, NaN out of reach."""
+        """Actuated coordinate. It is NaN out of reach."""
 
     @abstractmethod
     def reach(self, position: ca.SX) -> ca.SX:
-        """Reach margin, without unit and at most 1. It is zero or negative out of reach."""
+        """Reach margin, without unit, at most 1. It is zero or negative out of reach."""
 
     @abstractmethod
     def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
-        """Gap of the loop, m^2, for any coordinate. It is smooth wherever A is."""
+        """Gap of the loop, m^2, for any coordinate.
+
+        It is a smooth function of the position, even out of reach.
+        """
 
     @abstractmethod
     def direction(self, position: ca.SX) -> ca.SX:
-        """Unit vector (3,) of the force at A that the actuator can give."""
+        """Unit vector (3,) of the force at A from the actuator."""
 
     @abstractmethod
     def leverage(self, position: ca.SX) -> ca.SX:
-        """Leverage of the actuator on its leg, in 0..1. It is zero where the leg is singular
-        (J_a1).
+        """Leverage of the actuator on its leg, in 0..1.
+
+        It is zero if the leg is singular (J_a1).
         """
 
     @abstractmethod
     def placements(self, position: ca.SX) -> list[Placement]:
-        """Places of the leg's bodies."""
+        """Placements of the leg's bodies."""
 
     @abstractmethod
     def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
         """Angular velocities (3,) of the bodies, linear in the velocity (3,) of A."""
 
     def driven_inertia(self, body: np.ndarray) -> float:
-        """Inertia of the driven body, given as mass, Ixx, Iyy, Izz (4,), at its actuator.
+        """Inertia of the driven body at its actuator. NaN if no body is driven alone.
 
-        NaN where no body is driven.
+        `body` (4,) has mass, Ixx, Iyy, Izz.
         """
         return float(body[0]) if self.bodies[0].driven == "mass" else float("nan")
 
@@ -251,13 +256,15 @@ class Leg(BaseModel, ABC):
     def gradient(self, position: ca.SX) -> ca.SX:
         """Gradient (3,) of the coordinate with respect to A.
 
-        It is the force at A of a unit torque or force (eq. 8).
+        It is also the force at A due to a unit torque or force of the actuator (eq. 8).
         """
         at = ca.SX.sym("position", 3)
         return ca.substitute(ca.jacobian(self.coordinate(at), at).T, at, position)
 
     def line(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Vector (3,) along the gradient, and its divisor: eq. 7 before it becomes eq. 8."""
+        """Vector (3,) parallel to the gradient, and its divisor: the terms of eq. 7, whose ratio is
+        eq. 8.
+        """
         return self.gradient(position), ca.SX(1)
 
     def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
@@ -271,9 +278,9 @@ class Leg(BaseModel, ABC):
     def force(
         self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM
     ) -> ca.SX:
-        """Force at A (3,), N, that moves the bodies.
+        """Force at A (3,), N, that is needed for the motion of the bodies.
 
-        `rigid` (4 n,) are the inertial parameters of the bodies, one after the other.
+        `rigid` (4 n,) has the inertial parameters of the bodies, one body after the other.
         """
         at, moving, gaining, own = (
             ca.SX.sym(name, n) for name, n in zip("pvai", (3, 3, 3, rigid.numel()), strict=True)
@@ -292,7 +299,7 @@ class Leg(BaseModel, ABC):
         )
 
     def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:
-        """Mass (3, 3) that the leg adds at A."""
+        """Mass matrix (3, 3) of the leg at A."""
         at = ca.SX.sym("p", 3)
         moving = ca.SX.sym("v", 3)
         own = ca.SX.sym("i", rigid.numel())
@@ -302,7 +309,8 @@ class Leg(BaseModel, ABC):
         return symmetric_from_lower(_replaced(total, (at, own), (position, rigid)))
 
     def coriolis(self, position: ca.SX, velocity: ca.SX, rigid: ca.SX) -> ca.SX:
-        """Matrix C (3, 3), of which C velocity is the Coriolis and centrifugal force at A.
+        """Matrix C (3, 3), whose product with the velocity is the Coriolis and centrifugal force at
+        A.
 
         It is that of eq. 21 and 22: the sum of J^T (M_body J_dot + C_body J).
         """
@@ -322,16 +330,16 @@ class Leg(BaseModel, ABC):
     def _maps(
         self, position: ca.SX, velocity: ca.SX, rigid: ca.SX
     ) -> list[tuple[tuple[ca.SX, ca.SX], ca.SX, ca.SX, ca.SX]]:
-        """Mass, inertia (3, 3), maps and angular velocity of every body.
+        """Mass, inertia (3, 3), two maps and angular velocity of every body.
 
-        The maps (3, 3) are from the velocity of A to that of the centre, and to the angular
-        velocity.
+        The maps (3, 3) give the velocity of the centre of mass and the angular velocity from the
+        velocity of A.
         """
         found = []
         spins = self.angular_velocities(position, velocity)
         for body, (place, spin) in enumerate(zip(self.placements(position), spins, strict=True)):
             own = rigid[4 * body : 4 * body + 4]
-            # moments that do no work would leave rounding errors
+            # moments that do no work would only add rounding errors
             working = [
                 own[k] if name in self.bodies[body].moments else 0
                 for k, name in enumerate(INERTIAL)
@@ -350,7 +358,7 @@ def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.S
 def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
     """Axes (3, 3) of a link along the unit vector z.
 
-    x is normal to a given direction and to z, and y = z x x.
+    x is perpendicular to a given direction and to z, and y = z x x.
     """
     across = ca.cross(ca.SX(across_from), z)
     x = across * (1 / ca.norm_2(across))
@@ -358,14 +366,14 @@ def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
 
 
 def universal_spin(axis: np.ndarray | ca.SX, z: ca.SX, z_rate: ca.SX) -> ca.SX:
-    """Angular velocity (3,) of a body on a universal joint, whose z moves at a rate (3,).
+    """Angular velocity (3,) of a body on a universal joint, whose z changes at a rate (3,).
 
-    The body turns about a first axis, a unit vector that stands still on the base, and about its
-    own x (see `link_axes`).
+    The body turns about a first axis, a unit vector fixed on the base, and about its own x (see
+    `link_axes`).
     """
     across = ca.cross(ca.SX(axis), z)
     inverse = 1 / ca.dot(across, across)
-    # About the first axis z moves along `across`, and along y about x.
+    # Rotation about the first axis moves z along `across`; rotation about x moves it along y.
     turn = ca.dot(z_rate, across) * inverse
     swing = ca.dot(z_rate, ca.cross(z, across)) * inverse
     return turn * axis - swing * across

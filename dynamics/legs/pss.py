@@ -1,7 +1,7 @@
 """Legs with a slider on the base (P) and a link from the slider to A.
 
 The link has spherical joints (S) at both ends, or a universal joint (U) at the slider. The slider
-does not turn, so that only its mass does work.
+does not rotate, and only its mass does work.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from dynamics.legs.rss import Z
 
 
 class PssLeg(Leg):
-    """Slider that is at B where its coordinate is zero, and a link from the slider to A.
+    """Slider that is at B if its coordinate is zero, and a link from the slider to A.
 
-    The link does not spin about its length. Its x is normal to the direction of the slider and to
-    its length.
+    The link does not spin about its length. Its x is perpendicular to the direction of the slider
+    and to its length.
     """
 
     bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy")))
@@ -50,22 +50,22 @@ class PssLeg(Leg):
 
     type: Literal["pss"] = "pss"
     slider_axis: Direction = Field(
-        description="where the slider goes as its coordinate grows, unit vector, base axes"
+        description="direction of the slider for growing coordinates, unit vector, base axes"
     )
     link_length: Length = Field(description="from the slider to A, m")
     slider_length: Length = Field(
-        0.040, description="of the slider as it is drawn and hides stickers, m"
+        0.040, description="length of the drawn slider, which can hide stickers, m"
     )
     slider_radius: Length = Field(
-        0.014, description="of the slider as it is drawn and hides stickers, m"
+        0.014, description="radius of the drawn slider, which can hide stickers, m"
     )
     link_radius: Length = Field(
-        0.006, description="of the link as it is drawn and hides stickers, m"
+        0.006, description="radius of the drawn link, which can hide stickers, m"
     )
 
     @property
     def across_from(self) -> np.ndarray:
-        """Vector (3,) that the x of the link is normal to, besides its length."""
+        """Direction (3,) that the x of the link is perpendicular to."""
         return self.slider_axis
 
     def lengths(self) -> str:
@@ -86,7 +86,7 @@ class PssLeg(Leg):
         return across + self.side * root * self.slider_axis
 
     def reach(self, position: ca.SX) -> ca.SX:
-        """sin^2 of the angle between the link and the plane across the slider's axis."""
+        """sin^2 of the angle between the link and the plane perpendicular to the slider's axis."""
         across = self._parts(position)[1]
         return 1 - ca.dot(across, across) / self.link_length**2
 
@@ -109,7 +109,7 @@ class PssLeg(Leg):
     def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
         gradient = self.gradient(position)
         link_rate = self._link_rate(position, velocity)
-        # link . A_ddot + |link_dot|^2 = link . slider_axis s_ddot: the link keeps its length.
+        # The length of the link is constant: link . A_ddot + |link_dot|^2 = link . axis s_ddot.
         stretch = ca.dot(link_rate, link_rate) / ca.dot(self.link(position), self.slider_axis)
         return ca.dot(gradient, acceleration) + stretch
 
@@ -150,11 +150,13 @@ class PssLeg(Leg):
         return ca.cross(link, link_rate) / self.link_length**2
 
     def _link_rate(self, position: ca.SX, velocity: ca.SX) -> ca.SX:
-        """Time derivative of the link."""
+        """Time derivative of the link vector."""
         return velocity - ca.dot(self.gradient(position), velocity) * self.slider_axis
 
     def _parts(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Component of B->A along the slider's axis, and the rest of it (3,)."""
+        """Component of the vector from B to A along the slider's axis, and the perpendicular part
+        (3,).
+        """
         reach = position - self.base_joint
         axis = self.slider_axis
         along = ca.dot(reach, axis)
@@ -162,9 +164,9 @@ class PssLeg(Leg):
 
 
 class PusLeg(PssLeg):
-    """Slider with a link on a universal joint, which decides the spin of the link.
+    """Slider and a link on a universal joint, which determines the spin of the link.
 
-    The x of the link is normal to the first axis of that joint and to its length.
+    The x of the link is perpendicular to the first axis of that joint and to its length.
     """
 
     bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy", "Izz")))
@@ -177,7 +179,7 @@ class PusLeg(PssLeg):
 
     @property
     def across_from(self) -> np.ndarray:
-        """Vector (3,) that the x of the link is normal to, besides its length."""
+        """Direction (3,) that the x of the link is perpendicular to."""
         return self.joint_axis
 
     def _spin(self, link: ca.SX, link_rate: ca.SX) -> ca.SX:

@@ -1,15 +1,16 @@
 """Legs with a crank on the base: RSS, whose link has two spherical joints (S), and RUS.
 
 The inverse kinematics is in closed form (eq. 3 and 4). The dynamics uses the Jacobians of eq. 5-16.
-Their rates, Appendix A of the paper, are automatic derivatives, because eq. A5 and A6 are wrong as
-printed. The vector a from the platform origin to joint A is in the axes of the base: eq. 3 and 5
-need R a, though the text defines a in platform axes. Centres of mass are at mid-length. Forces are
-those of virtual work, as for any `Leg`, here in closed form, which is faster.
+Their rates (Appendix A of the paper) are computed by automatic differentiation, because eq. A5 and
+A6 are wrong as printed. The vector a from the platform origin to joint A is in the axes of the
+base: eq. 3 and 5 need R a, although the text defines a in platform axes. Centres of mass are at
+mid-length. Forces follow by virtual work, as for any `Leg`, but here in closed form, which is
+faster.
 
-The link of a RUS leg has a universal joint (U) at the tip of the crank, whose first axis is
-parallel to that of the crank. Both keep their direction in the axes of the base, and the link turns
-about that and about its own x. Its spin about its length follows, and all three of its moments do
-work.
+The link of a RUS leg has a universal joint (U) at the tip of the crank. The first axis of this
+joint is parallel to the crank axis, so that its direction is fixed in the axes of the base. The
+link rotates about this axis and about its own x. This determines its spin about its length, and all
+three of its moments of inertia do work.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ Z = np.array([0.0, 0.0, 1.0])
 class LegVectors:
     """Vectors of one leg in the axes of the base, m.
 
-    Crank angle (rad), axis s, crank w = T - B and link l = A - T, (3,) each, and their lengths,
-    which are constants of the robot.
+    They are the crank angle (rad), the axis s, the crank w = T - B and the link l = A - T, (3,)
+    each, and the lengths of crank and link, which are constants of the robot.
     """
 
     angle: ca.SX
@@ -58,8 +59,9 @@ class LegVectors:
 class LegMotion:
     """Motion of crank and link.
 
-    Acceleration of the crank, second time derivatives of crank and link vectors (3,), and angular
-    velocity and acceleration of the link (3,). The link does not spin about its own axis.
+    It has the angular acceleration of the crank, the second time derivatives of the crank and link
+    vectors (3,), and the angular velocity and acceleration of the link (3,). The link does not spin
+    about its own axis.
     """
 
     crank_acceleration: ca.SX
@@ -102,15 +104,15 @@ class RssLeg(Leg):
     crank_length: Length = Field(description="from B to the crank's tip, m")
     link_length: Length = Field(description="from the crank's tip to A, m")
     crank_radius: Length = Field(
-        0.010, description="of the crank as it is drawn and hides stickers, m"
+        0.010, description="radius of the drawn crank, which can hide stickers, m"
     )
     link_radius: Length = Field(
-        0.006, description="of the link as it is drawn and hides stickers, m"
+        0.006, description="radius of the drawn link, which can hide stickers, m"
     )
 
     @model_validator(mode="after")
     def _normal(self) -> Self:
-        """Normalise the directions."""
+        """Make the zero direction exactly perpendicular to the axis."""
         zero = self.crank_zero_direction
         axis = self.crank_axis
         product = float(axis @ zero)
@@ -135,7 +137,7 @@ class RssLeg(Leg):
         return self.model_copy(update={"crank_zero_direction": zero / np.linalg.norm(zero)})
 
     def vectors(self, position: ca.SX) -> LegVectors:
-        """Vectors of the leg with A at a position.
+        """Vectors of the leg for a position of A.
 
         The crank angle solves along cos(theta) + across sin(theta) = chord, on the branch of the
         leg.
@@ -158,7 +160,7 @@ class RssLeg(Leg):
         return self.vectors(position).angle
 
     def reach(self, position: ca.SX) -> ca.SX:
-        """sin^2 of the angle between the crank and its direction of reach."""
+        """sin^2 of the angle between the crank and the projection of the vector from B to A."""
         along, across, chord = self._chord(position)
         return 1 - chord**2 / (along**2 + across**2)
 
@@ -240,8 +242,7 @@ class RssLeg(Leg):
         motion = leg_motion(leg, velocity, acceleration)
         gradient = angle_gradient(leg)
         tangent = ca.cross(leg.axis, leg.crank)
-        # The crank turns about its own z alone, and a link without spin about l does no work
-        # against Izz.
+        # The crank rotates only about its own z. Izz of a link without spin about l does no work.
         lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
         torque = crank[0] * lever + crank[3] * motion.crank_acceleration
         pull = link[0] * (motion.tip_acceleration + motion.link_acceleration / 2 - gravity) / 2
@@ -264,8 +265,8 @@ class RssLeg(Leg):
         reflected = crank[3] + (crank[0] + link[0]) * (leg.crank_length**2 / 4)
         half = gradient @ (link[0] / 4 * tangent).T
         total = reflected * (gradient @ gradient.T) + link[0] / 4 * ca.SX.eye(3) + half + half.T
-        # Turning about x moves A along -y and the other way round, less what the crank takes up
-        # (eq. 13).
+        # Rotation about x moves A along -y, and about y along x. The motion of the crank is
+        # subtracted (eq. 13).
         x, y = _link_xy(leg)
         for inertia, (direction, weight) in ((link[1], y), (link[2], x)):
             row = direction - gradient * ca.dot(tangent, direction)
@@ -273,9 +274,9 @@ class RssLeg(Leg):
         return symmetric_from_lower(total)
 
     def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Components of B->A along and across the zero direction of the crank, and the chord.
+        """Components of the vector from B to A along and across the zero direction, and the chord.
 
-        The chord is the component that the length of the link asks for.
+        The chord is the component along the crank that the length of the link requires.
         """
         reach = position - self.base_joint
         zero = self.crank_zero_direction
@@ -287,11 +288,10 @@ class RssLeg(Leg):
 
 
 class ParallelogramLeg(RssLeg):
-    """Crank with two equal bars as its link, which keep the platform from turning (Delta robots).
+    """Crank and a link of two equal bars, which keep the platform from rotating (Delta robots).
 
-    The platform does not turn, so that the line between the ends of the bars does not turn either.
-    Both bars move as the link of an RSS leg does. The parameters of `link` are those of the two
-    bars together, and its moments are the sum of theirs.
+    The platform does not rotate, and neither does the line between the ends of the bars. Both bars
+    move like the link of an RSS leg. The parameters of `link` are the sums over both bars.
     """
 
     chart: ClassVar[str] = "translation"
@@ -299,13 +299,13 @@ class ParallelogramLeg(RssLeg):
     bar_distance: Length = Field(description="between the two bars of the parallelogram, m")
 
     def segments(self) -> list[Segment]:
-        """Bodies as a chain. The bars are side by side along the crank's axis."""
+        """Bodies as a chain. The bars are side by side along the crank axis."""
         crank, link = super().segments()
         return [crank, link._replace(copies=np.outer([-0.5, 0.5], self.bar_distance * Z))]
 
 
 class RrrLeg(RssLeg):
-    """Crank and link in one plane. All three joints are hinges normal to it (planar robots)."""
+    """Crank and link in one plane, with three hinges perpendicular to it (planar robots)."""
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Iyy",)))
     numbers: ClassVar[tuple[str, ...]] = (
@@ -325,7 +325,7 @@ def crank_leverage(leg: LegVectors) -> ca.SX:
 def angle_gradient(leg: LegVectors) -> ca.SX:
     """Gradient l / J_a1 (3,), 1/m, of the crank angle with respect to A.
 
-    It is also the force at A of a unit torque (eq. 8).
+    It is also the force at A due to a unit torque (eq. 8).
     """
     return leg.link * (1 / crank_leverage(leg))
 
@@ -336,7 +336,7 @@ def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMoti
     tangent = ca.cross(leg.axis, leg.crank)
     rate = ca.dot(gradient, velocity)
     link_rate = velocity - rate * tangent
-    # l . A_ddot + |l_dot|^2 = l . w_ddot: the link keeps its length.
+    # The length of the link is constant: l . A_ddot + |l_dot|^2 = l . w_ddot.
     stretch = ca.dot(link_rate, link_rate) + rate**2 * ca.dot(leg.link, leg.crank)
     crank_acceleration = ca.dot(gradient, acceleration) + stretch * (1 / crank_leverage(leg))
     tip_acceleration = crank_acceleration * tangent - rate**2 * leg.crank
@@ -352,9 +352,9 @@ def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMoti
 
 
 def _link_xy(leg: LegVectors) -> list[tuple[ca.SX, ca.SX]]:
-    """Pairs for the x and the y of the link's axes (see `link_axes`).
+    """Pairs for the x axis and the y axis of the link (see `link_axes`).
 
-    Each is a vector (3,) along the axis and 1 over its square.
+    Each pair has a vector (3,) along the axis and the reciprocal of its squared length.
     """
     across = ca.cross(leg.axis, leg.link)
     weight = 1 / ca.dot(across, across)
@@ -362,7 +362,7 @@ def _link_xy(leg: LegVectors) -> list[tuple[ca.SX, ca.SX]]:
 
 
 class RusLeg(RssLeg):
-    """Crank that turns about an axis on the base, and a link on a universal joint at its tip T."""
+    """Crank that rotates about an axis on the base, and a link on a universal joint at tip T."""
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Ixx", "Iyy", "Izz")))
     link_joint: ClassVar[str] = "universal"
@@ -375,7 +375,7 @@ class RusLeg(RssLeg):
         spin = universal_spin(leg.axis, leg.link / leg.link_length, link_rate / leg.link_length)
         return [rate * leg.axis, spin]
 
-    # the closed forms of RSS are those of a link that does not spin
+    # the closed forms of RSS hold only for a link that does not spin
 
     def force(
         self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM

@@ -1,8 +1,8 @@
-"""UPS leg of Gough-Stewart platforms: a universal joint (U) at B, cylinder and rod (P), A (S).
+"""UPS leg of Gough-Stewart platforms: universal joint (U) at B, cylinder and rod (P), joint A (S).
 
-The first axis of the universal joint stands still on the base. The leg turns about that and about
-its own x. Cylinder and rod turn alike, so that only the sums of their moments do work, all three of
-them.
+The first axis of the universal joint is fixed on the base. The leg rotates about this axis and
+about its own x. Cylinder and rod have the same rotation. Hence only the sums of their moments of
+inertia do work, about all three axes.
 """
 
 from __future__ import annotations
@@ -40,21 +40,23 @@ class UpsLeg(Leg):
     joint_axis: Direction = Field(
         description="first axis of the universal joint, unit vector, base axes"
     )
-    zero_length: Length = Field(description="from B to A where the coordinate is zero, m")
+    zero_length: Length = Field(description="distance from B to A at coordinate zero, m")
     cylinder_centre: Length = Field(description="from B to the centre of mass of the cylinder, m")
     rod_centre: Length = Field(description="from A back to the centre of mass of the rod, m")
-    cylinder_length: Length = Field(description="of the cylinder from B on, m")
-    rod_length: Length = Field(description="of the rod from A back, m")
+    cylinder_length: Length = Field(description="length of the cylinder, which begins at B, m")
+    rod_length: Length = Field(description="length of the rod, which ends at A, m")
     cylinder_radius: Length = Field(
-        0.014, description="of the cylinder as it is drawn and hides stickers, m"
+        0.014, description="radius of the drawn cylinder, which can hide stickers, m"
     )
-    rod_radius: Length = Field(0.008, description="of the rod as it is drawn and hides stickers, m")
+    rod_radius: Length = Field(
+        0.008, description="radius of the drawn rod, which can hide stickers, m"
+    )
 
     @property
     def stroke(self) -> tuple[float, float]:
         """Shortest and longest distance of A from B, m.
 
-        Neither end sticks out behind, and the rod stays in the cylinder.
+        In this range, no end protrudes backwards, and the rod remains in the cylinder.
         """
         return max(self.cylinder_length, self.rod_length), self.cylinder_length + self.rod_length
 
@@ -109,7 +111,7 @@ class UpsLeg(Leg):
 
     def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
         along = position - self.base_joint
-        # the part of the velocity along the leg drops out of both dot products
+        # the component of the velocity along the leg cancels in both dot products
         inverse = 1 / ca.norm_2(along)
         return 2 * [universal_spin(self.joint_axis, along * inverse, velocity * inverse)]
 

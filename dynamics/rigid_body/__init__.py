@@ -1,1 +1,1 @@
-"""Rigid robot in CasADi: virtual work in twists, and the equation of motion in coordinates."""
+"""Rigid-body dynamics in CasADi: virtual work, and the equation of motion in coordinates."""

@@ -1,7 +1,8 @@
 """Acceleration from the equation of motion, and derivatives of the slope of the state (CasADi).
 
 Both use a factor of the mass matrix (see `factored`). Derivatives are columns, one for each
-variable, which is a parameter or a number of the start. All columns solve the same equations.
+variable. A variable is a parameter or an entry of the start state. All columns solve the same
+equations.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ STAGES = 4
 
 
 def free_acceleration(size: int, joints: int) -> ca.Function:
-    """Function of the acceleration under torques at free joints.
+    """Function of the acceleration under torques, if no joint sticks.
 
     (factor of M (m, m), b (m,), J_theta (n, m), torque (n,)) -> q_ddot (m,), for m coordinates
     (`size`) and n joints.
@@ -42,9 +43,10 @@ def response(size: int) -> ca.Function:
 
 
 def acceleration_in_lanes(free: ca.Function, responding: ca.Function) -> ColumnFunction:
-    """Function of both for several states at once.
+    """Function of `free_acceleration` and `response` for several states at once.
 
-    Each column has the factor, b, J_theta, torque and a row, and then q_ddot and M^-1 row.
+    The inputs of a column are the factor, b, J_theta, torque and a row, and its outputs are q_ddot
+    and M^-1 row.
     """
     factor, *others = free.sx_in()
     row = responding.sx_in()[0]
@@ -57,15 +59,15 @@ def acceleration_in_lanes(free: ca.Function, responding: ca.Function) -> ColumnF
 def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     """Function of the derivatives of the slope of a state, and of the net torque of joints.
 
-    No joint is taken as stuck, and the platform has m coordinates. All columns share, for one of
-    the stages that lie side by side: what `motion_derivatives` returns; J_theta (n, m), and the
-    same with zeros for stuck joints; the factor of M (m, m); and what the torque of a joint loses
-    with its velocity (n,) and gains with its error, the integral of the error, and the rate of the
-    command (n,).
+    No joint sticks here, and the platform has m coordinates. All columns share these inputs, for
+    one of the stages, which are side by side in memory: the outputs of `motion_derivatives`;
+    J_theta (n, m), and the same with zeros for stuck joints; the factor of M (m, m); and the
+    derivatives (n,) of the torque of a joint with respect to its velocity (with opposite sign), its
+    error, the integral of the error, and the rate of the command.
 
-    Each column has as inputs the derivatives of pose and rate (m,), joint integral, command and its
-    rate (n,), and those of -M q_ddot - b (m,) and of the torque (n,) at a fixed state. Its outputs
-    are the derivatives of rate, acceleration (m,), command error and torque (n,).
+    The inputs of each column are the derivatives of pose and rate (m,), of joint integral, command
+    and its rate (n,), and, at a fixed state, of -M q_ddot - b (m,) and of the torque (n,). Its
+    outputs are the derivatives of rate, acceleration (m,), command error and torque (n,).
     """
     n = layout.joints
     by_pose, by_rate, factor = (ca.SX.sym(name, m, m) for name in ("by_pose", "by_rate", "factor"))
@@ -112,11 +114,10 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
 
 
 def factored(matrix: ca.SX) -> ca.SX:
-    """Factor of a symmetric matrix L D L^T (m, m).
+    """Factorisation L D L^T of a symmetric matrix (m, m), in one matrix.
 
-    L is below the diagonal, with ones on its own diagonal, and D L^T above. The reciprocals of D
-    are on the diagonal. They are not all positive and finite where the matrix is not positive
-    definite.
+    L, whose diagonal is one, is below the diagonal. D L^T is above it. The diagonal has the
+    reciprocals of D. They are not all positive and finite if the matrix is not positive definite.
     """
     size = matrix.shape[0]
     factor = ca.SX.zeros(size, size)
@@ -131,12 +132,12 @@ def factored(matrix: ca.SX) -> ca.SX:
 
 
 def summed(start: ca.SX, row: Sequence[ca.SX], column: Sequence[ca.SX]) -> ca.SX:
-    """Sum of a start and products, added in their order."""
+    """Start plus the products of two sequences, added in order."""
     return sum((one * other for one, other in zip(row, column, strict=True)), start)
 
 
 def lessened(start: ca.SX, row: Sequence[ca.SX], column: Sequence[ca.SX]) -> ca.SX:
-    """Start less products, taken away in their order."""
+    """Start minus the products of two sequences, subtracted in order."""
     for one, other in zip(row, column, strict=True):
         start -= one * other
     return start

@@ -1,12 +1,12 @@
 """Equation of motion in the platform's coordinates, and its derivatives, in CasADi.
 
-The integrator of the closed loop evaluates them. Let q be the coordinates, which are the pose or
-what the chart leaves free of it. The wrench balance is multiplied by T^T (twist = T q_dot, eq. 29):
+The integrator of the closed loop evaluates them. The coordinates q are the entries of the pose that
+the chart leaves free. The balance of wrenches is multiplied by T^T (twist = T q_dot, eq. 29):
 
     M(q) q_ddot + b(q, q_dot) = J_theta^T (torque - friction)
 
-Legs enter through the motion of their platform joints A only. Derivatives are therefore formed leg
-by leg with respect to three vectors of length 3, and chained through dA/dq.
+Legs contribute only through the motion of their platform joints A. Derivatives are therefore
+computed leg by leg with respect to three vectors of length 3, and multiplied by dA/dq.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:
-    """Functions that the closed loop integrates."""
+    """Functions that the integrator of the closed loop needs."""
     size = len(geometry.chart.freedoms)
     layout = parameter_layout(geometry.legs)
     motion = equation_of_motion(geometry)
@@ -126,8 +126,8 @@ def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
 def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
     """Function of the equation of motion for several states of one robot at once.
 
-    Each column has pose and rate (m,), and then J_theta_dot rate (n,), theta (n,), its rate (n,),
-    the factor of M (m, m), b (m,) and J_theta (n, m).
+    The inputs of a column are pose and rate (m,). Its outputs are J_theta_dot rate (n,), theta
+    (n,), its rate (n,), the factor of M (m, m), b (m,) and J_theta (n, m).
     """
     whole = motion.whole
     inputs = whole.sx_in()
@@ -141,9 +141,9 @@ def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
     """Function (q, rate, acceleration (m,), torque (n,), rigid (p,)) of derivatives.
 
     Acceleration and net joint torque are fixed. It returns the derivatives of M q_ddot + b -
-    J_theta^T torque with respect to q (m, m), rate (m, m) and rigid (m, p), and those of the joint
-    accelerations with respect to q (n, m) and rate (n, m). The last one is 2 J_theta_dot. The
-    caller solves for q_ddot, and that is never differentiated.
+    J_theta^T torque with respect to q (m, m), rate (m, m) and rigid (m, p), and the derivatives of
+    the joint accelerations with respect to q (n, m) and rate (n, m). The last one is 2 J_theta_dot.
+    The solution for q_ddot itself is never differentiated.
     """
     q, rate, acceleration = _coordinates(geometry, "q", "rate", "gain")
     motion = _poses(geometry, q, rate, acceleration)
@@ -155,8 +155,8 @@ def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
 def stop_derivatives(geometry: AnyGeometry) -> PartedFunction:
     """Function (q, change of rate (m,), impulse (n,), rigid (p,)) of derivatives at a stop.
 
-    It returns those of M change - J_theta^T impulse with respect to q (m, m), rate (m, m), which
-    are zero, and rigid (m, p). The motion is one from rest without gravity.
+    It returns the derivatives of M change - J_theta^T impulse with respect to q (m, m), rate (m,
+    m), which are zero, and rigid (m, p). The motion starts from rest, without gravity.
     """
     q, change = _coordinates(geometry, "q", "change")
     motion = _poses(geometry, q, 0 * q, change)
@@ -171,9 +171,9 @@ def _derivatives(
     gravity: ca.DM,
     count: int = 5,
 ) -> PartedFunction:
-    """Function of the first `count` derivatives of `motion_derivatives`.
+    """Function of the first `count` outputs of `motion_derivatives`.
 
-    The motion follows from coordinates.
+    `motion` are pose, rate and acceleration as expressions of `coordinates`.
     """
     layout = parameter_layout(geometry.legs)
     free = freedoms(geometry)
@@ -248,21 +248,21 @@ def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
 
 
 def _coordinates(geometry: AnyGeometry, *names: str) -> list[ca.SX]:
-    """Symbol of the coordinates."""
+    """Symbols of the coordinates or their derivatives, one vector for each name."""
     return [ca.SX.sym(name, len(geometry.chart.freedoms)) for name in names]
 
 
 def _poses(
     geometry: AnyGeometry, q: ca.SX, rate: ca.SX, acceleration: ca.SX
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Pose (6,), pose rate and pose acceleration of coordinates (m,) and their derivatives."""
+    """Pose (6,), pose rate and pose acceleration for coordinates (m,) and their derivatives."""
     free = freedoms(geometry)
     at_home = ca.SX(ca.DM(geometry.chart.pose(np.zeros(free.shape[1]))))
     return at_home + free @ q, ca.densify(free @ rate), ca.densify(free @ acceleration)
 
 
 def _joints(geometry: AnyGeometry) -> PlatformJointMotion:
-    """Motion of the joints A."""
+    """Motion of the joints A, with symbols for pose, rate and acceleration."""
     return PlatformJointMotion(
         geometry.platform_joints, *[ca.SX.sym(name, 6) for name in ("pose", "rate", "gain")]
     )
@@ -276,10 +276,10 @@ def _parted(
     sides: tuple[ca.SX, np.ndarray],
     at: tuple[Sequence[ca.SX], Sequence[ca.SX]] = ((), ()),
 ) -> PartedFunction:
-    """Function of expressions that each leg has, and of what follows from them.
+    """Function that consists of expressions of each leg, and of expressions that depend on them.
 
-    `end` gets the first expression of all legs, then the second, and so on. Symbols are replaced by
-    the values `at`.
+    `end` is called with the first expression of all legs, then the second, and so on. The symbols
+    at[0] are replaced by the expressions at[1].
     """
     columns = [ca.vertcat(*(ca.densify(ca.vec(one)) for one in part)) for part in parts]
     symbols = [
@@ -294,7 +294,7 @@ def _parted(
 
 
 def _shaped(column: ca.SX, like: list[ca.SX]) -> list[ca.SX]:
-    """Entries of a column in matrices of the shapes of others."""
+    """Split a column into matrices of the same shapes as others."""
     ends = np.cumsum([0, *(one.numel() for one in like)]).tolist()
     return [
         ca.reshape(own, *one.shape)
@@ -305,7 +305,7 @@ def _shaped(column: ca.SX, like: list[ca.SX]) -> list[ca.SX]:
 def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
     """Legs with symbols for their branches, and these symbols with their values.
 
-    Legs that differ in a sign are thus alike.
+    Legs that differ only in this sign then have the same expressions.
     """
     sides = ca.SX.sym("sides", len(geometry.legs))
     pairs = zip(geometry.legs, ca.vertsplit(sides), strict=True)
@@ -314,7 +314,7 @@ def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
 
 
 def _at(joints: PlatformJointMotion, outputs: list[ca.SX], *motion: ca.SX) -> list[ca.SX]:
-    """Expressions in the motion of the platform, at another motion."""
+    """Expressions evaluated at another motion of the platform."""
     return ca.substitute(outputs, [joints.pose, joints.rate, joints.gain], list(motion))
 
 
@@ -323,7 +323,7 @@ def _leg_derivatives(
 ) -> tuple[ca.SX, ca.SX, list[ca.SX], list[ca.SX]]:
     """Columns (3, p) of a leg's own parameters, net force (3,), and derivatives.
 
-    The derivatives are those of the force and of theta_ddot with respect to position, velocity and
+    The derivatives of the force and of theta_ddot are with respect to position, velocity and
     acceleration of A.
     """
     position, velocity, acceleration = (
@@ -351,7 +351,7 @@ def _leg_derivatives(
 
 
 def _by_pose(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
-    """Derivatives with respect to the pose, from those with respect to the motion of A."""
+    """Derivatives with respect to the pose, from derivatives with respect to the motion of A."""
     by_position, by_velocity, by_acceleration = rows
     return (
         by_position @ joints.gradient[leg]

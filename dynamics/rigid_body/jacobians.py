@@ -1,8 +1,8 @@
 """Inverse kinematics of a robot, its Jacobians, singularities and closure, from its legs (CasADi).
 
 With J_a1 and J_a2 of eq. 7, diag(J_a1) theta_dot = J_a2 twist. Then J_ad = J_a1^-1 J_a2 (eq. 8),
-and J_theta = J_ad T maps pose rates (eq. 29). A pose has six entries also where the platform has
-fewer freedoms (see `kinematics.platform.Chart`).
+and J_theta = J_ad T is the Jacobian for pose rates (eq. 29). A pose has six entries even if the
+platform has fewer degrees of freedom (see `kinematics.platform.Chart`).
 """
 
 import casadi as ca
@@ -13,7 +13,10 @@ from dynamics.kinematics.platform import pose_rate_to_twist, rotation_matrix
 
 
 def freedoms(geometry: AnyGeometry) -> ca.DM:
-    """Derivative d(pose)/d(coordinates) (6, m) without its zeros. It also spans the twists."""
+    """Derivative d(pose)/d(coordinates) (6, m) as a sparse matrix.
+
+    Its columns also span the twists.
+    """
     return ca.sparsify(ca.DM(geometry.chart.basis))
 
 
@@ -24,7 +27,10 @@ def platform_arms(geometry: AnyGeometry, pose: ca.SX) -> list[ca.SX]:
 
 
 def joint_coordinates(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
-    """Joint coordinates (n,), rad or m, at a pose (6,). NaN for a leg that cannot reach."""
+    """Joint coordinates (n,), rad or m, at a pose (6,).
+
+    NaN for a leg that cannot reach the pose.
+    """
     arms = platform_arms(geometry, pose)
     return ca.vertcat(
         *[leg.coordinate(pose[0:3] + arm) for leg, arm in zip(geometry.legs, arms, strict=True)]
@@ -32,7 +38,7 @@ def joint_coordinates(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
 
 
 def reach_margin(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
-    """Reach margins (n,), without unit, negative out of reach."""
+    """Reach margins (n,), without unit. They are negative out of reach."""
     arms = platform_arms(geometry, pose)
     return ca.vertcat(
         *[leg.reach(pose[0:3] + arm) for leg, arm in zip(geometry.legs, arms, strict=True)]
@@ -54,9 +60,9 @@ def pose_jacobian(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
 
 
 def placements(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
-    """Places (bodies, 15) of the bodies of all legs, leg by leg, in the axes of the base.
+    """Placements (bodies, 15) of the bodies of all legs, leg by leg, in the axes of the base.
 
-    A row has the centre of mass, m, the axes (3, 3) row by row, and the angular velocity, rad/s.
+    A row has the centre of mass, m, the axes (3, 3) by rows, and the angular velocity, rad/s.
     """
     rows = []
     for leg, arm in zip(geometry.legs, platform_arms(geometry, pose), strict=True):
@@ -72,8 +78,9 @@ def placements(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
 def singularity_measures(geometry: AnyGeometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Leverage (n,) of each actuator on its leg, in 0..1, and J_a2 (n, n) without unit.
 
-    J_a2 is for the twists that the platform can have. Its rows are [d, a x d] with the unit vectors
-    d along which the legs push. Angular columns are divided by the characteristic length.
+    The columns of J_a2 are the twists that the platform can have. Its rows are [d, a x d], with the
+    unit vectors d of the forces of the legs. Angular columns are divided by the characteristic
+    length.
     """
     leverages = []
     rows = []
@@ -86,9 +93,9 @@ def singularity_measures(geometry: AnyGeometry, pose: ca.SX) -> tuple[ca.SX, ca.
 
 
 def loop_closure(geometry: AnyGeometry, pose: ca.SX, joints: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Gaps (n,), m^2, of the loops of eq. 3 and 4 at a pose and any joint coordinates.
+    """Gaps (n,), m^2, of the loops of eq. 3 and 4, at a pose and any joint coordinates.
 
-    Also returns d(gaps)/d(coordinates of the platform) (n, n).
+    The second result is d(gaps)/d(coordinates of the platform) (n, n).
     """
     arms = platform_arms(geometry, pose)
     legs = enumerate(zip(geometry.legs, arms, strict=True))

@@ -1,10 +1,9 @@
 """Virtual-work dynamics (eq. 17-26) in CasADi, as sums over platform and legs.
 
-The functions are those that `Robot` evaluates. Wrenches act at the platform origin, in the axes of
-the base.
+`Robot` evaluates these functions. Wrenches act at the platform origin, in the axes of the base.
 
-The paper's eq. 20 carries M, C and G of the fictitious forces into eq. 23, with negative masses and
-G = +m g. Here M is positive definite, G is the wrench that holds the robot up, and tau_g = M
+In eq. 20 and 23 of the paper, M, C and G belong to the fictitious forces, with negative masses and
+G = +m g. Here M is positive definite, G is the wrench that balances gravity, and tau_g = M
 twist_dot + C twist + G + tau_f as in eq. 17.
 """
 
@@ -71,7 +70,7 @@ def inertial_wrench(
 ) -> ca.SX:
     """Wrench M twist_dot + C twist + G (6,) for inertial parameters `rigid`.
 
-    It is the product of the regressor and the parameters, without the regressor.
+    It equals the product of the regressor and the parameters, but the regressor is not computed.
     """
     gravity = ca.DM(geometry.gravity)
     layout = parameter_layout(geometry.legs)

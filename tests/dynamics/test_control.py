@@ -401,7 +401,8 @@ def test_a_bandwidth_that_no_gains_give_is_refused_with_what_can_be_had():
     robot = dynamics.load_robot("delta3")
     model = Model(robot, robot.parameter_sets["identified"].vector, FrictionLaw())
     with pytest.raises(
-        SimulationError, match=r"bandwidth of 40 rad/s with a damping of 0\.9 at 29 Hz: found were"
+        SimulationError,
+        match=r"bandwidth of 40 rad/s with a damping of 0\.9 at 29 Hz: the best gains have",
     ):
         design_servo(model, LoopSettings(SERVO, SLOW), robot.home_pose, 40.0, 0.9)
 

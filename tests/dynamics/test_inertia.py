@@ -38,7 +38,7 @@ def test_inertias_that_no_body_has_are_refused_by_name_or_changed_so_that_the_mo
     assert "--allow-unphysical-inertia" in text
     text = mjcf_text(robot, allow_unphysical_inertia=True)
     assert "link5, link6: Izz 0.00213 to 0.001046" in text
-    assert "do not alter the motion" in text
+    assert "does not alter the motion" in text
     changed, torques = robot.nominal_parameters.copy(), np.ones((300, 6))
     changed[robot.layout.rigid] = physical_inertias(
         robot.layout, changed, allow_changes=True

@@ -354,7 +354,7 @@ REFUSED = {
         (
             simulate_batch,
             {"parameters": np.zeros((0, 67))},
-            "0 parameter vectors and 1 references do not pair",
+            "0 parameter vectors and 1 references must have the same number",
         ),
         (
             simulate_batch,
@@ -437,13 +437,13 @@ def test_parameters_of_the_joint_pid_have_their_limits_and_a_start_what_its_run_
 def test_answers_of_sensor_and_controller_are_six_numbers_or_name_the_frame(robot, loop):
     """Never a lost frame; None is one of a sensor, and nothing of a controller."""
     with pytest.raises(
-        SimulationError, match=r"at frame 2 .*what the pose sensor returned.* is nan, must"
+        SimulationError, match=r"at frame 2 .*value returned by the pose sensor.* is nan, must"
     ):
         loop.run(5, sensor=lambda frame, time, pose: pose * (np.nan if frame == 2 else 1))
     for answer, words in ((np.zeros((1, 6)), "shape"), (None, "must be numbers")):
         answers = [*robot.inverse_kinematics(loop.reference(2).poses), answer]
         with pytest.raises(
-            SimulationError, match=rf"at frame 2 .*what the controller returned.* {words}"
+            SimulationError, match=rf"at frame 2 .*value returned by the controller.* {words}"
         ):
             loop.run(5, controller=lambda frame, *_, answers=answers: answers[frame])
 

@@ -687,7 +687,7 @@ def test_warm_up_ends_in_one_line_where_code_finds_no_room_and_keeps_what_is_who
     assert command("warm-up", "quick", "--quiet") == 1
     reason = os.strerror(errno.EROFS if options == "ro" else errno.ENOSPC)
     said = one_line(capfd.readouterr().err)
-    assert f"cannot be kept in {disk.path / 'new' / 'code'} ({reason})" in said
+    assert f"cannot be saved in {disk.path / 'new' / 'code'} ({reason})" in said
     kept = {path.name for path in disk.path.glob("new/code/*")}
     assert kept <= set(OBJECTS)
     assert all(load_object(name) is not None for name in kept)

@@ -153,19 +153,19 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
             "computed_torque",
             UNSTABLE,
             SimulationError,
-            "from frame to frame is 2.203, must be below 1; it is up to ",
+            "from frame to frame is 2.203, must be below 1; the law is stable up to ",
         ),
         (
             "computed_torque",
             {**TOO_FAST, **BLIND},
             SimulationError,
-            "frame is 25.74, must be below 1; it is up to ",
+            "frame is 25.74, must be below 1; the law is stable up to ",
         ),
         (
             "computed_torque",
             TOO_FAST,
             SimulationError,
-            "is too fast for 60 Hz, half of which is 188 rad/s: its largest",
+            "is too fast for 60 Hz: the bandwidth must be at most half the frame rate, 188 rad/s; the largest",
         ),
         (
             "sliding_mode",
