@@ -2,7 +2,7 @@
 
 Robots
 
-    load_robot(name_or_path)                    built-in robot, or one of a TOML file
+    load_robot(name_or_path)                    built-in robot, or robot of a TOML file
     built_in_robots()                           names of the built-in robots
     Robot                                       kinematics and dynamics, one pose or a batch
     fast_forward_dynamics(robot, parameters)    forward dynamics for inner loops
@@ -13,12 +13,12 @@ Closed loops
     closed_loop.simulate_servo(robot, parameters, reference, settings)   one run
     simulate_batch(robot, parameters, references, settings)              many runs on all cores
 
-Every error that a user can cause is a DynamicsError. Names are imported on first use: CasADi and
-numba take a second to load, for which the help of the command line must not wait.
+Every error that a user can cause is a DynamicsError. Names are imported at their first use: CasADi
+and Numba take a second to load, and the help of the command line does not need them.
 
 Conventions: SI units and rad. A pose is [x y z alpha beta gamma] with
-R = Rx(alpha) Ry(beta) Rz(gamma). A twist is [h_dot, omega] in the axes of the base. The crank is
-what the paper calls the wrench.
+R = Rx(alpha) Ry(beta) Rz(gamma). A twist is [h_dot, omega] in the axes of the base. The paper calls
+the crank the wrench.
 """
 
 from importlib import import_module
@@ -42,7 +42,7 @@ _HOME = {
 
 __all__ = ["DynamicsError", "closed_loop", *_HOME]
 
-if not TYPE_CHECKING:  # a type checker would take every name for one that this knows
+if not TYPE_CHECKING:  # otherwise, a type checker would accept every name
 
     def __getattr__(name: str) -> Any:
         if name == "closed_loop":

@@ -1,4 +1,4 @@
-"""Bodies of a robot's legs as parts with places, for other engines and to draw them."""
+"""Bodies of a robot's legs as parts with positions, for other engines and for drawing."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,13 +15,13 @@ from dynamics.robot_platform import CHART_TOLERANCE
 
 
 class Part(NamedTuple):
-    """Body of a leg, or one of the equal bars that it consists of.
+    """Body of a leg, or one of the equal bars of a body.
 
-    The name is such as link1 or link1a. `leg` is the leg's number, from 0, and `body` the row in
-    the layout of the robot. `offset` (3,) leads from the joint of the body to the joint of the
-    part, in the axes of the body before, m. `share` is the part's share of the parameters of the
-    body. `before` is the number of the part that it hangs on, or -1 for the base. `last` is True
-    where it ends at the platform.
+    The name is, for example, link1 or link1a. `leg` is the index of the leg, and `body` is the row
+    of the body in the layout of the robot. `offset` (3,) is the vector from the joint of the body
+    to the joint of the part, in the axes of the body before, m. `share` is the part's share of the
+    parameters of the body. `before` is the index of the part to which it is connected, or -1 for
+    the base. `last` is True if it ends at the platform.
     """
 
     name: str
@@ -35,16 +35,16 @@ class Part(NamedTuple):
 
 
 BASE = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
-"""Placement of the base itself: origin, axes, spin."""
+"""Placement of the base: origin, axes, spin."""
 
 
 @dataclass(frozen=True)
 class Frames:
     """Frames of the parts, in the axes of the base.
 
-    `origin` (parts, 3) is the joint to the part before, m. `axes` (parts, 3, 3) are columns. `spin`
-    (parts, 3) is the angular velocity, rad/s. A last row is the base itself, so that its number is
-    -1.
+    `origin` (parts, 3) is the joint with the part before, m. `axes` (parts, 3, 3) are columns.
+    `spin` (parts, 3) is the angular velocity, rad/s. The last row is the base, which thus has the
+    index -1.
     """
 
     origin: np.ndarray
@@ -53,11 +53,11 @@ class Frames:
 
 
 class Drawn(NamedTuple):
-    """Numbers from which the drawn parts are placed.
+    """Numbers from which the ends of the drawn parts are computed.
 
-    `body` and `before` (parts,) are rows of each part and of the part before in the placements, -1
-    for the base. `offset` (parts, 3) is in the axes of the part before, m. `centre` (parts, 3) and
-    `ends` (parts, 2, 3) are in the axes of the part, m.
+    `body` and `before` (parts,) are the rows of each part and of the part before it in the
+    placements; the base is -1. `offset` (parts, 3) is in the axes of the part before, m. `centre`
+    (parts, 3) and `ends` (parts, 2, 3) are in the axes of the part, m.
     """
 
     body: np.ndarray
@@ -70,9 +70,9 @@ class Drawn(NamedTuple):
 class Room(NamedTuple):
     """Memory for the inputs and outputs of a robot's functions.
 
-    `at` (6 + g,) and `moving` (12 + g,) hold a pose, then a twist, then the constants of the
-    functions. `reach` (2, n) holds joint coordinates and reach margins, and `placements` is
-    (bodies, 15).
+    `at` (6 + g,) has a pose and the constants of the functions. `moving` (12 + g,) has a pose, a
+    twist and these constants. `reach` (2, n) has joint coordinates and reach margins, and
+    `placements` is (bodies, 15).
     """
 
     at: np.ndarray
@@ -82,7 +82,7 @@ class Room(NamedTuple):
 
 
 class Parts:
-    """Parts of all legs of a geometry, leg by leg from the base."""
+    """Parts of all legs of a geometry, leg by leg, each from the base on."""
 
     def __init__(self, geometry: RobotGeometry) -> None:
         layout = parameter_layout(geometry.legs)
@@ -118,7 +118,7 @@ class Parts:
         self._held = np.where(chart.basis.any(axis=1), np.nan, chart.home)
 
     def frames(self, robot: Robot, pose: np.ndarray, twist: np.ndarray | None = None) -> Frames:
-        """Frames of the parts with the platform at a pose (6,) and moving with a twist (6,).
+        """Frames of the parts at a pose (6,) and a twist (6,) of the platform.
 
         Raises UnreachablePoseError or ChartError.
         """
@@ -135,9 +135,9 @@ class Parts:
         return Frames(origin, axes, found[:, 12:])
 
     def rods(self, robot: Robot, pose: np.ndarray) -> np.ndarray:
-        """Ends (parts, 2, 3) of what is drawn of each part, in the axes of the base, m.
+        """Ends (parts, 2, 3) of the rods that draw the parts, in the axes of the base, m.
 
-        Raises what `frames` raises.
+        Raises the same errors as `frames`.
         """
         # importing Numba takes time
         from dynamics.compiled.kernel import chosen
@@ -158,12 +158,12 @@ class Parts:
         ends = np.empty((len(self.all), 2, 3))
         where = kinematics.address, placements.address, at, self._held, CHART_TOLERANCE
         if not chosen(place_rods, True)(*where, self._drawn, room, ends):
-            # raises the error that says why
+            # raises the error with the reason
             robot.check_reach(at)
         return ends
 
 
 @lru_cache(maxsize=16)
 def parts_of(geometry: RobotGeometry) -> Parts:
-    """Parts of a geometry, made once."""
+    """Parts of a geometry. They are cached."""
     return Parts(geometry)

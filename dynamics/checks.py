@@ -1,11 +1,11 @@
-"""Checks of arguments and of entries of files.
+"""Checks of arguments, and of entries of files.
 
-Arguments become numbers and arrays, or an error with name, value and limit. Nothing is transposed,
-padded, parsed from text, or cast from complex numbers or truth values.
+Arguments are converted to numbers and arrays, or an error with the name, value and limit is raised.
+Arrays are never transposed or padded. Text, complex numbers and truth values are never converted.
 
-Entries of files have the ranges of machines, from robots on a chip to cranes, in SI units. A number
-outside of its range is a slip of the keyboard or of a unit, and loses all its digits in what is
-computed with it. Schemas for editors show the ranges as well.
+Entries of files must be in the ranges of machines, from robots on a chip to cranes, in SI units. A
+number outside its range is usually a typing error or a wrong unit. Schemas for editors include the
+ranges.
 """
 
 from collections.abc import Sequence
@@ -25,9 +25,9 @@ ErrorClass = type[DynamicsError]
 def floats(
     name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeError, finite: bool = True
 ) -> np.ndarray:
-    """Value as a float64 array of one of the shapes, in which "N" is any length.
+    """Value as a float64 array of one of the shapes, in which "N" means any length.
 
-    A float64 array is not copied. Raises `error`, with the array or with the place of an entry that
+    A float64 array is not copied. Raises `error`, with the value or with the index of an entry that
     is not finite.
     """
     if (
@@ -36,7 +36,7 @@ def floats(
         and value.shape in shapes
         and np.isfinite(value).all()
     ):
-        # inner loops come here, and need a third of the time
+        # shortcut for inner loops, which takes a third of the time
         return value
     try:
         array = np.asarray(value)
@@ -66,7 +66,10 @@ def rows(name: str, value: object, width: int) -> np.ndarray:
 
 
 def mask(name: str, value: object, length: int, error: ErrorClass) -> np.ndarray:
-    """Value as bool of shape (length,). Raises `error` for anything else, numbers included."""
+    """Value as a bool array of shape (length,).
+
+    Raises `error` for anything else, including numbers.
+    """
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
@@ -87,7 +90,7 @@ def real(
     above: float | None = None,
     unit: str = "",
 ) -> float:
-    """Value as a finite float, >= least or > above where these are given. Raises `error`."""
+    """Value as a finite float, >= least or > above if these are given. Raises `error` otherwise."""
     limit = f" >= {least:g}" if least is not None else "" if above is None else f" > {above:g}"
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise error(f"{name} is {shown(value)}{unit}, must be a number{limit}")
@@ -102,7 +105,7 @@ def real(
 
 
 def whole(name: str, value: object, error: ErrorClass, *, least: int, most: float = np.inf) -> int:
-    """Value as an int from least to most. Raises `error`."""
+    """Value as an int from `least` to `most`. Raises `error` otherwise."""
     limit = f"a whole number >= {least}" + (f" and <= {most}" if most < np.inf else "")
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise error(f"{name} is {shown(value)}, must be {limit}")
@@ -112,14 +115,14 @@ def whole(name: str, value: object, error: ErrorClass, *, least: int, most: floa
 
 
 def flag(name: str, value: object, error: ErrorClass) -> bool:
-    """Value as True or False. Raises `error` for anything else, numbers included."""
+    """Value as True or False. Raises `error` for anything else, including numbers."""
     if not isinstance(value, bool | np.bool_):
         raise error(f"{name} is {shown(value)}, must be True or False")
     return bool(value)
 
 
 def check_choice(name: str, value: object, valid: Sequence[str], error: ErrorClass) -> None:
-    """Raise `error`, which lists the valid names, unless the value is one of them."""
+    """Raise `error`, with the valid names, unless the value is one of them."""
     if not isinstance(value, str) or value not in valid:
         raise error(
             f"unknown {name} `{value if isinstance(value, str) else shown(value)}`; valid: "
@@ -147,7 +150,7 @@ def shown(value: object) -> str:
 
 
 def _fits(shape: tuple[int, ...], wanted: Shape) -> bool:
-    """Return True where a shape is a wanted one."""
+    """Return True if a shape is the wanted shape."""
     pairs = zip(shape, wanted, strict=False)
     return len(shape) == len(wanted) and all(want in ("N", got) for got, want in pairs)
 
@@ -161,7 +164,10 @@ def _shapes_text(shapes: Sequence[Shape]) -> str:
 
 @dataclass(frozen=True)
 class Within:
-    """Range of a number from `least` to `most`, in a unit; `zero` says that 0 is valid as well."""
+    """Range of a number from `least` to `most`, in a unit.
+
+    If `zero` is True, 0 is valid as well.
+    """
 
     least: float
     most: float
@@ -169,12 +175,12 @@ class Within:
     zero: bool = False
 
     def check(self, value: float | None) -> float | None:
-        """Return the value. Raises ValueError, with the range, if it lies outside."""
+        """Return the value. Raises ValueError, with the range, if it is outside."""
         if value is None or self.least <= value <= self.most or (self.zero and value == 0.0):
             return value
         also = "0 or " if self.zero else ""
         words = f"{also}{self.least:g} to {self.most:g} {self.unit}".rstrip()
-        raise ValueError(f"{value:g} is beyond what a machine can have, {words}")
+        raise ValueError(f"{value:g} is outside the range of machines, {words}")
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
@@ -188,7 +194,7 @@ class Within:
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         least = min(self.least, 0.0) if self.zero else self.least
-        # A field may have narrower limits of its own, which hold as well.
+        # A field can also have narrower limits of its own.
         shown = handler(schema)
         return {
             **shown,
@@ -198,20 +204,20 @@ class Within:
 
 
 def within(quantity: Any) -> Within:
-    """Range of a quantity, for numbers that are in no field of a model."""
+    """Range of a quantity, for numbers that are not fields of a model."""
     found: Within = get_args(quantity)[1]
     return found
 
 
 Mass = Annotated[float, Within(1e-12, 1e6, "kg", zero=True)]
-"""From a grain of silicon to a thousand tonnes."""
+"""Range from a grain of silicon to a thousand tonnes."""
 Inertia = Annotated[float, Within(1e-24, 1e9, "kg m^2", zero=True)]
 Length = Annotated[float, Within(1e-6, 1e3, "m")]
 Place = Annotated[float, Within(-1e3, 1e3, "m or rad")]
 """Coordinate of a point, or an angle."""
 Travel = Annotated[float, Within(1e-9, 1e3, "rad or m")]
 Margin = Annotated[float, Within(1e-12, 1e3, "rad or m", zero=True)]
-"""Distance kept, step or error of a coordinate."""
+"""Margin, step or error of a coordinate."""
 Speed = Annotated[float, Within(1e-9, 1e6, "rad/s or m/s")]
 Acceleration = Annotated[float, Within(-1e3, 1e3, "m/s^2")]
 Force = Annotated[float, Within(1e-12, 1e9, "N m or N", zero=True)]

@@ -1,12 +1,12 @@
-"""Closed loops of a robot whose geometry is off: its poses, and their derivatives.
+"""Closed loops of a robot with deviations of its geometry: its poses, and their derivatives.
 
-The gaps of the loops (`rigid_body.jacobians.loop_closure`) have the geometric numbers as a third
-argument. They vanish at a pose, so that its derivatives follow implicitly:
+The gaps of the loops (`rigid_body.jacobians.loop_closure`) also depend on the geometric numbers.
+They are zero at a pose, and the derivatives of the pose follow implicitly:
 
     d(q)/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers)
 
-One compiled function serves all geometries near a nominal one, so that a search over them compiles
-nothing.
+One compiled function serves all geometries near a nominal one. A search over geometries therefore
+compiles nothing.
 """
 
 from dataclasses import dataclass
@@ -26,14 +26,14 @@ from dynamics.rigid_body.jacobians import loop_closure
 
 @dataclass(frozen=True)
 class Closure:
-    """Loops of geometries that differ from a nominal one by deviations (g,), m and rad."""
+    """Loops of geometries that differ from a nominal geometry by deviations (g,), m and rad."""
 
     nominal: RobotGeometry
 
     def poses(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Poses (N, 6) at which the loops close with joint coordinates (N, n), from starts (N, 6).
 
-        Raises ConvergenceError for the first row whose loops stay open.
+        Raises ConvergenceError for the first row whose loops do not close.
         """
         found = self.nearest(joints, deviations, start)
         if not np.isfinite(found).all():
@@ -45,7 +45,7 @@ class Closure:
         return found
 
     def nearest(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """The same as `poses`, with NaN for rows whose loops stay open."""
+        """The same as `poses`, with NaN for rows whose loops do not close."""
 
         def gaps(poses: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
             return self._function(poses, theta, deviations[None])[:2]
@@ -59,8 +59,8 @@ class Closure:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of the platform's coordinates at closed loops.
 
-        At poses (N, 6) with joints (N, n), they are those with respect to deviations (N, m, g) and
-        to joint coordinates (N, m, n).
+        At poses (N, 6) with joint coordinates (N, n), they are the derivatives with respect to
+        deviations (N, m, g) and to joint coordinates (N, m, n).
         """
         _, by_coordinates, by_joints, by_numbers = self._function(poses, joints, deviations[None])
         return -np.linalg.solve(by_coordinates, by_numbers), -np.linalg.solve(
@@ -69,7 +69,7 @@ class Closure:
 
     @cached_property
     def _function(self) -> MachineFunction:
-        """Compiled function of the gaps."""
+        """Compiled function of the gaps and their derivatives."""
         key = b"closure of the loops" + self.nominal.digest
         return compiled_functions(key, lambda: [closure_function(self.nominal)])["closure"]
 
@@ -77,8 +77,8 @@ class Closure:
 def closure_function(nominal: RobotGeometry) -> ca.Function:
     """Function (pose (6,), joints (n,), deviations (g,)) of the gaps of the loops.
 
-    It returns the gaps (n,), m^2, and their derivatives with respect to coordinates (n, m), joint
-    coordinates (n, n) and deviations (n, g).
+    It returns the gaps (n,), m^2, and their derivatives with respect to the coordinates (n, m), the
+    joint coordinates (n, n) and the deviations (n, g).
     """
     pose = ca.SX.sym("pose", 6)
     joints = ca.SX.sym("joints", len(nominal.legs))

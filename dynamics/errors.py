@@ -1,14 +1,17 @@
-"""Errors of the dynamics package. Every message has the value, the limit, and the leg or name."""
+"""Errors of the dynamics package.
+
+Every message states the value, the limit, and the leg or name.
+"""
 
 LONGEST = 4000
-"""Characters of a message."""
+"""Largest number of characters of a message."""
 
 
 class DynamicsError(Exception):
     """Base class of all errors of this package. The message is one line."""
 
     def __str__(self) -> str:
-        """Message on one line of at most `LONGEST` characters, whatever a file had in it."""
+        """Message on one line of at most `LONGEST` characters, even if it quotes a file."""
         text = " ".join(super().__str__().splitlines())
         return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 

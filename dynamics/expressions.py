@@ -1,16 +1,16 @@
-"""CasADi functions from expressions."""
+"""Construction of CasADi functions from expressions."""
 
 import casadi as ca
 
 
 def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
-    """CasADi function with dense outputs, in which common subexpressions are computed once.
+    """CasADi function with dense outputs, in which common subexpressions are computed only once.
 
-    Legs share rotations and lever arms, so that forward dynamics halves in size and time.
+    Legs share rotations and lever arms. This halves the size and the time of forward dynamics.
     """
     return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
 
 
 def symmetric_from_lower(matrix: ca.SX) -> ca.SX:
-    """Symmetric matrix with its upper triangle from the lower, so that entries are formed once."""
+    """Symmetric matrix from its lower triangle, so that each entry is computed once."""
     return ca.tril2symm(ca.tril(matrix))

@@ -1,7 +1,7 @@
-"""Files that people write and pass on, read within limits or refused in one line.
+"""Reading of files from users, within limits. Other files are refused with a one-line message.
 
-The limits are far beyond what a person writes. They are low enough that any file of at most a
-megabyte is read or refused within seconds.
+The limits far exceed what a person writes. They are low enough that any file of at most a megabyte
+is read or refused within seconds.
 """
 
 import json
@@ -18,25 +18,25 @@ import yaml
 from pydantic import AfterValidator, WithJsonSchema
 
 LARGEST = 500_000
-"""Largest number of bytes of a file of settings."""
+"""Largest size of a file of settings, in bytes."""
 
 LARGEST_XML = 1_000_000
-"""Largest number of bytes of an XML file."""
+"""Largest size of an XML file, in bytes."""
 
 DEEPEST = 16
-"""Largest depth of tables and lists, and number of parts of a dotted key."""
+"""Largest depth of tables and lists, and largest number of parts of a dotted key."""
 
 DEEPEST_ELEMENT = 150
-"""Largest depth of elements of XML."""
+"""Largest depth of XML elements."""
 
 LARGEST_YAML = 100_000
-"""Largest number of bytes of a YAML file."""
+"""Largest size of a YAML file, in bytes."""
 
 NAME = r"^\w[\w .+-]*$"
-"""Pattern of the names of robots, sensors, scenarios and studies, which become names of files."""
+"""Pattern of the names of robots, sensors, scenarios and studies, which are used as file names."""
 
 LONGEST_NAME = 60
-"""Largest number of characters of such a name. Its file then has at most 255 bytes."""
+"""Largest number of characters of such a name. The file name then has at most 255 bytes."""
 
 _YamlLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
@@ -50,16 +50,18 @@ _TEXTS = re.compile(
     """,
     re.DOTALL | re.VERBOSE,
 )
-"""Texts and comments of TOML, each to its end, so that a search takes linear time."""
+"""Strings and comments in TOML. Each match extends to its end, so that a search takes
+linear time.
+"""
 
 
 def is_name(name: str) -> bool:
-    """Tell whether a name can become that of a file."""
+    """Tell whether a name can be used as a file name."""
     return bool(re.fullmatch(NAME, name)) and len(name) <= LONGEST_NAME
 
 
 def check_name(name: str) -> str:
-    """Return the name. Raises ValueError for one that could not be that of a file."""
+    """Return the name. Raises ValueError for a name that cannot be used as a file name."""
     if is_name(name):
         return name
     raise ValueError(
@@ -73,11 +75,11 @@ Name = Annotated[
     AfterValidator(check_name),
     WithJsonSchema({"type": "string", "pattern": NAME, "maxLength": LONGEST_NAME}),
 ]
-"""Name that becomes that of a file."""
+"""Name that is used as a file name."""
 
 
 def is_file(path: str | PathLike[str]) -> bool:
-    """Return True where there is such a file. No path, such as one with NUL, is no file."""
+    """Return True if there is such a file. An invalid path, such as one with NUL, is no file."""
     try:
         return Path(path).is_file()
     except (OSError, ValueError):
@@ -101,12 +103,12 @@ def read_bytes(
         reason = (error.strerror if isinstance(error, OSError) else None) or error
         raise refusal(f"cannot read {source}: {reason}") from error
     if len(content) > largest:
-        raise refusal(f"{source} has more than {largest:,} bytes, which no such file needs")
+        raise refusal(f"{source} has more than {largest:,} bytes, the limit for such files")
     return content
 
 
 def read_text(path: str | PathLike[str], source: str, refusal: type[Exception]) -> str:
-    """Text of a file in UTF-8. Raises what `read_bytes` raises."""
+    """Text of a file in UTF-8. Raises `refusal` as `read_bytes` does, and for other encodings."""
     try:
         return read_bytes(path, source, refusal).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -116,14 +118,14 @@ def read_text(path: str | PathLike[str], source: str, refusal: type[Exception]) 
 def parse_toml(text: str, source: str, refusal: type[Exception]) -> dict[str, Any]:
     """Content of TOML text. `source` is its name in messages.
 
-    Raises `refusal` for text that is no TOML or has more than `LARGEST` characters, for tables and
-    lists deeper than `DEEPEST`, for integers beyond 64 bits, and for control characters.
+    Raises `refusal` for text that is not TOML or has more than `LARGEST` characters, for tables and
+    lists deeper than `DEEPEST`, for integers beyond 64 bits, for dates, and for control characters.
     """
     if len(text) > LARGEST:
-        raise refusal(f"{source} has more than {LARGEST:,} characters, which no such file needs")
+        raise refusal(f"{source} has more than {LARGEST:,} characters, the limit for such files")
     deep = f"{source} has keys, tables or lists more than {DEEPEST} deep"
     bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
-    # the time of tomllib grows as the square of the number of parts
+    # the time of tomllib grows with the square of the number of parts
     if any(key.count(".") >= DEEPEST for key in bare):
         raise refusal(deep)
     try:
@@ -134,7 +136,7 @@ def parse_toml(text: str, source: str, refusal: type[Exception]) -> dict[str, An
         raise refusal(deep) from None
     except ValueError:
         # int() refuses more than some thousand digits
-        raise refusal(f"{source} has an integer beyond 64 bits, or a date that is none") from None
+        raise refusal(f"{source} has an integer beyond 64 bits, or an invalid date") from None
     fault = _fault(content)
     if fault:
         raise refusal(f"{source} has {fault}")
@@ -142,7 +144,7 @@ def parse_toml(text: str, source: str, refusal: type[Exception]) -> dict[str, An
 
 
 def _fault(content: dict[str, Any]) -> str:
-    """Text for the first thing in a content that is beyond the limits, or an empty text."""
+    """Text on the first entry of a content that exceeds the limits, or an empty text."""
     left: list[tuple[Any, int]] = [(content, 0)]
     while left:
         value, depth = left.pop()
@@ -158,14 +160,14 @@ def _fault(content: dict[str, Any]) -> str:
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             return "an integer beyond 64 bits"
         elif not isinstance(value, (str, int, float)):
-            return f"a date or time, {value}, which none needs"
+            return f"a date or time, {value}, which is not allowed"
     return ""
 
 
 def parse_json(text: str, source: str, refusal: type[Exception]) -> Any:
     """Content of JSON text.
 
-    Raises `refusal` for text that is no JSON or too deep, and for endless integers.
+    Raises `refusal` for text that is not JSON, is too deep, or has integers with too many digits.
     """
     try:
         return json.loads(text)
@@ -175,10 +177,10 @@ def parse_json(text: str, source: str, refusal: type[Exception]) -> Any:
 
 
 def parse_yaml(content: bytes, source: str, refusal: type[Exception]) -> Any:
-    """Content of YAML of mappings, lists and names. Every scalar is a text.
+    """Content of YAML text with mappings, lists and names. Every scalar is returned as text.
 
-    Raises `refusal` for content that is no YAML, for aliases, for a key that is there twice, and
-    for more than `DEEPEST` levels.
+    Raises `refusal` for content that is not YAML, for aliases, for a duplicate key, and for more
+    than `DEEPEST` levels.
     """
     try:
         _check_events(yaml.parse(content, Loader=_YamlLoader), source, refusal)
@@ -198,7 +200,7 @@ def _check_events(events: Iterable[Any], source: str, refusal: type[Exception]) 
     depth = 0
     for event in events:
         if isinstance(event, yaml.AliasEvent):
-            raise refusal(f"{source} has an alias, *{event.anchor}; write out what it stands for")
+            raise refusal(f"{source} has an alias, *{event.anchor}; write its content instead")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
@@ -206,9 +208,9 @@ def _check_events(events: Iterable[Any], source: str, refusal: type[Exception]) 
 
 
 def parse_xml(content: bytes, source: str, refusal: type[Exception]) -> Xml.Element:
-    """Root of XML.
+    """Root element of XML.
 
-    Raises `refusal` for content that is no XML, for elements more than `DEEPEST_ELEMENT` deep, and
+    Raises `refusal` for content that is not XML, for elements more than `DEEPEST_ELEMENT` deep, and
     for a document type, which could define entities.
     """
     try:
@@ -218,14 +220,16 @@ def parse_xml(content: bytes, source: str, refusal: type[Exception]) -> Xml.Elem
 
 
 class _Builder(Xml.TreeBuilder):
-    """Builder of the tree of XML within limits. Raises ValueError beyond them."""
+    """Builder of an XML tree within limits. Raises ValueError beyond them."""
 
     def __init__(self) -> None:
         super().__init__()
         self._depth = 0
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        raise ValueError("it declares a document type and may define entities, which none needs")
+        raise ValueError(
+            "it declares a document type, which is not allowed: it could define entities"
+        )
 
     def start(self, tag: Any, attrs: Any, /) -> Xml.Element:
         self._depth += 1

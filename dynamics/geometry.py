@@ -1,4 +1,6 @@
-"""Geometry of a parallel robot: legs, home of the platform, travel of the joints."""
+"""Geometry of a parallel robot: its legs, the home pose of the platform, and the travel of
+the joints.
+"""
 
 import hashlib
 from collections import Counter
@@ -15,18 +17,19 @@ from dynamics.legs.geometric_numbers import POINTS, deviations, moved, unit_of, 
 from dynamics.legs.leg import Leg
 
 SAME_PLACE = 1e-6
-"""Distance, m, below which joints of two legs are one."""
+"""Distance, m, below which joints of two legs coincide."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobotGeometry:
-    """Legs and chart of a robot. Two geometries are equal when all their numbers are.
+    """Legs and chart of a robot. Two geometries are equal if all their numbers are equal.
 
-    `travel_limit` is the largest magnitude of a joint coordinate, rad or m, and `gravity` (3,) is
-    in m/s^2. Lengths are in m, and vectors in the axes of the base unless named otherwise. Legs are
-    assembled: each knows which solution of its inverse kinematics is the one at home. Raises
-    RobotFileError, with leg and numbers, for a machine with more or fewer freedoms than actuators,
-    for two legs in one place, and where a leg cannot reach the home pose.
+    `travel_limit` is the largest magnitude of a joint coordinate, rad or m. `gravity` (3,) is in
+    m/s^2. Lengths are in m, and vectors are in the axes of the base unless stated otherwise. Legs
+    are assembled: the branch of each leg's inverse kinematics at home is selected.
+
+    Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
+    of actuators, if two legs coincide, or if a leg cannot reach the home pose.
     """
 
     legs: tuple[Leg, ...]
@@ -66,17 +69,17 @@ class RobotGeometry:
 
     @property
     def platform_joints(self) -> np.ndarray:
-        """Platform joints a (legs, 3), in the axes of the platform, m."""
+        """Platform joints A (legs, 3), in the axes of the platform, m."""
         return np.array([leg.platform_joint for leg in self.legs])
 
     @property
     def prismatic(self) -> bool:
-        """True where the actuators slide. They turn otherwise."""
+        """True if the actuators slide, False if they rotate."""
         return self.legs[0].prismatic
 
     @cached_property
     def digest(self) -> bytes:
-        """Digest of all numbers but the travel limit, for caches."""
+        """Digest of all numbers except the travel limit, for caches."""
         content = hashlib.sha256(repr((self.chart, self.gravity.tolist())).encode())
         for leg in self.legs:
             content.update(repr([(name, _plain(value)) for name, value in leg]).encode())
@@ -92,12 +95,12 @@ class RobotGeometry:
 
     @property
     def symbols(self) -> tuple[ca.SX, ...]:
-        """No symbols, because all numbers are known. See `MovableGeometry`."""
+        """Empty tuple, because all numbers are known. See `MovableGeometry`."""
         return ()
 
     @property
     def characteristic_length(self) -> float:
-        """Length, m, by which rotations become comparable to translations.
+        """Length, m, that makes rotations comparable to translations.
 
         It is the RMS distance of the joints A from the origin of the platform.
         """
@@ -122,8 +125,9 @@ class RobotGeometry:
 
     @property
     def numbers(self) -> np.ndarray:
-        """Geometric numbers (g,), m. Turns are zero, because they are counted from this
-        geometry.
+        """Geometric numbers (g,), m.
+
+        Rotations are zero, because they are relative to this geometry.
         """
         return np.concatenate([values(leg) for leg in self.legs])
 
@@ -142,7 +146,7 @@ class RobotGeometry:
         )
 
     def shifted(self, joints: np.ndarray) -> "RobotGeometry":
-        """Geometry whose joint coordinates read less by values (n,), rad or m."""
+        """Geometry whose joint coordinates are smaller by values (n,), rad or m."""
         return replace(
             self,
             legs=tuple(leg.shifted(float(by)) for leg, by in zip(self.legs, joints, strict=True)),
@@ -160,12 +164,13 @@ class RobotGeometry:
         length_std: float = 0.0,
         turn_std: float = 0.0,
     ) -> "RobotGeometry":
-        """Geometry of a robot that is not built as drawn, with drawn normal errors.
+        """Geometry of a robot with manufacturing errors, which are drawn from normal distributions.
 
-        Standard deviations are `std`, m, of every coordinate of the joints B and A, `length_std`,
-        m, of the lengths, and `turn_std`, rad, of the axes. Joint coordinates are set to zero at
-        home as those of a real robot are. Errors of zero give the geometry itself. Raises
-        RobotFileError for a negative error, and where a leg does not reach the home pose any more.
+        The standard deviations are `std`, m, for every coordinate of the joints B and A,
+        `length_std`, m, for the lengths, and `turn_std`, rad, for the axes. Joint coordinates are
+        zeroed at home, as on a real robot. If all standard deviations are zero, the geometry itself
+        is returned. Raises RobotFileError for a negative standard deviation, and if a leg no longer
+        reaches the home pose.
         """
         real("geometry error", std, RobotFileError, least=0, unit=" m")
         real("error of lengths", length_std, RobotFileError, least=0, unit=" m")
@@ -187,7 +192,7 @@ class RobotGeometry:
             raise RobotFileError(f"with joints off by {std:g} m: {error}") from error
 
     def _check_freedoms(self) -> None:
-        """Raise RobotFileError for legs that do not suit the chart or each other."""
+        """Raise RobotFileError for legs that do not match the chart or each other."""
         if self.chart.name not in FREEDOMS:
             raise RobotFileError(f"unknown chart `{self.chart.name}`; valid: {', '.join(FREEDOMS)}")
         if not self.legs:
@@ -206,8 +211,8 @@ class RobotGeometry:
                 )
             if leg.prismatic != self.prismatic:
                 raise RobotFileError(
-                    f"leg {number}: actuators that slide and such that turn cannot share a joint "
-                    "PID"
+                    f"leg {number}: actuators that slide and actuators that turn cannot share a "
+                    "joint PID"
                 )
         if len(self.legs) != freedoms:
             kind = "under-actuated" if len(self.legs) < freedoms else "over-constrained"
@@ -221,7 +226,7 @@ class RobotGeometry:
             )
 
     def _check_places(self) -> None:
-        """Raise RobotFileError for two legs in one place."""
+        """Raise RobotFileError if two legs coincide."""
         for a, first in enumerate(self.legs):
             for b, second in enumerate(self.legs[:a]):
                 ends = np.concatenate(
@@ -238,13 +243,15 @@ class RobotGeometry:
 
 @dataclass(frozen=True)
 class MovableGeometry:
-    """All geometries near a nominal one, whose numbers differ from its own by symbols."""
+    """All geometries near a nominal one. Their numbers differ from the nominal ones by symbols."""
 
     nominal: RobotGeometry
 
     @cached_property
     def symbols(self) -> tuple[ca.SX, ...]:
-        """Deviations (g,) of the geometric numbers, m and rad, as the last input of functions."""
+        """Deviations (g,) of the geometric numbers, m and rad, which are the last input of
+        functions.
+        """
         return (ca.SX.sym("deviations", len(self.nominal.number_names)),)
 
     @cached_property
@@ -256,7 +263,7 @@ class MovableGeometry:
 
     @property
     def platform_joints(self) -> list[ca.SX]:
-        """Platform joint a (3,) of each leg, in the axes of the platform, m."""
+        """Platform joint A (3,) of each leg, in the axes of the platform, m."""
         return [ca.SX(leg.platform_joint) for leg in self.legs]
 
     @property
@@ -276,9 +283,9 @@ class MovableGeometry:
 
 
 AnyGeometry = RobotGeometry | MovableGeometry
-"""Geometry of which kinematics and dynamics are expressions."""
+"""Geometry for which kinematics and dynamics are built as expressions."""
 
 
 def _plain(value: object) -> object:
-    """Value without arrays."""
+    """Value in which an array is replaced by a list."""
     return value.tolist() if isinstance(value, np.ndarray) else value

@@ -1,18 +1,18 @@
 """Inertias that a rigid body can have, and the effect of changed inertias on the motion.
 
-A rigid body has a positive mass, and no principal moment larger than the sum of the other two
-(`moments_fault`). Published tables break this, as the cranks and links of the paper's Table 1 do,
-and multibody engines refuse such bodies. `physical_inertias` names them, or changes as little as
-possible. Where it can, it changes what the motion does not feel:
+A rigid body has a positive mass, and no principal moment of inertia larger than the sum of the
+other two (`moments_fault`). Published tables break this rule, as the cranks and links in Table 1 of
+the paper do, and multibody engines refuse such bodies. `physical_inertias` names these bodies, or
+changes them as little as possible. If it can, it changes only values without effect on the motion:
 
-- A body of which one moment does work keeps that moment. An example is a crank that turns about its
-  own z, with Izz.
-- A body of which two moments do work keeps both, and the third gives way. An example is a link
+- If one moment of a body does work, this moment is kept. An example is a crank that rotates about
+  its own z, with Izz.
+- If two moments of a body do work, both are kept, and the third is changed. An example is a link
   without spin, with Ixx and Iyy.
-- Where all three moments do work, as those of the platform, they share the change equally. They
-  become the nearest moments in the least-squares sense.
+- If all three moments do work, as on the platform, they are changed to the nearest valid moments in
+  the least-squares sense.
 
-`acceleration_changes` measures at random states what that means for the motion of the robot.
+`acceleration_changes` measures the effect on the motion of the robot at random states.
 """
 
 from collections.abc import Mapping
@@ -28,23 +28,23 @@ from dynamics.workspace import measure
 
 MOMENTS = ("Ixx", "Iyy", "Izz")
 
-# Engines refuse a moving body without mass or inertia. The limit of MuJoCo is 1e-15.
+# Smallest mass and inertia. Engines refuse a moving body without them; MuJoCo's limit is 1e-15.
 SMALLEST = 1e-12
 
-# A sum of two rounded moments may fall below the third by one unit of the last digit; MuJoCo
-# compares exactly.
+# Relative tolerance: the sum of two rounded moments can be below the third by one unit of the last
+# digit, and MuJoCo compares them exactly.
 ROUNDING = 1e-14
 
 
 class UnphysicalInertiaError(ParameterError):
-    """Bodies with a mass and principal inertias that no rigid body can have."""
+    """Bodies whose mass and principal moments no rigid body can have."""
 
 
 @dataclass(frozen=True)
 class BodyInertias:
     """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body (bodies, 4).
 
-    `changes` says by body what was changed, and is empty where nothing was.
+    `changes` describes the changes by body. It is empty if nothing was changed.
     """
 
     values: np.ndarray
@@ -56,7 +56,7 @@ def physical_inertias(
 ) -> BodyInertias:
     """Inertias of parameters (p,) that a multibody engine accepts.
 
-    Raises UnphysicalInertiaError, with bodies and values, where one must be changed and
+    Raises UnphysicalInertiaError, with bodies and values, if one must be changed and
     `allow_changes` is False.
     """
     given = layout.bodies_of(np.array(parameters, dtype=float))
@@ -68,8 +68,8 @@ def physical_inertias(
     if broken and not allow_changes:
         raise UnphysicalInertiaError(
             f"no rigid body has these inertias [kg, kg m^2]: {'; '.join(grouped(broken))}; pass "
-            "allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to take the "
-            "nearest ones that engines accept"
+            "allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to use the "
+            "nearest inertias that engines accept"
         )
     values = given.copy()
     changes = dict[str, str]()
@@ -81,9 +81,9 @@ def physical_inertias(
 
 
 def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
-    """Text for a principal moment that exceeds the sum of the other two.
+    """Text on a principal moment that exceeds the sum of the other two.
 
-    It may exceed the sum by the share `rounding`. The text is empty where a rigid body can have the
+    It may exceed the sum by the share `rounding`. The text is empty if a rigid body can have the
     moments.
     """
     largest = max(moments, key=moments.__getitem__)
@@ -99,7 +99,9 @@ def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
 
 
 def grouped(texts: dict[str, str]) -> list[str]:
-    """Texts by body as lines `body, body: text`, with one line for all bodies that share a text."""
+    """Texts by body as lines `body, body: text`, with one line for all bodies with the same
+    text.
+    """
     bodies: dict[str, list[str]] = {}
     for body, text in texts.items():
         bodies.setdefault(text, []).append(body)
@@ -107,7 +109,7 @@ def grouped(texts: dict[str, str]) -> list[str]:
 
 
 def _fault(row: np.ndarray) -> str:
-    """Text for the fault of a body's mass and moments (4,), empty where there is none."""
+    """Text on the fault in the mass and moments (4,) of a body. It is empty without a fault."""
     for name, value in zip(("mass", *MOMENTS), row, strict=True):
         if value < SMALLEST:
             return f"{name} = {value:g} is below {SMALLEST:g}"
@@ -130,7 +132,9 @@ def _repaired(body: Body, row: np.ndarray) -> np.ndarray:
 
 
 def _one_kept(x: float, y: float, kept: float) -> list[float]:
-    """Moments x, y and one that is kept, such that a body can have them."""
+    """Moments x, y and `kept`, of which x and y are changed to values that a rigid body can
+    have.
+    """
     if x + y < kept:
         half = (kept - x - y) / 2 + ROUNDING * kept
         return [x + half, y + half, kept]
@@ -138,7 +142,7 @@ def _one_kept(x: float, y: float, kept: float) -> list[float]:
 
 
 def _two_kept(z: float, x: float, y: float) -> list[float]:
-    """Moments z, x and y, of which x and y are kept, such that a body can have them."""
+    """Moments z, x and y, of which z is changed to a value that a rigid body can have."""
     slack = ROUNDING * (x + y)
     return [min(max(z, abs(x - y) + slack), x + y - slack), x, y]
 
@@ -155,27 +159,28 @@ def _nearest_moments(moments: np.ndarray) -> np.ndarray:
 
 
 def _difference(before: np.ndarray, after: np.ndarray) -> str:
-    """Text for what was changed."""
+    """Text on the values that were changed."""
     named = zip(("mass", *MOMENTS), before, after, strict=True)
     return ", ".join(f"{name} {old:g} -> {new:g}" for name, old, new in named if old != new)
 
 
 STATES = 300
 TRAVEL_RATE = 1.0
-"""Standard deviation of joint rates, in travel limits a second."""
+"""Standard deviation of joint rates, in travel limits per second."""
 
 TRAVEL_GAIN = 10.0
-"""Standard deviation of joint accelerations, in travel limits a second^2."""
+"""Standard deviation of joint accelerations, in travel limits per second squared."""
 
 
 def acceleration_changes(
     robot: Robot, parameters: np.ndarray, inertias: np.ndarray
 ) -> dict[str, float]:
-    """Largest |change| / |acceleration| of forward dynamics for each changed body, by body.
+    """Largest |change| / |acceleration| of forward dynamics for each changed body.
 
-    `inertias` (bodies, 4) are masses and moments in the order of the layout. Bodies that have them
-    already in the parameters (p,) are left out. Linear and angular acceleration count separately,
-    over the states of `travel_states`. Raises ParameterError for parameters outside their range.
+    `inertias` (bodies, 4) are masses and moments in the order of the layout. Bodies with the same
+    values in the parameters (p,) are omitted. Linear and angular accelerations are compared
+    separately, over the states of `travel_states`. Raises ParameterError for parameters outside
+    their range.
     """
     own = robot.layout.check(parameters)
     layout = robot.layout
@@ -187,7 +192,7 @@ def acceleration_changes(
         layout.bodies_of(other)[index] = inertias[index]
         if not np.array_equal(other, own):
             change = robot.forward_dynamics(*state, other).reshape(-1, 2, 3) - before
-            # zero where the platform cannot turn
+            # sizes are zero if the platform cannot rotate
             sizes = np.linalg.norm(before, axis=2)
             effects[body] = float(
                 (np.linalg.norm(change, axis=2)[sizes > 0] / sizes[sizes > 0]).max()
@@ -198,7 +203,7 @@ def acceleration_changes(
 def travel_states(
     robot: Robot, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random poses within the travel limit and twists, (STATES, 6) each, and torques (STATES, n).
+    """Random poses within the travel limit, twists, both (STATES, 6), and torques (STATES, n).
 
     They are always the same for a robot.
     """
@@ -208,8 +213,8 @@ def travel_states(
     at_home = robot.coordinate_jacobian(robot.home_pose)
     pose = np.empty((0, 6))
     while len(pose) < STATES:
-        # The linear map from angles to poses leaves the reach far from home: the factor keeps some
-        # draws near it.
+        # Far from home, poses from this linear map are out of reach. The random factor makes some
+        # of the poses nearer to home.
         angles = (
             robot.travel_limit
             * rng.uniform(0, 1, (STATES, 1))

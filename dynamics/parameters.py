@@ -25,17 +25,19 @@ LANES = 8
 def room_for_derivatives(parameters: int, start: int) -> int:
     """Number of columns for the derivatives of one number, a multiple of LANES.
 
-    The columns are for the parameters, the length of a step and the entries of a start.
+    There is one column for each parameter, for the length of a step, and for each entry of a start
+    state.
     """
     return -(-(parameters + 1 + start) // LANES) * LANES
 
 
 @dataclass(frozen=True, eq=False)
 class RigidGroups:
-    """Combinations (k, r) of the r inertial parameters of a robot on which its motion depends.
+    """Groups (k, r) of the r inertial parameters of a robot on which its motion depends.
 
-    `pivots` (k,) are one parameter of each combination, ascending. It has the coefficient 1 there,
-    and is in no other combination.
+    Each group is a linear combination of the parameters. `pivots` (k,) are the indices of one
+    parameter of each group, in ascending order. This parameter has the coefficient 1 in its group
+    and 0 in all other groups.
     """
 
     pivots: np.ndarray
@@ -44,8 +46,8 @@ class RigidGroups:
     def of_all(self, by_pivots: np.ndarray) -> np.ndarray:
         """Derivatives (..., p) with respect to all parameters.
 
-        `by_pivots` are derivatives with respect to the pivots and to the parameters after the
-        inertial ones.
+        `by_pivots` has the derivatives with respect to the pivots, and then with respect to the
+        parameters that are not inertial.
         """
         count = len(self.pivots)
         return np.concatenate(
@@ -57,8 +59,8 @@ class RigidGroups:
 class ParameterLayout:
     """Parameters of a robot: of its bodies, of joint friction, and of the joint PID.
 
-    `bodies` are all bodies, the platform first, with the kind of each. `of_leg` are the places of
-    the bodies of each leg among them. `prismatic` is True where actuators slide.
+    `bodies` are the names of all bodies, the platform first, and `kinds` are their kinds. `of_leg`
+    are the indices of the bodies of each leg. `prismatic` is True if the actuators slide.
     """
 
     bodies: tuple[str, ...]
@@ -83,12 +85,12 @@ class ParameterLayout:
 
     @cached_property
     def coulomb_names(self) -> tuple[str, ...]:
-        """Names of the dry friction of the joints."""
+        """Names of the dry friction parameters."""
         return tuple(f"{joint}.coulomb" for joint in self.joint_names)
 
     @cached_property
     def viscous_names(self) -> tuple[str, ...]:
-        """Names of the viscous friction of the joints."""
+        """Names of the viscous friction parameters."""
         return tuple(f"{joint}.viscous" for joint in self.joint_names)
 
     @cached_property
@@ -112,35 +114,35 @@ class ParameterLayout:
 
     @property
     def rigid(self) -> slice:
-        """Place of the inertial parameters."""
+        """Slice of the inertial parameters."""
         return slice(0, len(self.rigid_names))
 
     @property
     def coulomb(self) -> slice:
-        """Place of the dry friction."""
+        """Slice of the dry friction parameters."""
         return slice(self.rigid.stop, self.rigid.stop + self.joints)
 
     @property
     def viscous(self) -> slice:
-        """Place of the viscous friction."""
+        """Slice of the viscous friction parameters."""
         return slice(self.coulomb.stop, self.coulomb.stop + self.joints)
 
     @property
     def dynamic(self) -> slice:
-        """Place of the dynamic parameters."""
+        """Slice of the dynamic parameters."""
         return slice(0, self.viscous.stop)
 
     @property
     def joint_pid(self) -> slice:
-        """Place of the gains."""
+        """Slice of the gains of the joint PID."""
         return slice(self.viscous.stop, self.viscous.stop + len(JOINT_PID))
 
     def bodies_of(self, rigid: np.ndarray) -> np.ndarray:
-        """View of the inertial parameters with one row (mass, Ixx, Iyy, Izz) a body."""
+        """View of the inertial parameters with one row (mass, Ixx, Iyy, Izz) per body."""
         return rigid[..., self.rigid].reshape(*rigid.shape[:-1], len(self.bodies), len(INERTIAL))
 
     def leg_rows(self, leg: int) -> list[int]:
-        """Places of the inertial parameters of a leg's bodies, one body after the other."""
+        """Indices of the inertial parameters of a leg's bodies, one body after the other."""
         return [
             len(INERTIAL) * body + entry
             for body in self.of_leg[leg]
@@ -155,12 +157,14 @@ class ParameterLayout:
     def unit(self, name: str) -> str:
         """Unit of a parameter, such as `crank1.mass` or `joint_pid.lp`.
 
-        Units of friction and gains follow the actuators.
+        The units of friction and gains depend on the kind of actuators.
         """
         return unit_of(name, self.prismatic)
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Parameters as those of rigid bodies, dry and viscous friction, and lp, li, ld (3,)."""
+        """Split parameters into inertial parameters, dry friction, viscous friction, and
+        lp, li, ld (3,).
+        """
         return (
             values[self.rigid],
             values[self.coulomb],
@@ -169,9 +173,9 @@ class ParameterLayout:
         )
 
     def check(self, values: ArrayLike, *, batch: bool = False) -> np.ndarray:
-        """Dynamic parameters as floats (p,), or (N, p) where a batch is allowed.
+        """Dynamic parameters as floats (p,), or (N, p) if `batch` is True.
 
-        Raises ParameterError for another shape, for a value that is NaN, infinite or negative, and
+        Raises ParameterError for a wrong shape, for a value that is NaN, infinite or negative, and
         for a platform without mass. The message has the parameter with its value, unit and limit,
         and its row in a batch.
         """
@@ -197,7 +201,7 @@ class ParameterLayout:
 def parameter_layout(legs: Sequence[Leg]) -> ParameterLayout:
     """Layout of a robot with these legs.
 
-    The platform is first. Then come the first bodies of all legs, then the second ones.
+    The platform is first. The first bodies of all legs follow, and then their second bodies.
     """
     found: list[tuple[int, Body]] = []
     for place in range(max(len(leg.bodies) for leg in legs)):

@@ -1,4 +1,4 @@
-"""A robot as its users call it: kinematics and dynamics on NumPy arrays."""
+"""Robot with its kinematics and dynamics on NumPy arrays."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class Robot(RobotDynamics):
     """Kinematics and dynamics of a robot with n joints, m coordinates and p dynamic parameters.
 
     A pose (6,) is [x y z alpha beta gamma] of the platform in the frame of the base (eq. 1). A
-    twist (6,) is [h_dot, omega] in the axes of the base. The m coordinates are those entries of
-    the pose that the platform can change. Joint coordinates are angles, or lengths where the
-    actuators slide: N and N s/m then take the place of N m and N m s/rad. All units are SI.
+    twist (6,) is [h_dot, omega] in the axes of the base. The m coordinates are the entries of the
+    pose that the platform can change. Joint coordinates are angles. If the actuators slide, they
+    are lengths, and N and N s/m replace N m and N m s/rad. All units are SI.
 
-    Every method also takes batches with a leading axis, such as (N, 6), and then returns one axis
-    more. Where `parameters` are None, a method takes `nominal_parameters`.
+    Every method also accepts batches with a leading axis, such as (N, 6), and its results then have
+    this axis, too. If `parameters` is None, a method uses `nominal_parameters`.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Robot(RobotDynamics):
     parameter_sets : dict
         All sets of the robot file by name.
     layout : ParameterLayout
-        Place and unit of each parameter.
+        Position and unit of each parameter.
     geometry : RobotGeometry
         Joints, legs and chart.
     functions_of : RobotGeometry
@@ -78,7 +78,7 @@ class Robot(RobotDynamics):
     Raises
     ------
     ShapeError
-        If an array has another shape, or entries that are not finite.
+        If an array has a wrong shape, or entries that are not finite.
     ParameterError
         If a parameter is outside its range.
     ChartError
@@ -100,27 +100,27 @@ class Robot(RobotDynamics):
     def casadi(self, name: str) -> ca.Function:
         """CasADi function of the kinematics or dynamics, for a controller or an optimiser.
 
-        The function has the equations of the method of the same name. It checks nothing, and
-        gives NaN where a leg cannot reach.
+        The function has the same equations as the method of the same name. It checks no arguments,
+        and returns NaN for a pose that a leg cannot reach.
 
         Parameters
         ----------
         name : str
             inverse_kinematics, joint_jacobian, pose_jacobian, mass_matrix, coriolis_matrix,
             gravity_wrench, friction_wrench, regressor, inverse_dynamics or forward_dynamics.
-            Friction has a sign function, so that the last four are smooth only where no joint
-            is at rest.
+            Friction has a sign function. friction_wrench, inverse_dynamics and forward_dynamics
+            are therefore smooth only if no joint is at rest, and so is regressor.
 
         Returns
         -------
         casadi.Function
-            Function with named inputs and outputs. Vectors are columns, and parameters (p,) are
-            always an input of the dynamics.
+            Function with named inputs and outputs. Vectors are columns. Functions of the dynamics
+            have the parameters (p,) as an input.
 
         Raises
         ------
         DynamicsError
-            If there is no function of that name, with the valid names.
+            If there is no function of that name. The message lists the valid names.
 
         Examples
         --------
@@ -136,10 +136,10 @@ class Robot(RobotDynamics):
         return casadi_function(self.geometry, name)
 
     def moved(self, deviations: ArrayLike) -> Robot:
-        """Robot with other geometric numbers.
+        """Robot with changed geometric numbers.
 
-        All robots that are moved from one share its functions, which are compiled once and are a
-        third slower than those of a robot file.
+        All robots made from one robot by this method share its functions. These are compiled once,
+        and are a third slower than the functions of a robot file.
 
         Parameters
         ----------
@@ -149,12 +149,12 @@ class Robot(RobotDynamics):
         Returns
         -------
         Robot
-            The other robot.
+            The changed robot.
 
         Raises
         ------
         RobotFileError
-            If a leg does not reach the home pose any more.
+            If a leg no longer reaches the home pose.
         ShapeError
             See the class.
 
@@ -168,7 +168,7 @@ class Robot(RobotDynamics):
         return Robot(RobotDescription(self.name, geometry, self.parameter_sets), self.functions_of)
 
     def with_parameters(self, parameters: ArrayLike) -> Robot:
-        """Robot whose nominal parameters are others, such as identified ones.
+        """Robot with other nominal parameters, such as identified ones.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class Robot(RobotDynamics):
         return Robot(RobotDescription(self.name, self.geometry, sets), self.functions_of)
 
     def with_geometry(self, geometry: RobotGeometry) -> Robot:
-        """Robot with another geometry of the same kinds of legs, and functions of its own.
+        """Robot with another geometry with the same kinds of legs. It has its own functions.
 
         Parameters
         ----------
@@ -209,7 +209,7 @@ class Robot(RobotDynamics):
         Returns
         -------
         Robot
-            The other robot, or this one where the geometry is its own.
+            The other robot, or this robot if the geometry is the same object.
 
         Raises
         ------
@@ -230,27 +230,27 @@ class Robot(RobotDynamics):
 def fast_forward_dynamics(
     robot: Robot, parameters: np.ndarray | None = None
 ) -> StateToAcceleration:
-    """Make a function for inner loops that does what `Robot.forward_dynamics` does.
+    """Make a function for inner loops that computes the same as `Robot.forward_dynamics`.
 
-    The function is some 80 times faster than the method, because it does not check reach and
-    conditioning. It returns its own array, which the next call overwrites, so that it is not
-    thread safe. Where all cranks are locked and the platform still moves, eq. 40 holds and the
-    function returns the acceleration. `Robot.forward_dynamics` refuses such a pose, because no
-    controller can hold it.
+    The function is about 80 times faster than the method, because it does not check reach and
+    conditioning. It always returns the same array, which the next call overwrites, and is
+    therefore not thread safe. In a pose in which the platform can move although all cranks are
+    locked, eq. 40 holds, and the function returns the acceleration. `Robot.forward_dynamics`
+    refuses such a pose, because no controller can hold it.
 
     Parameters
     ----------
     robot : Robot
         Robot that moves.
     parameters : ndarray, shape (p,), optional
-        Dynamic parameters, checked once. The default is the nominal ones.
+        Dynamic parameters, which are checked once. The default is `nominal_parameters`.
 
     Returns
     -------
     callable
         Function (pose (6,), twist (6,), torque (n,)) -> twist_dot (6,) of float64 arrays. It
-        raises ShapeError for other arrays. It raises SingularPoseError where the result is not
-        finite: out of reach, with a singular mass matrix, or for NaN.
+        raises ShapeError for other arrays. It raises SingularPoseError if the result is not
+        finite: out of reach, for a singular mass matrix, or for NaN in the input.
 
     Raises
     ------
@@ -271,8 +271,8 @@ def fast_forward_dynamics(
     function = robot.functions["forward_dynamics"]
     result = np.zeros(6)
     inputs = np.concatenate([np.zeros(12 + joints), fixed, function.constants])
-    # Assigning to a memoryview costs half of assigning to an array, and refuses other shapes and
-    # types. The stubs of NumPy do not know that.
+    # Assigning to a memoryview takes half the time of assigning to an array, and refuses other
+    # shapes and types. The type stubs of NumPy do not support it.
     pose_in: Any = memoryview(inputs[0:6].data)
     twist_in: Any = memoryview(inputs[6:12].data)
     torque_in: Any = memoryview(inputs[12 : 12 + joints].data)
@@ -289,7 +289,7 @@ def fast_forward_dynamics(
         except (TypeError, ValueError):
             _refuse(at_pose, at_twist, at_torque, joints)
         call()
-        # The mass matrix couples all entries: one that is not finite makes all of them so.
+        # The mass matrix couples all entries: if one is not finite, none is.
         first = values[0]
         if not first - first == 0.0:
             raise SingularPoseError(
@@ -302,7 +302,7 @@ def fast_forward_dynamics(
 
 
 def _refuse(pose: object, twist: object, torque: object, joints: int) -> None:
-    """Raise the ShapeError of the argument that is no float64 array of its shape."""
+    """Raise ShapeError for the first argument that is not a float64 array of the right shape."""
     given = {"pose": (pose, 6), "twist": (twist, 6), "torque": (torque, joints)}
     for name, (value, size) in given.items():
         if floats(name, value, (size,), finite=False) is not value:

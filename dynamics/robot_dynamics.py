@@ -1,4 +1,4 @@
-"""Dynamics of a robot on NumPy arrays, one state or a batch of them."""
+"""Dynamics of a robot on NumPy arrays, for one state or a batch."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class RobotDynamics(RobotKinematics):
         Returns
         -------
         ndarray, shape (6, 6) or (N, 6, 6)
-            Matrix whose product with the twist is the Coriolis and centrifugal wrench.
+            Coriolis matrix. Its product with the twist is the Coriolis and centrifugal wrench.
 
         Raises
         ------
@@ -73,7 +73,7 @@ class RobotDynamics(RobotKinematics):
         return self._call("coriolis_matrix", self._poses(pose), twist, self._parameters(parameters))
 
     def gravity_wrench(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
-        """Wrench G of eq. 23, which holds the robot against gravity.
+        """Wrench G of eq. 23, which balances gravity.
 
         Parameters
         ----------
@@ -235,7 +235,7 @@ class RobotDynamics(RobotKinematics):
         ]
 
     def static_torque(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
-        """Actuator torques that hold the robot at rest without help from friction.
+        """Actuator torques that hold the robot at rest without friction.
 
         Parameters
         ----------
@@ -260,12 +260,12 @@ class RobotDynamics(RobotKinematics):
         (6,)
         """
         poses = rows("pose", pose, 6)
-        # Friction is zero at rest, with the exact sign function.
+        # With the exact sign function, friction is zero at rest.
         rest = np.zeros_like(poses)
         return self.inverse_dynamics(poses, rest, rest, parameters)
 
     def _regular(self, pose: ArrayLike) -> np.ndarray:
-        """Poses as an array, if they are in reach and the joints can balance every wrench there."""
+        """Poses as an array, checked to be in reach and not singular."""
         poses = self._poses(pose)
         jacobian = self._call("joint_jacobian", poses) @ self.geometry.chart.basis
         condition = np.atleast_1d(np.linalg.cond(jacobian))
@@ -278,7 +278,7 @@ class RobotDynamics(RobotKinematics):
         return poses
 
     def _parameters(self, parameters: ArrayLike | None) -> np.ndarray:
-        """Dynamic parameters as an array, by default the nominal ones."""
+        """Dynamic parameters as an array, by default `nominal_parameters`."""
         if parameters is None:
             return self.nominal_parameters
         return self.layout.check(parameters, batch=True)

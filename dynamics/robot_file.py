@@ -1,4 +1,4 @@
-"""Robot files: TOML with geometry and parameter sets, built in by name or given by path."""
+"""Robot files: TOML with a geometry and parameter sets. Some are built in; others have a path."""
 
 from dataclasses import dataclass
 from importlib import resources
@@ -19,11 +19,11 @@ from dynamics.legs.leg import INERTIAL
 from dynamics.parameters import JOINT_PID, ParameterLayout, parameter_layout
 
 MOST_COMPLAINTS = 24
-"""Largest number of faults that a message lists: four for each of six legs."""
+"""Largest number of faults in a message: four for each of six legs."""
 
 
 class Family(NamedTuple):
-    """Family of robots whose legs are all of one kind: the kind, their number, and the chart."""
+    """Family of robots with legs of one kind: the kind, the number of legs, and the chart."""
 
     kind: str
     legs: int
@@ -58,7 +58,7 @@ class _Strict(BaseModel):
 class BodyInertia(_Strict):
     """Mass, kg, and moments about the body's own axes through its centre of mass, kg m^2.
 
-    Each is one value, or a list with one value a leg.
+    Each is one value, or a list with one value per leg.
     """
 
     mass: Mass | list[Mass]
@@ -70,7 +70,7 @@ class BodyInertia(_Strict):
 class Friction(_Strict):
     """Dry friction, N m or N, and viscous friction, N m s/rad or N s/m, of the joints.
 
-    Each is one value, or a list with one value a leg.
+    Each is one value, or a list with one value per leg.
     """
 
     coulomb: Force | list[Force]
@@ -80,7 +80,7 @@ class Friction(_Strict):
 class JointPid(_Strict):
     """Gains of the joint PID, which all joints share.
 
-    `unit` is that of lp, and must be stated where actuators slide.
+    `unit` is the unit of lp. It must be stated if the actuators slide.
     """
 
     lp: Gain
@@ -90,7 +90,7 @@ class JointPid(_Strict):
 
 
 class Parameters(BaseModel):
-    """Set of parameters: platform, joints, gains, and a table for each kind of the legs' bodies."""
+    """Set of parameters: platform, joints, gains, and a table for each kind of leg body."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
     __pydantic_extra__: dict[str, BodyInertia] = Field(init=False)
@@ -106,12 +106,12 @@ class RobotFile(_Strict):
     A pose is [x y z alpha beta gamma].
     """
 
-    name: Name = Field(description="its name, in records and reports")
+    name: Name = Field(description="name of the robot in records and reports")
     family: str | None = Field(
-        None, description=f"one of {', '.join(FAMILIES)}: names kind of legs and chart"
+        None, description=f"one of {', '.join(FAMILIES)}; determines the kind of legs and the chart"
     )
     chart: str | None = Field(
-        None, description=f"freedoms of the platform, where no family says: {', '.join(FREEDOMS)}"
+        None, description=f"freedoms of the platform, without a family: {', '.join(FREEDOMS)}"
     )
     home_pose: list[Place] = Field(
         min_length=6, max_length=6, description="pose of the platform at home, m and rad"
@@ -121,17 +121,16 @@ class RobotFile(_Strict):
         [0.0, 0.0, -9.81], min_length=3, max_length=3, description="m/s^2, base axes"
     )
     legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
-        description="a table for each leg; with a family also one table with a value, or a list "
-        "with one a leg, a key"
+        description="a table for each leg; with a family also a single table, in which each key "
+        "has one value, or a list with one value per leg"
     )
     parameters: dict[str, Parameters] = Field(
-        description="named sets; `initial` is what identification starts from"
+        description="named sets; `initial` has the initial guess of identification"
     )
 
     @model_validator(mode="before")
     @classmethod
     def _by_family(cls, values: Any) -> Any:
-        """Replace a family by legs one by one, each with its kind."""
         if not isinstance(values, dict) or "legs" not in values:
             return values
         name = values.get("family")
@@ -156,14 +155,15 @@ class RobotFile(_Strict):
 
 
 def robot_schema() -> dict[str, Any]:
-    """JSON schema of robot files, for editors. It is kept in
-    `dynamics/robots/robot.schema.json`.
+    """JSON schema of robot files, for editors.
+
+    It is saved in `dynamics/robots/robot.schema.json`.
     """
     schema = RobotFile.model_json_schema()
     one_a_leg = schema["properties"]["legs"]
     columns = {
         "type": "object",
-        "description": "with a family: for each key one value, or a list with one a leg",
+        "description": "with a family: each key has one value, or a list with one value per leg",
     }
     schema["properties"]["legs"] = {
         "anyOf": [one_a_leg, columns],
@@ -184,7 +184,7 @@ def _check_types(legs: Any) -> None:
 def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, Any]]:
     """Tables of the legs, from one table with columns.
 
-    A column is one value for all legs, or a list with one value a leg.
+    A column is one value for all legs, or a list with one value per leg.
     """
     fields = {_plural(name): name for name in KINDS[family.kind].model_fields}
     legs: list[dict[str, Any]] = [{} for _ in range(family.legs)]
@@ -198,8 +198,7 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
         )
         if each and len(value) != family.legs:
             raise ValueError(
-                f"legs.{key} needs one value, or one for each of {family.legs} legs, got "
-                f"{len(value)}"
+                f"legs.{key} needs one value, or a list of {family.legs} values, got {len(value)}"
             )
         for number, leg in enumerate(legs):
             leg[name] = value[number] if each else value
@@ -207,7 +206,6 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
 
 
 def _plural(name: str) -> str:
-    """Plural of a field."""
     if name.endswith("axis"):
         return name.removesuffix("axis") + "axes"
     return name + "s" if name.endswith(("joint", "direction")) else name
@@ -217,7 +215,7 @@ def _plural(name: str) -> str:
 class ParameterSet:
     """Named parameter set.
 
-    `dynamic` (p,) are in the order of `Robot.parameter_names`, and `joint_pid` (3,) are lp, li, ld.
+    `dynamic` (p,) is in the order of `Robot.parameter_names`, and `joint_pid` (3,) has lp, li, ld.
     """
 
     dynamic: np.ndarray
@@ -250,7 +248,7 @@ def built_in_robots() -> list[str]:
     Returns
     -------
     list of str
-        Names that `load_robot` takes.
+        Names that `load_robot` accepts.
 
     Raises
     ------
@@ -272,16 +270,19 @@ def built_in_robots() -> list[str]:
 def read_robot_file(name_or_path: str | Path) -> RobotDescription:
     """Read a built-in robot by its name, or a TOML robot file by its path.
 
-    Raises RobotFileError for an unknown name, with the valid ones; for a file that cannot be read;
-    for an unknown or missing key, with its place; and for geometry or parameters that make no
-    robot.
+    Raises RobotFileError for an unknown name, with the valid names; for a file that cannot be read;
+    for an unknown or missing key, with its place; and for geometry or parameters that are not
+    valid.
     """
     source, text = _read_text(name_or_path)
     return parsed_robot(text, f"robot file {source}")
 
 
 def parsed_robot(text: str, source: str) -> RobotDescription:
-    """Robot of the text of a file, which messages call `source`. Raises as `read_robot_file`."""
+    """Robot from the text of a robot file. `source` is the name of the file in messages.
+
+    Raises the same errors as `read_robot_file`.
+    """
     try:
         content = RobotFile.model_validate(parse_toml(text, source, RobotFileError))
     except ValidationError as error:
@@ -303,7 +304,6 @@ def parsed_robot(text: str, source: str) -> RobotDescription:
 
 
 def _geometry(content: RobotFile) -> RobotGeometry:
-    """Geometry of the content of a file."""
     if content.chart is None:
         raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
     if content.chart not in FREEDOMS:
@@ -315,7 +315,7 @@ def _geometry(content: RobotFile) -> RobotGeometry:
 
 
 def _read_text(name_or_path: str | Path) -> tuple[str, str]:
-    """Text of a robot file. Raises RobotFileError."""
+    """Name and text of a robot file. Raises RobotFileError."""
     if not isinstance(name_or_path, str | PathLike):
         raise RobotFileError(
             f"a robot is given by its name or the path of its file, got {shown(name_or_path)}"
@@ -331,7 +331,7 @@ def _read_text(name_or_path: str | Path) -> tuple[str, str]:
 
 
 def _one_line(error: ValidationError) -> str:
-    """Faults with their places, in one line. A fault that several legs share is said once."""
+    """Faults with their places, in one line. A fault that several legs have is stated once."""
     legs: dict[str, list[str]] = {}
     found = error.errors()
     for item in found[:MOST_COMPLAINTS]:
@@ -343,7 +343,7 @@ def _one_line(error: ValidationError) -> str:
             place = place[3:]
         last = str(place[-1]) if place else ""
         if last.startswith("list[" if not isinstance(item["input"], list) else "function-"):
-            continue  # one value is no list with one a leg, nor such a list one value
+            continue  # pydantic also reports the alternative that the value was not meant for
         place = [part for part in place if not str(part).startswith(("list[", "function-"))]
         said = [".".join(map(str, place)), item["msg"].removeprefix("Value error, ")]
         got = "" if item["type"] in ("value_error", "missing") else f", got {shown(item['input'])}"
@@ -354,7 +354,6 @@ def _one_line(error: ValidationError) -> str:
 
 
 def _parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> ParameterSet:
-    """Parameter set of its table."""
 
     def per_leg(key: str, value: float | list[float], count: int) -> list[float]:
         expanded = value if isinstance(value, list) else [value] * count
@@ -389,8 +388,8 @@ def _parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> Pa
         raise RobotFileError(
             f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} "
             f"{f'is in {stated}' if stated else 'has no unit'}, but the actuators "
-            f"{'slide' if layout.prismatic else 'turn'}: their gains are in {unit}, which "
-            f'joint_pid says by unit = "{unit}"'
+            f"{'slide' if layout.prismatic else 'turn'}: their gains are in {unit}, which is "
+            f'stated by unit = "{unit}" in joint_pid'
         )
     joint_pid = np.array([getattr(values.joint_pid, gain) for gain in JOINT_PID])
     for array in (dynamic, joint_pid):

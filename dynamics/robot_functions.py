@@ -1,4 +1,4 @@
-"""Functions of a robot's geometry: compiled ones for its own use, and CasADi's for its users."""
+"""Functions of a robot's geometry: compiled functions, and CasADi functions for users."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -43,9 +43,9 @@ CASADI = {
 
 @lru_cache(maxsize=16)
 def own_functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
-    """Compiled functions of a geometry, the same for all its robots.
+    """Compiled functions of a geometry, shared by all robots with this geometry.
 
-    Robots do not hold them, so that robots can be pickled.
+    Robots have no reference to them, and can thus be pickled.
     """
     return compiled_functions(
         geometry.digest, lambda: robot_functions(geometry) + motion_functions(geometry), HOT
@@ -54,7 +54,7 @@ def own_functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
 
 @lru_cache(maxsize=4)
 def _movable_functions(nominal: RobotGeometry) -> dict[str, MachineFunction]:
-    """Compiled functions of all geometries near a nominal one. Their last input is deviations."""
+    """Compiled functions of all geometries near a nominal one. The last input is the deviations."""
     movable = MovableGeometry(nominal)
     key = b"movable" + nominal.digest
     return compiled_functions(
@@ -64,7 +64,7 @@ def _movable_functions(nominal: RobotGeometry) -> dict[str, MachineFunction]:
 
 @lru_cache(maxsize=64)
 def nearby_functions(nominal: RobotGeometry, geometry: RobotGeometry) -> dict[str, MachineFunction]:
-    """Compiled functions of a geometry near a nominal one, of the set that both share."""
+    """Compiled functions of a geometry near a nominal one. Their machine code is shared."""
     deviations = geometry.deviations_from(nominal)
     return {
         name: replace(one, constants=deviations)
@@ -74,7 +74,7 @@ def nearby_functions(nominal: RobotGeometry, geometry: RobotGeometry) -> dict[st
 
 @lru_cache(maxsize=64)
 def casadi_function(geometry: RobotGeometry, name: str) -> ca.Function:
-    """CasADi function of a geometry, with the inputs and outputs that `CASADI` names."""
+    """CasADi function of a geometry, with named inputs and outputs as in `CASADI`."""
     found = next(one for one in robot_functions(geometry) if one.name() == name)
     inputs, outputs = (names.split() for names in CASADI[name])
     given = [ca.SX.sym(one, found.size1_in(k)) for k, one in enumerate(inputs)]

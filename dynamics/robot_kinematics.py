@@ -1,4 +1,4 @@
-"""Kinematics of a robot on NumPy arrays, one pose or a batch of them."""
+"""Kinematics of a robot on NumPy arrays, for one pose or a batch."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class RobotKinematics(RobotPlatform):
         Raises
         ------
         ConvergenceError
-            If no pose near the start has these coordinates, with leg and residual.
+            If no pose with these coordinates is found. The message has the leg and the residual.
         ShapeError, ChartError
             See the class.
 
@@ -107,14 +107,15 @@ class RobotKinematics(RobotPlatform):
     ) -> np.ndarray:
         """Poses in which the robot can be assembled with given joint coordinates.
 
-        Newton's method searches from random starts, so that more starts may find more poses. A
-        Gough-Stewart platform has up to 40 (Dietmaier, 1998). Poses with a leg folded the other
-        way than at home are left out, because their inverse kinematics is another one.
+        Newton's method searches from random starts. More starts can find more poses; a
+        Gough-Stewart platform has up to 40 (Dietmaier, 1998). Poses with a leg that is folded the
+        other way than at home are excluded, because they belong to another branch of the inverse
+        kinematics.
 
         Parameters
         ----------
         theta : array_like, shape (n,), optional
-            Joint coordinates, rad or m. The default is those at home.
+            Joint coordinates, rad or m. The default is the coordinates at home.
         starts : int
             Number of random starts.
         seed : int
@@ -123,7 +124,7 @@ class RobotKinematics(RobotPlatform):
         Returns
         -------
         ndarray, shape (k, 6)
-            Poses. The one nearest to home is first.
+            Poses, of which the first is nearest to home.
 
         Raises
         ------
@@ -140,7 +141,7 @@ class RobotKinematics(RobotPlatform):
         count = whole("starts", starts, DynamicsError, least=1)
         drawn = whole("seed", seed, DynamicsError, least=0)
         geometry = self.geometry
-        # the legs reach no farther than this from the middle of their base joints
+        # radius of the search about the centre of the base joints
         centre = geometry.base_joints.mean(axis=0)
         legs = geometry.joints_at(self.home_pose) - geometry.base_joints
         reach = np.linalg.norm(legs, axis=1).max()

@@ -1,4 +1,4 @@
-"""Platform of a robot: names, poses, twists and reach, for one pose or a batch of them."""
+"""Names, poses, twists and reach of a robot, for one pose or a batch."""
 
 from __future__ import annotations
 
@@ -20,22 +20,26 @@ from dynamics.parameters import parameter_layout
 from dynamics.robot_file import ParameterSet, RobotDescription
 from dynamics.robot_functions import nearby_functions, own_functions
 
-# A system with a larger condition number loses all digits. A healthy robot is near 1e2.
+# With a larger condition number, all digits are lost. Usual robots have about 1e2.
 CONDITION_LIMIT = 1e10
 
 CHART_TOLERANCE = 1e-9
-"""Largest part of a pose or a twist outside the chart, m, rad, m/s or rad/s, that is rounding."""
+"""Largest part of a pose or twist outside the chart that counts as rounding: m, rad, m/s or
+rad/s.
+"""
 
 
 class RobotPlatform:
     """Names, poses, twists and reach of a robot. See `Robot`."""
 
     def __init__(self, description: RobotDescription, nominal: RobotGeometry | None = None) -> None:
-        """Make a robot of its description, with the functions of a nominal geometry nearby."""
+        """Make a robot from its description, with the functions of a nearby nominal
+        geometry, if given.
+        """
         check_type("description", description, RobotDescription, RobotFileError)
         self.name = description.name
         self.geometry = description.geometry
-        # robots of other geometries share the functions of a nominal one, see `moved`
+        # robots made by `moved` share the functions of the nominal geometry
         self.functions_of = nominal or description.geometry
         self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
         self.layout = parameter_layout(self.geometry.legs)
@@ -69,7 +73,7 @@ class RobotPlatform:
 
     @property
     def functions(self) -> dict[str, MachineFunction]:
-        """Compiled functions by name. They are compiled when they are first asked for."""
+        """Compiled functions by name. They are compiled at their first use."""
         if self.functions_of is self.geometry:
             return own_functions(self.geometry)
         return nearby_functions(self.functions_of, self.geometry)
@@ -85,12 +89,12 @@ class RobotPlatform:
         Returns
         -------
         ndarray, shape (6,) or (N, 6)
-            Pose. The entries that the platform cannot change are those at home.
+            Pose. The entries that the platform cannot change have their values at home.
 
         Raises
         ------
         ShapeError
-            If the shape is another one.
+            If the shape is wrong.
 
         Examples
         --------
@@ -101,7 +105,7 @@ class RobotPlatform:
         return self.geometry.chart.pose(values)
 
     def coordinates(self, pose: ArrayLike) -> np.ndarray:
-        """Coordinates of the platform at a pose, which may be a measured one.
+        """Coordinates of the platform at a true or measured pose.
 
         Parameters
         ----------
@@ -116,7 +120,7 @@ class RobotPlatform:
         Raises
         ------
         ShapeError
-            If the shape is another one.
+            If the shape is wrong.
 
         Examples
         --------
@@ -126,7 +130,7 @@ class RobotPlatform:
         return self.geometry.chart.coordinates(rows("pose", pose, 6))
 
     def twist(self, pose: ArrayLike, pose_rate: ArrayLike) -> np.ndarray:
-        """Twist of a pose rate (eq. 2).
+        """Twist for a pose rate (eq. 2).
 
         Parameters
         ----------
@@ -180,7 +184,7 @@ class RobotPlatform:
         return self._call("twist_dot", rows("pose", pose, 6), rate, acceleration)[..., 0]
 
     def pose_rate(self, pose: ArrayLike, twist: ArrayLike) -> np.ndarray:
-        """Pose rate of a twist, the inverse of `twist`.
+        """Pose rate for a twist. This is the inverse of `twist`.
 
         Parameters
         ----------
@@ -195,7 +199,7 @@ class RobotPlatform:
         Raises
         ------
         SingularPoseError
-            If beta is pi/2 or -pi/2, where Euler rates have no value.
+            If beta is pi/2 or -pi/2, because Euler rates are then undefined.
         ShapeError
             See the class.
 
@@ -213,7 +217,7 @@ class RobotPlatform:
         return self._call("pose_rate", poses, rows("twist", twist, 6))[..., 0]
 
     def reach_margin(self, pose: ArrayLike) -> np.ndarray:
-        """Margin of each leg before the end of its reach.
+        """Margin of each leg to the limit of its reach.
 
         The margin has no unit and is at most 1. For a crank it is sin^2 of the angle between the
         crank and its direction of reach.
@@ -226,7 +230,7 @@ class RobotPlatform:
         Returns
         -------
         ndarray, shape (n,) or (N, n)
-            Margins. They are negative out of reach, and -inf where squares overflow.
+            Margins. They are negative out of reach, and -inf if squares overflow.
 
         Raises
         ------
@@ -248,12 +252,12 @@ class RobotPlatform:
         pose : array_like, shape (6,) or (N, 6)
             Pose of the platform.
         name, row : str
-            Words of the message for the pose and for the number of its row.
+            Words for the pose and for its row in the error message.
 
         Raises
         ------
         UnreachablePoseError
-            With the first leg and the first pose that are out of reach.
+            If a leg cannot reach a pose. The message has the first leg and pose out of reach.
         ShapeError, ChartError
             See the class.
 
@@ -273,14 +277,14 @@ class RobotPlatform:
         )
 
     def charted(self, pose: ArrayLike, name: str = "pose") -> np.ndarray:
-        """Poses as an array, if the platform can have them.
+        """Poses as an array, checked that the platform can have them.
 
         Parameters
         ----------
         pose : array_like, shape (6,) or (N, 6)
             Pose of the platform.
         name : str
-            Word of the message for the pose.
+            Word for the pose in the error message.
 
         Returns
         -------
@@ -308,20 +312,20 @@ class RobotPlatform:
         return np.where(np.isnan(margin), -np.inf, margin)
 
     def _poses(self, pose: ArrayLike) -> np.ndarray:
-        """Poses as an array, if they are in reach."""
+        """Poses as an array, checked to be in reach."""
         poses = rows("pose", pose, 6)
         self.check_reach(poses)
         return poses
 
     def _twists(self, name: str, value: ArrayLike) -> np.ndarray:
-        """Twists as an array, if the platform can have them."""
+        """Twists as an array, checked that the platform can have them."""
         twists = rows(name, value, 6)
         free = self.geometry.chart.basis
         self._check_chart(name, twists, twists - twists @ free @ free.T)
         return twists
 
     def _check_chart(self, name: str, given: np.ndarray, forbidden: np.ndarray) -> None:
-        """Raise ChartError for rows with a part that the platform of this robot cannot do."""
+        """Raise ChartError if the platform cannot have a pose or twist."""
         if np.abs(forbidden).max(initial=0.0) <= CHART_TOLERANCE:
             return
         names = ", ".join(self.coordinate_names)
@@ -335,7 +339,9 @@ class RobotPlatform:
         )
 
     def _call(self, name: str, *arguments: np.ndarray, output: int = 0) -> np.ndarray:
-        """Output of a function, (rows, columns) or, where an argument is a batch, one axis more."""
+        """Output of a function: (rows, columns), or with one more axis if an argument is a
+        batch.
+        """
         batched = [argument.shape[0] for argument in arguments if argument.ndim == 2]
         if len(set(batched) - {1}) > 1:
             shapes = ", ".join(str(argument.shape) for argument in arguments)

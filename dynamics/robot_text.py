@@ -1,4 +1,4 @@
-"""Text of a robot file, as `robot_file` reads it, with one table a leg and all digits."""
+"""Text of a robot file in the format of `robot_file`, with one table per leg and all digits."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from dynamics.robot_file import ParameterSet, RobotDescription
 
 
 def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
-    """TOML of a robot, with comments before it in lines of their own.
+    """TOML text of a robot, with comments in separate lines at the beginning.
 
     Reading it gives the same robot, to the last digit.
     """
@@ -38,7 +38,7 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
 
 
 def _fields(leg: Leg) -> list[str]:
-    """Fields of a leg."""
+    """Lines with the fields of a leg."""
     fields = [(name, getattr(leg, name)) for name in type(leg).model_fields]
     fields.sort(key=lambda field: field[0] != "type")
     return [f"{name} = {_value(value)}" for name, value in fields if value is not None]
@@ -65,7 +65,7 @@ def _parameters(values: ParameterSet, layout: ParameterLayout) -> list[str]:
 
 
 def _table(name: str, columns: dict[str, np.ndarray]) -> str:
-    """Line of a table, with one value where all values are equal."""
+    """Line with a table. A column of equal values is written as one value."""
     said = {
         key: column[0] if np.all(column == column[0]) else column for key, column in columns.items()
     }
@@ -73,12 +73,12 @@ def _table(name: str, columns: dict[str, np.ndarray]) -> str:
 
 
 def _key(name: str) -> str:
-    """Name as a key of TOML, in quotes where it needs them."""
+    """Name as a TOML key, in quotes if necessary."""
     return name if re.fullmatch("[A-Za-z0-9_-]+", name) else json.dumps(name)
 
 
 def _value(value: object) -> str:
-    """Value as TOML writes it."""
+    """Value in TOML."""
     if isinstance(value, np.ndarray):
         return f"[{', '.join(_value(entry) for entry in value.tolist())}]"
     return json.dumps(value) if isinstance(value, str | int) else repr(float(value))  # type: ignore[arg-type]

@@ -1,15 +1,16 @@
 """Limits of the motion of a robot: travel, reach, and its two kinds of singularity.
 
-- Travel is the magnitude of each joint coordinate, against the travel limit.
-- Reach is the reach margin of a leg. For a crank it is sin^2 of the angle between the crank and the
-  direction to the platform joint in the plane of the crank. At 0 the leg is stretched or folded.
-- The actuator side (J_a1) is the leverage of an actuator on its leg, in 0..1. For a crank it is
-  |(w x l) . s| / (|w| |l|). Where it vanishes, the actuator does not move the platform any more.
-  For a crank it vanishes together with the reach margin.
+- Travel is the magnitude of each joint coordinate, which has a limit.
+- Reach is the reach margin of a leg. For a crank, it is sin^2 of the angle between the crank and
+  the direction to the platform joint in the plane of the crank. At 0, the leg is stretched or
+  folded.
+- The actuator side (J_a1) is the leverage of an actuator on its leg, in 0..1. For a crank, it is
+  |(w x l) . s| / (|w| |l|). If it is zero, the actuator does not move the platform. For a crank, it
+  is zero if the reach margin is zero.
 - The platform side (J_a2) is the condition number of J_a2 for the motions that the platform can
-  make. Its rows are unit vectors along the forces of the legs, and its angular columns are divided
-  by the characteristic length, so that all entries are plain numbers. Where it is infinite, the
-  platform moves with all actuators locked.
+  make. The rows of J_a2 are unit vectors along the forces of the legs. Its angular columns are
+  divided by the characteristic length, so that all entries have no unit. If the condition number is
+  infinite, the platform can move although all actuators are locked.
 
 The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m
 for rss6). `rigid_body.jacobians.singularity_measures` has the measures as CasADi expressions.
@@ -36,14 +37,14 @@ from dynamics.kinematics import forward_kinematics
 from dynamics.robot import Robot
 
 LEAST_LEVERAGE = 0.05
-"""Least leverage for `check_motion`.
+"""Smallest leverage for `check_motion`.
 
-Below it an actuator's force is multiplied by more than 20 along its leg. rss6 is above 0.09 within
-its travel.
+Below it, the force along the leg is more than 20 times the force of the actuator. rss6 is above
+0.09 within its travel.
 """
 
 MOST_CONDITION = 20.0
-"""Largest condition numbers for `check_motion`.
+"""Largest condition number for `check_motion`.
 
 rss6 is below 5 (J_a2) and 10 (J_ad) within its travel.
 """
@@ -51,10 +52,10 @@ rss6 is below 5 (J_a2) and 10 (J_ad) within its travel.
 
 @dataclass(frozen=True)
 class WorkspaceMeasures:
-    """Measures of N poses. All but the reach margins are NaN where a leg cannot reach.
+    """Measures of N poses. All except the reach margins are NaN if a leg cannot reach the pose.
 
     `theta` (N, n) is in rad or m. `reach_margin` (N, n) is negative out of reach. `leverage` (N, n)
-    is that of J_a1. `platform_rows` (N, n, n) are J_a2 without unit. `travel_limit` is in rad or m.
+    is from J_a1. `platform_rows` (N, n, n) is J_a2 without unit. `travel_limit` is in rad or m.
     """
 
     theta: np.ndarray
@@ -76,7 +77,7 @@ class WorkspaceMeasures:
     def _condition(self, matrices: np.ndarray) -> np.ndarray:
         """Condition numbers of matrices, NaN out of reach."""
         result = np.full(len(matrices), np.nan)
-        # NumPy refuses matrices with NaN.
+        # NumPy raises an error for matrices with NaN.
         result[self.reachable] = np.linalg.cond(matrices[self.reachable])
         return result
 
@@ -95,8 +96,8 @@ class WorkspaceMeasures:
 class Extreme:
     """Point of a motion that is nearest to a limit.
 
-    It has a value, its limit, and a row. `time` is in s, and NaN where no times are given. `leg` is
-    1 to n, and None where all are concerned.
+    It has its value, the limit, and its row. `time` is in s, and NaN if no times are given. `leg`
+    is 1 to n, and None if the value belongs to no single leg.
     """
 
     value: float
@@ -110,8 +111,8 @@ class Extreme:
 class MotionExtremes:
     """Points of a motion that are nearest to the limits.
 
-    They are those of the reach margin, of the travel |theta| (rad or m), of the leverage of J_a1,
-    and of the condition number of the scaled J_a2.
+    The limits are those of the reach margin, of the travel |theta| (rad or m), of the leverage
+    (J_a1), and of the condition number of the scaled J_a2.
     """
 
     reach: Extreme
@@ -129,7 +130,7 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     poses = np.atleast_2d(robot.charted(pose))
     theta, margin = (part[..., 0] for part in robot.functions["inverse_kinematics"](poses))
     leverage, platform_rows = robot.functions["singularity_measures"](poses)
-    # squares have overflowed there
+    # a margin is NaN if squares have overflowed
     margin[np.isnan(margin)] = -np.inf
     unreachable = ~(margin > 0).all(axis=1)
     for values in (theta, leverage, platform_rows):
@@ -138,10 +139,10 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
 
 
 def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
-    """Measures of poses for random joint coordinates within the travel limit, from home.
+    """Measures of poses for random joint coordinates within the travel limit.
 
-    Coordinates without a pose near home are left out, so that there may be fewer rows than samples.
-    The result is always the same for a robot.
+    Each pose is searched from home. Coordinates without a pose are omitted, so that there can be
+    fewer rows than samples. The result is always the same for a robot.
     """
     limit = robot.travel_limit
     # The seed is fixed: a report of a robot must not change from run to run.
@@ -160,13 +161,13 @@ def check_motion(
     least_leverage: float = LEAST_LEVERAGE,
     most_condition: float = MOST_CONDITION,
 ) -> MotionExtremes:
-    """Points nearest to the limits of a motion that is within all of them.
+    """Check a motion against all limits, and return its points nearest to them.
 
-    The motion is poses (N, 6) at times (N,), s, with N >= 1. Raises, with time or row, leg, value
-    and limit: UnreachablePoseError; TravelError beyond the travel limit less `travel_margin` (rad
-    or m); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of
-    the scaled J_a2 above `most_condition`; ShapeError for another shape, or for times that do not
-    increase.
+    The motion is poses (N, 6) at times (N,), s, with N >= 1. Each error states the time or row, the
+    leg, the value and the limit. Raises UnreachablePoseError; TravelError beyond the travel limit
+    minus `travel_margin` (rad or m); SingularPoseError for a leverage (J_a1) below `least_leverage`
+    or a condition number of the scaled J_a2 above `most_condition`; ShapeError for a wrong shape,
+    or for times that do not increase.
     """
     poses = np.atleast_2d(rows("pose", pose, 6))
     if not len(poses):

@@ -164,8 +164,8 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     """Functions M, C, G, friction, regressor (eq. 23-26), inverse and forward dynamics (eq. 17,
     40).
 
-    Wrenches have six entries. The legs carry those that the chart forbids, and they drop out where
-    torques balance the others.
+    Wrenches have six entries. The legs balance the entries that the chart forbids, and these have
+    no effect on the torques.
     """
     layout = parameter_layout(geometry.legs)
     pose = ca.SX.sym("pose", 6)
@@ -186,7 +186,7 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     acceleration = free @ ca.ldl_solve(
         free.T @ (jacobian.T @ (torque - friction) - bias), diagonal, upper, order
     )
-    # Coulomb and viscous friction of eq. 24, without its stray second v_E
+    # Coulomb and viscous friction of eq. 24, without its second v_E, which is a misprint
     rubbing = [jacobian.T @ ca.diag(ca.sign(velocity)), jacobian.T @ ca.diag(velocity)]
     regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), *rubbing)
     torques = ca.solve((jacobian @ free).T, free.T @ inertial) + friction

@@ -134,7 +134,7 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
         (
             "link_length = 0.30133373938841",
             "link_length = -0.3",
-            "link_length: -0.3 is beyond what a machine can have",
+            "link_length: -0.3 is outside the range of machines",
         ),
         (
             "link_length = 0.30133373938841",
@@ -149,7 +149,7 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
         (
             f"    {FIRST_JOINT},\n",
             "",
-            "legs.base_joints needs one value, or one for each of 6 legs, got 5",
+            "legs.base_joints needs one value, or a list of 6 values, got 5",
         ),
         (
             FIRST_JOINT,
@@ -170,7 +170,7 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
         (
             "crank = { mass = 0.685",
             "crank = { mass = -0.685",
-            r"crank.mass: -0.685 is beyond what a machine can have",
+            r"crank.mass: -0.685 is outside the range of machines",
         ),
         ("home_pose = [0.0, ", "home_pose = [", "home_pose: List should have at least 6 items"),
         (
@@ -286,7 +286,7 @@ def test_machines_with_more_or_fewer_freedoms_than_actuators_are_counted_and_nam
         ),
         (
             ("rss6", slice(5), [legs["pss6"][0]]),
-            "leg 6: actuators that slide and such that turn cannot share a joint",
+            "leg 6: actuators that slide and actuators that turn cannot share a joint",
         ),
         (("rss6", slice(5), [legs["rss6"][2]]), "legs 3 and 6 are in one place"),
         (
