@@ -104,7 +104,7 @@ def test_rows_that_have_no_pose_are_named_with_leg_and_residual_or_as_folded_the
     ):
         robot.forward_kinematics([np.zeros(6), [3.0, -3.0, 3.0, -3.0, 3.0, -3.0], np.zeros(6)])
     with pytest.raises(
-        ConvergenceError, match=r"\(row 0\) .* closes the loops with leg \d folded the other way"
+        ConvergenceError, match=r"\(row 0\) .* closes the loops, but leg \d is folded the other way"
     ):
         robot.forward_kinematics([1.2393, -1.4656, -0.0294, 1.3016, 0.6802, 0.0804])
 
