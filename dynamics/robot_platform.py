@@ -219,8 +219,8 @@ class RobotPlatform:
     def reach_margin(self, pose: ArrayLike) -> np.ndarray:
         """Margin of each leg to the limit of its reach.
 
-        The margin has no unit and is at most 1. For a crank it is sin^2 of the angle between the
-        crank and its direction of reach.
+        The margin has no unit and is at most 1. For a crank, it is sin^2 of the angle between the
+        crank and the direction to the platform joint in the plane of the crank.
 
         Parameters
         ----------

@@ -38,8 +38,8 @@ def repeat_servo(
 ) -> list[ClosedLoopRun | LoopFailure]:
     """Run the servo's loop once for each noise of the ideal sensor.
 
-    The runs are those of `simulate_servo` up to rounding. They take about half the time, because
-    the equation of motion is computed for eight of them at once.
+    The results are equal to those of `simulate_servo` up to rounding. The runs take about half the
+    time, because the equation of motion is computed for eight runs at once.
 
     Parameters
     ----------
@@ -197,8 +197,8 @@ def simulate_batch(
     if not set(lengths) <= {1, count}:
         of_starts = "" if starts is None else f" and {len(begins)} start states"
         raise SimulationError(
-            f"{len(vectors)} parameter vectors and {len(given)} references{of_starts} must have "
-            "the same number or be single"
+            f"got {len(vectors)} parameter vectors and {len(given)} references{of_starts}; each "
+            "number must be 1 or the number of runs"
         )
 
     def one(index: int) -> ClosedLoopRun:
@@ -238,7 +238,7 @@ def prepare(robot: Robot) -> None:
     reference = Reference(np.tile(robot.home_pose, (2, 1)), np.zeros((2, 6)))
     settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), FrameTiming(60.0))
     parameters = next(iter(robot.parameter_sets.values())).vector
-    # the first one compiles all that one run needs, the second one what lanes need
+    # the first call compiles the functions for single runs, the second the functions for lanes
     simulate_servo(robot, parameters, reference, settings)
     repeat_servo(robot, parameters, reference, settings, np.zeros((1, 2, 6)))
 
@@ -257,7 +257,10 @@ def _repeat(
 
 
 def _cores() -> int:
-    """Number of cores that this process may use, or those of the machine where that is unknown."""
+    """Number of cores that this process may use.
+
+    If that is unknown, it is the number of all cores.
+    """
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

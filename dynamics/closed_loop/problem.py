@@ -302,7 +302,7 @@ def _check_start(
     check_type("start", start, StartState, SimulationError)
     start.check_sizes(robot)
     check_start_pose(robot, parameters, start.pose)
-    _check_latencies(settings.timing, "start latencies: that of command", start.latencies)
+    _check_latencies(settings.timing, "start: latency of command", start.latencies)
 
 
 @lru_cache(maxsize=64)

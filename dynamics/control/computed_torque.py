@@ -7,9 +7,9 @@ Here p is the way back: the motion from the present pose of the robot into the d
 torque is the mean over a frame period, because it acts for that time.
 
 With an observer, the way back begins at the state predicted for the arrival of the torque. The
-estimated disturbance is subtracted. Dry friction has the signs of the way back: near rest, joints
-often move in the opposite direction to the desired motion, and with its signs the torque would be
-wrong by twice the Coulomb torque.
+estimated disturbance is subtracted. Dry friction has the signs of the way back. Near rest, joints
+often move against the desired motion, whose signs would make the torque wrong by twice the Coulomb
+torque.
 
 Without an observer, the way back begins at the last measured pose. Its rate is the difference of
 the last two poses. An integral replaces the disturbance. Dry friction has the signs of the desired

@@ -6,8 +6,8 @@ The drives need not accept torques. While a command U acts, the torque of a driv
 
 as in `closed_loop.drives`. Along the desired motion, everything except U is known, and each command
 follows from the previous one. With the zero hold, the mean torque of the drive during a command is
-the torque of the inverse dynamics. With the linear hold, the torque at the end of the ramp is that
-torque. The servo adds its correction.
+equal to the torque of the inverse dynamics. With the linear hold, the torque of the drive at the
+end of the ramp is equal to it. The servo adds its correction.
 
 Before the motion, the robot is in equilibrium, and the integral z provides the torque of the model
 at rest. An error of the torque at rest has an effect only by its change along the motion.

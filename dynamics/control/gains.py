@@ -107,8 +107,8 @@ def torque_figures(
 ) -> LoopFigures:
     """Characteristic values of the law computed_torque near rest at a pose (6,).
 
-    An observer compensates the latency by prediction. The values are then those of the feedback of
-    its prediction, without latency. The bandwidth is always the desired one.
+    An observer compensates the latency by prediction, and the values are then those of the loop
+    without latency. The bandwidth is always the desired one.
     """
     period, delay = _times(settings, feedback)
 

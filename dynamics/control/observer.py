@@ -71,11 +71,11 @@ class Observer:
     At each frame, `see` processes the measured pose, `ahead` predicts, and `issue` stores the
     command.
 
-    `model` is the robot as the law knows it. `pose` (6,) is the pose at rest at the start, which
-    the command `holding` (n,) holds. `latencies` (frames,) are the latencies of the commands. Each
-    is used from the time at which its command is issued. `noise(frame)` is the covariance (6, 6) of
-    a measured pose, and `common` (6, 6) is the covariance of the error that all measured poses have
-    in common.
+    `model` is the law's model of the robot. `pose` (6,) is the pose at rest at the start, and
+    `holding` (n,) is the command that holds it. `latencies` (frames,) are the latencies of the
+    commands; the latency of a command is not used before the command is issued. `noise(frame)` is
+    the covariance (6, 6) of a measured pose. `common` (6, 6) is the covariance of the error that
+    all measured poses have in common.
     """
 
     def __init__(
@@ -115,7 +115,8 @@ class Observer:
         else:
             self._state[at.integral] = self._model.held(pose, self._drives)[1]
         scale = np.abs(torque).mean()
-        # In a frame period, the walk changes by as much as the smooth error of a model does.
+        # The random walk changes as much per frame period as the error of the model, whose change
+        # is smooth along a motion.
         walk = np.zeros(at.size)
         doubt = np.zeros(at.size)
         felt_scale = SCALE_FELT if self._drives.torques else 1.0
@@ -154,7 +155,8 @@ class Observer:
         return self._state[self._prediction.blocks.viscous].copy()
 
     def see(self, frame: int, pose: np.ndarray | None) -> Estimate:
-        """Go on to a frame, and update the state by its measured pose (6,), or None if it is lost.
+        """Go on to a frame, and update the state by its measured pose (6,). The pose is None if
+        lost.
 
         Returns the estimate before the update.
         """

@@ -75,7 +75,7 @@ class Connection:
     def seen_from(self, body: int) -> tuple[Freedom, ...]:
         """Elementary joints in the order from the given body to the other one.
 
-        The signs of the axes are those of the motion of the other body.
+        Each axis has the sign for the motion of the other body relative to the given one.
         """
         if body == self.first:
             return self.freedoms

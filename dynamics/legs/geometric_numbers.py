@@ -1,12 +1,13 @@
 """Geometric numbers of a leg: the numbers that determine its kinematics.
 
-Each kind of leg lists its own (`Leg.numbers`): coordinates of its joints, and lengths, m, and small
-rotations of its axis, rad. Rotations are measured from the leg itself, about its own directions.
+Each kind of leg lists the names of its geometric numbers (`Leg.numbers`). They are coordinates of
+its joints and lengths, m, and small rotations of its axis, rad. Rotations are relative to the leg
+itself.
 `u` and `v` are perpendicular to the axis. On a crank, `u` is along its zero direction. `crank_zero`
 is about the axis.
 
-The numbers of a leg are thus the numbers of another leg plus a vector of deviations. The deviations
-can be symbols, and the leg then has derivatives with respect to them.
+A leg can be described by another leg and a vector of deviations of the geometric numbers. The
+deviations can be symbols, with respect to which the leg then has derivatives.
 """
 
 from typing import Any, TypeVar
@@ -38,7 +39,7 @@ def values(leg: Leg) -> np.ndarray:
 def moved(leg: AnyKind, deviations: ArrayLike | ca.SX) -> AnyKind:
     """Leg whose geometric numbers are changed by deviations (k,), m and rad.
 
-    If the deviations are symbols, only the expressions of the leg work, and have derivatives.
+    If the deviations are symbols, the leg can only be used in CasADi expressions.
     """
     by = (
         deviations

@@ -160,7 +160,7 @@ class RssLeg(Leg):
         return self.vectors(position).angle
 
     def reach(self, position: ca.SX) -> ca.SX:
-        """sin^2 of the angle between the crank and the projection of the vector from B to A."""
+        """sin^2 of the angle between the crank and the direction to A in the plane of the crank."""
         along, across, chord = self._chord(position)
         return 1 - chord**2 / (along**2 + across**2)
 

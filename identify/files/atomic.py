@@ -1,7 +1,8 @@
-"""Atomic writing: files appear whole or not at all, and a failure is one line.
+"""Atomic writing: a file is written completely or not at all, and a failure is one line.
 
-A file's content is made in memory, because libraries such as netCDF's crash when their disk is
-full. The content is then written beside its place, flushed to the disk, and renamed.
+The content of a file is made in memory, because some libraries, such as netCDF, crash if their disk
+is full. The content is then written to a temporary file in the same folder, flushed to the disk,
+and renamed.
 """
 
 import errno
@@ -27,7 +28,7 @@ TEMPORARY = ".cmmsim-"
 
 @contextmanager
 def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
-    """Turn an error that keeps the block from writing a file into a WriteError of one line.
+    """Convert an error of the block that writes a file into a WriteError with one line.
 
     ``size`` is the number of bytes of the file, if known.
     """
@@ -40,17 +41,17 @@ def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
     else:
         return
     needed = "" if size is None else _needed(Path(path), size)
-    # A file of `atomic_contents` is named by the place that it would have had.
+    # A file in `atomic_contents` is named by its final place.
     place = Path(*(part for part in Path(path).parts if not part.startswith(TEMPORARY)))
     raise WriteError(f"cannot write {place}: {reason}{needed}; name another place")
 
 
 def write_bytes(path: Path | str, content: bytes, *, parents: bool = False) -> None:
-    """Write a file, whole or not at all.
+    """Write a file, completely or not at all.
 
-    With ``parents``, missing folders are made, and removed again on failure.
+    With ``parents``, missing folders are made. After a failure, they are removed.
 
-    Raises WriteError if there is no room, no permission, or no such folder.
+    Raises WriteError if there is no space, no permission, or no such folder.
     """
     write_files({Path(path): content}, parents=parents)
 
@@ -66,7 +67,7 @@ def write_figure(path: Path | str, figure: "Figure") -> None:
 
 
 def figure_bytes(figure: "Figure", suffix: str, dpi: int = 150) -> bytes:
-    """Return the content of a figure's file, whose format a suffix such as ``.png`` names."""
+    """Return the content of a figure's file in the format of a suffix, such as ``.png``."""
     stream = io.BytesIO()
     figure.savefig(stream, format=suffix.removeprefix("."), dpi=dpi)
     return stream.getvalue()
@@ -81,12 +82,12 @@ def write_files(
 ) -> None:
     """Write several files: all of them, or none.
 
-    ``parents`` is as in `write_bytes`. ``check`` reads the first file before any is in place, and
-    refuses it by an exception.
+    ``parents`` is as in `write_bytes`. ``check`` is called with the temporary path of the first
+    file before any file is in place, and can refuse it by an exception.
 
     Raises WriteError.
     """
-    mark = token_hex(4)  # one for all files, so that a reader of the first finds the others
+    mark = token_hex(4)  # the same for all files, so that `check` can find the other files
     folders: list[Path] = []
     beside: dict[Path, Path] = {}
     placed: list[Path] = []
@@ -113,9 +114,9 @@ def write_files(
 
 
 def check_writable(path: Path | str) -> None:
-    """Raise WriteError if a file could not be written, before its content is made.
+    """Raise WriteError if a file cannot be written. This is checked before its content is made.
 
-    This is so if it is a folder, or if its nearest existing folder cannot be written to.
+    The reason is that the path is a folder, or that its nearest existing folder is not writable.
     """
     path = Path(path)
     with writing(path):
@@ -127,7 +128,7 @@ def check_writable(path: Path | str) -> None:
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """Make a folder and those above it; return those that were missing, the outermost first."""
+    """Make a folder and its parents. Return the folders that were missing, the outermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -138,14 +139,14 @@ def make_folder(folder: Path) -> list[Path]:
 
 
 def take_back(folders: list[Path]) -> None:
-    """Remove folders that `make_folder` has made, if they are empty."""
+    """Remove folders made by `make_folder`, if they are empty."""
     for folder in reversed(folders):
         with suppress(OSError):
             folder.rmdir()
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove unfinished files of a killed process from a folder and the folders in it."""
+    """Remove incomplete files of a killed process from a folder and its subfolders."""
     for path in (*folder.glob(f"{TEMPORARY}*"), *folder.glob(f"*/{TEMPORARY}*")):
         with suppress(OSError):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -153,10 +154,10 @@ def remove_leftovers(folder: Path) -> None:
 
 @contextmanager
 def atomic_contents(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder whose contents stand in ``folder`` when the block has ended.
+    """Yield a temporary folder, whose contents are moved into ``folder`` after the block.
 
-    It lies within the folder, so the folder itself is never replaced. It may therefore be the
-    current directory. An exception leaves the folder as it was.
+    The temporary folder is within ``folder``, which is never replaced and can thus be the current
+    directory. After an exception, ``folder`` is unchanged.
 
     Raises WriteError.
     """
@@ -185,14 +186,14 @@ def _write_beside(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
     except OSError:
-        # The message says how much is free, and what was written so far is.
+        # The message states the free space, which includes that of the incomplete file.
         with suppress(OSError):
             path.unlink(missing_ok=True)
         raise
 
 
 def _needed(path: Path, size: int) -> str:
-    """Words for a message: how many bytes a file takes, and how many are free."""
+    """Return text on the size of a file and the free space, for a message."""
     needed = f"; it takes {_shown(size)}"
     with suppress(OSError, ValueError):
         return f"{needed}, {_shown(shutil.disk_usage(path.parent).free)} are free"

@@ -1,6 +1,6 @@
-"""Described xarray datasets over time, checked for dimensions, units and names, in netCDF groups.
+"""Described xarray datasets over time, with checked dimensions, units and names, in netCDF groups.
 
-Files are written whole or not at all, and read with clear errors. `covariance.nc` holds the
+Files are written completely or not at all, and errors of reading are clear. `covariance.nc` has the
 covariance of the estimated parameters, in their SI units.
 """
 
@@ -23,7 +23,7 @@ from identify.files.stranger import ENGINE, Content, load, load_elsewhere
 
 
 def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
-    """Write datasets as groups of one file (see `netcdf`), whole or not at all.
+    """Write datasets as groups of one file (see `netcdf`), completely or not at all.
 
     Raises WriteError.
     """
@@ -33,8 +33,8 @@ def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
 def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
     """Return the file of datasets by the names of their groups; the name ``""`` is the main group.
 
-    Groups are written one by one: an `xarray.DataTree` would give each truth the coordinates of its
-    record.
+    Groups are written one by one, because an `xarray.DataTree` would give each truth the
+    coordinates of its record.
     """
     stream = io.BytesIO()
     mode: Literal["w", "a"] = "w"
@@ -73,7 +73,7 @@ def _read(path: Path | str, group: str | None) -> Content:
         content = Path(path).read_bytes()
     except OSError as error:
         raise RecordError(f"cannot read {path}: {error.strerror or error}") from None
-    # The right digest shows a file of our own, which the library reads safely.
+    # A file with the right digest was written by this program, and is safe to read.
     if is_sealed(path, content):
         return load(content, group)
     try:
@@ -116,11 +116,11 @@ LABELS: dict[str, list[str]] = {
 
 
 SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
-"""Units of joint variables where actuators slide, by those where they turn."""
+"""Units of joint variables for sliding actuators, by the units for turning actuators."""
 
 
 def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
-    """Return the variables with the joints' units: those of actuators that slide, or that turn."""
+    """Return the variables with the joint units of sliding or of turning actuators."""
     if not prismatic:
         return variables
     return {
@@ -130,7 +130,7 @@ def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
 
 
 def joint_numbers(values: ArrayLike) -> list[int]:
-    """Return the labels of the joints, from 1 on, of values whose last axis they are."""
+    """Return the labels of the joints, from 1 on, for values whose last axis is the joint."""
     shape = np.shape(values)
     return list(range(1, (shape[-1] if len(shape) > 1 else 0) + 1))
 
@@ -175,9 +175,9 @@ def described_dataset(
 
 
 def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None:
-    """Raise RecordError if a dataset lacks one of the variables, or has it on other dimensions.
+    """Raise RecordError if a dataset lacks a variable, or has it with other dimensions.
 
-    The message names it.
+    The message names the variable.
     """
     missing = [name for name in variables if name not in data]
     if missing:
@@ -217,7 +217,7 @@ def shown(value: object) -> str:
 
 
 def plain(value: object) -> object:
-    """Return the value, with a NumPy number from netCDF turned into a plain one."""
+    """Return the value, with a NumPy number converted to a Python number."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -237,7 +237,7 @@ DIMENSIONS = ("parameter", "parameter_2")
 def write_covariance(
     path: Path | str, layout: ParameterLayout, covariance: Array, others: Sequence[str] = ()
 ) -> None:
-    """Write the covariance (p + k, p + k) of a robot's parameters and of k others.
+    """Write the covariance (p + k, p + k) of a robot's parameters and of k other quantities.
 
     The names of the others end with their units. Raises WriteError.
     """
@@ -245,13 +245,15 @@ def write_covariance(
 
 
 def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict[str, str]:
-    """Return the units of a robot's parameters and of others, whose names end with their units."""
+    """Return the units of a robot's parameters, and of others, whose names end with their units."""
     units = {name: layout.unit(name) for name in layout.names}
     return units | {name: name.rpartition("_")[2] for name in others}
 
 
 def covariance_netcdf(units: Mapping[str, str], covariance: Array) -> bytes:
-    """Return the file of a covariance (p, p) of numbers by their names, each with its unit."""
+    """Return the file of a covariance (p, p) of quantities, which are given by name with
+    their units.
+    """
     labels = {name: list(units) for name in DIMENSIONS}
     described = {
         "units": "product of the units of both parameters",

@@ -1,7 +1,7 @@
 """Calls of functions in another process, within limits of time and memory.
 
-A library can hang, crash, or ask for all memory on a file that somebody else made or that is
-damaged. The process that reads such a file is ended if it exceeds the limits.
+On a damaged or malicious file, a library can hang, crash, or allocate all memory. The process that
+reads such a file is killed if it exceeds the limits.
 """
 
 import os
@@ -16,11 +16,11 @@ from typing import Any
 from dynamics.errors import DynamicsError
 
 LIMIT_S = 8
-"""Seconds that the reading may take."""
+"""Time limit for reading, s."""
 START_S = 60
-"""Additional seconds for the process to start on a busy machine."""
+"""Additional time for the process to start on a busy machine, s."""
 LIMIT_MEMORY = 1_000_000_000
-"""Largest number of bytes that the reading may allocate, if the system can limit them."""
+"""Largest number of bytes that reading may allocate, on systems that can limit it."""
 
 CODE = "from identify.files.limited_process import serve; serve()"
 TOO_LONG = f"it cannot be read within {LIMIT_S} s"
@@ -67,22 +67,22 @@ def _ended_by_alarm(status: int) -> bool:
 
 
 def serve() -> None:
-    """Do the call that is pickled on standard input, and write a pickle of its result or error."""
-    # Whatever the library prints must not get among the bytes of the pickle.
+    """Do the call pickled on standard input, and write the pickle of its result or error."""
+    # Output of the library must not be mixed with the bytes of the pickle.
     out = sys.stdout
     sys.stdout = sys.stderr
-    # Functions are pickled by name, so that this imports their modules, which is not limited.
+    # Functions are pickled by name: this imports their modules, before the limits are set.
     read, given = pickle.loads(sys.stdin.buffer.read())
     with suppress(ImportError, ValueError, OSError):
         import resource
 
         resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_MEMORY, LIMIT_MEMORY))
-    if hasattr(signal, "alarm"):  # elsewhere the other process alone watches the time
+    if hasattr(signal, "alarm"):  # on other systems, only the calling process limits the time
         signal.alarm(LIMIT_S)
     try:
         found = read(*given)
     except DynamicsError as error:
         found = error
-    except Exception as error:  # whatever the library makes of such a file
+    except Exception as error:  # the library can raise any error for such a file
         found = StrangerError(" ".join(str(error).split()) or type(error).__name__)
     out.buffer.write(pickle.dumps(found))

@@ -1,4 +1,4 @@
-"""One process at a time in a folder, such as that of a run or a study."""
+"""Lock of a folder, such as that of a run or a study, for one process at a time."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,20 +10,20 @@ from identify.errors import IdentifyError, OutputFolderError
 from identify.files.atomic import make_folder, remove_leftovers, take_back, writing
 
 LOCK = ".lock"
-"""Name of the locked file. One that a killed process left behind does not block."""
+"""Name of the locked file. A file that a killed process has left does not block."""
 
 PRIVATE = 0o600
-"""Mode of the file. Only its owner can open it, because whoever opens it can hold it."""
+"""Mode of the file. Only its owner can open it, because any process that opens it can lock it."""
 
 
 @contextmanager
 def working_in(folder: Path) -> Iterator[None]:
-    """Keep a folder for this process, as `locked` does, and make it if it is missing.
+    """Lock a folder for this process, as `locked` does, and make it if it is missing.
 
-    A new folder that stays empty is removed.
+    A new folder that remains empty is removed.
 
-    Raises OutputFolderError if another process has the folder. Raises WriteError if it cannot be
-    made, or if nothing can be written into it.
+    Raises OutputFolderError if another process has locked the folder. Raises WriteError if it
+    cannot be made, or if nothing can be written into it.
     """
     with writing(folder):
         made = make_folder(folder)
@@ -36,13 +36,14 @@ def working_in(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(folder: Path, error: type[IdentifyError]) -> Iterator[None]:
-    """Keep a folder for this process in the block; the hold ends with the process.
+    """Lock a folder for this process during the block. The lock ends with the process at the
+    latest.
 
-    Leftovers of a killed process in the folder are removed first. A lock of another user, which
-    cannot be opened, is ignored.
+    Leftovers of a killed process in the folder are removed first. A lock file of another user,
+    which cannot be opened, is ignored.
 
-    Raises the given error if another process has the folder. Raises WriteError if nothing can be
-    written into it.
+    Raises the given error if another process has locked the folder. Raises WriteError if nothing
+    can be written into it.
     """
     lock = FileLock(folder / LOCK, mode=PRIVATE, blocking=False)
     with writing(folder):
@@ -52,7 +53,7 @@ def locked(folder: Path, error: type[IdentifyError]) -> Iterator[None]:
         yield
     finally:
         if lock.is_locked:
-            # Removed while it is held, when nobody else can have taken it.
+            # Remove the file while it is locked, because no other process can have locked it.
             with suppress(OSError):
                 (folder / LOCK).unlink()
             lock.release()

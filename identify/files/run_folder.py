@@ -1,6 +1,6 @@
 """Folder of a run: its files, the stages that write them, and its figures in result.json.
 
-The figures are standard JSON: one that does not exist is null.
+The figures are standard JSON. A figure that does not exist is null.
 """
 
 import json
@@ -19,7 +19,7 @@ from identify.files.lock import LOCK, working_in
 from identify.files.seal import check_netcdf, check_toml, opened_json, sealed_json
 
 LARGEST_JSON = 100_000_000
-"""Largest number of bytes of a result, or of poses at which a robot stood."""
+"""Largest size, in bytes, of a result or of measured static poses."""
 
 WRITTEN_BY = {
     "scenario.toml": "excite",
@@ -35,7 +35,7 @@ WRITTEN_BY = {
 """The stage of ``cmmsim`` that writes each file."""
 
 UNFINISHED = ("geometry", "trajectories.json")
-"""Files that `excite` writes before the scenario. Without the scenario a plan is not finished."""
+"""Files that `excite` writes before the scenario. Without the scenario, a plan is not complete."""
 
 BEGUN = ("geometry", "figures", *WRITTEN_BY)
 """Files and folders that the folder of an unfinished run may hold."""
@@ -47,11 +47,11 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.scenario = path / "scenario.toml"  # resolved
-        self.trajectories = path / "trajectories.json"  # exciting and unseen ones, with the seed
+        self.trajectories = path / "trajectories.json"  # of excitation and validation; the seed
         self.experiment = path / "experiment.nc"  # record and truth of the excitation run
-        self.payload = path / "payload.nc"  # the same under a load, if that is the scale anchor
+        self.payload = path / "payload.nc"  # the same with a load, if that is the scale anchor
         self.covariance = path / "covariance.nc"  # of the estimated parameters
-        self.validation = path / "validation.nc"  # records and truth of the unseen runs
+        self.validation = path / "validation.nc"  # records and truth of the validation runs
         self.model = path / "model.nc"  # poses of the models on the same trajectories
         self.result = path / "result.json"  # figures of the run
         self.report = path / "report.html"
@@ -67,11 +67,11 @@ class RunFolder:
 
     @property
     def holds_own_record(self) -> bool:
-        """True if the record is the user's own, which follows no trajectory designed here."""
+        """True if the record is from the user, and follows no trajectory designed here."""
         return self.experiment.is_file() and not self.trajectories.exists()
 
     def require(self, *names: str) -> None:
-        """Check that files of earlier stages are there, and netCDF files undamaged.
+        """Check that files of earlier stages exist, and that netCDF files are not damaged.
 
         Their digests are compared before a library opens any of them.
 
@@ -80,7 +80,7 @@ class RunFolder:
         OutputFolderError
             A file is missing. The message names the first one and the stage that writes it.
         RecordError
-            A netCDF file cannot be read, or does not have the digest that it carries.
+            A netCDF file cannot be read, or its digest is wrong.
         """
         if not self.path.is_dir():
             raise OutputFolderError(
@@ -98,12 +98,12 @@ class RunFolder:
 
 @contextmanager
 def new_run_folder(path: Path | str, also: Collection[str] = ()) -> Iterator[RunFolder]:
-    """Keep a new or empty folder for this process, see `working_in`.
+    """Lock a new or empty folder for this process, see `working_in`.
 
-    The folder may hold the names in ``also``. Leftovers of a killed process do not count.
+    The folder may contain the names in ``also``. Leftovers of a killed process are ignored.
 
-    Raises OutputFolderError if the folder holds anything else, or if another process works in it.
-    Raises WriteError if it cannot be made.
+    Raises OutputFolderError if the folder contains anything else, or if another process works in
+    it. Raises WriteError if it cannot be made.
     """
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
@@ -123,11 +123,11 @@ ENTRIES = {
     "identify": ("identification", "before", "after", "seconds"),
     "validate": ("sensor", "validation"),
 }
-"""What the stages write into a result, and later ones read."""
+"""Entries that the stages write into a result, and that later stages read."""
 
 
 def save_result(path: Path | str, result: dict[str, Any]) -> None:
-    """Write a result, whole or not at all.
+    """Write a result, completely or not at all.
 
     Raises WriteError.
     """
@@ -135,19 +135,19 @@ def save_result(path: Path | str, result: dict[str, Any]) -> None:
 
 
 def result_json(result: dict[str, Any]) -> bytes:
-    """Return the file of a result, with its digest; its numbers are as in `as_json`."""
+    """Return the file of a result, with its digest. Numbers are converted as in `as_json`."""
     return _text(sealed_json(_plain(result))).encode()
 
 
 def as_json(result: dict[str, Any]) -> str:
-    """Return a result as text: arrays become lists, numbers that are not finite become null."""
+    """Return a result as text. Arrays become lists; numbers that are not finite become null."""
     return _text(_plain(result))
 
 
 def save_files(
     folder: Path, files: Mapping[str, Any], check: Callable[[Path], object] | None = None
 ) -> None:
-    """Write files by their names, all of them or none, into a folder, which is made if missing.
+    """Write files by name into a folder, all of them or none. A missing folder is made.
 
     The content of a file is bytes, text, figures of a run (dict, written as JSON), or a drawn
     figure, written in the format of its suffix. ``check`` is as in `write_files`. Raises
@@ -188,8 +188,8 @@ def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> Non
 def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
     """Return the root mean square of pose errors (N, 6) [m, rad], in um and urad.
 
-    ``counted`` (N,) bool selects the rows that count, such as the frames that were not lost. The
-    default is all. All figures are NaN if no row counts, or if one that counts is not finite: a
+    ``counted`` (N,) bool selects the rows that count, such as frames that were not lost. The
+    default is all rows. All figures are NaN if no row counts, or if a counted row is not finite: a
     model that diverged has no error.
     """
     rows = np.asarray(errors, dtype=float)
@@ -200,7 +200,7 @@ def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
 
 
 def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
-    """Return the six figures [um, urad] of one entry; NaN where they are null or absent."""
+    """Return the six figures [um, urad] of one entry. They are NaN if they are null or absent."""
     if not figures:
         return [math.nan] * 6
     values = [*figures[f"position_{of}_um"], *figures[f"orientation_{of}_urad"]]

@@ -1,9 +1,9 @@
-"""Files that carry a digest of their own content, so that a damaged one is refused.
+"""Files with a digest of their own content, by which a damaged file is recognised.
 
-The digest is behind the end of a netCDF file, in the first entry of a JSON file, and in the first
-line of a TOML file. It is written and removed with the file: a file that is whole is never taken
-for a damaged one, however the program that writes it ends. A file without a digest was made by
-somebody else.
+The digest is after the end of a netCDF file, in the first entry of a JSON file, and in the first
+line of a TOML file. It is written and removed together with the file. A complete file is therefore
+never mistaken for a damaged one, even if the program that writes it is killed. A file without a
+digest was not written by this program.
 """
 
 import json
@@ -15,21 +15,21 @@ from typing import Any
 from identify.errors import RecordError
 
 KEY = "sha256"
-"""Name of the first entry of a JSON file, which holds its digest."""
+"""Name of the first entry of a JSON file, which has its digest."""
 
 _TRAILER = b"\ncmmsim sha256 "
 _HEX = 2 * sha256().digest_size
 _COMMENT = "# sha256 "
-_REMEDY = ", of all that follows; take this line away to have a change by hand stand"
+_REMEDY = ", of all that follows; delete this line to keep a change made by hand"
 
 
 def sealed(content: bytes) -> bytes:
-    """Return a netCDF file with its digest behind it, where HDF5 does not look."""
+    """Return a netCDF file with its digest after its end, where HDF5 ignores it."""
     return content + _TRAILER + _hex(content) + b"\n"
 
 
 def is_sealed(path: Path | str, content: bytes) -> bool:
-    """Tell whether a netCDF file carries a digest.
+    """Tell whether a netCDF file has a digest.
 
     Raises RecordError if the digest is wrong.
     """
@@ -42,7 +42,7 @@ def is_sealed(path: Path | str, content: bytes) -> bool:
 
 
 def check_netcdf(path: Path) -> None:
-    """Check that a netCDF file carries the right digest or none, without opening it.
+    """Check that a netCDF file has the right digest or none, without opening it.
 
     Raises RecordError if the digest is wrong or the file cannot be read.
     """
@@ -71,7 +71,7 @@ def sealed_toml(text: str) -> str:
 
 
 def check_toml(path: Path) -> Path:
-    """Return the path of a TOML file that carries the right digest or none.
+    """Return the path of a TOML file that has the right digest or none.
 
     Raises RecordError if the digest is wrong or there is no such file.
     """
@@ -79,8 +79,8 @@ def check_toml(path: Path) -> Path:
     comment = _COMMENT.encode()
     if first.startswith(comment) and first[len(comment) :][:_HEX] != _hex(text):
         raise RecordError(
-            f"{path} is damaged, or was changed by hand: {_DIFFERS}; take its first line away to "
-            "have the change stand, or write it anew"
+            f"{path} is damaged, or was changed by hand: {_DIFFERS}; delete its first line to "
+            "keep the change, or write it again"
         )
     return path
 

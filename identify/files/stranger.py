@@ -1,4 +1,4 @@
-"""Reading of netCDF content, also from files that somebody else made or that may be damaged."""
+"""Reading of netCDF content that can be damaged, or come from an untrusted source."""
 
 import io
 import math
@@ -12,16 +12,19 @@ from identify.files.limited_process import within_limits
 ENGINE: Literal["h5netcdf"] = "h5netcdf"
 
 LIMIT_BYTES = 256_000_000
-"""Largest size of the numbers in a file: that of a record of a million frames."""
+"""Largest size of the numbers in a group. A record of a million frames has this size."""
 
 Content = tuple[list[str], xr.Dataset | None]
-"""Names of the groups, and a group; None if it was not asked for or does not exist."""
+"""Names of the groups, and one group.
+
+The group is None if it was not requested or does not exist.
+"""
 
 
 def load(content: bytes, group: str | None, most: float = math.inf) -> Content:
-    """Load a group of at most this many bytes of numbers, and the names of all groups.
+    """Load a group of at most ``most`` bytes of numbers, and the names of all groups.
 
-    Raises the library's errors, and ValueError if the group is larger.
+    Raises the errors of the library, and ValueError if the group is larger.
     """
     names: list[str] = []
     with h5py.File(io.BytesIO(content), "r") as file:
@@ -40,7 +43,7 @@ def load(content: bytes, group: str | None, most: float = math.inf) -> Content:
 
 
 def load_elsewhere(content: bytes, group: str | None) -> Content:
-    """Load as `load` does, in another process and within the limits.
+    """Load as `load` does, but in another process and within limits.
 
     Raises StrangerError.
     """

@@ -1,4 +1,4 @@
-"""Versions of the software that made a result, and their comparison over the rows of a study."""
+"""Versions of the software that made a result, and their comparison between the rows of a study."""
 
 import platform
 import warnings
@@ -22,16 +22,19 @@ PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of each package that takes part in a result.
+    """Return the versions of Python and of each package that affects a result.
 
-    An absent package has ``"not installed"``.
+    A missing package has ``"not installed"``.
     """
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
 @cache
 def _version(name: str) -> str:
-    """Version of a package, cached: each row of a study asks for it, and a search takes 4 ms."""
+    """Return the version of a package.
+
+    It is cached, because a search takes 4 ms for each row of a study.
+    """
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -39,7 +42,7 @@ def _version(name: str) -> str:
 
 
 class OtherVersionsWarning(UserWarning):
-    """Warning that some rows were computed with other versions of packages than those here."""
+    """Warning that some rows were computed with other versions of packages."""
 
 
 @cache
@@ -49,13 +52,13 @@ def product_version() -> str:
 
 
 def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
-    """Compare the versions of other places, by their names, with those here.
+    """Compare the versions of other places, given by name, with the versions here.
 
-    Rows of another cmmsim are those of another simulation, which is an error. Other versions of
-    numerical packages change figures by little or nothing. One warning names each such version
-    once. ``remedy`` is the advice at the end of the error.
+    Rows from another version of cmmsim belong to another simulation, which is an error. Other
+    versions of numerical packages change figures slightly or not at all. A warning names each such
+    version once. ``remedy`` is the advice at the end of the error.
 
-    Raises StudyError if a place has another cmmsim, or none.
+    Raises StudyError if a place has another version of cmmsim, or none.
     """
     here = versions()
     places = dict[tuple[str, str], list[str]]()
@@ -71,7 +74,7 @@ def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
             for (package, version), (first, *more) in places.items()
         )
         warnings.warn(
-            f"figures may differ a little where versions do: {text}",
+            f"figures may differ slightly between versions of packages: {text}",
             OtherVersionsWarning,
             stacklevel=2,
         )

@@ -6,25 +6,27 @@ from identify.reporting.number_format import number, with_deviation
 from identify.reporting.tables import Table
 
 SHOWN = 12
-"""Number of candidates that the table has."""
+"""Largest number of candidates in the table."""
 
 
 def diagnosis_text(result: dict[str, Any]) -> tuple[str, ...]:
-    """Return what the diagnosis of a result says, with the remedies. Empty if there is none."""
+    """Return the diagnosis of a result and its remedies as sentences. Empty without a diagnosis."""
     entry = result.get("diagnosis")
     if entry is None:
         return ()
     remedies = [text for one in entry["findings"] for text in one["remedies"]]
     asked = (
-        "What the model leaves of the record was asked for its cause. Each cause is judged by how "
-        "much of the misfit it explains beside the parameters; those that chance does not explain "
-        "are fitted, one after the other."
+        "The residuals of the model were examined for their cause. Each possible cause is judged "
+        "by the share of the misfit that it explains in addition to the parameters. Causes that "
+        "are not explained by chance are fitted, one after the other."
     )
     return (asked, f"Diagnosis: {entry['says']}.", *(f"Remedy: {text}." for text in remedies))
 
 
 def diagnosis_table(result: dict[str, Any]) -> Table:
-    """Return the candidates of a diagnosis as they were ranked, without rows if there is none."""
+    """Return the candidates of a diagnosis in their order, without rows if there is no
+    diagnosis.
+    """
     entry = result.get("diagnosis") or {"candidates": []}
     rows = tuple(
         (
@@ -38,9 +40,9 @@ def diagnosis_table(result: dict[str, Any]) -> Table:
         for one in entry["candidates"][:SHOWN]
     )
     return Table(
-        "What each cause alone explains of the misfit",
+        "Share of the misfit that each cause alone explains",
         ("cause or group", "explains", "score statistic", "free numbers", "size ± std", "unit"),
         rows,
-        "Before any cause is fitted, to first order; the deviations are those that noise makes.",
+        "To first order, before any cause is fitted. Standard deviations are due to noise.",
         folded=True,
     )

@@ -1,6 +1,7 @@
-"""Goals of a run, and the judgement whether its result meets them.
+"""Goals of a run, and the check whether its result meets them.
 
-The limits on accuracy and on the honesty of stated uncertainties are the same on every machine.
+The limits on accuracy, and on the correctness of stated uncertainties, are the same on every
+machine.
 """
 
 import math
@@ -20,8 +21,8 @@ SENSOR_URAD = 100.0
 PARAMETER_FRACTION = 0.05
 PARAMETER_STDS = 3.0
 
-UNSEEN_POSITION = "unseen motion, position"
-UNSEEN_ORIENTATION = "unseen motion, orientation"
+UNSEEN_POSITION = "validation motion, position"
+UNSEEN_ORIENTATION = "validation motion, orientation"
 SENSOR_POSITION = "cameras, position"
 SENSOR_ORIENTATION = "cameras, orientation"
 LOST = "lost frames"
@@ -32,9 +33,9 @@ FAR_OFF = "friction and gains far off"
 
 @dataclass(frozen=True)
 class Goal:
-    """Goal of a run: a value that is to keep to a limit, both in ``unit``.
+    """Goal of a run: a value that must keep a limit, both in ``unit``.
 
-    ``relation`` is ``<=`` or ``>=``. ``detail`` explains the value in words that continue its name.
+    ``relation`` is ``<=`` or ``>=``. ``detail`` explains the value in words that follow its name.
     """
 
     name: str
@@ -51,9 +52,9 @@ class Goal:
 
 
 def check_goals(result: dict[str, Any]) -> list[Goal]:
-    """Judge every goal for which the result holds the needed entries.
+    """Judge every goal for which the result has the necessary entries.
 
-    Accuracy is that of the worst axis in the worst run.
+    The accuracy of the worst axis in the worst run counts.
     """
     parts = (_validation, _sensor, explanation_goals, _parameters)
     return [goal for part in parts for goal in part(result)]
@@ -76,22 +77,19 @@ def explanation_goals(result: dict[str, Any]) -> list[Goal]:
     if "whiteness" in found:
         chance = found["whiteness"]["p_value"]
         percent = math.nan if chance is None else 100 * chance
-        text = (
-            "probability that noise alone leaves residuals that depend as much on those of the "
-            "frames before"
-        )
+        text = "probability that noise alone gives residuals with such a dependence between frames"
         goals.append(Goal(CHANCE, percent, ">=", 100 * SUSPICIOUS, "%", text))
     return goals
 
 
 def _validation(result: dict[str, Any]) -> list[Goal]:
-    # One row (6,) a run, in µm and µrad, so that the maximum is that of the worst axis and run.
+    # One row (6,) per run, in µm and µrad, so that the maximum is over axes and runs.
     rows = np.array([rms_row(run["true"]) for run in result.get("validation", [])])
     if not len(rows):
         return []
     text = (
         "identified model against the true robot, RMS of the worst axis in the worst of "
-        f"{len(rows)} unseen runs"
+        f"{len(rows)} validation runs"
     )
     return [
         Goal(UNSEEN_POSITION, float(rows[:, :3].max()), "<=", VALIDATION_UM, "µm", text),
@@ -122,7 +120,7 @@ def _parameters(result: dict[str, Any]) -> list[Goal]:
     }
     if not judged:
         return []
-    # A small friction may be off by more than 5 %, if its standard deviation says so.
+    # A small friction may be off by more than 5 %, if that is within its stated uncertainty.
     outside = [name for name, p in judged.items() if not within_tolerance(p)]
     text = (
         f"of {len(judged)}: estimates off the truth by more than 5 % and more than 3 standard "

@@ -1,35 +1,35 @@
 """Formatting of numbers for reports.
 
-A number gets the digits that its uncertainty allows. It is written as zero where only rounding
-errors are left.
+A number gets the digits that its uncertainty allows. It is written as zero if it is only a rounding
+error.
 """
 
 import math
 import re
 
 ROUNDING = 1e-9
-"""Share of the size of its parts below which a sum counts as a rounding error."""
+"""Share of the size of its terms below which a sum counts as a rounding error."""
 
 LONG = 6
-"""Largest power of ten, exclusive, of numbers that are written without one."""
+"""Power of ten from which on a number is written with a power of ten."""
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Format a number with so many significant digits; "-" if it does not exist."""
+    """Format a number with the given number of significant digits, or "-" if there is none."""
     if value is None or not math.isfinite(value):
         return "-"
     mantissa, exponent, power = f"{value:.{digits}g}".partition("e")
     if exponent:
         raised = f"{mantissa} × 10{str(int(power)).translate(SUPERSCRIPTS)}"
-        # Format g switches to powers as soon as the digits do not reach the decimal point.
+        # Format g uses a power as soon as the digits do not reach the decimal point.
         mantissa = f"{float(f'{mantissa}e{power}'):.0f}" if 0 < int(power) < LONG else raised
     return mantissa.replace("-", "−")
 
 
 def with_deviation(value: float, std: float | None) -> str:
-    """Format a value to the second digit of its standard deviation, as "0.1046 ± 0.0011"."""
+    """Format a value to the second digit of its standard deviation, such as "0.1046 ± 0.0011"."""
     if std is None or not math.isfinite(std) or std <= 0:
         return number(value)
     return _to_the_second_digit((value, std), std, " ± ")
@@ -46,7 +46,7 @@ def interval(low: float, high: float) -> str:
 def _to_the_second_digit(values: tuple[float, float], of: float, between: str) -> str:
     """Format two values to the second digit of the number ``of``.
 
-    They get a common power of ten where they are small or large.
+    Small or large values get a common power of ten.
     """
     power = math.floor(math.log10(max(map(abs, values))))
     # Numbers of everyday size are written without a power.
@@ -59,16 +59,18 @@ def _to_the_second_digit(values: tuple[float, float], of: float, between: str) -
 
 
 def spelled(text: str) -> str:
-    """Return a computed sentence with its numbers and signs as people write them."""
+    """Return a sentence from the program with numbers and signs in typographic form."""
     text = re.sub(r"\d+(\.\d+)?e[+-]?\d+", lambda found: number(float(found[0])), text)
     return text.replace("<=", "≤").replace(">=", "≥").replace("**", "^")
 
 
 def rounded(value: float | None, size: float) -> float | None:
-    """Return the value, or zero where it is only rounding beside the size of its parts."""
+    """Return the value, or zero if it is only a rounding error compared with the size of
+    its terms.
+    """
     return 0.0 if value is not None and abs(value) <= ROUNDING * size else value
 
 
 def share(value: float) -> str:
-    """Format a probability in per cent. Tiny ones are given as an upper bound."""
+    """Format a probability in per cent. A tiny probability is given as an upper bound."""
     return "less than 10⁻⁶ %" if value < 1e-8 else f"{number(100 * value, 2)} %"

@@ -1,8 +1,8 @@
 """Figures of the paper whose experiment this project repeats.
 
-They stand beside those of a run only where the run repeats the paper's settings. The rows give the
-RMS of x, y, z [µm] and alpha, beta, gamma [µrad]. They compare the paper's identified model with
-measurements of a real robot, whose truth was not known.
+They are given only for runs that repeat the settings of the paper. Rows are the RMS of x, y, z [µm]
+and alpha, beta, gamma [µrad]. They compare the identified model of the paper with measurements of a
+real robot, whose truth was not known.
 """
 
 from identify.reporting.settings import BUILT_IN_PAPER, changed_settings
@@ -15,7 +15,7 @@ CITATION = (
 DOI = "https://doi.org/10.3390/electronics8080836"
 
 BEFORE = (1260.0, 1160.0, 1550.0, 2520.0, 3580.0, 2800.0)
-"""RMS of the starting model on the exciting trajectory (table 3)."""
+"""RMS of the initial model on the exciting trajectory (table 3)."""
 
 AFTER = (408.0, 235.0, 494.0, 956.0, 797.0, 725.0)
 """RMS of the identified model on the exciting trajectory (table 3)."""
@@ -32,9 +32,9 @@ VALIDATION = (
     (342.0, 510.0, 557.0, 1411.0, 1156.0, 711.0),
     (318.0, 379.0, 473.0, 1219.0, 1023.0, 905.0),
 )
-"""RMS of the identified model on ten unseen trajectories (table 4).
+"""RMS of the identified model on ten validation trajectories (table 4).
 
-The 1411 exceeds the 1.4e-3 rad that the text states.
+The value 1411 exceeds the 1.4e-3 rad stated in the text.
 """
 
 INDEX_FIRST = 0.38

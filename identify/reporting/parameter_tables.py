@@ -1,6 +1,6 @@
 """Tables of the identified parameters and of the base parameters.
 
-Sentences say what fixes the scale, which law the drives have, and why a parameter is not
+Sentences state what fixes the scale, which law the drives have, and why a parameter is not
 identified.
 """
 
@@ -11,8 +11,8 @@ from identify.estimation.identifiability import RESTS_ON_PRIOR
 from identify.reporting.number_format import interval, number, rounded, with_deviation
 from identify.reporting.tables import Table
 
-ON_GUESS = "rests on starting values"
-"""Remark on an estimate that depends on the starting values of other parameters."""
+ON_GUESS = "rests on initial guess"
+"""Remark on an estimate that depends on the initial guess of other parameters."""
 
 Entry = dict[str, Any]
 
@@ -20,8 +20,8 @@ Entry = dict[str, Any]
 def parameter_table(result: dict[str, Any]) -> Table:
     """Return the table of the identified parameters.
 
-    It holds the starting value, the truth where it is known, and the estimate with its standard
-    deviation and interval.
+    It has the initial guess, the truth if it is known, and the estimate with its standard deviation
+    and interval.
     """
     identification = result["identification"]
     rows = [
@@ -35,18 +35,19 @@ def parameter_table(result: dict[str, Any]) -> Table:
         if p["identifiable"]
     ]
     note = (
-        "The interval holds the truth in 95 % of such experiments; it ends where no such value "
-        "can exist. "
+        "The interval contains the truth in 95 % of such experiments. It excludes values that are "
+        "physically impossible. "
     )
     if any(row[-1] for row in rows):
         note += (
-            f"One that {ON_GUESS} is shown only in sums with other parameters: it is right where "
-            "their starting values are, within the standard deviations that were stated for them."
+            f"A parameter that {ON_GUESS} is shown by the record only in sums with other "
+            "parameters. It is right if their initial guesses are right within the standard "
+            "deviations stated for them."
         )
     header = (
         "parameter",
         "unit",
-        "start",
+        "initial",
         "truth",
         "estimate ± standard deviation",
         "95 % interval",
@@ -59,22 +60,22 @@ def parameter_table(result: dict[str, Any]) -> Table:
 
 
 def scale_sentence(identification: Mapping[str, Any]) -> str:
-    """Return the sentence that says what fixes the common factor of all parameters.
+    """Return the sentence that states what fixes the common factor of all parameters.
 
-    It warns where the intended anchor does not fix it.
+    It warns if the intended anchor does not fix it.
     """
     anchor = identification["scale_anchor"]
     said = ANCHORS.get(anchor, anchor)
     gain = identification["parameters"].get("joint_pid.lp", {})
     share = gain.get("prior_share") or 0.0
     if not identification.get("drive", {}).get("in_loop", True):
-        return "The overall scale is that of the torques that were commanded."
+        return "The overall scale is fixed by the commanded torques."
     if anchor == "prior" or share <= RESTS_ON_PRIOR:
         return f"The overall scale is fixed by {said}."
     return (
         f"The overall scale should be fixed by {said}, but is not: {100 * share:.0f} % of the "
-        "variance of joint_pid.lp comes from the starting values, and all that is given in kg, N m "
-        "or N is as good as those."
+        "variance of joint_pid.lp comes from the initial guess, and all values in kg, N m or N are "
+        "only as good as this guess."
     )
 
 
@@ -82,7 +83,7 @@ ANCHORS = {
     "platform_mass": "the weighed mass of the platform",
     "joint_gain": "a known gain of the joint controller",
     "payload": "a second run under a known load",
-    "prior": "the starting values alone: all of them may be off by one common factor",
+    "prior": "the initial guess alone: all parameters may be off by one common factor",
 }
 """Descriptions of the scale anchors."""
 
@@ -90,12 +91,12 @@ ANCHORS = {
 def group_table(result: dict[str, Any]) -> Table:
     """Return the table of the base parameters that combine several parameters.
 
-    It holds the truth, the estimate and its standard deviation.
+    It has the truth, and the estimate with its standard deviation.
     """
     identification = result["identification"]
     rows = []
     for group in identification.get("groups", {}).values():
-        # A sum of one member is a parameter by itself, and stands in the table of parameters.
+        # A sum of one member is a parameter itself, and is in the table of parameters.
         if len(group["coefficients"]) > 1:
             known = _remark(group) if group["identifiable"] else "not identified"
             shown = _shown(group, _size(group, identification["parameters"]))
@@ -103,13 +104,13 @@ def group_table(result: dict[str, Any]) -> Table:
                 (group["expression"].replace(" - ", " − "), *shown[:-1], _deviations(group), known)
             )
     note = (
-        "In the SI unit of the first parameter of each sum. A sum may be known where none of its "
-        "members is: it counts as identified when little of the size of its members is in doubt, "
-        "though it may almost vanish itself."
+        "In the SI unit of the first parameter of each sum. A sum can be identified even if none "
+        "of its members is. It counts as identified if its standard deviation is small compared "
+        "with the size of its members, even if the sum itself is almost zero."
     )
     header = (
         "sum",
-        "start",
+        "initial",
         "truth",
         "estimate ± standard deviation",
         "95 % interval",
@@ -117,7 +118,7 @@ def group_table(result: dict[str, Any]) -> Table:
         "",
     )
     return Table(
-        f"The {len(rows)} sums that motion shows", header, tuple(rows), note, folded=True
+        f"The {len(rows)} sums on which the motion depends", header, tuple(rows), note, folded=True
     ).without_empty()
 
 
@@ -132,8 +133,8 @@ def correlation_table(result: dict[str, Any]) -> Table:
         "Strongest correlations of identified parameters",
         ("parameters", "correlation"),
         rows,
-        "Poses show friction and gains relative to each other better than their common factor, "
-        "which moves all of them together: their ratios are known better than each of them.",
+        "Poses determine the ratios of friction and gains better than their common factor. Their "
+        "errors are therefore strongly correlated.",
         folded=True,
     )
 
@@ -149,15 +150,15 @@ DRIVES = {
 
 
 def drive_sentence(identification: Mapping[str, Any]) -> str:
-    """Return the sentence that says which law the drives have, and how that is known.
+    """Return the sentence that states the law of the drives, and how it is known.
 
-    It is empty where the scenario states the usual law, a PID.
+    It is empty if the scenario states the usual law, a PID.
     """
     drive = identification.get("drive")
     if drive is not None and not drive.get("in_loop", True):
         return (
-            "The drives took torques: the record says nothing of the law by which they follow "
-            "joint commands."
+            "The drives took torques: the record has no information about the law by which they "
+            "follow joint commands."
         )
     if drive is None or (drive["decided_by"] == "scenario" and drive["law"] == "pid"):
         return ""
@@ -186,36 +187,35 @@ def drive_sentence(identification: Mapping[str, Any]) -> str:
         f"{name} = {with_deviation(one['estimate'], one['std'])} {one['unit']}"
         for name, one in drive.get("gains", {}).items()
     )
-    return f"{said} As such drives name them its gains are {own}." if own else said
+    return f"{said} In the form usual for such drives, its gains are {own}." if own else said
 
 
 def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
-    """Return the reasons why parameters are not identified, each with their names."""
+    """Return the reasons why parameters are not identified, each with the names of parameters."""
     parameters = identification["parameters"]
     groups = identification.get("groups", {}).values()
     coefficients = [group["coefficients"] for group in groups]
     alone = {name for weights in coefficients for name in weights if len(weights) == 1}
     summed = {name for weights in coefficients for name in weights if len(weights) > 1}
     left = [name for name, p in parameters.items() if not p["identifiable"]]
-    # A record that the model does not explain leaves every parameter unidentified.
+    # If the model does not explain the record, no parameter is identified.
     if left and len(left) == len(parameters):
-        return [("the model does not explain the record, so that no estimate can be trusted", left)]
+        return [("the model does not explain the record, and no estimate can be trusted", left)]
     fixed = set(identification.get("drive", {}).get("fixed_at_zero", ()))
     shown = (alone | {name for name in parameters if name.startswith("joint_pid.")}) - fixed
     outside = set() if identification.get("drive", {}).get("in_loop", True) else shown - alone
     shown -= outside
     kinds = {
         "the law of the drives has no such gain": [name for name in left if name in fixed],
-        "the drives took torques, and these gains had no part in the run": [
+        "the drives took torques, and these gains had no effect in the run": [
             name for name in left if name in outside
         ],
-        "motion shows them only in sums with others, and not one by one; the sums are what is "
-        "known": [name for name in left if name in summed],
-        "this record shows them too badly. It neither halves what the starting value left open, "
-        "nor leaves less than "
-        "half of their size in doubt. More or faster motion may show them": [
-            n for n in left if n in shown
+        "motion shows them only in sums with other parameters, and not individually": [
+            name for name in left if name in summed
         ],
+        "this record does not determine them well enough: their standard deviation is more than "
+        "half of that of the initial guess, or more than half of their size. More or faster motion "
+        "may help": [n for n in left if n in shown],
         "no motion of this robot depends on them": [
             n for n in left if n not in summed | shown | fixed | outside
         ],
@@ -228,10 +228,10 @@ def _remark(entry: Entry) -> str:
 
 
 def _shown(entry: Entry, size: float) -> tuple[str, ...]:
-    """Format start, truth, estimate, interval and error of an entry.
+    """Format initial guess, truth, estimate, interval and error of an entry.
 
-    What is not identified gets dashes, so that nobody quotes it. ``size`` is the size of the parts
-    of the entry; values that are only rounding beside it are shown as zero.
+    The last three are dashes if the entry is not identified, so that nobody quotes them. ``size``
+    is the size of the terms of the entry; rounding errors relative to it are shown as zero.
     """
     start = number(rounded(entry["initial"], size))
     true = number(rounded(entry["true"], size))
@@ -244,7 +244,7 @@ def _shown(entry: Entry, size: float) -> tuple[str, ...]:
 
 
 def _deviations(group: Entry) -> str:
-    """Format the error in standard deviations."""
+    """Format the error in units of the standard deviation."""
     true = group["true"]
     estimate = group["estimate"]
     std = group["std"]
@@ -254,7 +254,7 @@ def _deviations(group: Entry) -> str:
 
 
 def _size(group: Entry, parameters: Mapping[str, Entry]) -> float:
-    """Return the sum of the absolute values of the parts of a sum at their starting values."""
+    """Return the sum of the absolute values of the terms of a sum at the initial guess."""
     return sum(
         abs(weight * (parameters[name]["initial"] or 0.0))
         for name, weight in group["coefficients"].items()

@@ -1,4 +1,4 @@
-"""Pictures of a run by the names of their files, each with a caption that says how to read it."""
+"""Pictures of a run by the names of their files, each with a caption that explains it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from identify.reporting.run_data import RunData, read_run
 class Picture:
     """Function that draws a figure, and its caption.
 
-    ``painted`` is true if a page takes the figure as an image, because it has too many strokes or
+    ``painted`` is true if a page includes the figure as an image, because it has many strokes or
     grey values.
     """
 
@@ -32,7 +32,7 @@ class Picture:
 def run_figures(folder: Path | str) -> dict[str, Callable[[], Figure]]:
     """Return the figures of a finished run by the names of their files.
 
-    Each is a function that draws the figure for print.
+    Each figure is given as a function that draws it for print.
 
     Raises
     ------
@@ -76,54 +76,53 @@ def pictures(data: RunData) -> dict[str, Picture]:
 
 
 FIT = (
-    "The {}: measured poses (circles), starting model (dashed) and identified model (line); "
-    "beneath each component what the identified model leaves of every measured pose, with its RMS "
-    "for the starting and for the identified model."
+    "The {}: measured poses (circles), initial model (dashed) and identified model (line); below "
+    "each component, the measured pose minus the identified model in every frame, with the RMS for "
+    "the initial and for the identified model."
 )
 
 GROUPS = (
-    "Which parameters enter which sum that motion shows: one row a sum, one column a parameter. "
-    "The area of a dot is the share of coefficient times starting value; an open one is "
+    "Parameters in each sum on which the motion depends: one row per sum, one column per "
+    "parameter. The area of a dot is the share of coefficient times initial guess; an open dot is "
     "subtracted. A star marks a sum that is identified."
 )
 
 CORRELATION = (
-    "How the errors of identified parameters go together: the area of a dot is the size of their "
-    "correlation, an open one is negative."
+    "Correlations of the errors of identified parameters: the area of a dot is the size of the "
+    "correlation, and an open dot is negative."
 )
 
 
 def _of_the_diagnosis(result: dict[str, Any]) -> dict[str, Picture]:
-    """Show what the causes explain; nothing where noise explains the record."""
+    """Show the share of the misfit that causes explain, or nothing without a diagnosis."""
     entry = result.get("diagnosis")
     if entry is None:
         return {}
     text = (
-        "Causes for which the model may miss the record: what of the misfit each alone explains "
-        "beside the parameters (left), and what is left of it as those that were found are fitted "
-        "(right)."
+        "Possible causes of the misfit: the share that each alone explains in addition to the "
+        "parameters (left), and the misfit that remains as the causes found are fitted (right)."
     )
     return {"diagnosis": Picture(lambda: diagnosis.diagnosis_figure(entry), text)}
 
 
 def _errors(data: RunData) -> Picture:
-    """Show the errors of both models against the truth or, without one, the measurement."""
+    """Show the errors of both models against the truth or, if it is unknown, the measurement."""
     shown = data.validation_fit
     if shown is None:
         text = (
-            "How far both models are from the measured poses of the record; dotted: the noise "
+            "Distance of both models from the measured poses of the record; dotted: the noise "
             "that the cameras state."
         )
         return Picture(lambda: fit.error_figure(data.excitation_fit), text)
     text = (
-        "How far both models, and the single poses that the cameras measure, are from the true "
-        "robot, on the first trajectory that no model was fitted to."
+        "Distance of both models, and of the single measured poses, from the true robot on the "
+        "first validation trajectory."
     )
     return Picture(lambda: fit.error_figure(shown), text)
 
 
 def _of_the_scene(data: RunData) -> dict[str, Picture]:
-    """Show robot, cameras and camera images; nothing where the robot's file is gone."""
+    """Show robot, cameras and camera images, or nothing if the robot's file is missing."""
     cell = data.scene
     view = data.stereo_view
     if isinstance(cell, str):
@@ -137,13 +136,12 @@ def _of_the_scene(data: RunData) -> dict[str, Picture]:
         }
     text = (
         f"The robot {data.robot} and both cameras, with their rays to the stickers of the "
-        "platform, half way along the exciting trajectory; beneath it what both cameras see at "
+        "platform, half way along the exciting trajectory; below, the images of both cameras at "
         "that time, with the stickers that were found."
     )
     residuals = (
-        "The same images, drawn anew from scenario, seed and true pose: detected ellipses, and "
-        "arrows from each detected centre that show by how much it misses the true one, enlarged "
-        "as written."
+        "The same images, rendered again from scenario, seed and true pose: detected ellipses, and "
+        "arrows that show the error of each detected centre, enlarged as stated."
     )
     return {
         "scene": Picture(
@@ -157,14 +155,14 @@ def _of_the_sensor(data: RunData) -> dict[str, Picture]:
     measured = poses(data.experiment, "measured")
     covariances = data.experiment["measured_covariance"].values
     errors = None if data.truth is None else true_poses(data.truth) - measured
-    # The reference has no noise, so that it tells which components move.
+    # The reference has no noise, and shows which components move.
     shown = moving(poses(data.experiment, "reference"))
     text = (
-        "How well single poses are measured: ellipses that hold 95 % of true poses by what the "
-        "cameras state, enlarged along the path as written above each row."
+        "Uncertainty of single measured poses: ellipses that contain 95 % of true poses according "
+        "to the cameras, along the path, enlarged as stated above each row."
     )
     if errors is not None:
-        text += " Dots: the true poses, their distance from the measured ones enlarged alike."
+        text += " Dots: the true poses, whose distance from the measured poses is enlarged equally."
     return {
         "ellipses": Picture(
             lambda: paths.ellipse_figure(measured, covariances, shown, errors), text
@@ -176,14 +174,14 @@ def _of_the_motion(data: RunData) -> dict[str, Picture]:
     time = data.experiment["time"].values
     reference = poses(data.experiment, "reference")
     path = (
-        "The exciting trajectory as a path in space, and the orientation on its way; the same "
-        "times are marked."
+        "The exciting trajectory as a path in space, and the orientation along it; the same times "
+        "are marked in both."
     )
     return {
         "path": Picture(lambda: paths.path_figure(time, reference), path),
         "excitation": Picture(
             lambda: paths.excitation_figure(time, reference),
-            "The exciting trajectory over time, as it is asked for.",
+            "The desired exciting trajectory over time.",
         ),
     }
 
@@ -202,13 +200,13 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
     if shown is None:
         return {}
     bars = (
-        "The identified model on each unseen trajectory: bars against the truth, diamonds what the "
-        "uncertainty of the parameters lets expect, dashes against the measurement, whose noise "
-        "they hold."
+        "RMS of the identified model on each validation trajectory: bars against the truth; "
+        "diamonds as expected from the uncertainty of the parameters; dashes against the "
+        "measurement, including its noise."
     )
     text = (
-        FIT.format("first unseen trajectory")
-        + " Thick: what it misses of the truth; dotted: predicted."
+        FIT.format("first validation trajectory")
+        + " Thick: the truth minus the identified model; dotted: its predicted range."
     )
     return {
         "validation_errors": Picture(

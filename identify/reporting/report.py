@@ -1,6 +1,6 @@
 """HTML page of a report.
 
-The page is one text without a script. Its figures take on the colours of the reader's screen.
+The page is one file without a script. Its figures adapt to the colours of the reader's screen.
 """
 
 import base64
@@ -32,12 +32,12 @@ FIRST_LOOK = ("scene", "errors")
 """Names of the pictures beside the verdict."""
 
 WIDEST_PX = 1500
-"""Largest width and height of an image on the page. The PNG file beside it has every pixel."""
+"""Largest width and height of an image on the page. The separate PNG file has all pixels."""
 
 QUALITY = 85
-"""Quality of an image on the page, as WebP counts it."""
+"""Quality of an image on the page, on the scale of WebP."""
 
-# Figures are drawn in the colours of the palette, which the page then replaces by names.
+# Figures are drawn in the colours of the palette. The page replaces these by CSS variables.
 _NAMES = {code: name for name, code in PALETTE.items()}
 _CODES = re.compile("|".join(_NAMES))
 
@@ -49,8 +49,8 @@ def write_report(
 ) -> Path:
     """Write the report and the figures of a run folder, and return the path of the report.
 
-    The files are ``report.html``, ``figures/*.png`` and ``figures/*.pdf``. All or none are written.
-    ``further`` returns files that are written with them.
+    The files are ``report.html``, ``figures/*.png`` and ``figures/*.pdf``. Either all or none of
+    them are written. ``further`` returns additional files to write.
 
     Raises
     ------
@@ -66,14 +66,14 @@ def write_report(
     shown = pictures(data)
     drawings = {}
     files: dict[Path, bytes] = {}
-    # Everything is drawn before anything is written, so that a failure leaves the old report.
+    # Everything is drawn before anything is written: after a failure, the old report remains.
     with (progress or SilentProgress()).stage("report", len(shown) + 1) as advance:
         for name, picture in shown.items():
             figure = drawn(picture.draw)
             png = figure_bytes(figure, ".png")
             files[run.figures / f"{name}.png"] = png
             files[run.figures / f"{name}.pdf"] = figure_bytes(figure, ".pdf")
-            # An SVG of many strokes would be larger than the image, and slow to show.
+            # An SVG with many strokes would be larger than the image, and slow to display.
             drawings[name] = painting(png) if picture.painted else svg_text(figure, name)
             advance()
         files[run.report] = render(data, shown, drawings).encode()
@@ -87,7 +87,7 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
 
     ``drawings`` holds the pictures as HTML elements, by their names.
     """
-    # The texts come from files, and may hold characters that mean something in HTML.
+    # The texts come from files, and can have characters with a meaning in HTML.
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -115,7 +115,7 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
 
 
 def painting(png: bytes) -> str:
-    """Return an <img> element that holds a PNG file, made small enough for a page."""
+    """Return an <img> element with a PNG image, reduced to the size for a page."""
     stream = io.BytesIO()
     with Image.open(io.BytesIO(png)) as image:
         whole = image.convert("RGB")
@@ -139,7 +139,7 @@ def _sentence(text: str) -> str:
 def _coloured(element: str) -> str:
     """Return a figure whose colours are variables of the page.
 
-    Screen readers skip it, because its caption tells what it shows.
+    Screen readers skip it, because its caption describes it.
     """
     # CSS variables work in a style, but not in an attribute of SVG.
     text = re.sub(r'\sfill="(#[0-9a-f]{6})"', r' style="fill: \g<1>"', element)

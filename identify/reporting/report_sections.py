@@ -16,7 +16,8 @@ from identify.reporting.tables import Table
 class Fold:
     """Text that is folded under a title.
 
-    ``printed`` is true if it is shown on paper, ``verbatim`` if its lines are kept as they are.
+    ``printed`` is true if it is also shown in print. ``verbatim`` is true if its line breaks are
+    kept.
     """
 
     title: str
@@ -29,8 +30,8 @@ class Fold:
 class Section:
     """Section of the report.
 
-    It has a text in paragraphs, names of pictures, names of folded pictures by their titles,
-    tables, and folded texts.
+    It has paragraphs of text, names of pictures, names of folded pictures by title, tables, and
+    folded texts.
     """
 
     title: str
@@ -42,39 +43,40 @@ class Section:
 
 
 def sensor_section(data: RunData) -> Section:
-    """Describe the sensor's errors where the truth is known, else what it states of itself."""
+    """Describe the sensor: its errors if the truth is known, otherwise its stated uncertainty."""
     ok = data.experiment["measured_ok"].values.astype(bool)
     note = data.scenario.sensor_note
     name = Path(data.scenario.sensor).stem
     said = [] if data.truth is None else [f"The sensor is {name}{f': {note}' if note else '.'}"]
     if isinstance(data.scene, str):
         said.append(f"Robot and cameras are not drawn: {data.scene}.")
-    # A record of a real robot has no entry of the sensor, because no truth is known.
+    # The result of a real robot has no entry `sensor`, because no truth is known.
     if "sensor" not in data.result:
         said.append(
             f"{len(ok)} frames were recorded at {data.scenario.timing.frame_rate_hz:g} Hz; in "
-            f"{int((~ok).sum())} of them the platform was lost. No truth is known here: what "
-            "follows is what the sensor states of itself."
+            f"{int((~ok).sum())} of them the platform was lost. The truth is not known: the "
+            "uncertainties below are those that the sensor states."
         )
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
     if data.cameras_acquitted:
         common_errors = data.result["identification"].get("nuisances")
-        beside = ", plus errors that all frames share" if common_errors else ""
+        beside = ", plus errors that all frames have in common" if common_errors else ""
         said.append(
-            f"Its errors are the noise that it states, independent from frame to frame{beside}."
+            "Its errors agree with the noise that it states, and are independent from frame to "
+            f"frame{beside}."
         )
     elif data.cameras_acquitted is not None:
         said.append(
-            "Its errors are larger than the noise that it states, or depend on those of the "
-            "frames before."
+            "Its errors are larger than the noise that it states, or depend on the errors of "
+            "earlier frames."
         )
     watch = data.result.get("drift_watch")
     if watch and watch.get("noticed_s") is None:
         said.append(
-            "Judged by the pattern of the stickers, and by how closely the two rays to each of "
-            "them meet, the cameras kept their calibration."
+            "The cameras kept their calibration, according to the pattern of the stickers and to "
+            "the distance between the two rays to each sticker."
         )
-    # An empty table is left out.
+    # An empty table is omitted.
     common = [table for table in (tables.common_error_table(data.result),) if table.rows]
     shown = (tables.sensor_table(data.result), *common)
     return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)
@@ -86,7 +88,7 @@ def excitation_section(data: RunData) -> Section:
 
 
 def fit_section(data: RunData) -> Section:
-    """Describe how the models follow the exciting trajectory, and how the search ended."""
+    """Describe how well the models follow the exciting trajectory, and how the search ended."""
     found = data.result["identification"]
     text = (
         f"The search took {found['iterations']} steps; it ended because "
@@ -103,18 +105,18 @@ def fit_section(data: RunData) -> Section:
 
 
 def parameter_section(data: RunData) -> Section:
-    """Describe the identified parameters and, folded, the others with the reasons."""
+    """Describe the identified parameters and, folded, the other parameters with the reasons."""
     found = data.result["identification"]
     parameters = found["parameters"]
     groups = found.get("groups", {})
     known = [p for p in parameters.values() if p["identifiable"]]
     sums = [group for group in groups.values() if len(group["coefficients"]) > 1]
     known_sums = sum(bool(group["identifiable"]) for group in sums)
-    counted = f", and {known_sums} of {len(sums)} sums of several" if sums else ""
+    counted = f", and {known_sums} of {len(sums)} sums of parameters" if sums else ""
     text = [
-        f"The record identifies {len(known)} of {len(parameters)} parameters{counted}. Identified "
-        "means that it at least halves the standard deviation of the starting value, and brings it "
-        "below half of the quantity's size.",
+        f"The record identifies {len(known)} of {len(parameters)} parameters{counted}. A quantity "
+        "is identified if the record at least halves the standard deviation of its initial guess, "
+        "and reduces it to less than half of the quantity's size.",
         parameter_tables.scale_sentence(found),
         *filter(None, [parameter_tables.drive_sentence(found)]),
         *_prior_text(found),
@@ -127,31 +129,31 @@ def parameter_section(data: RunData) -> Section:
     pairs = [parameter_tables.correlation_table(data.result)] if known else []
     shown = [table for table in (parameter_tables.parameter_table(data.result),) if table.rows]
     shown += [table for table in (parameter_tables.group_table(data.result),) if table.rows]
-    folded = {"How the errors of the parameters go together": "correlation"} if known else {}
+    folded = {"Correlations of the errors of the parameters": "correlation"} if known else {}
     return Section(
         "Parameters", tuple(text), ("parameters", "groups"), folded, (*shown, *pairs), tuple(folds)
     )
 
 
 def validation_section(data: RunData) -> Section:
-    """Describe the errors on unseen trajectories."""
+    """Describe the errors on validation trajectories."""
     if not data.validation:
         text = (
-            "There are no unseen trajectories of this record. Record another motion of the robot, "
-            "and compare what the model predicts of it: a model that only follows the motion that "
-            "it was fitted to is of no use."
+            "This record has no validation trajectories. Record another motion of the robot, and "
+            "compare it with the prediction of the model: a model that only follows the motion to "
+            "which it was fitted is of no use."
         )
         return Section("Validation", (text,))
     both = (
         tables.validation_table(data.result, data.beside_paper),
         tables.prediction_table(data.result),
     )
-    text = f"{len(data.validation)} trajectories that had no part in the identification."
+    text = f"{len(data.validation)} trajectories that were not used in the identification."
     return Section("Validation", (text,), ("validation_errors", "fit_validation"), tables=both)
 
 
 def provenance_section(data: RunData) -> Section:
-    """List scenario, versions and times, so that the run can be repeated."""
+    """List the scenario, versions and times that are needed to repeat the run."""
     changed = tables.settings_table(data.result, data.scenario_toml)
     made = f"Record made {data.experiment.attrs.get('created', 'at an unknown time')}."
     text = [made, "Every picture is also in the folder figures, as PDF for print and as PNG."]
@@ -183,7 +185,7 @@ SECTIONS: tuple[Callable[[RunData], Section], ...] = (
 
 
 def _prior_text(found: dict[str, Any]) -> list[str]:
-    """Tell how many estimates depend on the starting values of other parameters."""
+    """State how many estimates depend on the initial guesses of other parameters."""
     counts = {
         "parameters": sum(bool(p.get("rests_on_prior")) for p in found["parameters"].values()),
         "sums": sum(bool(g.get("rests_on_prior")) for g in found.get("groups", {}).values()),
@@ -192,8 +194,8 @@ def _prior_text(found: dict[str, Any]) -> list[str]:
     if not said:
         return []
     return [
-        f"{said} rest on the starting values of others: they are as good as those, and are marked "
-        "in the tables."
+        f"{said} rest on the initial guesses of other parameters, and are only as good as these. "
+        "They are marked in the tables."
     ]
 
 
@@ -204,13 +206,13 @@ def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
     unshown = conditioning["unshown"]
     return [
         f"Poses determine {directions} independent quantities of this robot and its controller, up "
-        "to one factor that is common to all of them. This record shows "
-        f"{directions - unshown} of them better than the starting values do."
+        "to one factor that is common to all of them. This record determines "
+        f"{directions - unshown} of them better than the initial guess does."
     ]
 
 
 def _index_text(data: RunData) -> tuple[str, ...]:
-    """Tell what the search for an exciting trajectory gained."""
+    """State what the search for an exciting trajectory gained."""
     chosen = data.trajectories
     if chosen is None:
         return ()
@@ -222,7 +224,7 @@ def _index_text(data: RunData) -> tuple[str, ...]:
     )
     if data.beside_paper:
         text += (
-            f" The paper, on its own geometry, went from {paper.INDEX_FIRST:g} to "
+            f" With its own geometry, the paper improved it from {paper.INDEX_FIRST:g} to "
             f"{paper.INDEX_BEST:g} by a genetic algorithm."
         )
     return (text,)
@@ -234,6 +236,6 @@ def _paper_text(data: RunData) -> tuple[str, ...]:
     return (
         "This run repeats the paper's experiment on a simulated robot of the same kind, with its "
         "masses, gains and motion frequencies; its filter and its search for a trajectory differ "
-        "from the paper's (scenario.toml). The paper's own figures stand beside. They are of "
-        "a real robot whose truth nobody knows.",
+        "from the paper's (scenario.toml). The figures of the paper are given for comparison. They "
+        "are from a real robot, whose truth is not known.",
     )

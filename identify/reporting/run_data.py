@@ -1,6 +1,6 @@
-"""Data of a run that its report shows, read from the files of the run.
+"""Data of a run for its report, read from the files of the run.
 
-A record of a real robot has less of them than a simulated run.
+A record of a real robot has less data than a simulated run.
 """
 
 from collections.abc import Mapping
@@ -34,10 +34,10 @@ from identify.trajectory import TrajectorySet, load_trajectories
 class RunData:
     """Data of a run.
 
-    The covariance (p, p) is that of the parameters with the given names (p,). ``validation`` holds
-    the unseen runs, ``validation_truth`` the truth of the first one, and ``models`` what the models
-    do on the record and on the unseen runs. For a record of a real robot, truth and trajectories
-    are None, and there are no unseen runs.
+    The covariance (p, p) belongs to the parameters with the given names (p,). ``validation`` has
+    the records of the validation runs, ``validation_truth`` the truth of the first one, and
+    ``models`` the poses of the models in all runs. For a record of a real robot, truth and
+    trajectories are None, and there are no validation runs.
     """
 
     result: dict[str, Any]
@@ -70,22 +70,22 @@ class RunData:
 
     @cached_property
     def beside_paper(self) -> bool:
-        """True if the run repeats the paper's experiment, so that the two can be compared."""
+        """True if the run repeats the experiment of the paper, so that both can be compared."""
         return repeats_the_paper(self.scenario_toml)
 
     @cached_property
     def cameras_acquitted(self) -> bool | None:
         """True if the cameras cannot be the cause of the model's residuals.
 
-        None where no truth is known.
+        None if the truth is not known.
         """
         return cameras_acquitted(self.experiment, self.truth)
 
     @cached_property
     def scene(self) -> Workcell | str:
-        """Robot and cameras as the scenario places them, or the reason why they cannot be drawn.
+        """Robot and cameras as placed by the scenario, or the reason why they cannot be drawn.
 
-        A record of a real robot shows the robot alone. A file that is gone is such a reason.
+        A missing file is such a reason. For a record of a real robot, only the robot is shown.
         """
         try:
             robot = load_robot(self.scenario.robot)
@@ -98,8 +98,8 @@ class RunData:
     def stereo_view(self) -> StereoView | None:
         """View of both cameras of a simulated run at the middle of the record.
 
-        The images are drawn anew from scenario, seed and true pose. None where they cannot be
-        drawn.
+        The images are rendered again from scenario, seed and true pose. None if they cannot be
+        rendered.
         """
         if self.truth is None or isinstance(self.scene, str):
             return None
@@ -114,7 +114,7 @@ class RunData:
     def middle(self) -> Array:
         """Pose (6,) of the platform half way through the record, in m and rad.
 
-        It is the true pose where that is known, and the reference otherwise.
+        It is the true pose if that is known, and the reference otherwise.
         """
         measured = (
             poses(self.experiment, "reference") if self.truth is None else true_poses(self.truth)
@@ -125,16 +125,16 @@ class RunData:
     def excitation_fit(self) -> Fit:
         """Measurement and models on the exciting trajectory."""
         covariances = self.experiment["measured_covariance"].values
-        # One number a component: the root of the mean variance over the frames that were measured.
+        # One number per component: the root of the mean variance over the measured frames.
         noise = np.sqrt(np.nanmean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
         fit = replace(_fit(self.experiment, self.models[EXCITATION]), noise=noise)
         return fit if self.truth is None else replace(fit, truth=true_poses(self.truth))
 
     @cached_property
     def validation_fit(self) -> Fit | None:
-        """Measurement, models and truth on the first unseen trajectory.
+        """Measurement, models and truth on the first validation trajectory.
 
-        None where there is none.
+        None if there is none.
         """
         if not self.validation or self.validation_truth is None:
             return None
@@ -165,7 +165,7 @@ def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
 
 
 def read_run(run: RunFolder) -> RunData:
-    """Read the files that the stages of a run wrote. A record without truth needs no validation.
+    """Read the files of a run. A record of a real robot, without truth, needs no validation.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def read_run(run: RunFolder) -> RunData:
     RecordError
         A file is damaged, or the files are not of one run.
     """
-    # What is missing is reported before anything is read, with the stage that writes it.
+    # A missing file is reported before anything is read, with the stage that writes it.
     run.require("result.json", "covariance.nc", "experiment.nc")
     files = RunFiles(run)
     simulated = TRUTH_GROUP in group_names(run.experiment)
@@ -203,7 +203,7 @@ def read_run(run: RunFolder) -> RunData:
 
 
 def _checked_result(run: RunFolder, files: RunFiles, simulated: bool) -> dict[str, Any]:
-    """Read the result of a run, and check that it was made of the files that are there."""
+    """Read the result of a run, and check that it was made from the present files."""
     result = load_result(run.result)
     check_entries(run.result, result, "identify", *(["validate"] if simulated else []))
     later = ["validation.nc"] if simulated else []

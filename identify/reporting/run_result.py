@@ -1,4 +1,4 @@
-"""Entries of `result.json`, from what the stages computed and recorded."""
+"""Entries of `result.json`, from the results and records of the stages."""
 
 from typing import Any
 
@@ -28,8 +28,8 @@ def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
 def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) -> Array:
     """Return one column of an identification entry as a robot's parameters (p,).
 
-    ``column`` is "initial", "estimate" or another of the entry. Raises RecordError if a parameter
-    is missing, is no number, or has a value that no model can have.
+    ``column`` is a column of the entry, such as "initial" or "estimate". Raises RecordError if a
+    parameter is missing, is not a number, or has a value that no model can have.
     """
     values = parameter_column(identification, column, robot.layout.names)
     try:
@@ -39,7 +39,7 @@ def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) 
 
 
 def check_intervals(identification: dict[str, Any]) -> None:
-    """Refuse an estimate outside its own interval, which no identification gives.
+    """Refuse an estimate outside its own interval, which no identification produces.
 
     Raises RecordError, which names the parameter, its estimate and its interval.
     """
@@ -55,12 +55,12 @@ def check_intervals(identification: dict[str, Any]) -> None:
 def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
     """Compare the sensor with the truth over all pairs of record and truth.
 
-    The entry also holds the speed of rendering and measuring in one process.
+    The entry also has the speed of rendering and measuring in one process.
     """
     errors = np.vstack(
         [recording.poses(record, "measured") - true_poses(truth) for record, truth in runs]
     )
-    # A lost frame has no pose, and only counts as lost.
+    # A lost frame has no pose, and is only counted as lost.
     ok = np.concatenate([record["measured_ok"].values.astype(bool) for record, _ in runs])
     seconds = sum(float(record.attrs["sensor_seconds"]) for record, _ in runs)
     return {
@@ -74,9 +74,10 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
 def validation_entry(
     record: xr.Dataset, truth: xr.Dataset, initial: Array, identified: Array
 ) -> dict[str, Any]:
-    """Return the entry of one unseen run.
+    """Return the entry of one validation run.
 
-    Both models (N, 6) are compared with the measured and with the true poses of the plant.
+    The poses of both models (N, 6) are compared with the measured and with the true poses of the
+    plant.
     """
     ok = record["measured_ok"].values.astype(bool)
     measured = recording.poses(record, "measured")
@@ -90,10 +91,9 @@ def validation_entry(
 
 
 def prediction_entry(prediction: PosePrediction, truth: xr.Dataset) -> dict[str, Any]:
-    """Compare the plant's deviation from the predicted poses with the expected one.
+    """Compare the plant's deviation from the predicted poses with the expected deviation.
 
-    The entry holds both as RMS over the run, and the squared deviation in units of the expected
-    one.
+    The entry has both as RMS over the run, and the squared deviation relative to the expected one.
     """
     std = 1e6 * np.sqrt(np.mean(prediction.std**2, axis=0))
     true = true_poses(truth)

@@ -1,4 +1,4 @@
-"""Settings of a run, compared with those of the built-in scenario that it began with."""
+"""Settings of a run, compared with the settings of the built-in scenario on which it is based."""
 
 import tomllib
 from collections.abc import Mapping
@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 from identify.scenario import load_scenario, scenario_names
 
 BUILT_IN_PAPER = "paper"
-"""Name of the built-in scenario that has the paper's settings.
+"""Name of the built-in scenario with the settings of the paper.
 
 Scenarios without a built-in name are compared with it.
 """
 
 
 class Setting(NamedTuple):
-    """Setting of a run by its dotted key, with its value and that of the built-in scenario.
+    """Setting of a run by its dotted key, with its value and the value in the built-in scenario.
 
-    A value is a dash where the scenario does not have the setting.
+    A value is a dash if the scenario does not have the setting.
     """
 
     key: str
@@ -28,15 +28,15 @@ class Setting(NamedTuple):
 def changed_settings(
     recorded: str, estimator: Mapping[str, Any] | None = None
 ) -> tuple[str, list[Setting]]:
-    """Return the name of the built-in scenario that fits a recorded one, and what differs.
+    """Return the built-in scenario with which a recorded one is compared, and the differences.
 
     Parameters
     ----------
     recorded
         The scenario of the record, as TOML.
     estimator
-        Settings of the identification by dotted key. They may have been changed after the record
-        was made.
+        Settings of the identification by dotted key. A user can change them after the record was
+        made.
     """
     ours = _settings(recorded)
     name = ours["name"].value if "name" in ours else ""
@@ -62,7 +62,7 @@ def changed_settings(
 
 
 class _Stated(NamedTuple):
-    """Value of a scenario, None where it states none, and what the value means."""
+    """Value in a scenario, None if it has none, and the meaning of the value."""
 
     value: Any
     meaning: str
@@ -86,7 +86,7 @@ def _settings(text: str) -> dict[str, _Stated]:
 
 
 def _shown(value: Any) -> str:
-    """Format a value for a table, with a dash where there is none."""
+    """Format a value for a table, with a dash if there is none."""
     if value is None:
         return "-"
     return str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,6 +1,7 @@
-"""Tables of a run, and the summaries at the terminal.
+"""Tables of a run, and the summaries on the terminal.
 
-The paper's figures stand beside those of a run that repeats the paper's experiment.
+For a run that repeats the experiment of the paper, the figures of the paper are given for
+comparison.
 """
 
 import math
@@ -27,8 +28,7 @@ AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, s
 class Table:
     """Table of text with a title.
 
-    ``note`` says what the reader must know to read it. ``folded`` is true if only the title is seen
-    at first.
+    ``note`` explains the table. ``folded`` is true if only the title is shown at first.
     """
 
     title: str
@@ -39,8 +39,8 @@ class Table:
 
     @property
     def words(self) -> tuple[bool, ...]:
-        """Flags of the columns that hold words, and not numbers."""
-        # Signs and dashes are the typographic ones that `number` writes.
+        """Flags of the columns with words instead of numbers."""
+        # Signs and dashes are typographic, as written by `number`.
         numeric = re.compile(r"([-+−≤≥(]? ?[\d.]+.*|[-–]?|diverged)$")
         columns = zip(*self.rows, strict=True)
         return tuple(
@@ -72,7 +72,7 @@ class Table:
 def goals_table(result: dict[str, Any]) -> Table:
     """Return every goal with its value, its limit and whether it is met.
 
-    The speed stands below, which no goal judges.
+    The last rows state the speed, for which there is no goal.
     """
     rows = tuple(
         (
@@ -84,7 +84,7 @@ def goals_table(result: dict[str, Any]) -> Table:
         )
         for goal in check_goals(result)
     )
-    note = "Speed has no limit: it is the machine's."
+    note = "Speed has no limit, because it depends on the machine."
     return Table(
         "Goals", ("goal", "value", "limit", "", "what"), (*rows, *_speed_rows(result)), note
     )
@@ -94,7 +94,7 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return the rows on the speed of the stages that have been run."""
     rate = result.get("sensor", {}).get("stereo_frames_per_second")
     seconds = result.get("seconds", {})
-    # Names with a dot are parts of a stage, and would be counted twice.
+    # Names with a dot are parts of a stage, and are already counted in it.
     stages = [
         value
         for name, value in seconds.items()
@@ -114,8 +114,8 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
 def common_error_table(result: dict[str, Any]) -> Table:
     """Return the errors that all poses of the record have in common.
 
-    Each has the standard deviation that was known beforehand, the estimate from the record and its
-    standard deviation.
+    Each row has the prior standard deviation, and the estimate from the record with its standard
+    deviation.
     """
     found = result["identification"]
     rows = tuple(
@@ -127,16 +127,16 @@ def common_error_table(result: dict[str, Any]) -> Table:
         for name, before in found.get("nuisance_prior_std", {}).items()
     )
     note = (
-        "True minus known, in the unit that ends the name; of the geometry in m and rad. Where a "
-        "servo acts, it takes the platform to where such an error does not show; then little is "
-        f"learnt of it.{_shares(found)}"
+        "True minus known value, in the unit at the end of the name; geometric errors are in m and "
+        "rad. A visual servo compensates such errors, so that the record can tell little of them."
+        f"{_shares(found)}"
     )
-    header = ("error", "standard deviation beforehand", "found ± standard deviation")
-    return Table("What is wrong in all frames alike", header, rows, note, folded=True)
+    header = ("error", "prior standard deviation", "estimate ± standard deviation")
+    return Table("Errors common to all frames", header, rows, note, folded=True)
 
 
-KINDS = {"rig": "cameras", "teaching": "taught frames", "exposure": "exposures apart"}
-"""Words for the kinds of common errors whose names need some."""
+KINDS = {"rig": "cameras", "teaching": "taught frames", "exposure": "delay between exposures"}
+"""Words for kinds of common errors whose names need an explanation."""
 
 
 def _shares(found: dict[str, Any]) -> str:
@@ -144,7 +144,7 @@ def _shares(found: dict[str, Any]) -> str:
     identified = [
         one.get("common_share") for one in found["parameters"].values() if one["identifiable"]
     ]
-    # Older results have no share, or one number for all kinds together.
+    # Older results have no shares, or one number for all kinds.
     shares = [one for one in identified if isinstance(one, dict)]
     largest = {kind: max(one[kind] for one in shares) for kind in (shares[0] if shares else ())}
     said = ", ".join(
@@ -156,8 +156,8 @@ def _shares(found: dict[str, Any]) -> str:
 def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -> Table:
     """Compare the model with the measurement on the exciting trajectory.
 
-    The rows are before and after identification. For a run that repeats the paper's experiment, the
-    paper's table 3 stands beside them.
+    The columns are before and after identification. For a run that repeats the experiment of the
+    paper, its table 3 is given beside them.
     """
     before = _rms(rms_row(result.get("before")))
     after = _rms(rms_row(result.get("after")))
@@ -170,39 +170,39 @@ def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -
         "Model against measurement on the exciting trajectory, RMS",
         header,
         tuple(zip(*columns, strict=True)),
-        "diverged: the loop of the starting model is unstable." if "diverged" in before else "",
+        "diverged: the loop of the initial model is unstable." if "diverged" in before else "",
     )
 
 
 def validation_table(result: dict[str, Any], beside_paper: bool = False) -> Table:
-    """Compare the models with measurement and truth on the unseen trajectories.
+    """Compare the models with measurement and truth on the validation trajectories.
 
-    For a run that repeats the paper's experiment, the paper's table 4 follows.
+    For a run that repeats the experiment of the paper, its table 4 follows.
     """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
         rows.append((f"{n}: identified, true", *_rms(rms_row(run["true"]))))
         rows.append((f"{n}: identified, measured", *_rms(rms_row(run["measured"]))))
         if "initial_true" in run:
-            rows.append((f"{n}: starting, true", *_rms(rms_row(run["initial_true"]))))
+            rows.append((f"{n}: initial, true", *_rms(rms_row(run["initial_true"]))))
     if beside_paper:
         rows += [
             (f"paper {n}: identified, measured", *map(number, row))
             for n, row in enumerate(paper.VALIDATION, 1)
         ]
     return Table(
-        "Each unseen trajectory, RMS",
+        "Each validation trajectory, RMS",
         ("run: model, against", *AXIS_HEADER),
         tuple(rows),
-        "true: against where the true robot was; measured: against what the cameras saw of it.",
+        "true: against the true poses of the robot; measured: against its measured poses.",
         folded=True,
     )
 
 
 def prediction_table(result: dict[str, Any]) -> Table:
-    """Compare the predicted deviation of the plant from the identified model with the found one.
+    """Compare the predicted deviation of the plant from the identified model with the actual one.
 
-    The rows are the unseen trajectories.
+    The rows are the validation trajectories.
     """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
@@ -214,15 +214,15 @@ def prediction_table(result: dict[str, Any]) -> Table:
             (f"{n}: found", *_rms(found), number(predicted.get("normalised_squared_error")))
         )
     return Table(
-        "How far the true robot was expected from the predicted poses, and how far it was, RMS",
+        "Predicted and actual distance of the true robot from the predicted poses, RMS",
         ("run", *AXIS_HEADER, "found²/predicted²"),
         tuple(rows),
-        "Predicted by the identified model and what its record taught of errors in common to all "
-        "frames; how far, from the uncertainty of both, and from what the cameras' noise does to "
-        "the robot through the servo. The last column is the squared error in units of what was "
-        "predicted: one on average where the prediction is right. The runs share one set of "
-        "parameters, so they stray together. Where cameras and taught frames count as exact, their "
-        "error, which moves the robot as a whole, is not predicted.",
+        "Poses are predicted by the identified model and the estimated errors common to all "
+        "frames. The predicted distance follows from the uncertainty of both, and from the noise "
+        "of the cameras, which moves the robot through the servo. The last column is the squared "
+        "error relative to the prediction: one on average if the prediction is right. All runs "
+        "have the same estimated parameters, so their errors are not independent. If cameras and "
+        "taught frames count as exact, their errors, which move the whole robot, are not included.",
         folded=True,
     )
 
@@ -230,7 +230,7 @@ def prediction_table(result: dict[str, Any]) -> Table:
 def sensor_table(result: dict[str, Any]) -> Table:
     """Compare the measured poses with the truth."""
     sensor = result["sensor"]
-    header = ("frames", "lost", "frames a second", *AXIS_HEADER)
+    header = ("frames", "lost", "frames per second", *AXIS_HEADER)
     frames = sensor["frames"]
     lost = sensor["lost_frames"]
     rate = sensor.get("stereo_frames_per_second")
@@ -245,10 +245,10 @@ def seconds_table(result: dict[str, Any]) -> Table:
 
 
 def settings_table(result: dict[str, Any], recorded: str) -> Table:
-    """Return the differences from the built-in scenario that the recorded one is compared with.
+    """Return the differences between the recorded scenario and a built-in one.
 
     ``recorded`` is the scenario of the record (TOML). Settings that were changed for the
-    identification are among the differences.
+    identification are included.
     """
     base, changed = changed_settings(recorded, result.get("settings"))
     rows = tuple((one.key, one.value, one.built_in, one.meaning) for one in changed)
@@ -258,7 +258,7 @@ def settings_table(result: dict[str, Any], recorded: str) -> Table:
 
 
 def versions_table(result: dict[str, Any]) -> Table:
-    """Return the versions of the software that identified."""
+    """Return the versions of the software of the identification."""
     rows = tuple((name, str(value)) for name, value in result.get("versions", {}).items())
     return Table("Software", ("package", "version"), rows, folded=True)
 
@@ -270,11 +270,11 @@ def _rms(values: list[float]) -> list[str]:
 def print_identification(result: dict[str, Any], path: Path) -> None:
     """Print a summary of the identification.
 
-    It says what is identified, how well the model explains the record, the time it took, and where
-    the result is.
+    It states what is identified, how well the model explains the record, the time, and the path of
+    the result.
     """
     identification = result["identification"]
-    kinds = {"parameters": "parameters", "groups": "sums of them that motion shows"}
+    kinds = {"parameters": "parameters", "groups": "sums of them that the motion depends on"}
     entries = {said: identification.get(kind, {}).values() for kind, said in kinds.items()}
     counts = [
         f"{sum(bool(one['identifiable']) for one in of)} of {len(of)} {said}"
@@ -290,14 +290,14 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
         typer.echo("the model explains the record to within the cameras' noise")
     elif goals:
         typer.echo(
-            "the model does NOT explain the record: it is wrong, or the cameras err by more than "
-            "they state"
+            "the model does NOT explain the record: the model is wrong, or the errors of the "
+            "cameras exceed their stated noise"
         )
     typer.echo(f"result: {path}")
 
 
 def print_goals(result: dict[str, Any], report: Path) -> None:
-    """Print the goals of a run with their values, which were missed, and where the report is."""
+    """Print the goals of a run with their values, the missed goals, and the path of the report."""
     table = goals_table(result)
     print_table(
         table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note

@@ -1,4 +1,4 @@
-"""Variation of the estimates over several runs, beside the paper's table 5.
+"""Variation of the estimates over several runs, compared with table 5 of the paper.
 
 It is given as a table, a figure and the entry of `variation.json`.
 """
@@ -12,15 +12,15 @@ from identify.reporting.tables import Table, number
 from identify.validation.variation import Variation
 
 GOAL_PERCENT = 5.0
-"""Largest variation that every identified parameter should have."""
+"""Goal for the largest variation of an identified parameter."""
 
 PAPER_WORST_PERCENT = 24.9
-"""Largest variation in the paper's table 5."""
+"""Largest variation in table 5 of the paper."""
 
 SMALLEST_PERCENT = 0.1
 """Left end of the figure's axis.
 
-The platform is weighed once for all runs, so that its mass hardly varies.
+The platform is weighed once for all runs, and its mass therefore hardly varies.
 """
 
 PAPER_PERCENT = {
@@ -43,13 +43,13 @@ PAPER_PERCENT = {
 }
 """Variation of the parameters of the paper's robot (table 5).
 
-It holds the rows that can be told apart, as our copy lacks a cell in the left column, of parameters
-that can be identified at all.
+Only parameters that can be identified are included. Rows that cannot be assigned are omitted,
+because our copy lacks a cell in the left column.
 """
 
 
 def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
-    """Return the entry of `variation.json`. ``trajectories`` says which runs it is of."""
+    """Return the entry of `variation.json`. ``trajectories`` names the kind of runs."""
     name, worst = found.worst
     return {
         "trajectories": trajectories,
@@ -58,7 +58,7 @@ def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
         "goal_percent": GOAL_PERCENT,
         "paper_worst_percent": PAPER_WORST_PERCENT,
         "parameters": {
-            # Also of parameters that are not identified in every run, which the table leaves out.
+            # The table omits parameters that are not identified in every run; this entry does not.
             parameter: {
                 "unit": found.layout.unit(parameter),
                 "mean": found.mean[k],
@@ -75,8 +75,8 @@ def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
 def variation_table(found: Variation) -> Table:
     """Return the table of the parameters that every run identifies.
 
-    It holds mean, variation, the variation that the intervals let expect, and the paper's
-    variation.
+    It has the mean, the variation, the variation expected from the intervals, and the variation in
+    the paper.
     """
     rows = tuple(
         (
@@ -94,15 +94,15 @@ def variation_table(found: Variation) -> Table:
         ("parameter", "unit", "mean", "variation [%]", "expected [%]", "paper [%]"),
         rows,
         "Variation: standard deviation over mean. Expected: from the standard deviations that the "
-        "runs state. Parameters that are identified in every run; the platform is weighed once for "
-        "all.",
+        "runs state. Only parameters that are identified in every run are listed. The platform is "
+        "weighed once for all runs.",
     )
 
 
 def variation_figure(found: Variation) -> Figure:
     """Draw the variation of each identified parameter.
 
-    Markers show the expected variation and the paper's. A line shows the goal.
+    Markers show the expected variation and the variation in the paper. A line shows the goal.
     """
     shown = np.flatnonzero(found.identified)
     figure = Figure(figsize=(9, 2.0 + 0.28 * len(shown)), layout="constrained")
@@ -118,7 +118,7 @@ def variation_figure(found: Variation) -> Figure:
         label="expected",
     )
     paper = [PAPER_PERCENT.get(found.names[k], np.nan) for k in shown]
-    axes.plot(paper, places, "x", color="tab:red", label="paper, its robot")
+    axes.plot(paper, places, "x", color="tab:red", label="robot of the paper")
     axes.axvline(
         GOAL_PERCENT, color="black", linestyle="--", linewidth=1, label=f"goal {GOAL_PERCENT:g} %"
     )

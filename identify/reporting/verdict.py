@@ -1,9 +1,8 @@
 """Verdict on a run in whole sentences.
 
-It says what is right, what is not, what may be the cause, and what cannot be known. The model is
-called wrong only where the cameras cannot be the cause. For that the truth must be known, and the
-cameras' errors must be no larger than the noise that they state, without dependence from frame to
-frame.
+It states what is right, what is not, the possible causes, and what cannot be known. The model is
+called wrong only if the cameras cannot be the cause. For this, the truth must be known, and the
+errors of the cameras must agree with their stated noise and be independent from frame to frame.
 """
 
 from dataclasses import dataclass
@@ -23,15 +22,15 @@ from identify.reporting.goals import check_goals, explanation_goals
 from identify.reporting.number_format import number, share
 
 CAMERAS_MISS = 1.5
-"""Limit of the mean squared error of the measured poses, in units of the stated covariance.
+"""Limit of the mean squared error of the measured poses, relative to the stated covariance.
 
-Beyond it, the cameras may be the cause.
+Beyond it, the cameras can be the cause.
 """
 
 
 @dataclass(frozen=True)
 class KeyNumber:
-    """Number of the first look, with its unit and its meaning."""
+    """Number of the summary, with its unit and its meaning."""
 
     value: str
     unit: str
@@ -52,16 +51,16 @@ class Verdict:
 
 
 def cameras_acquitted(record: xr.Dataset, truth: xr.Dataset | None) -> bool | None:
-    """Tell whether the cameras' errors are only the noise that they state.
+    """Tell whether the errors of the cameras are only the noise that they state.
 
-    None if no truth is known, or if the record is too short to judge.
+    None if the truth is not known, or if the record is too short to judge.
     """
     if truth is None:
         return None
     ok = record["measured_ok"].values.astype(bool)
     errors = true_poses(truth) - poses(record, "measured")
     roots = np.linalg.cholesky(record["measured_covariance"].values[ok])
-    # Whitened errors have unit covariance where the cameras state their noise correctly.
+    # Whitened errors have unit covariance if the cameras state their noise correctly.
     white = np.full_like(errors, np.nan)
     white[ok] = np.linalg.solve(roots, errors[ok][..., None])[..., 0]
     try:
@@ -74,8 +73,8 @@ def cameras_acquitted(record: xr.Dataset, truth: xr.Dataset | None) -> bool | No
 def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
     """Return the verdict on a result.
 
-    ``acquitted`` is true if the cameras cannot be the cause of the residuals, as
-    `cameras_acquitted` returns it.
+    ``acquitted`` is the result of `cameras_acquitted`: true if the cameras cannot be the cause of
+    the residuals.
     """
     every = check_goals(result)
     unseen = bool(result.get("validation"))
@@ -83,14 +82,14 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
     explained = all(goal.passed for goal in explanation_goals(result))
     sentences = [_residual_sentence(result, explained, acquitted)]
     if unseen:
-        # What weighs most stands first: a model that does not explain its record is no model.
+        # A model that does not explain its record is wrong, so that this is stated first.
         sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
     sentences += [
         f"Not met: {sentence(goal)}"
         for goal in missed
         if goal.name not in (goals.RESIDUALS, goals.CHANCE)
     ]
-    # Without unseen runs no truth is known, and only the residuals can be judged.
+    # Without validation runs, the truth is not known, and only the residuals can be judged.
     if not unseen:
         headline = EXPLAINED if explained else _blame(None, result)
         return Verdict(explained, headline, (*sentences, NO_TRUTH))
@@ -103,10 +102,10 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
 
 
 NO_TRUTH = (
-    "No truth is known of this record. So nobody can tell here how far the measured poses, the "
-    "estimates and the model's predictions are from the real robot: an error that the cameras "
-    "repeat in every frame, and an error of the model that the parameters take up, leave no trace "
-    "in the residuals."
+    "The truth is not known for this record. Hence the errors of the measured poses, the estimates "
+    "and the predictions cannot be determined here: an error of the cameras that is the same in "
+    "every frame, and an error of the model that the parameters compensate, leave no trace in the "
+    "residuals."
 )
 
 
@@ -115,11 +114,11 @@ def sentence(goal: goals.Goal) -> str:
     relation = "at most" if goal.relation == "<=" else "at least"
     limit = f"{relation} {number(goal.limit)} {goal.unit}".strip()
     value = f"{number(goal.value)} {goal.unit}".strip()
-    return f"{goal.name} {value} where {limit} is wanted ({goal.detail})."
+    return f"{goal.name} {value}, required {limit} ({goal.detail})."
 
 
 def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
-    """Return three numbers for the first look."""
+    """Return three numbers for the summary."""
     identification = result["identification"]
     parameters = identification["parameters"]
     validation = result.get("validation")
@@ -135,11 +134,11 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
         worst = KeyNumber(
             number(float(rows.max()), 2),
             "µm",
-            "from the true robot: the identified model, on motion that it never saw.",
+            "error of the identified model on validation trajectories, against the true robot.",
         )
         measured = max(rms_row(result["sensor"])[:3])
         seen = KeyNumber(
-            number(measured, 2), "µm", "from the true pose: one pose as the cameras measure it."
+            number(measured, 2), "µm", "error of one measured pose, against the true pose."
         )
         return [worst, seen, shown]
     before = max(rms_row(result.get("before"))[:3])
@@ -148,20 +147,20 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
         number(after, 2), "µm", "between the identified model and the measured poses of the record."
     )
     if np.isfinite(before):
-        meaning = "between the starting model and the same poses."
+        meaning = "between the initial model and the same poses."
         began = KeyNumber(number(before, 2), "µm", meaning)
     else:
-        began = KeyNumber("–", "", "The starting model is unstable.")
+        began = KeyNumber("–", "", "The initial model is unstable.")
     return [left, began, shown]
 
 
 def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
-    """Tell how far both models are from the true robot on unseen trajectories."""
+    """State the errors of both models against the true robot on validation trajectories."""
     runs = result["validation"]
     identified = np.array([rms_row(run.get("true")) for run in runs])
     started = np.array([rms_row(run.get("initial_true")) for run in runs])
     turns = bool((identified[:, 3:] != 0).any())
-    text = f"On {len(runs)} trajectories that it never saw, the identified model "
+    text = f"On {len(runs)} validation trajectories, the identified model "
     if np.isfinite(identified).all():
         text += (
             f"stays within {_distance(identified, turns)} of the true robot (RMS of the worst axis)"
@@ -171,19 +170,21 @@ def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
     if not all("initial_true" in run for run in runs):
         return f"{text}."
     if np.isfinite(started).all():
-        return f"{text}; the model that it started from misses by {_distance(started, turns)}."
-    return f"{text}; the model that it started from is unstable."
+        return f"{text}; the initial model is off by {_distance(started, turns)}."
+    return f"{text}; the initial model is unstable."
 
 
 def _distance(rows: Array, turns: bool) -> str:
-    """Format the largest of errors (n, 6) [µm, µrad], without the angles if none turns."""
+    """Format the largest of errors (n, 6) [µm, µrad], without angles if the platform does
+    not rotate.
+    """
     position = float(rows[:, :3].max())
     orientation = float(rows[:, 3:].max())
     return f"{number(position, 2)} µm" + (f" and {number(orientation, 2)} µrad" if turns else "")
 
 
 def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool | None) -> str:
-    """Tell whether the residuals are only noise and, where they are not, what may be the cause."""
+    """State whether the residuals are only noise and, if not, the possible cause."""
     found = {goal.name: goal for goal in explanation_goals(result)}
     if not found:
         return "How well the model explains the record was not tested."
@@ -192,49 +193,48 @@ def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool 
         size = number(found[goals.RESIDUALS].value, 3)
         limit = number(found[goals.RESIDUALS].limit, 3)
         parts.append(
-            f"its mean square is {size} times what they state, where noise alone makes up to "
+            f"their mean square is {size} times the stated noise, and noise alone gives up to "
             f"{limit}"
         )
     if goals.CHANCE in found:
         chance = share(found[goals.CHANCE].value / 100)
-        parts.append(f"noise alone would look as regular in {chance} of cases")
+        parts.append(f"noise alone would be as correlated in {chance} of cases")
     said = "; ".join(parts)
     if explained:
-        return f"What it leaves of the record is the cameras' noise: {said}."
+        return f"The residuals are the noise of the cameras: {said}."
     return (
-        f"What it leaves of the record is more than the cameras' noise: {said}. "
-        f"{_cause(acquitted, result)}"
+        f"The residuals are more than the noise of the cameras: {said}. {_cause(acquitted, result)}"
     )
 
 
 def _drift_warning(result: dict[str, Any]) -> str | None:
     """Return the warning of the run's drift watch.
 
-    None where the cameras still fitted their calibration, or nobody watched.
+    None if the calibration of the cameras was still valid, or if there was no drift watch.
     """
     return (result.get("drift_watch") or {}).get("warning")
 
 
 def _cause(acquitted: bool | None, result: dict[str, Any]) -> str:
-    # Cameras that have moved spoil the measurement, whatever the model is.
+    # If the cameras have moved, the measurement is wrong for any model.
     if warning := _drift_warning(result):
         return (
-            f"{warning[0].upper()}{warning[1:]}. Calibrate them again; whether the model is "
-            "right cannot be told."
+            f"{warning[0].upper()}{warning[1:]}. Calibrate them again; the record cannot tell "
+            "whether the model is right."
         )
     if acquitted:
         return (
-            "The cameras are not the cause, for they miss the truth only by the noise that they "
-            "state: the model's geometry, joints or friction are not those of the robot."
+            "The cameras are not the cause, because their errors agree with their stated noise: "
+            "the geometry, the joints or the friction of the model are not those of the robot."
         )
     if acquitted is None:
         return (
-            "The cause may be the model, or cameras with errors that they do not state; the "
-            "record alone cannot tell."
+            "The cause is the model, or cameras with errors beyond their stated noise; the record "
+            "alone cannot tell."
         )
     return (
-        "The cameras miss the truth by more than they state, or not by chance: they may be the "
-        "cause, or the model."
+        "The errors of the cameras are larger than they state, or not random: the cause can be the "
+        "cameras or the model."
     )
 
 
@@ -243,7 +243,7 @@ EXPLAINED = "The identified model explains the record to within the cameras' noi
 
 def _blame(acquitted: bool | None, result: dict[str, Any]) -> str:
     if _drift_warning(result):
-        return "Model and measurement disagree, and the cameras are not as they were calibrated."
+        return "Model and measurement disagree, and the cameras have lost their calibration."
     if acquitted:
-        return "The model is not that of the robot."
-    return "Model and measurement disagree, by an error of the model or of the cameras."
+        return "The model does not describe the robot."
+    return "Model and measurement disagree, because of an error of the model or of the cameras."

@@ -1,4 +1,4 @@
-"""Scenarios: settings of a synthetic experiment, read from TOML and checked as a whole."""
+"""Scenarios: settings of a synthetic experiment, read from TOML and checked for consistency."""
 
 from identify.scenario.plant_sections import Model, Plant
 from identify.scenario.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names

@@ -1,4 +1,4 @@
-"""Names of a robot's parameters, as a scenario may state them."""
+"""Names of a robot's parameters in a scenario."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -8,13 +8,13 @@ if TYPE_CHECKING:
 
 
 def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
-    """Check that names are those of parameters of a robot, given by name or path.
+    """Check that names are parameters of a robot, which is given by name or path.
 
-    Raises ValueError with the valid names for one that is not, and if there is no such robot.
+    Raises ValueError, with the valid names, for another name, and if there is no such robot.
     """
     if not known:
         return
-    # Late imports: dynamics loads CasADi, for which the command line's help must not wait.
+    # Late imports: dynamics loads CasADi, which the help of the command line does not need.
     from dynamics.errors import RobotFileError
     from dynamics.parameters import parameter_layout
     from dynamics.robot_file import read_robot_file

@@ -24,7 +24,10 @@ FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
     "smoothed": (("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),),
     "stribeck": (("static_ratio",), ("stribeck_velocity_rad_s", "stribeck_velocity_m_s")),
 }
-"""Constants that each friction law needs, each with its possible keys. A law takes no others."""
+"""Constants that each friction law needs, each with its possible keys.
+
+A law has no other constants.
+"""
 
 DriveName = Literal["pid", "pd", "pi", "cascade", "pid_filtered"]
 """Laws by which drives turn joint commands into torques, see `closed_loop.drives`.
@@ -35,11 +38,11 @@ They are the paper's PID, parts of it, a P-PI cascade, and a PID with a filtered
 FILTERED: DriveName = "pid_filtered"
 
 AUTO = "auto"
-"""Drive of a model whose law the record is to decide."""
+"""Drive of a model whose law is determined from the record."""
 
 
 def check_filter(drive: str, seconds: float | None) -> None:
-    """Check that the filtered drive has the time constant of its filter, and no other has.
+    """Check that only the filtered drive has a time constant of a filter.
 
     Raises ValueError otherwise.
     """
@@ -57,7 +60,7 @@ DRIVE_GAINS: dict[str, tuple[str, ...]] = {
     "cascade": ("lp", "li", "ld"),
     "pid_filtered": ("lp", "li", "ld"),
 }
-"""Gains that each law of the drives reads."""
+"""Gains that each law of the drives uses."""
 
 
 class Servo(Section):
@@ -71,20 +74,20 @@ class Servo(Section):
 class Control(Section):
     """Law by which `cmmsim track` makes the robot follow a motion.
 
-    All other runs have the law pid, except the excitation, which has a key of its own. The torque
-    limit holds in all runs, and the model includes it.
+    All other runs use the law pid, except the excitation, which has its own key. The torque limit
+    applies to all runs, and the model includes it.
     """
 
     law: str = Field("pid", description=f"control law: {', '.join(LAWS)}, or module:function")
     observer: bool = Field(
         True,
-        description="whether an observer predicts the pose for laws that know a model",
+        description="whether an observer predicts the pose for laws with a model",
     )
     torque_access: bool = Field(
         True, description="whether the drives take torques; otherwise only joint commands"
     )
     torque_limit_N_m: float | None = quantity(None, "N m", "largest torque of an actuator", gt=0)
-    torque_limit_N: float | None = quantity(None, "N", "the same, where actuators slide", gt=0)
+    torque_limit_N: float | None = quantity(None, "N", "the same for actuators that slide", gt=0)
     bandwidth_rad_s: float | None = quantity(
         None,
         "rad/s",
@@ -110,7 +113,7 @@ class _Friction(Section):
         None, "rad/s", "velocity v_s over which the law smoothed smooths the sign", gt=0
     )
     smoothing_velocity_m_s: float | None = quantity(
-        None, "m/s", "the same, where actuators slide", gt=0
+        None, "m/s", "the same for actuators that slide", gt=0
     )
     static_ratio: float | None = quantity(
         None, "1", "ratio of breakaway to Coulomb torque of the law stribeck", ge=1, le=1e3
@@ -119,7 +122,7 @@ class _Friction(Section):
         None, "rad/s", "velocity over which the breakaway torque falls to the Coulomb torque", gt=0
     )
     stribeck_velocity_m_s: float | None = quantity(
-        None, "m/s", "the same, where actuators slide", gt=0
+        None, "m/s", "the same for actuators that slide", gt=0
     )
 
     @model_validator(mode="after")
@@ -141,11 +144,11 @@ class _Friction(Section):
 
 
 class Plant(_Friction):
-    """Simulated real robot. Each way in which it may differ from the estimator's model is a switch.
+    """Simulated real robot. Each possible difference from the estimator's model is a setting.
 
     With the largest geometry error, all of 100 robots reach the whole box of +-10 mm and +-0.04
-    rad. With twice that error, one does not. With the largest stiffness, a run differs from that of
-    rigid joints by 0.03 um, and takes 1000 steps a frame.
+    rad. With twice that error, one does not. With the largest stiffness, a run differs from a run
+    with rigid joints by 0.03 um, and takes 1000 steps per frame.
     """
 
     parameters: str = Field(
@@ -195,15 +198,18 @@ class Plant(_Friction):
         le=1e6,
     )
     joint_stiffness_N_m: float | None = quantity(
-        None, "N/m", "the same, where actuators slide", gt=0, le=1e9
+        None, "N/m", "the same for actuators that slide", gt=0, le=1e9
     )
     joint_damping_N_m_s_rad: float = quantity(0.05, "N m s/rad", "damping of that spring", ge=0)
-    joint_damping_N_s_m: float = quantity(50.0, "N s/m", "the same, where actuators slide", ge=0)
+    joint_damping_N_s_m: float = quantity(50.0, "N s/m", "the same for actuators that slide", ge=0)
     motor_inertia_kg_m2: float = quantity(
         3e-4, "kg m2", "part of the driven body's inertia on the motor's side of that spring", gt=0
     )
     motor_mass_kg: float = quantity(
-        0.3, "kg", "part of the driven body's mass on the motor's side, where actuators slide", gt=0
+        0.3,
+        "kg",
+        "part of the driven body's mass on the motor's side, for actuators that slide",
+        gt=0,
     )
 
     @property
@@ -248,11 +254,14 @@ class Model(_Friction):
 
     @property
     def drive_law(self) -> DriveName:
-        """Law of the drives. Where the record is to decide, it is the paper's until then."""
+        """Law of the drives.
+
+        If it is determined from the record, it is the law of the paper until then.
+        """
         return "pid" if self.drive == "auto" else self.drive
 
     def with_drive(self, law: DriveName) -> "Model":
-        """Return a copy with an identified law of the drives, if the model leaves that open."""
+        """Return a copy with an identified law of the drives, if the model leaves the law open."""
         if self.drive != AUTO:
             return self
         filter_time = self.derivative_filter_s if law == FILTERED else None
@@ -260,7 +269,7 @@ class Model(_Friction):
 
     @property
     def drives_considered(self) -> tuple[DriveName, ...]:
-        """Laws of the drives that `auto` chooses from."""
+        """Laws of the drives from which `auto` selects."""
         return tuple(
             law for law in get_args(DriveName) if law != FILTERED or self.derivative_filter_s
         )

@@ -1,4 +1,4 @@
-"""Scenario: settings of a synthetic experiment, read from TOML and checked as a whole.
+"""Scenario: settings of a synthetic experiment, read from TOML and checked for consistency.
 
 Each field states its unit. An error names the key, the value and the unit and, for a wrong name,
 the valid names.
@@ -36,18 +36,18 @@ if TYPE_CHECKING:
 ESTIMATOR_SECTIONS = ("identification", "model", "filter")
 """Sections of a scenario that only the estimator reads.
 
-They may change after the record was made. All others may not.
+A user can change them after the record was made, but no other sections.
 """
 
 RECORDED = ("identification.scale_anchor", "identification.anchor_std")
-"""Settings of these sections that the record depends on.
+"""Settings in these sections on which the record depends.
 
-The record holds what its scale anchor measured.
+The record includes what its scale anchor measured.
 """
 
 
 class Scenario(Section):
-    """Whole synthetic experiment. `load_scenario` loads one."""
+    """Complete synthetic experiment. It is loaded by `load_scenario`."""
 
     name: Name = Field(description="short name, used for folders")
     description: str = ""
@@ -57,15 +57,15 @@ class Scenario(Section):
     sensor: str = Field(
         "ctrack780", description="built-in sensor, or path of a sensor file relative to this file"
     )
-    sensor_note: str = Field("", description="note of the sensor file about its figures")
+    sensor_note: str = Field("", description="note from the sensor file about its figures")
     sensor_changes: dict[str, Any] = Field(
         {}, description="entries that replace those of the sensor file"
     )
     renderer: str = Field(
         "auto",
-        description="renderer of the images; pyrender; analytic; auto, which is pyrender where "
-        "OpenGL works; module:function; or statistical, which draws errors of sticker centres "
-        "instead",
+        description="renderer of the images; pyrender; analytic; auto, which is pyrender if "
+        "OpenGL works; module:function; or statistical, which has no images and draws errors of "
+        "sticker centres",
     )
     pose_method: Literal["registration", "planes"] = "registration"
     rig: Rig = Rig()
@@ -77,7 +77,7 @@ class Scenario(Section):
     excitation: Excitation = Excitation()
     filter: Filter = Filter()
     identification: Identification = Identification()
-    # Made late, because its check is one of dynamics, which loads CasADi.
+    # Made late, because its check imports dynamics, which loads CasADi.
     payload: Payload = Field(default_factory=Payload)
     validation: Validation = Validation()
     geometry: Geometry = Geometry()
@@ -121,7 +121,7 @@ class Scenario(Section):
         return self
 
     def _complete_from_the_sensor(self) -> None:
-        """Fill in the timing and the note that the scenario leaves to its sensor."""
+        """Fill in the timing and the note that the scenario does not state from its sensor."""
         whole = (
             self.timing.model_fields_set.issuperset(IN_FILE)
             and "sensor_note" in self.model_fields_set
@@ -129,8 +129,8 @@ class Scenario(Section):
         if whole and not self.sensor_changes:
             return
         timing, note = completed(self.timing, self.sensor, self.sensor_changes)
-        # Past the frozen model, so that these values do not count as set: with another sensor they
-        # are taken from that one.
+        # Bypass the frozen model, so that these values do not count as set: with another sensor,
+        # they come from that sensor.
         self.__dict__["timing"] = timing
         if "sensor_note" not in self.model_fields_set:
             self.__dict__["sensor_note"] = note
@@ -168,7 +168,7 @@ class Scenario(Section):
 
     def _check_whole_frames(self, key: str, duration_s: float) -> None:
         frames = duration_s * self.timing.frame_rate_hz
-        # A product of decimal numbers may miss a whole number by rounding.
+        # Because of rounding, the product of decimal numbers may not be exactly whole.
         if abs(frames - round(frames)) > 1e-6 or round(frames) < 1:
             raise ValueError(
                 f"{key} = {duration_s:g} s is {frames:g} frames at {self.timing.frame_rate_hz:g} "
@@ -178,12 +178,12 @@ class Scenario(Section):
     def with_overrides(self, overrides: Mapping[str, Any]) -> "Scenario":
         """Return a copy with values replaced by dotted path.
 
-        An example is ``{"timing.frame_rate_hz": 30.0}``. None restores the default. A value that is
-        a path starts from the current folder, and the copy holds it absolute, as files do. What
-        this scenario took from its sensor is taken again from the sensor of the copy.
+        An example is ``{"timing.frame_rate_hz": 30.0}``. None restores the default. A path as a
+        value is relative to the current folder, and the copy has it as an absolute path, as for
+        files. Values that this scenario has from its sensor come from the sensor of the copy.
 
-        Raises ScenarioError if a dotted path does not exist (with the valid names) or a value does
-        not fit.
+        Raises ScenarioError if a dotted path does not exist (with the valid names) or a value is
+        not valid.
         """
         # Values that are not set are left out, so that another sensor can provide them.
         data = self.model_dump(exclude_none=True, exclude_unset=True)
@@ -192,10 +192,10 @@ class Scenario(Section):
         return SCENARIOS.from_dict(data, f"scenario {self.name!r}")
 
     def with_estimator_settings(self, overrides: Mapping[str, Any]) -> "Scenario":
-        """Return a record's scenario with other settings of the estimator, by dotted path.
+        """Return the scenario of a record with other settings of the estimator, by dotted path.
 
-        Raises ScenarioError if the record was made with a setting (with the sections allowed), or
-        as `with_overrides` does.
+        Raises ScenarioError if a setting is not one of the estimator (with the allowed sections),
+        and as `with_overrides` does.
         """
         for path in overrides:
             section, _, name = path.partition(".")
@@ -208,7 +208,7 @@ class Scenario(Section):
         return self.with_overrides(overrides) if overrides else self
 
     def estimator_settings(self) -> dict[str, Any]:
-        """Return all settings of the estimator by dotted path, without those that are not set."""
+        """Return all settings of the estimator by dotted path, except those that are not set."""
         return {
             f"{section}.{name}": value
             for section in ESTIMATOR_SECTIONS
@@ -216,7 +216,7 @@ class Scenario(Section):
         }
 
     def with_drive(self, law: DriveName) -> "Scenario":
-        """Return a copy with an identified law of the drives, if its model leaves that open."""
+        """Return a copy with an identified law of the drives, if its model leaves the law open."""
         return self.model_copy(update={"model": self.model.with_drive(law)})
 
     def sensor_file(self) -> "SensorFile":
@@ -224,7 +224,7 @@ class Scenario(Section):
         return self.timing.in_sensor_file(self.sensor, self.sensor_changes)
 
     def to_toml(self) -> str:
-        """Return TOML text with every default written out with its unit.
+        """Return TOML text with all values, including defaults, and their units.
 
         Reading it gives an equal scenario.
         """
@@ -258,9 +258,9 @@ def scenario_names() -> list[str]:
 
 
 def load_scenario(name_or_path: str | Path, **entries: Any) -> Scenario:
-    """Load a built-in scenario by name, or one from a TOML file.
+    """Load a built-in scenario by name, or a scenario from a TOML file.
 
-    Paths in a file start from the file's folder.
+    Paths in a file are relative to the folder of the file.
 
     Parameters
     ----------
@@ -272,12 +272,12 @@ def load_scenario(name_or_path: str | Path, **entries: Any) -> Scenario:
     Returns
     -------
     Scenario
-        Scenario, checked as a whole.
+        Scenario, checked for consistency.
 
     Raises
     ------
     ScenarioError
-        There is no such scenario or entry (with the valid names), or a value does not fit.
+        There is no such scenario or entry (with the valid names), or a value is not valid.
 
     Examples
     --------
@@ -298,23 +298,23 @@ def _dotted(entries: Mapping[str, Any], section: str = "") -> Iterator[tuple[str
 
 
 def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
-    """Read a scenario from TOML text, whose paths start from the current folder.
+    """Read a scenario from TOML text, whose paths are relative to the current folder.
 
-    ``source`` names it in error messages. Raises ScenarioError if the text is no TOML or does not
-    fit.
+    ``source`` names it in error messages. Raises ScenarioError if the text is not TOML or not a
+    valid scenario.
     """
     return SCENARIOS.from_toml(text, source)
 
 
 def scenario_schema() -> dict[str, Any]:
-    """Return the JSON schema of scenario files, which `built_in/scenario.schema.json` holds."""
+    """Return the JSON schema of scenario files. It is saved in `built_in/scenario.schema.json`."""
     return Scenario.model_json_schema()
 
 
 def numbers_by_name() -> Iterator[str]:
     """Yield the dotted keys whose values are tables of numbers by name.
 
-    Such names may have dots themselves.
+    These names can contain dots.
     """
     for section, field in Scenario.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
@@ -327,7 +327,7 @@ def numbers_by_name() -> Iterator[str]:
 
 
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:
-    # The keys of such a table may have dots, so that the path is split only up to the table.
+    # The keys of such a table can contain dots, so the path is split only up to the table.
     tables = ("sensor_changes", *numbers_by_name())
     table = next((one for one in tables if path.startswith(f"{one}.")), "")
     *sections, key = path.split(".", table.count(".") + 1 if table else -1)

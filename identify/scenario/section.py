@@ -1,4 +1,4 @@
-"""Base of all sections of a scenario: fields with units and limits, and keys of the actuators."""
+"""Base of all sections of a scenario: fields with units and limits, and keys for actuators."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ ACTUATOR_KEYS = {
     "torque_limit": ("torque_limit_N_m", "torque_limit_N"),
     "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
 }
-"""Keys of the settings of the joints, for actuators that turn and for those that slide."""
+"""Keys of the joint settings, for turning and for sliding actuators."""
 
 
 RANGES = {
@@ -52,18 +52,18 @@ RANGES = {
     "1/s": within(Gain),
     "1": within(Ratio),
 }
-"""Ranges of quantities by their unit."""
+"""Range of values for each unit."""
 
 
 def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
     """Return a field with a unit, whose values must be in the range of the unit.
 
-    ``limits`` are further ones, as pydantic names them, such as ge and lt. For a field that may be
-    negative, only these hold.
+    ``limits`` are additional limits in pydantic's form, such as ge and lt. For a field that can be
+    negative, only these limits apply.
     """
     field = Field(default, description=what, json_schema_extra={"unit": unit}, **limits)
     if unit in RANGES and not limits.get("ge", 0) < 0:
-        # As a validator in the field's metadata, the range adds to the limits of pydantic.
+        # As a validator in the field's metadata, the range is checked in addition to the limits.
         field.metadata.append(RANGES[unit])
     return field
 
@@ -71,7 +71,7 @@ def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
 class Section(BaseModel):
     """Base of all sections.
 
-    Sections are frozen. They have exact types, known keys and finite numbers only.
+    Sections are frozen. Types must match exactly, keys must be known, and numbers must be finite.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)

@@ -13,7 +13,9 @@ from identify.own_parts import CRITERIA, LAWS, check_choice
 from identify.scenario.section import Section, quantity
 
 ROUNDING = 1e-9
-"""Relative tolerance for the moments of a flat body, of which two sum to the third."""
+"""Relative tolerance for the moments of a flat body, whose largest moment is the sum of the
+others.
+"""
 
 
 def check_moments(moments: Mapping[str, float]) -> None:
@@ -21,12 +23,12 @@ def check_moments(moments: Mapping[str, float]) -> None:
 
     Raises ValueError if one exceeds the sum of the other two, which no distribution of mass has.
     """
-    # A late import: dynamics loads CasADi, for which the command line's help must not wait.
+    # A late import: dynamics loads CasADi, which the help of the command line does not need.
     from dynamics.inertia import moments_fault
 
     fault = moments_fault(moments, ROUNDING)
     if fault:
-        raise ValueError(f"{fault} kg m2, as in no rigid body")
+        raise ValueError(f"{fault} kg m2, which no rigid body can have")
 
 
 def check_load_std(name: str, std: float, load_name: str, load: float, unit: str) -> None:
@@ -36,8 +38,8 @@ def check_load_std(name: str, std: float, load_name: str, load: float, unit: str
     """
     if std > load:
         raise ValueError(
-            f"{name} = {std:g} {unit} exceeds {load_name} = {load:g} {unit}: a load that may be "
-            "none is not known"
+            f"{name} = {std:g} {unit} exceeds {load_name} = {load:g} {unit}: such a load is not "
+            "known"
         )
 
 
@@ -54,9 +56,9 @@ class Excitation(Section):
         0.04, "rad", "largest angle from home in each axis", gt=0, lt=1.5
     )
     travel_margin_rad: float = quantity(
-        0.10, "rad", "distance kept from the travel limit of the joints", ge=0
+        0.10, "rad", "smallest distance from the travel limit of the joints", ge=0
     )
-    travel_margin_m: float = quantity(0.01, "m", "the same, where actuators slide", ge=0)
+    travel_margin_m: float = quantity(0.01, "m", "the same for actuators that slide", ge=0)
     candidates: int = quantity(
         64,
         "1",
@@ -75,7 +77,7 @@ class Excitation(Section):
         "module:function",
     )
     max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a joint", gt=0)
-    max_joint_velocity_m_s: float = quantity(0.2, "m/s", "the same, where actuators slide", gt=0)
+    max_joint_velocity_m_s: float = quantity(0.2, "m/s", "the same for actuators that slide", gt=0)
     least_leverage: float = quantity(
         0.05, "1", "least leverage of an actuator on its leg (J_a1)", ge=0, lt=1
     )
@@ -85,7 +87,7 @@ class Excitation(Section):
     law: str = Field(
         "pid",
         description=f"control law of the run, which uses the initial model: {', '.join(LAWS)}, or "
-        "module:function; with any law but pid the model gets the logged commands",
+        "module:function; with any other law than pid, the model gets the logged commands",
     )
     generations: int = quantity(
         324,
@@ -97,7 +99,7 @@ class Excitation(Section):
 
     @property
     def singularity_limits(self) -> dict[str, float]:
-        """Least leverage and largest condition, as `dynamics.workspace.check_motion` takes them."""
+        """Smallest leverage and largest condition number, as arguments of `check_motion`."""
         return {"least_leverage": self.least_leverage, "most_condition": self.most_condition}
 
     @field_validator("criterion")
@@ -131,13 +133,13 @@ CAMERA_CHANGE = Within(-1e3, 1e3, "in the unit of the parameter")
 """Range of the error or the drift of one parameter of a camera."""
 
 RIG_KNOWN = ["exact", "calibrated", "photographs"]
-"""Ways in which a rig may be known, besides the path of a calibration's result."""
+"""Ways in which a rig can be known, besides the path of a calibration result."""
 
 
 class Rig(Section):
     """Estimator's knowledge of the cameras.
 
-    The cameras that take the images are those of the sensor's file.
+    The true cameras, which take the images, are described in the sensor file.
     """
 
     known: str = Field(
@@ -151,20 +153,20 @@ class Rig(Section):
     )
     errors: dict[str, float] = Field(
         {},
-        description="true minus known camera parameters, which no covariance includes; "
+        description="true minus known camera parameters; no covariance includes these errors; "
         '{ "left.cx_px" = 0.1 }, in px, m or rad',
     )
     right_later_s: float | None = quantity(
         None,
         "s",
-        "true delay of the right camera's exposure; drawn if left out",
+        "true delay of the right camera's exposure; drawn at random if not stated",
         ge=-0.1,
         le=0.1,
     )
     right_later_std_s: float = quantity(
         0.0,
         "s",
-        "standard deviation of the delay of the right camera, which is taken as zero",
+        "standard deviation of that delay, which the estimator assumes to be zero",
         ge=0,
         le=0.1,
     )
@@ -176,8 +178,8 @@ class Rig(Section):
     )
     watch: Literal["platform", "both", "none"] = Field(
         "platform",
-        description="stickers that the drift watch uses; both are those of platform and base, "
-        "which takes twice the time",
+        description="stickers that the drift watch uses; both means platform and base, and takes "
+        "twice the time",
     )
 
     @field_validator("errors", "drift")
@@ -192,12 +194,12 @@ class Rig(Section):
 
     @property
     def exact(self) -> bool:
-        """True if the estimator takes the rig, and what was taught with it, as exact."""
+        """True if the estimator takes the rig, and all frames taught with it, as exact."""
         return self.known == "exact" and self.right_later_std_s == 0.0
 
 
 GEOMETRY_KNOWN = ["exact", "calibrated"]
-"""Ways in which a geometry may be known, besides the path of a calibrated robot."""
+"""Ways in which a geometry can be known, besides the path of a calibrated robot."""
 
 
 class Identification(Section):
@@ -254,7 +256,7 @@ class Identification(Section):
         if self.anchor_std is not None and self.scale_anchor in ("payload", "prior"):
             hint = ""
             if self.scale_anchor == "payload":
-                hint = "; payload.mass_std_kg says how well its load is known"
+                hint = "; payload.mass_std_kg states how well its load is known"
             raise ValueError(
                 f"anchor_std = {self.anchor_std:g}: the anchor {self.scale_anchor} measures no "
                 f"parameter{hint}"
@@ -263,15 +265,15 @@ class Identification(Section):
 
 
 LOAD_UNITS = {"mass": "kg", "Ixx": "kg_m2", "Iyy": "kg_m2", "Izz": "kg_m2"}
-"""Figures of a load, with the units that end their keys."""
+"""Figures of a load, with the units at the end of their keys."""
 
 
 class Payload(Section):
-    """Known load that the platform carries in the second run, if the scale anchor is a payload.
+    """Known load of the platform in the second run, if the scale anchor is a payload.
 
-    A load that is a percent heavier than stated makes all parameters a percent too small, and no
-    residual shows it. The standard deviations say how well the load is known. Intervals allow for
-    them, and a synthetic experiment draws its true load from them.
+    If the load is one per cent heavier than stated, all parameters are one per cent too small, and
+    no residual shows this. The standard deviations state how well the load is known. They widen the
+    intervals, and a synthetic experiment draws its true load from them.
     """
 
     mass_kg: float = quantity(
@@ -312,7 +314,7 @@ class Payload(Section):
 
 
 class Validation(Section):
-    """Validation: unseen trajectories on which the identified model is judged."""
+    """Validation: trajectories, not used in the identification, on which the model is judged."""
 
     count: int = quantity(10, "1", "number of validation trajectories", ge=1, le=1000)
     duration_s: float = quantity(10.0, "s", "length of each validation trajectory", gt=0, le=3600)
@@ -321,7 +323,7 @@ class Validation(Section):
 class Geometry(Section):
     """Kinematic calibration by static poses (`cmmsim geometry`).
 
-    It also says what servo and estimator of a run know of the geometry.
+    It also states how well servo and estimator of a run know the geometry.
     """
 
     known: str = Field(
@@ -364,30 +366,30 @@ class Geometry(Section):
     encoder_noise_rad: float = quantity(
         1e-5, "rad", "standard deviation of one reading of an encoder", ge=0
     )
-    encoder_noise_m: float = quantity(1e-6, "m", "the same, where actuators slide", ge=0)
+    encoder_noise_m: float = quantity(1e-6, "m", "the same for actuators that slide", ge=0)
     encoder_resolution_rad: float = quantity(
         4.8e-5, "rad", "step of an encoder, here of 17 bits; 0 means no steps", ge=0
     )
-    encoder_resolution_m: float = quantity(1e-6, "m", "the same, where actuators slide", ge=0)
+    encoder_resolution_m: float = quantity(1e-6, "m", "the same for actuators that slide", ge=0)
     encoder_offset_rad: float = quantity(
         0.0, "rad", "standard deviation of the reading of an encoder at zero", ge=0, le=0.05
     )
-    encoder_offset_m: float = quantity(0.0, "m", "the same, where actuators slide", ge=0, le=0.01)
+    encoder_offset_m: float = quantity(0.0, "m", "the same for actuators that slide", ge=0, le=0.01)
     unseen: int = quantity(
         200,
         "1",
-        "number of poses that are not measured, on which the result is judged",
+        "number of validation poses, which are not measured, to judge the result",
         ge=1,
         le=100_000,
     )
 
     @model_validator(mode="after")
     def _stands_where_it_is_known(self) -> "Geometry":
-        # A calibration alone may leave the frames unknown; a run needs the robot's place.
+        # A calibration works with unknown frames; a run needs the position of the robot.
         if self.known == "calibrated" and self.frames == "unknown":
             raise ValueError(
-                "known = 'calibrated' with frames = 'unknown': the geometry would be known up to "
-                "where the robot stands, and a run needs frames = 'taught'"
+                "known = 'calibrated' with frames = 'unknown': the position of the robot would not "
+                "be known; a run needs frames = 'taught'"
             )
         return self
 

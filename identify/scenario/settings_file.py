@@ -20,7 +20,7 @@ Settings = TypeVar("Settings", bound=BaseModel)
 
 @dataclass(frozen=True)
 class SettingsFiles(Generic[Settings]):
-    """Files of one kind: built-in ones by name, and a user's own by path.
+    """Files of one kind: built-in files by name, and files of the user by path.
 
     Attributes
     ----------
@@ -31,10 +31,10 @@ class SettingsFiles(Generic[Settings]):
     model
         Model of the content.
     error
-        Exception that a refusal raises, with the reason in one line.
+        Exception for a file that is refused, with the reason in one line.
     files
-        Keys, dotted for those in tables, that name files of another kind, each with the names that
-        are built in. Such a path, or a list of paths, starts from the file that states it.
+        Keys whose values name files of another kind, each with the built-in names of that kind.
+        Keys in tables are dotted. Such paths are relative to the file that states them.
     """
 
     kind: str
@@ -48,10 +48,10 @@ class SettingsFiles(Generic[Settings]):
         return sorted(path.stem for path in self.folder.glob("*.toml"))
 
     def load(self, name_or_path: str | Path) -> Settings:
-        """Read a built-in file by name, or a user's own by path.
+        """Read a built-in file by name, or a file of the user by path.
 
-        Raises the error of this kind if there is neither such a name (with the names) nor such a
-        file, or if the file is no TOML or has wrong content.
+        Raises the error of this kind if there is neither such a name (with the valid names) nor
+        such a file, or if the file is not TOML or has wrong content.
         """
         text, path = self.text(name_or_path)
         built_in = path.parent == self.folder
@@ -59,15 +59,16 @@ class SettingsFiles(Generic[Settings]):
         return self.from_toml(text, source, path.parent)
 
     def text(self, name_or_path: str | Path) -> tuple[str, Path]:
-        """Return the text and the path of a built-in file by name, or of a user's own by path.
+        """Return the text and the path of a built-in file by name, or of a file of the user by
+        path.
 
-        Raises as `load`.
+        Raises the same errors as `load`.
         """
         name = str(name_or_path)
         built_in = self.names()
         path = self.folder / f"{name}.toml" if name in built_in else Path(name)
         if not is_file(path):
-            # The system refuses to look for names with a null character or of great length.
+            # The system raises errors for names with a null character and for long names.
             folder = "\0" not in name and len(name) < 200 and path.is_dir()
             reason = " nor a file" + ", but a folder" * folder
             raise self.error(
@@ -78,14 +79,15 @@ class SettingsFiles(Generic[Settings]):
     def from_toml(self, text: str, source: str, folder: Path = Path()) -> Settings:
         """Read settings from TOML text.
 
-        ``source`` names it in messages. Its paths start from ``folder``. Raises as `load`.
+        ``source`` names it in messages. Its paths are relative to ``folder``. Raises the same
+        errors as `load`.
         """
         return self.from_dict(parse_toml(text, source, self.error), source, folder)
 
     def from_dict(self, content: Mapping[str, Any], source: str, folder: Path = Path()) -> Settings:
         """Read settings from nested mappings.
 
-        An error names all wrong entries in one line. Raises as `load`.
+        An error names all wrong entries in one line. Raises the same errors as `load`.
         """
         try:
             return self.model.model_validate(self._placed(content, folder))
@@ -93,7 +95,7 @@ class SettingsFiles(Generic[Settings]):
             raise self.error(f"{source}: {one_line(error, self.model)}") from error
 
     def _placed(self, value: Any, folder: Path, key: str = "") -> Any:
-        """Return the value at a dotted key, with its paths made absolute from a folder."""
+        """Return the value at a dotted key, with its paths made absolute."""
         if isinstance(value, Mapping):
             return {
                 name: self._placed(one, folder, f"{key}.{name}".lstrip("."))
@@ -108,8 +110,8 @@ class SettingsFiles(Generic[Settings]):
 def file_path(name: str, folder: Path, built_in: Collection[str]) -> str:
     """Return the absolute path of a file that is named relative to a folder.
 
-    A built-in name is returned as it is. So is a name that is neither built in nor a file: the
-    reader of the file refuses it with the valid names.
+    A built-in name is returned unchanged. So is a name that is neither built in nor a file, because
+    the reader of the file then refuses it and lists the valid names.
     """
     path = folder / name
     if name in built_in or not (path.suffix == ".toml" or is_file(path)):
@@ -120,17 +122,17 @@ def file_path(name: str, folder: Path, built_in: Collection[str]) -> str:
 def to_toml(model: BaseModel) -> str:
     """Return the TOML text of a two-level pydantic model, with units as comments.
 
-    Plain values come first, and then a table for each section. Fields whose value is None have no
-    TOML form and are left out.
+    Plain values come first, and then a table for each section. Fields with the value None have no
+    TOML form and are omitted.
     """
     return _text(model, lambda owner, name: None if getattr(owner, name) is None else "")
 
 
 def starting_toml(model: BaseModel, only: Collection[str] | None = None) -> str:
-    """Return TOML text to start a file from.
+    """Return TOML text as a template for a file.
 
-    It is that of `to_toml`, but a value that is not stated is a comment, which shows the default or
-    no value. Only the given fields and sections are written, by default all.
+    It is the text of `to_toml`, but a value that is not stated is commented out, and shows the
+    default or no value. Only the given fields and sections are written, by default all of them.
     """
     return _text(model, lambda owner, name: "" if name in owner.model_fields_set else "# ", only)
 
@@ -142,7 +144,7 @@ def _text(
 ) -> str:
     """Return TOML text.
 
-    ``before`` returns what stands before the entry of a field, or None if the field has no entry.
+    ``before`` returns the prefix of a field's entry, or None if the field has no entry.
     """
 
     def entries(section: BaseModel) -> list[str]:
@@ -171,10 +173,10 @@ def _text(
 
 
 MOST_COMPLAINTS = 8
-"""Number of errors of one file that are listed. The rest is counted."""
+"""Number of errors of one file that are listed. Further errors are only counted."""
 
 DOTTED = (
-    "; a name with a dot stands in quotes, which a shell leaves inside of others: "
+    "; a name with a dot must be in double quotes, and in a shell within single quotes: "
     """'key={"a.b"=0.1}'"""
 )
 
@@ -182,7 +184,7 @@ DOTTED = (
 def one_line(error: ValidationError, model: type[BaseModel]) -> str:
     """Return all errors of a validation in one line.
 
-    Each has key, value and unit and, for a wrong name, the valid names.
+    Each error has its key, value and unit and, for a wrong name, the valid names.
     """
     found = error.errors()
     said = [_complaint(details, model) for details in found[:MOST_COMPLAINTS]]
@@ -199,7 +201,7 @@ def _entry(name: str, value: Any, field: FieldInfo) -> str:
 
 def _toml_value(value: Any) -> str:
     if isinstance(value, str):
-        # Strings of JSON are strings of TOML, but for the control character DEL.
+        # JSON strings are TOML strings, except for the control character DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(_toml_value(one) for one in value)}]"
@@ -225,7 +227,7 @@ def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{key} is missing"
     unit = f" [{u}]" if path and path[-1] in fields and (u := _unit(fields[path[-1]])) else ""
     message = details["msg"]
-    # A dotted name without quotes makes a table where a number should be.
+    # A dotted name without quotes is a table instead of a number.
     nested = isinstance(details["input"], dict) and details["type"] == "float_type"
     return (
         f"{key} = {shown(details['input'])}{unit}: "
@@ -236,11 +238,11 @@ def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
 def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
     """Return the model that has the field at the end of a path.
 
-    A part of the path may be the key of a mapping to models.
+    A part of the path can be the key of a mapping to models.
     """
     owner: Any = model
     for part in path[:-1]:
-        # The next part of the path is a key of the user's own, and names no field.
+        # The next part of the path is a key chosen by the user, and names no field.
         if get_origin(owner) is dict:
             owner = get_args(owner)[1]
         elif (

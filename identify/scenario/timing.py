@@ -1,8 +1,8 @@
-"""Timing of sensor, servo and model: when the sensor looks, and when its poses are used.
+"""Timing of sensor, servo and model: the times of exposures and of their commands.
 
-The sensor's file states it, in keys without units, and a scenario may replace single values. Only
-this module knows both spellings. It imports the sensor within functions, because the command line's
-help must not wait for that.
+The file of the sensor states it, with keys without units, and a scenario can replace single values.
+Only this module uses both kinds of keys. It imports the sensor within functions, because the help
+of the command line does not need it.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from cmmsim.files import Timing as SensorTiming
 
 LATENCY_STDS = 5.0
-"""Standard deviations by which the mean latency may exceed the stated one."""
+"""Number of standard deviations by which the mean latency can exceed the stated one."""
 
 IN_FILE = {
     "frame_rate_hz": "frame_rate",
@@ -29,14 +29,14 @@ IN_FILE = {
     "latency_jitter_s": "latency_jitter",
     "dropout": "dropout",
 }
-"""Keys of the sensor's file, by the keys of a scenario's ``[timing]``."""
+"""Keys in the file of the sensor, by the keys in ``[timing]`` of a scenario."""
 
 
 class Timing(Section):
     """Sampling of the pose sensor and of the visual servo.
 
-    All values except the hold are the sensor file's where a scenario does not state them. A
-    measured pose is that in the middle of its exposure, which is the time of its frame.
+    A value that a scenario does not state comes from the file of the sensor, except the hold. A
+    measured pose is the pose in the middle of its exposure, which is the time of its frame.
     """
 
     frame_rate_hz: float = quantity(
@@ -72,11 +72,11 @@ class Timing(Section):
         return np.arange(self.frames(duration_s), dtype=float) * self.frame_period_s
 
     def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array | None:
-        """Draw the latency of each frame (frames,) [s]; None where all have the mean."""
+        """Draw the latency of each frame (frames,) [s]. None if all are equal to the mean."""
         return self.of_sensor().drawn_latencies(frames, rng) if self.latency_jitter_s else None
 
     def of_sensor(self) -> "SensorTiming":
-        """Return the same values as a sensor's file holds them.
+        """Return the same values in the form of a sensor file.
 
         Raises ValueError if they contradict each other.
         """
@@ -88,7 +88,9 @@ class Timing(Section):
             raise ValueError(f"timing: {error.errors()[0]['ctx']['error']}") from error
 
     def in_sensor_file(self, sensor: str, changes: Mapping[str, Any]) -> "SensorFile":
-        """Return a sensor's file, by name or path, with changes by dotted key and this timing."""
+        """Return a sensor file, given by name or path, with changes by dotted key and with
+        this timing.
+        """
         from cmmsim.files import read_sensor_file
 
         file = read_sensor_file(sensor, changes)
@@ -97,11 +99,11 @@ class Timing(Section):
     def check(self) -> None:
         """Check that the values agree, and that the closed loop can delay commands by the latency.
 
-        Raises ValueError otherwise, with the longest possible latency.
+        Otherwise, raises ValueError with the longest possible latency.
         """
         from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 
-        # The true mean may be longer than the stated one by what is not known of it.
+        # The true mean can be longer than the stated one, within its uncertainty.
         longest = self.of_sensor().largest_latency + LATENCY_STDS * self.latency_std_s
         if longest * self.frame_rate_hz > MAX_DELAY_FRAMES:
             raise ValueError(
@@ -115,13 +117,12 @@ class Timing(Section):
 def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[Timing, str]:
     """Return a timing completed from a sensor, and the note of the sensor's file.
 
-    What comes from the sensor does not count as set, so that with another sensor it is taken from
-    that one.
+    Values from the sensor do not count as set. With another sensor, they come from that sensor.
 
     Parameters
     ----------
     stated
-        Timing that the scenario states. The rest is taken from the sensor.
+        Timing that the scenario states. The other values come from the sensor.
     sensor
         Name of a built-in sensor, or path of a sensor's file.
     changes
@@ -133,7 +134,7 @@ def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[
         A change has no effect, because the scenario itself states another value, or the timing is
         not valid.
     cmmsim.CmmError
-        There is no such sensor, or its file is bad.
+        There is no such sensor, or its file is not valid.
     """
     from cmmsim.files import read_sensor_file
 
@@ -162,9 +163,9 @@ def sensor_names() -> list[str]:
 
 
 def by_dotted_key(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a scenario's ``[sensor_changes]`` by dotted key of the sensor's file.
+    """Return the ``[sensor_changes]`` of a scenario by dotted key of the sensor file.
 
-    They may be tables within tables.
+    In the scenario, they can be nested tables.
     """
     from cmmsim.files import dotted
 

@@ -354,7 +354,7 @@ REFUSED = {
         (
             simulate_batch,
             {"parameters": np.zeros((0, 67))},
-            "0 parameter vectors and 1 references must have the same number",
+            "got 0 parameter vectors and 1 references; each number must be 1",
         ),
         (
             simulate_batch,

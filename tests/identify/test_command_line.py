@@ -141,7 +141,7 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
     assert f"{missed} deviations, joint1.viscous\n" in shown
     assert all(
         text in shown
-        for text in ("unseen motion, position", "µrad", "stereo frames", str(run_folder.report))
+        for text in ("validation motion, position", "µrad", "stereo frames", str(run_folder.report))
     )
 
 

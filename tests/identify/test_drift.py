@@ -58,7 +58,7 @@ def test_a_drift_that_no_run_can_have_is_refused_before_anything_is_taught(drift
         Setup(scenario).sensor_plan.make(rss6(), 0)
     with pytest.raises(ScenarioError, match=r"rig\.watch"):
         quick(**{"rig.watch": "everything"})
-    with pytest.raises(ScenarioError, match="a name with a dot stands in quotes"):
+    with pytest.raises(ScenarioError, match="a name with a dot must be in double quotes"):
         quick(**{DRIFT_KEY: {"right": {"cx_px": 0.1}}})
 
 

@@ -218,7 +218,9 @@ def test_what_is_no_calibration_of_this_robot_is_refused_in_one_line(tmp_path):
     )
     assert "rrr3 has other legs than delta3" in said(robot="delta3")
     adrift = {"geometry.known": "calibrated", "geometry.frames": "unknown"}
-    assert "up to where the robot stands" in refusal(ScenarioError, scenario.with_overrides, adrift)
+    assert "the position of the robot would not be known" in refusal(
+        ScenarioError, scenario.with_overrides, adrift
+    )
     assert "is for a run with a folder" in said(**{"geometry.known": "calibrated"})
     far = written(tmp_path / "far", replace(known, robot=known.robot.moved(1500 * np.abs(errors))))
     assert "off that of rrr3, limit 0.02" in said(**{"geometry.known": str(far)})

@@ -162,7 +162,7 @@ def test_planes_and_commands_identify_too(tmp_path, capfd):
     position, orientation = worst(result, "true")
     assert position <= 5
     assert orientation <= 25
-    assert [name for name in missed(result) if not name.startswith("unseen")] == []
+    assert [name for name in missed(result) if not name.startswith("validation")] == []
     assert result["identification"]["iterations"] > 0
     assert result["identification"]["noise_ratio"] == pytest.approx(1.0, abs=0.15)
 

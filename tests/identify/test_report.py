@@ -160,7 +160,7 @@ def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finish
     shown = (
         "joint1.coulomb, joint_pid.lp",
         "+0.9877",
-        "shows 36 of them better",
+        "determines 36 of them better",
         "platform_mass",
         "diverged",
         paper.DOI,
@@ -175,7 +175,7 @@ def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finish
     result["sensor"]["lost_frames"] = 2
     result["identification"]["stop_reason"] = "<b>cost & step</b>"
     text = page_of(replace(data, result=result))
-    assert "Not met: lost frames 2 where at most 0 is wanted" in text
+    assert "Not met: lost frames 2, required at most 0" in text
     assert "7 of 8 goals are met" in text
     assert "&lt;b&gt;cost &amp; step&lt;/b&gt;" in text
 
@@ -373,7 +373,7 @@ def test_a_record_without_truth_has_a_report_that_says_what_nobody_can_tell(run_
     """Beside the models' errors against the measurement; no column and no figure of a truth."""
     data = read_run(without_truth(run_folder))
     text = page_of(data)
-    assert "No truth is known of this record" in text
+    assert "The truth is not known for this record" in text
     assert "2 of 2 goals are met" in text
     assert "<th" in text
     assert ">truth<" not in text
@@ -399,10 +399,10 @@ def test_a_scene_whose_robot_is_gone_is_not_drawn_and_the_page_says_why(finished
 def test_a_model_is_called_wrong_only_where_the_cameras_cannot_be_the_cause(result):
     assert verdict(result, True).headline == "The identified model moves as the true robot does."
     result["identification"]["whiteness"]["p_value"] = 1e-9
-    assert verdict(result, True).headline == "The model is not that of the robot."
+    assert verdict(result, True).headline == "The model does not describe the robot."
     for unknown in (None, False):
         assert verdict(result, unknown).headline == (
-            "Model and measurement disagree, by an error of the model or of the cameras."
+            "Model and measurement disagree, because of an error of the model or of the cameras."
         )
     assert "less than 10⁻⁶ %" in verdict(result, None).sentences[0]
     for name in ("sensor", "validation"):
@@ -532,7 +532,7 @@ def test_result_file_is_standard_json_with_null_for_what_is_not_finite_and_a_dam
 def test_good_result_meets_every_goal_and_one_without_validation_those_that_can_be_judged(result):
     assert len(goals(result)) == 8
     assert all(goal.passed for goal in goals(result).values())
-    assert goals(result)["unseen motion, position"].value == pytest.approx(1.8)
+    assert goals(result)["validation motion, position"].value == pytest.approx(1.8)
     assert goals(result)["cameras, orientation"].value == 50.0
     assert goals(result)["residuals of the model"].limit == pytest.approx(
         1.1 + 3.0902 * 0.04, abs=1e-5
@@ -545,15 +545,15 @@ def test_good_result_meets_every_goal_and_one_without_validation_those_that_can_
     [
         (
             lambda r: r["validation"][1]["true"].update(position_rms_um=[1, 2.1, 1]),
-            "unseen motion, position",
+            "validation motion, position",
         ),
         (
             lambda r: r["validation"][1]["true"].update(orientation_rms_urad=[1, 1, 10.1]),
-            "unseen motion, orientation",
+            "validation motion, orientation",
         ),
         (
             lambda r: r["validation"][0]["true"].update(position_rms_um=[None, 1, 1]),
-            "unseen motion, position",
+            "validation motion, position",
         ),
         (lambda r: r["sensor"].update(position_rms_um=[20.1, 1, 1]), "cameras, position"),
         (lambda r: r["sensor"].update(orientation_rms_urad=[1, 100.1, 1]), "cameras, orientation"),
@@ -632,7 +632,7 @@ def test_tables_show_our_numbers_beside_the_papers_and_none_of_a_parameter_that_
         "position_rms_um": [None] * 3,
         "orientation_rms_urad": [None] * 3,
     }
-    assert tables.validation_table(result).rows[2] == ("1: starting, true", *["diverged"] * 6)
+    assert tables.validation_table(result).rows[2] == ("1: initial, true", *["diverged"] * 6)
     lines = tables.goals_table(result).markdown().splitlines()
     assert {line.count("|") for line in lines} == {6}, "a cell for each column"
     assert tables.goals_table(result).words == (True, False, False, True, True)

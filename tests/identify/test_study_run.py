@@ -295,7 +295,7 @@ def test_one_warning_names_each_other_version_once_with_how_many_workers_have_it
     with pytest.warns(OtherVersionsWarning) as caught:
         check_workers(there)
     assert [str(one.message) for one in caught] == [
-        "figures may differ a little where versions do: numpy 1.2.3 (worker tcp://a:1 and 2 "
+        "figures may differ slightly between versions of packages: numpy 1.2.3 (worker tcp://a:1 and 2 "
         "more), here "
         f"{here['numpy']}; casadi 3.0 (worker tcp://d:1), here {here['casadi']}"
     ]

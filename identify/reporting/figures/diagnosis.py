@@ -1,4 +1,4 @@
-"""Figure of a diagnosis: what of the misfit is explained, cause by cause."""
+"""Figure of a diagnosis: the share of the misfit that each cause explains."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ SHOWN = 10
 def diagnosis_figure(entry: dict[str, Any]) -> Figure:
     """Draw an entry of a diagnosis.
 
-    The left panel has the share of the misfit that each candidate alone explains. The right panel
-    has the misfit that is left as one finding after the other is fitted.
+    The left panel shows the share of the misfit that each candidate alone explains. The right panel
+    shows the remaining misfit, as one finding after the other is fitted.
     """
     shown = entry["candidates"][:SHOWN]
     figure = Figure(figsize=(WIDTH, 0.9 + 0.2 * max(len(shown), 4)), layout="constrained")

@@ -19,7 +19,7 @@ from identify.reporting.goals import PARAMETER_FRACTION, is_friction_or_pid
 class RelativeErrors(NamedTuple):
     """Relative errors (n,) of parameters with their names, in per cent of the truth.
 
-    ``below`` and ``above`` are the reach of the 95 % interval below and above the estimate.
+    ``below`` and ``above`` are the distances from the estimate to the ends of the 95 % interval.
     """
 
     names: list[str]
@@ -31,8 +31,8 @@ class RelativeErrors(NamedTuple):
 def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
     """Return the relative errors of the identifiable parameters of a result.
 
-    The reach is zero where there is no interval. Where the truth is not known, the values are in
-    per cent of the estimate, whose error then counts as zero.
+    The distances are zero if there is no interval. If the truth is not known, values are in per
+    cent of the estimate, and the error is zero.
     """
     shown = {
         n: p
@@ -54,7 +54,7 @@ def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
 
 
 def _size(parameter: dict[str, Any]) -> float | None:
-    """Return the truth or, where that is not known, the estimate."""
+    """Return the truth or, if it is not known, the estimate."""
     true: float | None = parameter["true"]
     return parameter["estimate"] if true is None else true
 
@@ -68,7 +68,7 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
     others = {name: p for name, p in parameters.items() if name not in judged}
     groups = {"friction and joint controller": judged, "masses and inertias": others}
     shown = {title: relative_errors(group) for title, group in groups.items()}
-    # Inches: a frame, and a row for each parameter of the larger panel.
+    # Height in inches: margins, and a row for each parameter of the larger panel.
     height = max(2.2, 0.9 + 0.19 * max(len(found.names) for found in shown.values()))
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     label = "estimate − truth [% of the truth]"
@@ -104,10 +104,10 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
 def group_figure(
     groups: Mapping[str, dict[str, Any]], parameters: Mapping[str, dict[str, Any]]
 ) -> Figure:
-    """Draw which parameters enter which base parameter, and with which share.
+    """Draw the parameters of each base parameter, with their shares.
 
     A row is a base parameter that combines several parameters, and a column is a parameter. The
-    area of a dot is the share of coefficient times starting value. It is open where that is
+    area of a dot is the share of coefficient times initial guess. The dot is open if this is
     subtracted. A star marks an identified base parameter.
     """
     sums = {name: group for name, group in groups.items() if len(group["coefficients"]) > 1}
@@ -121,10 +121,10 @@ def group_figure(
             for n, weight in group["coefficients"].items()
         }
         whole = sum(abs(part) for part in parts.values()) or 1.0
-        # The share keeps the sign, which the dot shows as filled or open.
+        # The share is signed; the dot is filled or open accordingly.
         for name, part in parts.items():
             shares[row, columns.index(name)] = part / whole
-    # Parameters that start at zero have no share in any sum.
+    # Parameters with an initial guess of zero have no share in any sum.
     used = [k for k in range(len(columns)) if shares[:, k].any()]
     labels = [
         f"{name.removesuffix(' +')} + …{' *' if group['identifiable'] else ''}"
@@ -134,7 +134,7 @@ def group_figure(
     axes = figure.subplots()
     if not labels:
         axes.set_axis_off()
-        axes.set_title("Every parameter that motion shows is shown by itself: there are no sums")
+        axes.set_title("The motion shows each of its parameters separately: there are no sums")
         return figure
     dot_matrix(axes, shares[:, used], labels, [columns[k] for k in used])
     _key(axes, (1.0, 0.25, 0.05), "share of the sum", "subtracted")
@@ -144,8 +144,8 @@ def group_figure(
 def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
     """Draw the correlations (n, n) of the estimates.
 
-    The area of a dot is the size of a correlation. It is open where the correlation is negative.
-    One line of text says so where nothing is identified.
+    The area of a dot is the size of a correlation. The dot is open if the correlation is negative.
+    If nothing is identified, the figure has a line of text instead.
     """
     side = min(WIDTH, max(3.0, 1.4 + 0.2 * len(names)))
     figure = Figure(figsize=(side + 0.3, side), layout="constrained")
@@ -154,7 +154,7 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
         axes.set_axis_off()
         axes.set_title("No parameter is identified: no correlations")
         return figure
-    # The matrix is symmetric with ones on the diagonal: its lower triangle says all.
+    # The matrix is symmetric with ones on the diagonal: its lower triangle is sufficient.
     dot_matrix(axes, np.tril(correlations, -1), names, names)
     _key(axes, (1.0, 0.5, 0.1), "correlation", "negative")
     return figure
@@ -163,7 +163,7 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
 def dot_matrix(axes: Axes, values: Array, rows: Sequence[str], columns: Sequence[str]) -> None:
     """Draw values (rows, columns) from -1 to 1 as dots.
 
-    The area of a dot is the size of its value. It is open where the value is negative.
+    The area of a dot is the size of its value. The dot is open if the value is negative.
     """
     axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=6.5)
     axes.set_yticks(range(len(rows)), rows, fontsize=6.5)
@@ -176,10 +176,10 @@ def dot_matrix(axes: Axes, values: Array, rows: Sequence[str], columns: Sequence
 
 
 SMALLEST = 0.004
-"""Size of a value whose dot could not be seen."""
+"""Size of a value below which its dot would not be visible."""
 
 LARGEST = 58.0
-"""Area of the dot of a value of one, in square points."""
+"""Area of the dot for a value of one, in square points."""
 
 
 def _dots(sizes: Array | float, sign: float) -> dict[str, Any]:
@@ -193,7 +193,7 @@ def _dots(sizes: Array | float, sign: float) -> dict[str, Any]:
 
 
 def _key(axes: Axes, sizes: Sequence[float], of: str, negative: str) -> None:
-    """Draw the meaning of the dots above the panel."""
+    """Draw a legend of the dots above the panel."""
     # Empty plots put entries into the legend without drawing anything.
     for size in sizes:
         axes.scatter([], [], label=f"{size:g}", **_dots(size, 1.0))

@@ -1,6 +1,6 @@
 """Figures that show how well models follow the robot.
 
-They show it component by component over a run, in one look, and run by run.
+They show each component over a run, a summary of a run, and all validation runs.
 """
 
 from collections.abc import Sequence
@@ -33,16 +33,19 @@ from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
 from identify.reporting.number_format import number
 
 BAND = 2.0
-"""Predicted standard deviations around an error of zero. They hold 95 % of the true errors."""
+"""Half width of the predicted band around an error of zero, in standard deviations.
+
+It contains 95 % of the true errors.
+"""
 
 BAND_NAME = f"predicted ± {BAND:g} standard deviations"
 
 MARKS = 40
-"""Number of measured poses that are drawn. The errors beneath are those of every frame."""
+"""Number of measured poses that are drawn. The errors below them are drawn for every frame."""
 
 
 class Curve(NamedTuple):
-    """Values (N,) over time in the unit of their panel, and the style of their line."""
+    """Values (N,) over time in the unit of their panel, with the style of their line."""
 
     name: str
     values: Array
@@ -66,10 +69,10 @@ TRUE: dict[str, Any] = {"color": RED, "linestyle": "-", "linewidth": 1.4}
 class Fit:
     """Measured and modelled poses (N, 6) [m, rad] of a run over its time (N,) [s].
 
-    They are NaN where a measurement was lost or a model has diverged. ``initial`` are the poses of
-    the starting model. ``std`` (N, 6) is the predicted standard deviation of the truth from the
-    identified model. ``noise`` (6,) is the standard deviation of one measured pose, as the sensor
-    states it.
+    They are NaN if a measurement was lost or a model has diverged. ``initial`` are the poses of the
+    initial model. ``std`` (N, 6) is the predicted standard deviation of the truth from the
+    identified model. ``noise`` (6,) is the standard deviation of one measured pose according to the
+    sensor.
     """
 
     time: Array
@@ -88,13 +91,13 @@ class Fit:
             ("identified model", self.identified, IDENTIFIED),
         ]
         if self.initial is not None:
-            curves.insert(1, ("starting model", self.initial, STARTING))
+            curves.insert(1, ("initial model", self.initial, STARTING))
         return [Curve(name, 1e3 * poses[:, i], drawn) for name, poses, drawn in curves]
 
     def error_curves(self, i: int) -> list[Curve]:
         """Return the errors of the identified model in component i, in µm or µrad.
 
-        They are taken against the measurement and, where it is known, against the truth.
+        They are relative to the measurement and, if it is known, also to the truth.
         """
         curves = [
             Curve("measured − identified", 1e6 * (self.measured - self.identified)[:, i], NOISE)
@@ -106,14 +109,14 @@ class Fit:
         return curves
 
     def pose_range(self, i: int) -> tuple[float, float]:
-        """Return the range of the measurement, widened for the models.
+        """Return the range of the measurement, extended to show the models.
 
-        It is widened by half at most on either side, so that an unstable model does not hide the
-        rest.
+        The extension is limited to half of the range on either side, because an unstable model
+        would otherwise hide everything else.
         """
         curves = [curve.values for curve in self.pose_curves(i)]
         measured, *models = [values[np.isfinite(values)] for values in curves]
-        # A component that stands still has no range: one unit is shown around it.
+        # A component that does not move has no range: show one unit around it.
         low = measured.min()
         high = measured.max()
         reach = (high - low) / 2 or 1.0
@@ -135,8 +138,8 @@ class Fit:
     def distances(self, first: int) -> list[Curve]:
         """Return the lengths of the errors in position (first = 0) [µm] or orientation (3) [µrad].
 
-        The errors are those of both models and of the measurement against the truth. Where that is
-        not known, they are those of the models against the measurement.
+        They are the errors of both models and of the measurement against the truth. If the truth is
+        not known, they are the errors of the models against the measurement.
         """
         if self.truth is None:
             goal = self.measured
@@ -145,11 +148,11 @@ class Fit:
             goal = self.truth
             whose = ""
         poses: dict[str, tuple[Array | None, dict[str, Any]]] = {
-            f"starting model{whose}": (self.initial, STARTING),
+            f"initial model{whose}": (self.initial, STARTING),
             f"identified model{whose}": (self.identified, IDENTIFIED),
         }
         if self.truth is not None:
-            poses = {"what the cameras measure": (self.measured, NOISE)} | poses
+            poses = {"measured poses": (self.measured, NOISE)} | poses
         return [
             Curve(name, 1e6 * np.linalg.norm((model - goal)[:, first : first + 3], axis=1), drawn)
             for name, (model, drawn) in poses.items()
@@ -158,7 +161,7 @@ class Fit:
 
 
 def fit_figure(fit: Fit) -> Figure:
-    """Draw the measured poses and both models, with the errors beneath each component.
+    """Draw the measured poses and both models, with the errors below each component.
 
     It corresponds to figures 12 and 13 of the paper.
     """
@@ -191,10 +194,10 @@ def fit_figure(fit: Fit) -> Figure:
 
 
 def error_figure(fit: Fit) -> Figure:
-    """Draw the errors of both models over a run, in one look.
+    """Draw a summary of the errors of both models over a run.
 
-    Where the truth is known, the errors are taken against it, beside those of the measurement.
-    Otherwise they are taken against the measurement, beside the noise that the cameras state.
+    If the truth is known, the errors of models and measurement are relative to it. Otherwise, the
+    errors of the models are relative to the measurement, and the noise of the cameras is shown.
     """
     parts = [
         first for first in (0, 3) if any(first <= i < first + 3 for i in moving(fit.identified))
@@ -206,14 +209,14 @@ def error_figure(fit: Fit) -> Figure:
     for axes, first in zip(panels, parts, strict=True):
         _draw(axes, fit.time, fit.distances(first))
         if fit.truth is None and fit.noise is not None:
-            # The curves are lengths of error vectors, and so is this level.
+            # The curves are lengths of error vectors; this level is the length of the noise.
             level = 1e6 * float(np.linalg.norm(fit.noise[first : first + 3]))
             axes.axhline(level, color=GREY, linestyle=":", label="noise of one measured pose")
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(numticks=12))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.set_ylabel("position [µm]" if first == 0 else "orientation [µrad]")
-        # An error that passes through zero would stretch the logarithmic axis without end.
+        # An error near zero would stretch the logarithmic axis without limit.
         values = np.concatenate(
             [curve.values[np.isfinite(curve.values)] for curve in fit.distances(first)[-2:]]
         )
@@ -248,9 +251,9 @@ HATCHES = ("", "////", "xxxx")
 
 
 def validation_figure(validation: list[dict[str, Any]]) -> Figure:
-    """Draw the RMS of the identified model on each unseen trajectory.
+    """Draw the RMS of the identified model on each validation trajectory.
 
-    It is taken against truth and measurement, and stands beside the prediction and the goals.
+    It is drawn against truth and measurement, together with the prediction and the goals.
     """
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
@@ -260,7 +263,7 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
             true = [rms_row(run["true"])[i] for run in validation]
             measured = [rms_row(run["measured"])[i] for run in validation]
             predicted = [predicted_row(run)[i] for run in validation]
-            # Three bars a run, side by side: x, y, z or α, β, γ.
+            # Three bars per run, side by side: x, y, z or α, β, γ.
             places = runs + 0.25 * (i - first - 1)
             look = {
                 "edgecolor": LINES[i]["color"],
@@ -274,7 +277,7 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
                 label=f"{COMPONENTS[i]}, against the truth",
                 **look,
             )
-            # Marks of all three components look alike, so that one entry in the legend is enough.
+            # Marks of all three components look the same, and need only one entry in the legend.
             said = i == first
             axes.plot(
                 places,
@@ -302,6 +305,6 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
         axes.set_ylabel(f"RMS of {'position' if first == 0 else 'orientation'} [{UNITS[first]}]")
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
         axes.grid(visible=False, axis="x")
-    panels[1].set_xlabel("unseen trajectory")
+    panels[1].set_xlabel("validation trajectory")
     panels[1].set_xticks(runs)
     return figure

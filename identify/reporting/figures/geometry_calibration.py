@@ -10,15 +10,15 @@ from matplotlib.figure import Figure
 from identify.reporting.figures.style import BLUE, GREY, RED, WIDTH
 
 ROOM = 20.0
-"""Factor by which an axis ends above its curves, to leave room for the legend."""
+"""Ratio of the upper end of an axis to its highest curve. The space is for the legend."""
 
 
 def geometry_figure(entry: Mapping[str, Any]) -> Figure:
     """Draw the content of a geometry.json.
 
-    One panel shows the standard deviation of each geometric parameter and, where the truth is
-    known, its error. Where it was computed, a second panel shows the expected error of poses that
-    were not measured against the number of measured ones, random and chosen.
+    One panel shows the standard deviation of each geometric parameter and, if the truth is known,
+    its error. If it was computed, a second panel shows the expected error at validation poses
+    against the number of measured poses, both for random and for chosen poses.
     """
     several = "random_poses" in entry
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
@@ -32,17 +32,20 @@ def geometry_figure(entry: Mapping[str, Any]) -> Figure:
 
 
 def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
-    """Draw standard deviations and errors over the tolerance: a column a kind, a point a leg."""
+    """Draw standard deviations and errors, relative to the tolerance.
+
+    There is one column per kind of parameter, and one point per leg.
+    """
     kinds = list(dict.fromkeys(name.partition(".")[2] for name in parameters))
     legs = list(dict.fromkeys(name.partition(".")[0] for name in parameters))
-    # The points of a column are spread over 0.6 of its width, one place a leg.
+    # The points of the legs are spread over 0.6 of the width of a column.
     at = [
         kinds.index(name.partition(".")[2])
         + 0.6 * (legs.index(name.partition(".")[0]) / len(legs) - 0.4)
         for name in parameters
     ]
     rows = parameters.values()
-    # An estimate that equals the truth has no place on a logarithmic axis.
+    # An error of zero cannot be drawn on a logarithmic axis.
     missed = [
         (x, p)
         for x, p in zip(at, rows, strict=True)
@@ -54,10 +57,10 @@ def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
     )
     if known:
         axes.plot(*zip(*known, strict=True), "x", color=RED, label="error")
-    # A parameter counts as told if its standard deviation is below a third of the tolerance.
+    # A parameter counts as determined below a third of the tolerance.
     axes.axhline(1 / 3, color=GREY, linewidth=0.8, linestyle="--")
     axes.annotate(
-        "told below",
+        "determined below",
         (1, 1 / 3),
         xycoords=("axes fraction", "data"),
         color=GREY,
@@ -67,20 +70,20 @@ def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
     axes.set_yscale("log")
     axes.set_xticks(range(len(kinds)), kinds, rotation=40, ha="right", rotation_mode="anchor")
     axes.set_ylabel("share of the tolerance [1]")
-    axes.set_title("geometric numbers, one point a leg")
+    axes.set_title("geometric numbers, one point per leg")
     axes.grid(visible=False, axis="x")
     axes.legend(loc="lower right")
 
 
 def _by_count(axes: Axes, entry: Mapping[str, Any]) -> None:
-    """Draw the expected error of unmeasured poses against the number of random and chosen poses."""
+    """Draw the expected error at validation poses against the number of random and chosen poses."""
     random = entry["random_poses"]
     chosen = entry["selection"]["chosen"]
     for key, unit, color, line in (
         ("position_rms_um", "position [µm]", BLUE, "-"),
         ("orientation_rms_urad", "orientation [µrad]", RED, "--"),
     ):
-        # Random sets are given for several numbers of poses, the chosen set for one.
+        # There are random sets of several sizes, and one chosen set.
         counts = [one["poses"] for one in random]
         values = [_rms(one[key]) for one in random]
         axes.plot(counts, values, line, color=color, label=f"random poses, {unit}")
@@ -90,7 +93,7 @@ def _by_count(axes: Axes, entry: Mapping[str, Any]) -> None:
     axes.set_yscale("log")
     axes.set_ylim(top=axes.get_ylim()[1] * ROOM)
     axes.set_xlabel("number of poses")
-    axes.set_title("expected error of poses not measured")
+    axes.set_title("expected error at validation poses")
     axes.legend(loc="upper right")
 
 

@@ -17,15 +17,15 @@ OVERVIEW = (4.8, 4.9)
 """Width and height of the overview, in inches."""
 
 BENEATH = 0.4
-"""Share of the overview's height that the images take."""
+"""Share of the overview's height for the images."""
 
 
 def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None) -> Figure:
     """Draw robot, stickers and cameras with the platform at a pose (6,).
 
-    Beneath stand both camera images, if there is a view. The figure is higher than wide, to fit the
-    screen of a phone. Raises dynamics.UnreachablePoseError or dynamics.ChartError if the robot
-    cannot take the pose.
+    If there is a view, both camera images are drawn below. The figure is higher than wide, to fit
+    on the screen of a phone. Raises dynamics.UnreachablePoseError or dynamics.ChartError if the
+    robot cannot have the pose.
     """
     width, height = OVERVIEW
     beneath = 0.0 if view is None else BENEATH
@@ -33,7 +33,7 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
     axes = figure.add_axes((0.08, beneath, 0.87, 1 - beneath))
     draw_scene(axes, cell, pose, View(), rays=True, labels=True)
     if view is not None:
-        # The images are squares, in shares of a figure that is not.
+        # The images are square, but coordinates are shares of a figure that is not.
         side = (beneath - 0.05) * height / width
         for number, name in enumerate(SIDES):
             axes = figure.add_axes(
@@ -55,7 +55,7 @@ ARROW = 0.12
 def residual_figure(view: StereoView) -> Figure:
     """Draw both camera images with the detected ellipses and the errors of their centres.
 
-    The errors are enlarged arrows. One arrow beside them has its length written in px.
+    The errors are enlarged arrows. A reference arrow is labelled with its length in px.
     """
     errors = np.concatenate(
         [(found.centres - found.expected).reshape(-1, 2) for found in view.found.values()]
@@ -71,7 +71,7 @@ def residual_figure(view: StereoView) -> Figure:
 
 
 def _scale_arrow(axes: Axes, width: int, factor: float, length: float) -> None:
-    """Draw an arrow that stands for a length in px, in the lower left corner of an image."""
+    """Draw a reference arrow for a length in px in the lower left corner of an image."""
     left = axes.get_xlim()[0]
     low, high = axes.get_ylim()
     foot = left + 0.04 * width, low + 0.05 * (high - low)

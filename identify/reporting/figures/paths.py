@@ -1,6 +1,6 @@
 """Figures of the motion of a run.
 
-They show the motion over time, as a path in space, and how well each pose was measured.
+They show the motion over time and as a path in space, and the uncertainty of each measured pose.
 """
 
 from itertools import combinations
@@ -30,13 +30,13 @@ from identify.reporting.figures.style import (
 )
 
 PARTS = (("position", 0, "mm", "µm"), ("orientation", 3, "mrad", "µrad"))
-"""Halves of a pose: name, first component, unit of its motion and unit of its errors."""
+"""Parts of a pose: name, first component, unit of its motion and unit of its errors."""
 
 
 def excitation_figure(time: Array, poses: Array) -> Figure:
-    """Draw position and orientation of a trajectory over time, as figure 11 of the paper.
+    """Draw position and orientation of a trajectory over time, like figure 11 of the paper.
 
-    ``time`` (N,) is in s, ``poses`` (N, 6) in m and rad. Components that do not move are left out.
+    ``time`` (N,) is in s, ``poses`` (N, 6) in m and rad. Components that do not move are omitted.
     """
     shown = moving(poses)
     parts = [part for part in PARTS if any(part[1] <= i < part[1] + 3 for i in shown)]
@@ -58,8 +58,8 @@ MARKED = 10
 def path_figure(time: Array, poses: Array) -> Figure:
     """Draw the path (N, 6) [m, rad] of the platform over the time (N,) [s].
 
-    Position and orientation stand beside each other, with the same times marked on both. Components
-    that do not move are left out.
+    Position and orientation are side by side, with the same times marked. Components that do not
+    move are omitted.
     """
     shown = moving(poses)
     halves = [
@@ -69,7 +69,7 @@ def path_figure(time: Array, poses: Array) -> Figure:
     figure = Figure(figsize=(WIDTH if len(halves) > 1 else WIDTH / 1.6, 3.2))
     figure.subplots_adjust(left=0.02, right=0.94, bottom=0.06, top=0.94, wspace=0.12)
     elapsed = time - time[0]
-    # A little before the round time, lest rounding take the frame after it.
+    # Search slightly before the round time, so that rounding does not select the next frame.
     marks = np.searchsorted(
         elapsed, np.arange(0, elapsed[-1], _round_up(elapsed[-1] / MARKED)) - 1e-9
     )
@@ -98,7 +98,7 @@ def path_figure(time: Array, poses: Array) -> Figure:
 
 
 def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
-    """Draw a path (N, 2) or (N, 3) with its times, and its start as a square."""
+    """Draw a path (N, 2) or (N, 3) with marked times, and its start as a square."""
     axes.plot(*path.T, color=BLUE, linewidth=1.0)
     axes.plot(
         *path[marks[1:]].T,
@@ -116,7 +116,7 @@ def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> 
 
 
 def _plain_box(axes: Axes3D) -> None:
-    """Give a box thin panes without grey, and one scale for all axes."""
+    """Give a 3D box transparent panes, and the same scale on all axes."""
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.pane.set_facecolor((1, 1, 1, 0))
         axis.pane.set_edgecolor(GREY)
@@ -134,7 +134,7 @@ ELLIPSES = 12
 """Number of poses whose ellipses are drawn."""
 
 SHARE = 0.15
-"""Largest half axis of a drawn ellipse, as a share of the path's size."""
+"""Largest half axis of a drawn ellipse, as a share of the size of the path."""
 
 
 def ellipse_figure(
@@ -145,13 +145,13 @@ def ellipse_figure(
     Parameters
     ----------
     poses
-        Measured poses (N, 6) [m, rad], NaN where one was lost.
+        Measured poses (N, 6) [m, rad], NaN for a lost pose.
     covariances
-        Covariances (N, 6, 6) of the poses, as the sensor states them.
+        Covariances (N, 6, 6) of the poses according to the sensor.
     shown
-        Indices of the components that move. Each pair of them has a view.
+        Indices of the components that move. Each pair of them has a panel.
     errors
-        True minus measured poses (N, 6), where the truth is known. They are enlarged alike.
+        True minus measured poses (N, 6), if the truth is known. They are enlarged equally.
     """
     # Lost frames have neither a pose nor a covariance.
     kept = np.flatnonzero(
@@ -169,7 +169,7 @@ def ellipse_figure(
     grid = figure.subplots(max(len(views), 1), 3, squeeze=False)
     for row, ((name, first, unit, fine), pairs) in zip(grid, views, strict=False):
         half = slice(first, first + 3)
-        # The root of the largest eigenvalue bounds the half axes in every view.
+        # The root of the largest eigenvalue bounds the half axes in every panel.
         largest = 1e3 * np.sqrt(REACH * np.linalg.eigvalsh(covariances[chosen, half, half]).max())
         factor = round_down(SHARE * float(np.ptp(path[kept, half], axis=0).max()) / largest)
         for axes, columns in zip(row, pairs, strict=False):
@@ -187,7 +187,7 @@ def ellipse_figure(
                     linestyle="none",
                     marker=".",
                     color=RED,
-                    label="true pose, enlarged alike",
+                    label="true pose, enlarged equally",
                 )
             axes.set_aspect("equal", adjustable="datalim")
             axes.set_xlabel(f"{COMPONENTS[columns[0]]} [{unit}]")
@@ -198,14 +198,14 @@ def ellipse_figure(
         axes.set_visible(False)
     if views:
         legend_above(figure, grid[0, 0], columns=3)
-    # Axes of equal scale change their ticks once they have their place.
+    # Axes of equal scale change their ticks after their layout.
     figure.draw_without_rendering()
     return figure
 
 
 def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float) -> None:
     """Draw enlarged ellipses of covariances (n, 2, 2) [SI] about centres (n, 2) [mm or mrad]."""
-    # All ellipses are one line with gaps, which makes one entry in the legend and draws faster.
+    # All ellipses are one line with gaps: one entry in the legend, and faster drawing.
     gap = np.full((1, 2), np.nan)
     rings = [
         c + 1e3 * factor * ellipse_outline(cov) for c, cov in zip(centres, covariances, strict=True)
@@ -218,13 +218,13 @@ def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float
 REACH = float(chdtri(2, 1 - COVERED))
 """Squared Mahalanobis distance within which `COVERED` of the poses lie."""
 
-RING = f"holds {100 * COVERED:g} % of true poses"
+RING = f"contains {100 * COVERED:g} % of true poses"
 
 
 def ellipse_outline(covariance: Array) -> Array:
     """Return the outline (n, 2) of the ellipse that covers `COVERED` of a covariance (2, 2)."""
     angle = np.linspace(0, 2 * np.pi, 49)
-    # The small multiple of the identity lets a singular covariance have a Cholesky root.
+    # With a small multiple of the identity, a singular covariance has a Cholesky factor.
     root = np.linalg.cholesky(covariance + 1e-12 * np.trace(covariance) * np.eye(2))
     return np.asarray(
         np.sqrt(REACH) * np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T, dtype=float
@@ -232,7 +232,9 @@ def ellipse_outline(covariance: Array) -> Array:
 
 
 def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
-    """Draw a bar with its enlarged length in the fine unit, on axes in the coarse unit."""
+    """Draw a reference bar with its enlarged length in the fine unit, on axes in the coarse
+    unit.
+    """
     look: dict[str, Any] = {
         "frameon": False,
         "sep": 3,
@@ -254,5 +256,5 @@ def _round_up(value: float) -> float:
 def round_down(value: float) -> float:
     """Return the next lower of 1, 2 and 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
-    # The tolerance keeps a value that rounding has moved just below one of the steps.
+    # The tolerance allows for values that rounding has moved just below a step.
     return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

@@ -1,8 +1,8 @@
-"""Style that all figures share.
+"""Style of all figures.
 
-Sizes and fonts are those of print. Every curve has a line style or a marker of its own, so that
-curves also differ without colour. A report replaces the colours by those of the reader's screen.
-Figures therefore take their colours from `PALETTE` only.
+Sizes and fonts are those for print. Every curve has its own line style or marker, so that curves
+also differ without colour. A report replaces the colours by colours of the reader's screen. Figures
+must therefore use only the colours of `PALETTE`.
 """
 
 import io
@@ -60,7 +60,7 @@ STYLE: Any = {
     "lines.linewidth": 1.1,
     "lines.markersize": 3.5,
     "hatch.linewidth": 0.6,
-    # Text stays text: it can be searched and copied.
+    # Text is stored as text, which can be searched and copied.
     "pdf.fonttype": 42,
     "svg.fonttype": "none",
 }
@@ -78,14 +78,14 @@ LINES: tuple[dict[str, Any], ...] = (
 """Line styles of the components of a pose."""
 
 STILL = 1e-9
-"""Range in m or rad below which a component counts as still."""
+"""Range, m or rad, below which a component counts as not moving."""
 
 
 def drawn(draw: Callable[[], Figure]) -> Figure:
-    """Draw a figure in this style, and lay it out once for all files that are made of it."""
+    """Draw a figure in this style, and compute its layout once for all of its files."""
     with mpl.rc_context(STYLE):
         figure = draw()
-        # Layout engines move the axes at every drawing, so that files would differ.
+        # Layout engines move the axes at every drawing, and files would differ.
         if figure.get_layout_engine():
             figure.draw_without_rendering()
             # The engine "none" would still have every file drawn twice.
@@ -96,7 +96,7 @@ def drawn(draw: Callable[[], Figure]) -> Figure:
 def svg_text(figure: Figure, name: str) -> str:
     """Return a figure as an <svg> element.
 
-    Its identifiers begin with the name, so that several figures may share a page.
+    Its identifiers begin with the name, so that several figures can be on one page.
     """
     with mpl.rc_context(STYLE | {"svg.hashsalt": name}):
         stream = io.StringIO()
@@ -104,7 +104,7 @@ def svg_text(figure: Figure, name: str) -> str:
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
-    # Identifiers of several figures on one page would collide otherwise.
+    # Otherwise, identifiers of several figures on one page would collide.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{name}-", text)
     # Hundredths of a point are enough, and make a smaller file.
     text = re.sub(r"(\d\.\d\d)\d+", r"\g<1>", text)
@@ -119,7 +119,7 @@ def moving(poses: Array) -> list[int]:
 def panel_grid(
     count: int, width: float, height: float, above: float = 0.0, **shared: Any
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure with ``count`` panels, three in a row.
+    """Return a figure with ``count`` panels, three per row.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def panel_grid(
     width, height
         Size of a panel, in inches.
     above
-        Room for a title above the panels, in inches.
+        Space for a title above the panels, in inches.
     **shared
         Arguments of `matplotlib.figure.Figure.subplots`.
     """
