@@ -85,4 +85,6 @@ def serve() -> None:
         found = error
     except Exception as error:  # the library can raise any error for such a file
         found = StrangerError(" ".join(str(error).split()) or type(error).__name__)
+    if hasattr(signal, "alarm"):
+        signal.alarm(0)  # what follows is not limited
     out.buffer.write(pickle.dumps(found))
