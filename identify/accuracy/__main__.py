@@ -9,7 +9,7 @@ from identify.accuracy.session import markdown_table
 
 
 def main(arguments: list[str]) -> int | str:
-    """Return the exit status of the command: 0, or a line that says what is wrong."""
+    """Return the exit status of the command: 0, or an error message in one line."""
     if len(arguments) != 1:
         return (
             "usage: python -m identify.accuracy FILE, where FILE was saved by "

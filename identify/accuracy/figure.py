@@ -1,7 +1,7 @@
 """Figures of accuracy, each with its limit, and the object that records them in a test.
 
 Pytest imports this module at every start. NumPy and SciPy are therefore imported only when a test
-records something.
+records a figure.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class AccuracyError(IdentifyError):
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure, as one test recorded it under one name.
+    """One figure, recorded by one test under one name.
 
     Attributes
     ----------
@@ -46,9 +46,9 @@ class Figure:
     unit : str
         Unit of the value, of the limit and of the interval.
     better : {"lower", "higher"}
-        Direction of progress.
+        Direction of improvement.
     limit : float or None
-        Largest value that is good enough, or the smallest one where higher is better.
+        Largest good value, or the smallest good value if higher is better.
     interval : tuple of float or None
         Ends (low, high) of the confidence interval of a sample's mean.
     count : int
@@ -71,27 +71,27 @@ class Figure:
 
     @property
     def sign(self) -> int:
-        """Sign +1 where a larger value is worse, -1 where it is better."""
+        """Sign: +1 if a larger value is worse, -1 if it is better."""
         return 1 if self.better == "lower" else -1
 
     @property
     def best(self) -> float:
-        """End of the interval on the good side; the value where there is no interval."""
+        """Good end of the interval, or the value without an interval."""
         return self._end(-self.sign)
 
     @property
     def worst(self) -> float:
-        """End of the interval on the bad side; the value where there is no interval."""
+        """Bad end of the interval, or the value without an interval."""
         return self._end(self.sign)
 
     @property
     def beyond_limit(self) -> bool:
-        """True where the value, or the whole interval, lies on the bad side of the limit."""
+        """True if the value, or the whole interval, lies on the bad side of the limit."""
         return self.limit is not None and self.sign * (self.best - self.limit) > 0
 
     @property
     def undecided(self) -> bool:
-        """True where the interval contains the limit, so that the sample decides nothing."""
+        """True if the interval contains the limit, so that the sample is not decisive."""
         return (
             self.limit is not None
             and not self.beyond_limit
@@ -100,7 +100,7 @@ class Figure:
 
     @property
     def limit_text(self) -> str:
-        """Limit with its relation, such as "≤ 2", without a unit; empty where there is no limit."""
+        """Limit with its relation, such as "≤ 2", without a unit. Empty without a limit."""
         return (
             ""
             if self.limit is None
@@ -111,7 +111,7 @@ class Figure:
     def margin(self) -> float | None:
         """Distance of the value from the limit as a share of the limit, negative beyond it.
 
-        None where there is no limit, or where it is zero.
+        It is None if there is no limit, or if the limit is zero.
         """
         return self.sign * (self.limit - self.value) / abs(self.limit) if self.limit else None
 
@@ -143,15 +143,15 @@ def with_unit(text: str, unit: str) -> str:
 def percent(share: float, form: str) -> str:
     """Format a share in per cent, in a form such as ".0" or "+.1".
 
-    Shares of a hundredfold and more are written with a power of ten.
+    Shares from 100 (10,000 %) on are written with a power of ten.
     """
     return f"{share:{form}%}" if abs(share) < 100 else f"{100 * share:{form}e}%"
 
 
 class Accuracy:
-    """Recorder of the figures of accuracy of one test, as the fixture `accuracy` returns it.
+    """Recorder of the figures of one test, the value of the fixture `accuracy`.
 
-    A figure beyond its limit fails the test at the call.
+    A figure beyond its limit fails the test at once.
     """
 
     def __init__(self, test: str, properties: list[tuple[str, object]]) -> None:
@@ -172,15 +172,15 @@ class Accuracy:
         Parameters
         ----------
         name : str
-            Name of the figure, which must be new in this test.
+            Name of the figure. It must be new in this test.
         value : float
             The number.
         unit : str, optional
-            Its unit, as tables show it.
+            Unit of the value, for tables.
         limit : float, optional
-            Largest value with which the test passes, or the smallest one if higher is better.
+            Largest value with which the test passes, or the smallest value if higher is better.
         better : {"lower", "higher"}, optional
-            Direction of progress.
+            Direction of improvement.
 
         Raises
         ------
@@ -211,20 +211,20 @@ class Accuracy:
         Parameters
         ----------
         name : str
-            Name of the figure, which must be new in this test.
+            Name of the figure. It must be new in this test.
         values : array_like, shape (n,)
             At least two independent values.
         unit : str, optional
-            Their unit, as tables show it.
+            Unit of the values, for tables.
         limit : float, optional
-            Largest mean with which the test passes, or the smallest one if higher is better.
+            Largest mean with which the test passes, or the smallest mean if higher is better.
         better : {"lower", "higher"}, optional
-            Direction of progress.
+            Direction of improvement.
 
         Raises
         ------
         AccuracyError
-            There are fewer than two values, one of them is not a finite number, or the name was
+            There are fewer than two values, a value is not a finite number, or the name was
             recorded already.
 
         Examples
@@ -265,15 +265,16 @@ class Accuracy:
 
 
 def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, float]]:
-    """Return the mean of values (n,), n >= 2, and the interval that contains the true mean.
+    """Return the mean of values (n,), n >= 2, and its confidence interval.
 
-    The probability of the interval is CONFIDENCE. An end beyond the largest float is infinite.
+    The interval contains the true mean with the probability CONFIDENCE. An end beyond the largest
+    float is infinite.
     """
     import numpy as np
     from scipy.special import stdtrit
 
     count = len(values)
-    # A power of two scales without rounding, and within +-1 no square overflows.
+    # Scaling by a power of two causes no rounding, and avoids an overflow of squares.
     exponent = np.frexp(np.abs(values).max())[1]
     scaled = np.ldexp(values, -exponent)
     mean = np.mean(scaled)

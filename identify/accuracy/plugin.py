@@ -1,8 +1,8 @@
 """Plugin of pytest: its options, its marker, and the fixtures that record figures.
 
-A test chooses a scenario, robot or sensor of its own by `@pytest.mark.cmmsim(sensor="mine.toml")`.
-The option `--accuracy-sensor mine.toml` chooses it for all other tests. Pytest imports this module
-at every start, so everything heavy is imported only when a test asks for the testbed.
+A test can choose its scenario, robot or sensor by `@pytest.mark.cmmsim(sensor="mine.toml")`. The
+option `--accuracy-sensor mine.toml` chooses the sensor of all other tests. Pytest imports this
+module at every start, so slow imports are made only when a test uses the testbed.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add(
         "--accuracy-save",
         metavar="NAME",
-        help="save the figures of a session that passes, unless one is beyond its limit or NAME "
-        "holds figures that were not measured",
+        help="save the figures of a session that passes, unless a figure is beyond its limit or "
+        "NAME holds figures that were not measured",
     )
     add(
         "--accuracy-compare",
         metavar="NAME",
-        help="show saved figures, and the change from them, in the table",
+        help="show saved figures, and the changes since, in the table",
     )
     add(
         "--accuracy-fail",
         metavar="RATIO",
         type=ratio,
-        help="fail when a figure is worse than the saved one by more than RATIO of it, such as "
-        "0.1 (for a sample: when both intervals show it), when it rests on fewer values, when a "
-        "sample has become one number or the other way round, or when its test ran or was "
-        "skipped without recording it",
+        help="fail if a figure is worse than the saved figure by more than RATIO of it, such as "
+        "0.1 (for samples: if both whole intervals are), if it has fewer values, if a sample has "
+        "become a single number or the reverse, or if its test ran or was skipped without "
+        "recording it",
     )
     add(
         "--accuracy-dir",
@@ -74,12 +74,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add(
         "--accuracy-robot",
         metavar="NAME",
-        help="robot, built-in or a file, instead of the scenario's",
+        help="robot, built-in or a file, in place of the scenario's robot",
     )
     add(
         "--accuracy-sensor",
         metavar="NAME",
-        help="sensor, built-in or a file, instead of the scenario's",
+        help="sensor, built-in or a file, in place of the scenario's sensor",
     )
 
 
@@ -87,8 +87,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """Declare the marker, check the options, and register the session in the main process."""
     config.addinivalue_line(
         "markers",
-        f"{MARKER}(scenario=..., robot=..., sensor=...): choose what the cmmsim_ fixtures of a "
-        "test load, by built-in names or by files beside the test's file",
+        f"{MARKER}(scenario=..., robot=..., sensor=...): choose scenario, robot or sensor of the "
+        "cmmsim_ fixtures, by built-in names or by files beside the test's file",
     )
     if not hasattr(config, "workerinput"):
         _check_options(config)
@@ -102,7 +102,7 @@ def accuracy(request: pytest.FixtureRequest) -> Accuracy:
     Returns
     -------
     Accuracy
-        Its methods `record` and `sample` record a number or the mean of several values.
+        Recorder. Its method `record` records a number, and `sample` the mean of several values.
 
     Examples
     --------
@@ -110,21 +110,21 @@ def accuracy(request: pytest.FixtureRequest) -> Accuracy:
     ...     accuracy.record("centre error", 0.013, unit="px", limit=0.02)
     """
     properties = request.node.user_properties
-    # Plugins that repeat a failed test keep the figures of the earlier try.
+    # If a plugin repeats a failed test, the figures of the earlier try are still there.
     properties[:] = [entry for entry in properties if entry[0] != PROPERTY]
     return Accuracy(_node_id(request.node), properties)
 
 
 @pytest.fixture
 def cmmsim_seed(request: pytest.FixtureRequest) -> int:
-    """Seed of this test, which depends only on its node id and on --accuracy-seed."""
+    """Seed of this test. It depends only on the node id and on --accuracy-seed."""
     text = f"{request.config.getoption('accuracy_seed')} {_node_id(request.node)}"
     return int.from_bytes(sha256(text.encode()).digest()[:4], "big")
 
 
 @pytest.fixture
 def cmmsim_scenario(request: pytest.FixtureRequest) -> Scenario:
-    """Scenario of the test, with the robot and the sensor that were chosen for it."""
+    """Scenario of the test, with its chosen robot and sensor."""
     from identify import load_scenario
 
     chosen = _choices(request)
@@ -142,9 +142,9 @@ def cmmsim_robot(cmmsim_scenario: Scenario) -> Robot:
 
 @pytest.fixture(scope="session")
 def cmmsim_taught() -> dict[str, Taught]:
-    """Results of teaching, by the settings that they depend on.
+    """Cache of results of teaching, by the settings on which they depend.
 
-    Teaching takes seconds, so every process does it once for each sensor.
+    Teaching takes seconds, so every process teaches each sensor only once.
     """
     return {}
 
@@ -159,7 +159,7 @@ def cmmsim_sensor(
 ) -> Sensor:
     """Sensor of the test's scenario at the start of a run.
 
-    Its noise is drawn from the seed of the test. All tests share what it was taught.
+    Its noise depends on the seed of the test. All tests share the results of teaching.
     """
     from identify.setup import Setup
 
@@ -179,7 +179,7 @@ def _check_options(config: pytest.Config) -> None:
     Raises
     ------
     pytest.UsageError
-        One of them cannot.
+        One of them cannot be loaded.
     """
     chosen = _from_options(config)
     if not chosen:
@@ -201,10 +201,10 @@ def _check_options(config: pytest.Config) -> None:
 def _choices(request: pytest.FixtureRequest) -> dict[str, str]:
     """Return the names or files that this test uses.
 
-    Markers replace the choices of the command line, and the closest marker wins.
+    Markers replace the choices of the command line. The closest marker has priority.
     """
     chosen = _from_options(request.config)
-    # Pytest gives the closest marker first, and the last one here replaces the others.
+    # Pytest returns the closest marker first, so the reversed list ends with it.
     for mark in reversed(list(request.node.iter_markers(MARKER))):
         unknown = [repr(key) for key in mark.kwargs if key not in CHOICES] + [
             repr(value) for value in mark.args
@@ -231,13 +231,13 @@ def _from_options(config: pytest.Config) -> dict[str, str]:
 
 
 def _file_or_name(folder: Path, name: str | PathLike[str]) -> str:
-    """Return the path of the file with that name in the folder, or the name if there is none."""
+    """Return the path of a file with this name in the folder, or the name if there is no file."""
     path = folder / name
     return str(path) if path.is_file() else str(name)
 
 
 def _node_id(item: pytest.Item) -> str:
-    """Return a test's node id without the group that pytest-xdist appends with --dist loadgroup."""
+    """Return a test's node id, without the group that pytest-xdist appends (--dist loadgroup)."""
     return f"{item.parent.nodeid}::{item.name}" if item.parent else item.nodeid
 
 

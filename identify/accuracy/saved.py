@@ -1,7 +1,7 @@
-"""Saved sessions, one JSON file each, and their comparison with the present one.
+"""Saved sessions, one JSON file each, and their comparison with the present session.
 
-Pytest imports this module at every start. Whatever reads and writes files is therefore imported
-only when there is a file.
+Pytest imports this module at every start. Modules that read and write files are therefore imported
+only when they are needed.
 """
 
 import os
@@ -21,14 +21,14 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True)
 class Comparison:
-    """A figure, and the one that was saved under the same test and name."""
+    """A figure, and the saved figure of the same test and name."""
 
     now: Figure
     saved: Figure
 
     @property
     def mismatch(self) -> str:
-        """Reason why the two cannot be compared; empty if they can."""
+        """Reason why the figures cannot be compared. Empty if they can be compared."""
         for what in ("unit", "better"):
             new = getattr(self.now, what)
             old = getattr(self.saved, what)
@@ -38,7 +38,7 @@ class Comparison:
 
     @property
     def limit_change(self) -> str:
-        """One line with the limit and the saved one where they differ; empty otherwise."""
+        """One line with the present and the saved limit if they differ, else empty."""
         now, saved = (
             f"{f.limit_text} {f.unit}".strip() if f.limit_text else "none"
             for f in (self.now, self.saved)
@@ -51,10 +51,10 @@ class Comparison:
 
     @property
     def evidence_change(self) -> str:
-        """One line where the value rests on other evidence than the saved one; empty otherwise.
+        """One line if the value has other evidence than the saved value, else empty.
 
-        Other evidence is one number in place of a sample or the other way round, or fewer values.
-        An interval of fewer values is wider, so it could hide a change for the worse.
+        Other evidence is a single number in place of a sample or the reverse, or fewer values. An
+        interval of fewer values is wider, so it could hide a deterioration.
         """
         now = self.now
         saved = self.saved
@@ -64,21 +64,21 @@ class Comparison:
 
     @property
     def change(self) -> float:
-        """Growth of the value as a share of the saved one's size.
+        """Growth of the value, relative to the magnitude of the saved value.
 
-        Infinite if the saved value is zero and the present one is not.
+        It is infinite if the saved value is zero and the present value is not.
         """
         grown = self.now.value - self.saved.value
         if not grown:
             return 0.0
-        # The infinite change keeps the sign of the growth.
+        # An infinite change has the sign of the growth.
         return grown / abs(self.saved.value) if self.saved.value else float("inf") * grown
 
     def worse_by_more_than(self, ratio: float) -> bool:
-        """True where the value got worse by more than this share of the saved one's size.
+        """Return whether the value is worse by more than `ratio` times the saved value.
 
-        With intervals, even the good end of the new one must be that much worse than the bad end of
-        the saved one.
+        With intervals, the best end of the present interval is compared with the worst end of the
+        saved interval.
         """
         sign = self.now.sign
         return sign * (self.now.best - self.saved.worst) > ratio * abs(self.saved.value)
@@ -99,7 +99,7 @@ def _evidence(figure: Figure) -> str:
 
 
 def compare(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[Key, Comparison]:
-    """Pair figures with the saved ones by their key; figures without a partner are left out."""
+    """Pair figures with saved figures by their key. Figures without a partner are left out."""
     before = {figure.key: figure for figure in saved}
     return {
         figure.key: Comparison(figure, before[figure.key])
@@ -109,7 +109,7 @@ def compare(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[Key, 
 
 
 def missing(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[str, list[str]]:
-    """Return the names of the saved figures that are not among the given ones, by their test."""
+    """Return the names of saved figures that are missing in `figures`, by their test."""
     measured = {figure.key for figure in figures}
     gone: dict[str, list[str]] = {}
     for figure in saved:
@@ -155,7 +155,7 @@ class SavedSession:
 
 
 def saved_path(folder: Path, name: str) -> Path:
-    """Return the path of the file of a name in a folder.
+    """Return the path of the file for a name in a folder.
 
     Raises
     ------
@@ -164,13 +164,13 @@ def saved_path(folder: Path, name: str) -> Path:
     """
     if name.endswith(".json"):
         raise AccuracyError(
-            f"{name!r} is no name for saved figures: use {name.removesuffix('.json')!r}, "
+            f"{name!r} is not a valid name for saved figures: use {name.removesuffix('.json')!r}, "
             "which is saved in that file"
         )
     if not NAME.fullmatch(name):
         raise AccuracyError(
-            f"{name!r} is no name for saved figures: use up to 100 letters, digits, '.', '_' "
-            "and '-'"
+            f"{name!r} is not a valid name for saved figures: use up to 100 letters, digits, '.', "
+            "'_' and '-'"
         )
     return folder / f"{name}.json"
 
@@ -181,7 +181,7 @@ def find_saved(folder: Path, name: str) -> SavedSession:
     Raises
     ------
     AccuracyError
-        There is none. The message lists the saved names.
+        There is no such session. The message lists the saved names.
     """
     path = saved_path(folder, name)
     if not path.is_file():
@@ -212,7 +212,7 @@ def read_saved(path: Path) -> SavedSession:
         raise AccuracyError(f"{path} holds no accuracy figures (no entry format = {FORMAT!r})")
     if content.get("schema") != SCHEMA:
         raise AccuracyError(
-            f"{path} has schema {content.get('schema')!r}, this version reads {SCHEMA}"
+            f"{path} has schema {content.get('schema')!r}, but this version reads {SCHEMA}"
         )
     try:
         return TypeAdapter(SavedSession).validate_python(content)
@@ -230,10 +230,10 @@ def check_writable(path: Path) -> None:
     Raises
     ------
     AccuracyError
-        Nothing can be written there, or the file that would be replaced holds no figures.
+        The path cannot be written, or the file to be replaced holds no figures.
     """
     try:
-        # The folder may not exist yet. Then its nearest parent must be writable.
+        # If the folder does not exist yet, its nearest parent must be writable.
         with TemporaryFile(dir=next(place for place in path.parents if place.exists())):
             pass
         if path.exists():
@@ -258,7 +258,7 @@ def save(path: Path, session: SavedSession) -> None:
         names = "; ".join(f"{test}: {', '.join(figures)}" for test, figures in lost.items())
         raise AccuracyError(
             f"not saved as {session.name}: {path} holds figures that were not measured now "
-            f"({names}); take another name, or remove that file"
+            f"({names}); use another name, or remove that file"
         )
     try:
         text = dumps(asdict(session), indent=2, allow_nan=False, ensure_ascii=False) + "\n"

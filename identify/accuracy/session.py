@@ -1,8 +1,8 @@
-"""Gathering, comparing, saving and showing the figures of a test session.
+"""Collection, comparison, saving and display of the figures of a test session.
 
-The figures travel as user properties in the reports of the tests, which pytest-xdist brings from
-its workers. So the same figures arrive here with and without it. Sorted by node id they make the
-same table and the same file.
+The figures are user properties in the reports of the tests. pytest-xdist transfers these reports
+from its workers, so the same figures arrive here with and without pytest-xdist. They are sorted by
+node id, so that table and file do not depend on the order of the tests.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ def terminal_table(
     comparisons: Mapping[saved.Key, saved.Comparison],
     compared_with: str | None,
 ) -> list[str]:
-    """Return the aligned lines of the table, the figures of each test under its node id.
+    """Return the aligned lines of the table, with the figures of each test below its node id.
 
     With `compared_with`, the name of a saved session, two columns show its values and the change.
     """
@@ -51,13 +51,14 @@ def terminal_table(
         lines += [test, *(_aligned(row, widths) for row in group_rows)]
     if any(figure.undecided for figure in figures):
         lines.append(
-            f"{UNDECIDED}: passed, as the interval contains the limit; more values would decide"
+            f"{UNDECIDED}: passed, because the interval contains the limit; more values would "
+            "decide"
         )
     return lines
 
 
 def markdown_table(figures: Sequence[Figure]) -> str:
-    """Return figures as a Markdown table. The parameters of a parametrised test follow the name."""
+    """Return figures as a Markdown table. Names include the parameters of parametrised tests."""
     rows = [(_full_name(figure), *_cells(figure)) for figure in figures]
     lines: list[Row] = [HEADER, ("---", "--:", "--:", "---", "--:", "--:"), *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
@@ -87,7 +88,7 @@ def _compared(comparison: saved.Comparison | None) -> Row:
 
 
 def _aligned(row: Row, widths: Sequence[int]) -> str:
-    """Join a row with names and units flush left, all else flush right."""
+    """Join a row with names and units aligned left, and other cells aligned right."""
     left = (0, 3)
     cells = (
         c.ljust(w) if i in left else c.rjust(w)
@@ -111,7 +112,7 @@ WHY_MISSING = {
 
 
 class AccuracySession:
-    """Plugin object of the main process; the workers of pytest-xdist have none."""
+    """Plugin object of the main process. Workers of pytest-xdist do not have it."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._figures: dict[str, list[Figure]] = {}
@@ -128,7 +129,7 @@ class AccuracySession:
         self._prepare()
 
     def _prepare(self) -> None:
-        """Refuse what cannot work after the last test before the first one runs."""
+        """Check the options before the first test, because they are used after the last test."""
         if self._ratio is not None and self._compare is None:
             raise pytest.UsageError(
                 "--accuracy-fail needs --accuracy-compare NAME, the saved figures to compare with"
@@ -156,16 +157,16 @@ class AccuracySession:
 
     @property
     def comparisons(self) -> dict[saved.Key, saved.Comparison]:
-        """Figures paired with the saved ones."""
+        """Figures paired with saved figures."""
         return dict(saved.compare(self.figures, self._saved))
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        """Note the outcome of a module that is skipped as a whole."""
+        """Store the outcome of a module that is skipped as a whole."""
         if report.outcome != "passed":
             self._outcomes[report.nodeid] = report.outcome
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note the outcome from each report of a test, and the figures from the last."""
+        """Store the outcome from each report of a test, and the figures from its last report."""
         if report.when == "setup" or report.outcome != "passed":
             self._outcomes[report.nodeid] = report.outcome
         if report.when == "teardown":
@@ -175,7 +176,7 @@ class AccuracySession:
                 self._figures[found[0].test] = found
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Judge the comparison; save if all passed and no figure is beyond its limit."""
+        """Judge the comparison. Save if all tests passed and no figure is beyond its limit."""
         if self._compare is not None:
             self._judge(session)
         if self._save is not None:
@@ -209,7 +210,7 @@ class AccuracySession:
                 self._fail(session, f"worse by more than {self._ratio:.0%}: {pair.regression}")
 
     def _tell_missing(self, session: pytest.Session) -> None:
-        """Name the saved figures that were not measured.
+        """Report saved figures that were not measured.
 
         With --accuracy-fail the session fails if their test ran or was skipped.
         """
@@ -228,7 +229,7 @@ class AccuracySession:
     def _outcome(self, test: str) -> str | None:
         """Return the outcome of a test or of its module, or None if it did not run."""
         for node, outcome in self._outcomes.items():
-            # With --dist loadgroup, the reports name the group behind an @.
+            # With --dist loadgroup, node ids in reports end with @ and the group.
             if node == test or node.startswith(f"{test}@") or test.startswith(f"{node}::"):
                 return outcome
         return None
@@ -240,7 +241,7 @@ class AccuracySession:
             self._remark(f"not saved as {self._save}: {why}")
             return
         beyond = [f"{figure.test}: {figure.name}" for figure in self.figures if figure.beyond_limit]
-        # A test that may fail, such as one marked xfail, passes in spite of them.
+        # A test marked xfail does not fail the session, although its figures are beyond limits.
         if beyond:
             self._fail(
                 session, f"not saved as {self._save}: beyond their limits are {'; '.join(beyond)}"
@@ -259,7 +260,7 @@ class AccuracySession:
     def _tell(self, session: pytest.Session, text: str, guarded: bool) -> None:
         """Report a finding of the comparison.
 
-        With --accuracy-fail the session fails over a guarded one.
+        With --accuracy-fail the session fails if the finding is `guarded`.
         """
         if guarded and self._ratio is not None:
             self._fail(session, text)

@@ -1,11 +1,11 @@
-"""Base parameters: combinations of dynamic parameters that a motion can tell apart (section 4.2).
+"""Base parameters: combinations of dynamic parameters that a motion can identify (section 4.2).
 
-The wrench is H Xi (eq. 26). Where columns of H depend on each other, only combinations of their
-parameters act. With H = H_1 (1 | beta) P, the wrench is H Xi = H_1 (xi_1 + beta xi_2). The base
-parameters are xi_1 + beta xi_2, one for each pivot column. Columns are scaled to length one, so
-that the choice does not depend on units. Pivots are deterministic: of all columns that are long
-enough, the first in a stated order is taken (threshold pivoting). The groups are therefore the
-same, whatever motion shows them.
+The wrench is H Xi (eq. 26). If columns of H are linearly dependent, the wrench depends only on
+combinations of their parameters. With H = H_1 (1 | beta) P, the wrench is H Xi = H_1 (xi_1 + beta
+xi_2). The base parameters are xi_1 + beta xi_2, one for each pivot column. Columns are scaled to
+length one, so that the choice of pivots does not depend on units. Among all columns that are long
+enough, the pivot is the first in a fixed order (threshold pivoting). The groups are therefore the
+same for all motions.
 """
 
 from dataclasses import dataclass
@@ -25,25 +25,25 @@ from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
 
 DEPENDENT = 1e-8
-"""Length outside the pivots below which a column of length one depends on them."""
+"""Remainder below which a column of length one counts as linearly dependent on the pivots."""
 
 LONG_ENOUGH = 1e-3
-"""Least remainder of a column that may be a pivot, as a fraction of the longest one."""
+"""Smallest remainder of a pivot column, as a fraction of the longest remainder."""
 
 NEGLIGIBLE = 1e-7
 """Coefficient that counts as rounding, as a fraction of a group's largest contribution."""
 
 MOTIONS = 200
-"""Number of random motions. They excite whatever can be excited."""
+"""Number of random motions. They excite every parameter that can be excited."""
 
 REACH_SHARES = (0.03, 0.01, 0.003, 0.001)
-"""Range of random positions about home, as a share of the platform's size.
+"""Ranges of random positions about home, as shares of the platform's size.
 
-The first share is taken with which the robot reaches all poses.
+The first range is used in which the robot reaches all poses.
 """
 
 TURN = 0.05
-"""Range of random angles about home, rad, with the first of these shares."""
+"""Range of random angles about home, rad, for the first of these shares."""
 
 
 @dataclass(frozen=True)
@@ -53,16 +53,15 @@ class BaseParameters:
     Attributes
     ----------
     names : tuple of str
-        Names of its columns, the p dynamic parameters of a robot.
+        Names of the columns, the p dynamic parameters of a robot.
     combinations : ndarray, shape (rank, p)
         Matrix with base parameters = combinations @ parameters.
     pivots : tuple of int
-        Parameter after which each group is named, with coefficient 1.
+        Index of the parameter that names each group. It has the coefficient 1.
     unseen : tuple of str
         Names of the parameters without any effect.
     gap : tuple of float
-        Largest remainder of a column that was taken as dependent, and smallest of an independent
-        one.
+        Largest remainder of a dependent column, and smallest remainder of an independent column.
     """
 
     names: tuple[str, ...]
@@ -78,16 +77,16 @@ class BaseParameters:
 
     @cached_property
     def rigid_groups(self) -> RigidGroups:
-        """Groups of the inertial parameters, which stand first.
+        """Groups of the inertial parameters.
 
-        Friction is left out, as it is in no group with others.
+        Friction is left out, because friction parameters are in no group with other parameters.
         """
         inertial = np.flatnonzero([name.split(".")[1] in INERTIAL for name in self.names])
         rows = np.flatnonzero(np.isin(self.pivots, inertial))
         return RigidGroups(np.array(self.pivots)[rows], self.combinations[np.ix_(rows, inertial)])
 
     def group_names(self) -> tuple[str, ...]:
-        """Return the name of each group: its pivot's, with a plus if it has other members."""
+        """Return the name of each group: the name of its pivot, and a plus for further members."""
         lone = (np.abs(self.combinations) > 0).sum(axis=1) == 1
         return tuple(
             self.names[p] + ("" if alone else " +")
@@ -113,9 +112,9 @@ class BaseParameters:
 def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
     """Return the base parameters of a regression matrix (rows, p), by pivoted QR.
 
-    Among the columns of which enough is left, pivots go to friction first, then to the platform,
-    the moments of the legs' bodies, and their masses, those nearest to the platform first. Raises
-    EstimationError for a matrix without any effect.
+    Columns that are long enough become pivots in this order: friction, platform, moments of inertia
+    of the legs' bodies, then their masses, beginning next to the platform. Raises EstimationError
+    if the matrix is zero.
     """
     names = layout.dynamic_names
     lengths = np.linalg.norm(matrix, axis=0)
@@ -131,7 +130,7 @@ def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
     beta[np.abs(beta) < NEGLIGIBLE] = 0.0
     combinations = np.zeros((len(pivots), len(names)))
     combinations[np.arange(len(pivots)), seen[pivots]] = 1.0
-    # columns had length one: back to the parameters' own units
+    # The columns had length one. This converts beta to the units of the parameters.
     combinations[:, seen[others]] = beta * lengths[seen[others]] / lengths[seen[pivots]][:, None]
     order = np.argsort(seen[pivots])
     unseen = tuple(name for k, name in enumerate(names) if k not in seen)
@@ -142,9 +141,9 @@ def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
 
 @lru_cache(maxsize=8)
 def structure(robot: Robot) -> BaseParameters:
-    """Return the base parameters of a robot, whatever moves it. They are found once.
+    """Return the base parameters of a robot for any motion, from a cache.
 
-    Raises EstimationError as `structural_regressor` does.
+    Raises the EstimationError of `structural_regressor`.
     """
     return base_parameters(structural_regressor(robot), robot.layout)
 
@@ -152,9 +151,9 @@ def structure(robot: Robot) -> BaseParameters:
 def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) -> Array:
     """Return the regression matrix (m motions, p) of random motions about home.
 
-    Random poses, twists and accelerations excite whatever can be excited. Rows are wrenches along
-    the platform's m coordinates, since what the chart forbids moves nothing. Raises
-    EstimationError, with the last reason, if no neighbourhood of home is in reach.
+    Random poses, twists and accelerations excite every parameter that can be excited. Rows are
+    wrenches along the m coordinates that the platform can move in. Raises EstimationError, with the
+    last reason, if no neighbourhood of home is in reach.
     """
     rng = np.random.default_rng(seed)
     chart = robot.geometry.chart
@@ -185,8 +184,8 @@ def rank_by_singular_values(matrix: Array) -> int:
 def angle_to_singular_vectors(matrix: Array, found: BaseParameters) -> float:
     """Return the largest angle, rad, between the groups and the row space of a regression matrix.
 
-    The row space of the matrix (rows, p), with columns of length one, is that of its singular
-    vectors. The angle is pi / 2 where one of the two has a direction more than the other.
+    The row space of the matrix (rows, p), with columns of length one, is computed from its singular
+    vectors. The angle is pi / 2 if the two spaces have different dimensions.
     """
     lengths = np.linalg.norm(matrix, axis=0)
     scale = np.where(lengths > DEPENDENT * lengths.max(), lengths, 1.0)
@@ -201,11 +200,11 @@ def rank_by_threshold(matrix: Array, threshold: float) -> int:
     """Return the paper's count of base parameters (section 4.2).
 
     It is the number of diagonal entries of R above `threshold`, in the pivoted QR of the unscaled
-    H. The entries have the regressor's units (N, N m per unit of a parameter) and grow with the
-    root of the number of samples, so that the count depends on both. Where it exceeds the rank, the
-    threshold lies below rounding.
+    H. The entries have the regressor's units (N or N m per unit of a parameter) and grow with the
+    root of the number of samples, so the count depends on both. A count above the rank means that
+    the threshold is below the rounding errors.
     """
-    # the triangular factor has the same R, and far fewer rows
+    # The triangular factor has the same R, and far fewer rows.
     entries = np.diag(qr(triangular_factor(matrix), mode="r", pivoting=True)[0])
     return int(np.sum(np.abs(entries) > threshold))
 
@@ -230,25 +229,25 @@ def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[
         if longest <= DEPENDENT:
             return np.array(chosen), (longest, smallest)
         able = np.flatnonzero(lengths >= LONG_ENOUGH * longest)
-        # not the longest, which depends on the motion
+        # The longest column would depend on the motion, so a fixed order is used.
         pivot = int(able[np.argmin(preference[able])])
         smallest = min(smallest, float(lengths[pivot]))
         chosen.append(pivot)
         direction = left[:, pivot] / lengths[pivot]
-        for _ in range(2):  # the second pass removes what rounding left
+        for _ in range(2):  # the second pass removes rounding errors of the first
             left -= np.outer(direction, direction @ left)
         left[:, chosen] = 0.0
 
 
 def _preferences(layout: ParameterLayout) -> NDArray[np.intp]:
-    """Return the place (p,) of each dynamic parameter among columns that are long enough."""
+    """Return the rank (p,) of each dynamic parameter in the order of pivots."""
     friction, platform, moment, mass = range(4)
     kinds = np.full(len(layout.dynamic_names), friction)
     rigid = layout.bodies_of(kinds)
     rigid[:] = moment
     places = {body: place for bodies in layout.of_leg for place, body in enumerate(bodies)}
     last = max(places.values())
-    # the nearer a body is to the platform, the sooner its mass may be a pivot
+    # Masses of bodies near the platform come first.
     rigid[:, 0] = [mass + last - places.get(body, last) for body in range(len(rigid))]
     rigid[0] = platform
     return np.asarray(kinds * len(kinds) + np.arange(len(kinds)))

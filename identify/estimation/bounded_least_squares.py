@@ -1,9 +1,9 @@
 """Bounded Gauss-Newton with a trust region for nonlinear least squares (eq. 32-35).
 
 It minimises |r(p)|^2 with the Jacobian J of r. The paper's update (eq. 33, with the residual in
-place of its square) solves the linear problem without limits. Here the step stays inside the
-parameters' bounds and inside a box that shrinks when the model of the cost was wrong, which keeps
-it from stalling near unstable loops.
+place of its square) solves the linear problem without limits. Here the step is limited by the
+bounds of the parameters, and by a box that shrinks if the predicted cost was wrong. The box
+prevents stalling near unstable loops.
 """
 
 from collections.abc import Callable
@@ -17,16 +17,16 @@ from scipy.optimize import lsq_linear
 from dynamics import DynamicsError
 from identify.arrays import Array
 
-# factors of the trust region's radius
+# Factors of the trust region's radius.
 SHRINK = 0.25
 GROW = 2.0
 
-# ratios of the gain to the predicted one, below or above which the radius changes
+# Ratios of the gain to the predicted gain. Below POOR the radius shrinks, above GOOD it grows.
 POOR = 0.25
 GOOD = 0.75
 
 SMALLEST_RADIUS = 1e-10
-AT_BOUND = 1e-12  # share of the parameter's scale that rounding may leave
+AT_BOUND = 1e-12  # distance from a bound that counts as rounding, in scales of the parameter
 
 Linearisation = tuple[float, Array, Array]
 
@@ -35,14 +35,14 @@ class Problem(Protocol):
     """Problem that the solver minimises."""
 
     def cost(self, parameters: Array) -> float:
-        """Return |r|^2, which is infinite where the model cannot run."""
+        """Return |r|^2. It is infinite if the model is unstable."""
         ...
 
     def linearise(self, parameters: Array) -> Linearisation:
         """Return |r|^2, and a factor R (p, p) with a vector d (p,) of the linearised problem.
 
-        For these, |r + J step|^2 = |d + R step|^2 + constant. Raises DynamicsError where the model
-        cannot run.
+        They satisfy |r + J step|^2 = |d + R step|^2 + constant. Raises DynamicsError if the model
+        is unstable.
         """
         ...
 
@@ -51,7 +51,7 @@ class Problem(Protocol):
 class StopCriteria:
     """Criteria of eq. 35 by which a search stops.
 
-    The tolerances, tol1 and tol2, are relative changes of the cost and of every parameter.
+    The tolerances tol1 and tol2 are relative changes of the cost and of the parameters.
     """
 
     cost_tolerance: float
@@ -61,10 +61,10 @@ class StopCriteria:
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters (p,) that a search found, and the reason why it stopped.
+    """Parameters (p,) found by a search, and the reason why it stopped.
 
-    at_bound (p,): which parameters are at their bounds. costs: at the start and after each
-    iteration. evaluations: number of those of the model.
+    at_bound (p,): True for parameters at their bounds. costs: cost at the start and after each
+    iteration. evaluations: number of evaluations of the model.
     """
 
     parameters: Array
@@ -97,14 +97,14 @@ def minimise(
     start, lower : ndarray, shape (p,)
         Parameters at the start, and their lower bounds.
     scale : ndarray, shape (p,)
-        Size of a large change of each parameter.
+        Typical size of a large change of each parameter.
     criteria : StopCriteria
         Criteria by which the search stops.
     on_iteration : callable
-        Function (number of the iteration, cost) that is called after each.
+        Function (number of the iteration, cost) that is called after each iteration.
     ahead : bool
-        True allows linearising the problem at a trial that is then not taken. A problem that
-        follows its own steps does not allow it.
+        Whether the problem can be linearised at a trial step before the step is accepted. This
+        must be False for a problem with a state that follows the accepted steps.
     """
     parameters = start.copy()
     radius = 1.0
@@ -125,7 +125,7 @@ def minimise(
         tried = radius
         radius = _new_radius(radius, ratio, largest)
         if ratio > 0:
-            # A step cut short by the trust region says nothing about convergence.
+            # A step limited by the trust region is no evidence of convergence.
             if largest < 0.9 * tried:
                 change = _relative_change(step, parameters, scale)
                 reason = _converged(cost, new_cost, change, criteria)
@@ -145,9 +145,9 @@ def minimise(
 
 
 def _tried(problem: Problem, trial: Array, goes_on: bool) -> tuple[float, Linearisation | None]:
-    """Return the cost of a trial (p,) and, if the search may go on there, its linearisation.
+    """Return the cost of a trial (p,) and, with `goes_on`, its linearisation.
 
-    The linearisation gives the cost as well, which would be computed twice otherwise.
+    The linearisation includes the cost, so a separate computation of the cost is avoided.
     """
     if not goes_on:
         return problem.cost(trial), None
@@ -179,7 +179,7 @@ def _new_radius(radius: float, ratio: float, largest: float) -> float:
 
 
 def _relative_change(step: Array, parameters: Array, scale: Array) -> float:
-    """Return max |step_i / p_i| of eq. 35. A parameter near zero counts by its scale."""
+    """Return max |step_i / p_i| of eq. 35. For a parameter near zero, its scale replaces p_i."""
     return float(np.max(np.abs(step) / np.maximum(np.abs(parameters), 1e-3 * scale)))
 
 

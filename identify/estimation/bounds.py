@@ -1,27 +1,27 @@
-"""Bounds of a search, and the 95 % intervals of what is estimated within them.
+"""Bounds of a search, and the 95 % intervals of estimates within bounds.
 
-No parameter is negative. On demand, bodies must be such as can exist: a rigid body has a positive
-mass, and none of its principal moments of inertia exceeds the sum of the other two. With the second
-moments of its mass along its axes, J_x = integral of x^2 dm and so on,
+No parameter is negative. As an option, bodies must be physically possible: a rigid body has a
+positive mass, and none of its principal moments of inertia exceeds the sum of the other two. With
+the second moments of its mass along its axes, J_x = integral of x^2 dm and so on,
 
     Ixx = J_y + J_z,    Iyy = J_x + J_z,    Izz = J_x + J_y,
 
-and the triangle inequality of the moments is the same as J >= 0. A search in J instead of I
-therefore needs bounds only, see Traversaro et al., "Identification of fully physical consistent
+and the triangle inequality of the moments is equivalent to J >= 0. A search in J instead of I
+therefore needs only bounds, see Traversaro et al., "Identification of fully physical consistent
 inertial parameters" (IROS 2016).
 
-The covariance of an estimate is that of the problem without bounds. Bounds that hold the estimate
-back pull all of it from where the record and the starting guess alone would have it. Linearised
-about the estimate, that is
+The covariance of an estimate is computed without bounds. Active bounds move the whole estimate away
+from the estimate without bounds, the unheld estimate. Linearised about the estimate, it is
 
     unheld = estimate - W^-1 g,
 
 with the information W and the part g of the cost's gradient that the active bounds balance. The
-interval of the unheld estimate, cut to what is allowed, holds the truth as often as it says. But it
-may be empty, or leave the estimate outside. The interval given spans those of the unheld and of the
-held estimate, cut at the least allowed value. It is never empty, holds the estimate, and covers at
-least as often. The interval of the held estimate alone, cut there, would not: a sum of many
-quantities near their bounds is estimated too high by more than its standard deviation.
+interval of the unheld estimate, truncated at the bounds, has the stated coverage. But it can be
+empty, or not contain the estimate. The returned interval is the union of the intervals of both
+estimates and the range between them, truncated at the smallest allowed value. It is never empty,
+contains the estimate, and has at least the stated coverage. The truncated interval of the bounded
+estimate alone does not: a sum of many quantities near their bounds is estimated too high by more
+than its standard deviation.
 """
 
 from dataclasses import dataclass
@@ -39,19 +39,19 @@ from identify.estimation.prior import StartingGuess
 def combined_std(rows: Array, covariance: Array) -> Array:
     """Return the standard deviations (n,) of the combinations rows (n, p) @ parameters.
 
-    covariance (p, p): that of the parameters.
+    covariance (p, p): covariance of the parameters.
     """
     return np.asarray(np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows)))
 
 
 SMALLEST_SHARE = 1e-3
-"""Lower bound of parameters without which there is no model, as a share of the starting guess.
+"""Lower bound of parameters that must be above zero, as a share of the initial guess.
 
 Examples are the platform's mass and the integral gain.
 """
 
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
-"""Matrix that takes (J_x, J_y, J_z) to (Ixx, Iyy, Izz)."""
+"""Matrix that maps (J_x, J_y, J_z) to (Ixx, Iyy, Izz)."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class ParameterBounds:
     """Coordinates (p,) of a search, and their lower bounds.
 
     matrix (p, p): parameters = matrix @ coordinates. lower (p,): bounds of the coordinates.
-    statements: what each bound says of the parameters. physical: only bodies that can exist are
-    allowed.
+    statements: text of each bound in terms of parameters. physical: whether bodies must be
+    physically possible.
     """
 
     layout: ParameterLayout
@@ -72,8 +72,8 @@ class ParameterBounds:
     def nearest(self, parameters: Array) -> Array:
         """Return parameters (p,) within the bounds.
 
-        Negative ones are raised. Bodies that cannot exist are changed, if it can be in what the
-        motion does not feel.
+        Negative parameters are raised. Impossible bodies are changed, if possible without an effect
+        on the motion.
         """
         allowed = np.maximum(parameters, 0.0)
         if self.physical:
@@ -90,15 +90,15 @@ class ParameterBounds:
         return np.asarray(self.matrix @ coordinates, dtype=float)
 
     def least(self, rows: Array) -> Array:
-        """Return the least values (n,) of rows (n, p) @ parameters in the bounds, or -inf."""
+        """Return the smallest allowed values (n,) of rows (n, p) @ parameters, or -inf."""
         weights = rows @ self.matrix
-        # with a negative weight the value falls without end, as nothing is bounded above
+        # With a negative weight the value has no lower limit, because there are no upper bounds.
         return np.where((weights >= 0).all(axis=1), weights @ self.lower, -np.inf)
 
     def balanced(self, gradient: Array, at_bound: NDArray[np.bool_]) -> Array:
         """Return the part (p,) of a cost's gradient (p,) that active bounds balance.
 
-        at_bound (p,): which coordinates are at their bounds.
+        at_bound (p,): True for coordinates at their bounds.
         """
         multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
         return np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
@@ -115,7 +115,7 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     lower = np.zeros(len(names))
     for place in (names.index(name) for name in guess.above_zero):
         lower[place] = SMALLEST_SHARE * guess.values[place]
-    lower[guess.fixed] = -1.0  # the prior keeps them at zero, so that no bound holds them
+    lower[guess.fixed] = -1.0  # the prior fixes them at zero, so their bounds must not be active
     if physical:
         lower[layout.rigid] = np.maximum(lower[layout.rigid], SMALLEST)
     statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]
@@ -136,8 +136,8 @@ HALF_WIDTH = float(ndtri(0.975))
 class BoundedEstimate:
     """Estimate (p,) within bounds.
 
-    at_bound (p,): which coordinates of the bounds are at their bounds. unheld (p,): estimate by
-    record and starting guess alone. covariance (p, p): that of the unheld estimate.
+    at_bound (p,): True for coordinates at their bounds. unheld (p,): estimate without bounds.
+    covariance (p, p): covariance of the unheld estimate.
     """
 
     estimate: Array
@@ -149,21 +149,21 @@ class BoundedEstimate:
     def intervals(self, rows: Array) -> Array:
         """Return the 95 % intervals (n, 2) of the quantities rows (n, p) @ parameters.
 
-        They are cut at the least values allowed.
+        They are truncated at the smallest allowed values.
         """
         half = HALF_WIDTH * combined_std(rows, self.covariance)
-        # the interval spans those of both estimates, see above
+        # The interval covers the intervals of both estimates, see the module docstring.
         centres = np.stack([rows @ self.estimate, rows @ self.unheld])
         low = np.maximum(centres.min(axis=0) - half, self.bounds.least(rows))
         return np.stack([low, centres.max(axis=0) + half], axis=1)
 
     @property
     def active_bounds(self) -> tuple[str, ...]:
-        """Statements of the bounds that hold the estimate, as "platform.Izz <= Ixx + Iyy" is."""
+        """Statements of the active bounds, such as "platform.Izz <= Ixx + Iyy"."""
         return tuple(self.bounds.statements[k] for k in np.flatnonzero(self.at_bound))
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a warning if bounds hold the estimate, with how far beyond them it would go."""
+        """Return a warning if bounds are active, with the distance of the unheld estimate."""
         if not self.at_bound.any():
             return ()
         beyond = self.bounds.lower - self.bounds.coordinates(self.unheld)
@@ -174,9 +174,9 @@ class BoundedEstimate:
             for k in np.flatnonzero(self.at_bound)
         )
         return (
-            f"the estimate is held at {self.at_bound.sum()} bounds, beyond which no robot is: "
-            f"{said}; in brackets how far record and starting values would go beyond, in standard "
-            "deviations; the intervals allow for it",
+            f"the estimate is held at {self.at_bound.sum()} bounds, beyond which no robot exists: "
+            f"{said}; in brackets the distance of the unbounded estimate beyond the bound, in "
+            "standard deviations; the intervals take it into account",
         )
 
 
@@ -190,7 +190,7 @@ def bounded_estimate(
 ) -> BoundedEstimate:
     """Return the estimate (p,) of a search within bounds.
 
-    gradient (p,) is J^T r, and information (p, p) is J^T J. The others are as for
+    gradient (p,) is J^T r, and information (p, p) is J^T J. For the other arguments see
     `BoundedEstimate`.
     """
     unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))

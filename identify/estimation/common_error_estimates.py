@@ -2,8 +2,8 @@
 
 They are a by-product of the identification, a self-calibration. Let r = model - measured be the
 residuals in standard deviations of the noise, J their Jacobian with respect to the parameters, and
-M the modes of the common errors. Parameters p and errors z, of unit variance beforehand, minimise
-|r + J dp + M z|^2 + |z|^2 with what is known of p. The search for the parameters has z eliminated.
+M the modes of the common errors. The parameters p and the errors z, with prior variance one,
+minimise |r + J dp + M z|^2 + |z|^2 plus the prior of p. The search for the parameters eliminates z.
 At its optimum z = -(1 + M^T M)^-1 M^T r.
 """
 
@@ -21,9 +21,9 @@ from identify.model.loop_model import LoopModel
 class CommonErrorEstimates:
     """Estimates of the common errors of one record.
 
-    names: those of the k errors, each ending with its unit. prior_std, estimate (k,): standard
-    deviations beforehand, and estimates. covariance (k, k): that of the estimates. with_parameters
-    (p, k): covariance of the robot's parameters with them.
+    names: names of the k errors, each ending with its unit. prior_std, estimate (k,): prior
+    standard deviations, and estimates. covariance (k, k): covariance of the estimates.
+    with_parameters (p, k): covariance of the robot's parameters with the estimates.
     """
 
     names: tuple[str, ...]
@@ -46,7 +46,7 @@ class CommonErrorEstimates:
 def most_likely(run: LoopModel, parameters: Array) -> Array:
     """Return the most likely common errors (k,) of a run `with_common_errors` at the optimum (p,).
 
-    They are in standard deviations beforehand.
+    They are in prior standard deviations.
     """
     assert run.marginal is not None
     missed = replace(run, marginal=None).misses(parameters).ravel() - run.marginal.had
@@ -54,18 +54,18 @@ def most_likely(run: LoopModel, parameters: Array) -> Array:
 
 
 def most_likely_of(modes: Array, missed: Array) -> Array:
-    """Return the most likely errors (k,) by their modes (m, k) and the residuals (m,).
+    """Return the most likely errors (k,) for their modes (m, k) and the residuals (m,).
 
     Modes and residuals are in standard deviations of the noise alone.
     """
-    # normal equations of |missed + M z|^2 + |z|^2
+    # Normal equations of |missed + M z|^2 + |z|^2.
     return np.asarray(-np.linalg.solve(np.eye(modes.shape[1]) + modes.T @ modes, modes.T @ missed))
 
 
 def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[Array]:
     """Return the most likely errors (k,) of each run of a problem `with_common_errors`.
 
-    They are those that a model can contain.
+    Only errors that a model can contain are returned: errors of the poses, and the latency.
     """
     return [
         np.zeros(0) if run.marginal is None else most_likely(run, parameters)[: len(run.errors_had)]
@@ -74,10 +74,10 @@ def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[A
 
 
 def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
-    """Return the first run of each draw of common errors, and how the errors of all runs follow.
+    """Return the first run of each draw of common errors, and a matrix for all runs.
 
-    Records that state the same errors, equally well known, share a draw. A matrix (k, d) makes the
-    numbers of all runs (k,), record by record, of those of these first runs (d,).
+    Records that state the same errors with the same covariance share a draw. The matrix (k, d) maps
+    the independent numbers of the first runs (d,) to those of all runs (k,), record by record.
     """
     firsts: list[LoopModel] = []
     for run in runs:
@@ -90,16 +90,16 @@ def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
             return np.eye(own)
         if not own or not run.common.known_as(first.common):
             return np.zeros((own, other))
-        # the same errors, but each run has directions of its own that it notices
+        # The errors are the same, but each run has its own factor of their covariance.
         return np.asarray(np.linalg.pinv(run.common.whole_factor) @ first.common.whole_factor)
 
     return firsts, np.vstack([np.hstack([made_of(run, first) for first in firsts]) for run in runs])
 
 
 def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Array]:
-    """Return the covariance (p, p) of an estimate that each kind of common errors makes.
+    """Return the covariance (p, p) of an estimate due to each kind of common errors.
 
-    moved (p, k): effect of each of their numbers on the estimate, run by run.
+    moved (p, k): effect of each independent number on the estimate, run by run.
     """
     of_common: dict[str, Array] = {}
     for run in runs:
@@ -112,10 +112,10 @@ def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Arr
 def common_error_estimates(
     problem: OutputErrorProblem, parameters: Array, whole: Array
 ) -> CommonErrorEstimates:
-    """Return what the first record of a problem `with_common_errors` says of its common errors.
+    """Return the estimated common errors of the first record of a problem `with_common_errors`.
 
-    parameters (p,): the optimum. whole (p + k, p + k): covariance of the parameters, and of the
-    common errors in standard deviations beforehand.
+    parameters (p,): the optimum. whole (p + k, p + k): covariance of the parameters and of the
+    common errors, in prior standard deviations of the errors.
     """
     run = problem.runs[0]
     count = len(parameters)

@@ -1,30 +1,30 @@
-"""Covariance of an output-error estimate, from all that is not known exactly in the experiment.
+"""Covariance of an output-error estimate, from all uncertainties of the experiment.
 
-`identify.estimation.bounds` makes the intervals from it.
+`identify.estimation.bounds` computes the intervals from it.
 
-Sensor noise enters twice: in the measured poses, and through the servo in the plant's motion. A
-model that closes its own loop cannot follow the latter. Its residuals are coloured, and stick-slip
-makes the response nonlinear. So the experiment is repeated on the identified model with drawn
-noise. Each draw gives residuals r, and their scores J^T r spread as those of the real record do.
-With W the information of data and prior, the covariance of the estimate is W^-1 (cov(J^T r) + prior
-information) W^-1. In it, the part of the starting guess is what errors of the guess alone would
-make of the estimate. They are the same in every record that is taken.
+Sensor noise acts twice: in the measured poses, and through the servo on the plant's motion. A model
+that closes its own loop cannot follow the second effect. Its residuals are coloured, and stick-slip
+makes the response nonlinear. Therefore the experiment is repeated on the identified model with
+random noise. Each repetition gives residuals r, and the scores J^T r have the same covariance as
+those of the real record. With W the information of data and prior, the covariance of the estimate
+is W^-1 (cov(J^T r) + prior information) W^-1. The part with the information of the initial guess is
+the effect of errors of the guess. These errors are the same in every record.
 
-A model driven by the logged commands has white residuals, and W^-1 is the whole covariance. Where
-either model misses the record by more than noise explains, what its error does to the scores is
-added (`explanation`). All is computed in units where W is one.
+A model driven by the logged commands has white residuals, and W^-1 is the whole covariance. If a
+model misses the record by more than noise explains, the effect of its error on the scores is added
+(`explanation`). All matrices are computed in units in which W is the identity.
 
 Errors that all poses of a record have in common, of cameras, teaching, clocks and geometry, are
-parameters of the same problem. Their modes M stand in J behind the other columns, and each is known
-beforehand to one standard deviation. So the record says what it taught of them, and how they
-correlate with the parameters. The search estimates those of every record apart. Where records share
-one draw of them, the covariance of the estimate is that of a shared draw.
+further unknowns of the same problem. Their modes M are further columns of J, and each has a prior
+with standard deviation one. The covariance therefore contains their posterior covariance and their
+correlation with the parameters. The search estimates the common errors of each record separately.
+If records share the same errors, the covariance of the estimate takes this into account.
 
-A known load errs, too. Under the load L the model has the parameters p + L. An error dL moves the
-residuals of its records by J dL, with J their Jacobian with respect to the parameters, and the
-scores by J^T J dL. With S the covariance of the load, the scores spread by H S H beside the noise,
-where H = J^T J sums over all records made under this load. Where the load shows the scale, one that
-is a percent heavier than stated makes all parameters about a percent too small.
+A known load has errors, too. Under the load L the model has the parameters p + L. An error dL moves
+the residuals of its records by J dL, with J their Jacobian with respect to the parameters, and the
+scores by J^T J dL. With S the covariance of the load, the covariance of the scores grows by H S H,
+where H is the sum of J^T J over all records made under this load. For example, if the load fixes
+the scale and is one percent heavier than stated, all parameters are about one percent too small.
 """
 
 from collections.abc import Sequence
@@ -51,33 +51,33 @@ from identify.progress import Advance
 from identify.runtime import cores
 
 DRAWS = 100
-"""Number of repetitions. They give a standard deviation to 7 %."""
+"""Number of repetitions. They determine a standard deviation to 7 %."""
 
 FEWEST = 50
-"""Smallest number of repetitions that must have run to their end."""
+"""Smallest allowed number of stable repetitions."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of an estimate, if there were no bounds.
+    """Uncertainty of an estimate without regard to bounds.
 
     Attributes
     ----------
     whole : ndarray, shape (p + k, p + k)
-        Covariance of the estimate and, behind it, of the k common errors, record by record, in
-        their standard deviations beforehand.
+        Covariance of the estimate and the k common errors. The common errors follow record by
+        record, in units of their prior standard deviations.
     of_guess : ndarray, shape (p, p)
-        Part of the estimate's covariance that errors of the starting guess make.
+        Part of the estimate's covariance due to errors of the initial guess.
     of_common : dict of ndarray, shape (p, p)
-        Part that common errors make, by their kinds.
+        Parts due to common errors, by their kinds.
     information : ndarray, shape (p, p)
         Information of the poses alone.
     gradient : ndarray, shape (p,)
-        Gradient J^T r of poses and all that is known beside them, at the estimate.
+        Gradient J^T r of poses and prior at the estimate.
     misfit : Misfit
         Misfit of the record.
     unstable : int
-        Number of repeated experiments that ended early and were left out.
+        Number of unstable repetitions, which were left out.
     """
 
     whole: Array
@@ -135,7 +135,7 @@ def estimate_uncertainty(
     shown = [replace(one, rows=one.rows @ units) for one in linear]
     scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
     if misfit.significant:
-        # an error of the model lasts for many frames, whose residuals then are not independent
+        # An error of the model lasts for many frames, so their residuals are correlated.
         model = sum(
             coloured_score_covariance(one.left, one.rows, run.ok)
             for run, one in zip(runs, shown, strict=True)
@@ -147,7 +147,7 @@ def estimate_uncertainty(
     beforehand = _information(known_rows @ units[:size]) + _information(drawn.T @ units[size:])
     covariance = units @ (scores + beforehand) @ units.T
     return Uncertainty(
-        # symmetric but for rounding
+        # This removes asymmetry by rounding.
         (covariance + covariance.T) / 2,
         _information(problem.guess.rows @ units[:size] @ units[:size].T),
         covariance_by_kind(firsts, units[:size] @ units[size:].T @ drawn),
@@ -164,7 +164,7 @@ class _Linear:
 
     missed (n, 6): residuals of the model. slopes (n, 6, p): their derivatives with respect to the
     parameters. rows (n, 6, p + k): derivatives with respect to the parameters and the common errors
-    of all records. modes (n, 6, own): modes of the record's own common errors.
+    of all records. modes (n, 6, own): modes of the common errors of this record.
     """
 
     missed: Array
@@ -174,7 +174,7 @@ class _Linear:
 
     @property
     def left(self) -> Array:
-        """Residuals (n, 6) with the most likely common errors."""
+        """Residuals (n, 6) that remain with the most likely common errors."""
         modes = self.modes.reshape(self.missed.size, -1)
         return self.missed + self.modes @ most_likely_of(modes, self.missed.ravel())
 
@@ -182,7 +182,7 @@ class _Linear:
 def _linearised(runs: Sequence[LoopModel], parameters: Array) -> list[_Linear]:
     """Return the linearisation of each run about the parameters (p,).
 
-    Columns of the common errors stand behind those of the parameters, record by record.
+    The columns of the parameters come first, then the columns of the common errors by record.
     """
     modes = [run.whitened_modes for run in runs]
     counts = [one.shape[2] for one in modes]
@@ -200,7 +200,8 @@ def load_score_covariance(runs: Sequence[LoopModel], information: Sequence[Array
     """Return the covariance (q, q) of the scores T^T J^T r by the loads' standard deviations.
 
     It is of first order. information: T^T J^T J (q, p) of each run's residuals. Runs that state the
-    same load, equally well known, share its error. Different loads err independently.
+    same load with the same standard deviations share its error. Errors of different loads are
+    independent.
     """
     shown: dict[tuple[float, ...], Array] = {}
     for run, one in zip(runs, information, strict=True):
@@ -213,9 +214,9 @@ def load_score_covariance(runs: Sequence[LoopModel], information: Sequence[Array
 def _units(rows: list[Array]) -> Array:
     """Return a matrix T (p, p) with T^T W T = 1, and so W^-1 = T T^T.
 
-    W is the information of all rows (n, p) together. T comes from the rows themselves: W has the
-    square of their condition number, beyond what its inverse can bear where a record contradicts
-    the model.
+    W is the information of all rows (n, p) together. T is computed from the rows by QR, because W
+    has the square of their condition number. If a record contradicts the model, W could not be
+    inverted accurately.
     """
     triangle = triangular_factor(np.vstack(rows))
     return np.asarray(solve_triangular(triangle, np.eye(triangle.shape[1])))
@@ -236,9 +237,9 @@ def _noise(
 ) -> tuple[Array, Misfit, int]:
     """Return the covariance (q, q) of the scores by noise, the misfit, and the number of failures.
 
-    found: linearisation of each run, with rows in the units of the scores. A failure is a
-    repetition that ended early. Where the model's error decides, or its residuals are white, no
-    experiment is repeated.
+    found: linearisation of each run, with rows in the units of the scores. A failure is an unstable
+    repetition. No experiment is repeated if the model's error makes most of the residuals, or if
+    the residuals are white.
     """
     runs = zip(problem.runs, found, strict=True)
     white = misfit_of_white(np.concatenate([run.without_common(one.missed) for run, one in runs]))
@@ -250,7 +251,8 @@ def _noise(
     if len(scores) < FEWEST:
         raise EstimationError(
             f"{unstable} of {DRAWS} repeated experiments on the identified model ended in an "
-            "unstable loop: its servo cannot bear the sensor's noise, and no interval can be given"
+            "unstable loop: the servo is unstable with the sensor's noise, and no interval can be "
+            "given"
         )
     misfit = Misfit(white.found, float(np.mean(squares)), float(np.std(squares, ddof=1)))
     return np.cov(scores.T), misfit, unstable
@@ -263,10 +265,9 @@ def _repeated_scores(
     rng: np.random.Generator,
     advance: Advance,
 ) -> tuple[Array, list[float]]:
-    """Return scores and mean squared residuals of the repeated experiments whose loop is stable.
+    """Return scores and mean squared residuals of the stable repeated experiments.
 
-    The scores J^T r (draws, q) are those of noise. The residuals are those of noise and common
-    errors.
+    The scores J^T r (draws, q) are for noise alone. The residuals are for noise and common errors.
     """
 
     def judged(
@@ -290,9 +291,9 @@ def _repeated_scores(
         ]
 
     results = []
-    # a generator for each draw: results do not depend on the threads' order
+    # Each draw has its own generator, so results do not depend on the order of threads.
     each = rng.spawn(DRAWS)
-    # threads are enough: the compiled loop runs LANES draws at once, without Python's lock
+    # Threads are enough, because the compiled loop runs LANES draws at once without Python's lock.
     with ThreadPoolExecutor(cores()) as pool:
         for some in pool.map(repeat, [each[k : k + LANES] for k in range(0, DRAWS, LANES)]):
             results += [result for result in some if result]
@@ -300,7 +301,7 @@ def _repeated_scores(
     rows = np.concatenate([one.rows.reshape(-1, one.rows.shape[2]) for one in found])
     drawn = np.array([noise.ravel() for noise, _ in results]).reshape(len(results), len(rows))
     squares = [square for _, square in results]
-    # one product for all draws, as each alone would read all rows again
+    # A single product for all draws reads the rows only once.
     return drawn @ rows, squares
 
 
@@ -309,7 +310,7 @@ def repeated_experiments(
 ) -> list[ClosedLoopRun | LoopFailure]:
     """Repeat the experiment on the identified model, with noise from each generator.
 
-    Measured poses are NaN where lost. A run whose loop is unstable is returned as its LoopFailure.
+    Lost measured poses are NaN. For an unstable run, its LoopFailure is returned.
     """
     root = np.linalg.cholesky(run.covariance).T
     noises = np.stack([rng.standard_normal(run.measured.shape) @ root for rng in draws])

@@ -1,16 +1,17 @@
-"""Choice of the drives' law, by the evidence of a record for each law that is known.
+"""Choice of the law of the drives, by the evidence of a record for each known law.
 
-Each law is a model of its own: a warm start, then the search for the optimum of the output error
-under the logged commands, whose residuals are white. The evidence is the probability of the record
-with all parameters integrated out, over what was known of them before. About the optimum the cost
-is a parabola, so that by Laplace's method
+Each law is a separate model with a warm start and a search for the optimum of the output error
+under the logged commands, for which residuals are white. The evidence is the probability of the
+record, integrated over all parameters with their prior. Near the optimum the cost is quadratic. By
+Laplace's method
 
-    ln p(record | law) = -(cost + ln det W - ln det P) / 2 + the same for all,
+    ln p(record | law) = -(cost + ln det W - ln det P) / 2 + constant,
 
-with W the information of poses and prior at the optimum, and P that of the prior. A law has less
-evidence if the record excludes much of what its gains could have been. Before the record all laws
-are equally probable. Where the best of them misses the record by more than noise explains, all
-costs are divided by its misfit, so that a record that no law explains rules none out.
+with W the information of poses and prior at the optimum, and P the information of the prior. The
+constant is the same for all laws. A law has less evidence if the record excludes most of the prior
+range of its gains. All laws have the same prior probability. If even the best law misses the record
+by more than noise explains, all costs are divided by its misfit, so that a record that no law
+explains does not rule out any law.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,24 +31,24 @@ from identify.scenario import Model
 from identify.scenario.plant_sections import AUTO
 
 SURE = 0.95
-"""Probability from which on a record tells the law."""
+"""Smallest probability with which a law counts as certain."""
 
 FIRST = 4
-"""Number of iterations for every law at first.
+"""Number of iterations of the first search for every law.
 
-Laws that fit the record are near their optimum by then, while others may search for long.
+After these, laws that fit the record are near their optimum. Other laws could need many more.
 """
 
 HOPELESS = 10.0
-"""Factor of the best cost above which a law is not searched any further."""
+"""Factor of the best cost above which the search for a law is not continued."""
 
 
 @dataclass(frozen=True)
 class DriveChoice:
-    """Law of the drives, and how probable each law is.
+    """Law of the drives, and the probability of each law.
 
-    A law that the scenario names has the probability 1. in_loop: False if the drives took torques,
-    so that no law acted as the record was made.
+    A law that the scenario names has the probability 1. in_loop: False for torque commands, under
+    which the law of the drives did not act.
     """
 
     law: DriveName
@@ -56,20 +57,20 @@ class DriveChoice:
 
     @property
     def asked(self) -> bool:
-        """True if the record was asked for the law."""
+        """True if the law was chosen from the record."""
         return len(self.probabilities) > 1
 
     @property
     def sure(self) -> bool:
-        """True if the record tells the law."""
+        """True if the law is certain."""
         return self.probabilities[self.law] >= SURE
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a warning if the record cannot tell the law, or says nothing of it."""
+        """Return a warning if the record does not determine the law."""
         if not self.in_loop:
             return (
-                "the drives took torques: the law by which they follow joint commands is not in "
-                "this record, and its gains are those of the starting values",
+                "the commands are torques: the law by which the drives follow joint commands did "
+                "not act in this record, and its gains are those of the initial guess",
             )
         if self.sure:
             return ()
@@ -77,8 +78,8 @@ class DriveChoice:
             f"{name} {value:.0%}" for name, value in self.probabilities.items() if value >= 0.01
         )
         return (
-            f"the record cannot tell the law of the drives ({said}): the gains are those of "
-            f"{self.law}; move the robot faster or longer, or state the law in model.drive",
+            f"the record does not determine the law of the drives ({said}): the gains are for the "
+            f"law {self.law}; move the robot faster or longer, or state the law in model.drive",
         )
 
 
@@ -88,10 +89,10 @@ def choose_drive(
     progress: Progress,
     in_loop: bool = True,
 ) -> DriveChoice:
-    """Return the law that a model names or, if it leaves that open, the most probable one.
+    """Return the law that a model names or, if it leaves the law open, the most probable law.
 
     problem_of: function that returns the output-error problem under a law. in_loop: False if no law
-    acted in the record. Raises EstimationError if no law gives a model that runs.
+    acted in the record. Raises EstimationError if the model is unstable under all laws.
     """
     law = model.drive_law
     if not in_loop:
@@ -107,13 +108,13 @@ def choose_drive(
                 problem = problem_of(law)
                 early = replace(problem, stop=replace(problem.stop, max_iterations=FIRST))
                 first[law] = _searched(early, linear_warm_start(problem))
-            # a law under which no model runs is out, and the others decide
+            # A law with an unstable model is excluded.
             except (EstimationError, DynamicsError) as error:
                 failed.append(f"{law}: {error}")
             advance()
         if not first:
             raise EstimationError(
-                f"no law of the drives gives a model that runs: {'; '.join(failed)}"
+                f"the model is unstable under every law of the drives: {'; '.join(failed)}"
             )
         limit = HOPELESS * min(one.solution.costs[-1] for one in first.values())
         found = {
@@ -121,7 +122,7 @@ def choose_drive(
             for law, one in first.items()
             if one.solution.costs[-1] <= limit
         }
-        # laws that were left out count as searched
+        # Laws that were left out count as finished.
         advance(len(laws))
     return DriveChoice(*_weighed(found, laws))
 
@@ -129,7 +130,7 @@ def choose_drive(
 def _searched(problem: OutputErrorProblem, start: Array) -> Search:
     """Search for the optimum under the logged commands.
 
-    Raises EstimationError if no model runs.
+    Raises EstimationError if no stable model is found.
     """
     found = output_error_searches(problem, start, closed_loop=False, progress=SilentProgress())
     return found["command_driven"]
@@ -139,8 +140,8 @@ def _searched(problem: OutputErrorProblem, start: Array) -> Search:
 class Evidence:
     """Evidence of a record for a law.
 
-    cost: at the optimum. misfit: that of the poses alone, over the number of their components.
-    narrowed: ln det W - ln det P.
+    cost: cost at the optimum. misfit: cost of the poses alone, divided by the number of their
+    components. narrowed: ln det W - ln det P.
     """
 
     cost: float
@@ -165,12 +166,12 @@ def _weighed(
 ) -> tuple[DriveName, dict[str, float]]:
     """Return the most probable law, and the probability of each.
 
-    A law that gives no model has the probability zero.
+    A law without a stable model has the probability zero.
     """
     misfit = max(1.0, min(one.misfit for one in found.values()))
     logarithms = {law: -(one.cost / misfit + one.narrowed) / 2 for law, one in found.items()}
     best = max(logarithms, key=lambda law: logarithms[law])
-    # relative to the best one, as the evidence itself is too small for a floating-point number
+    # The evidence is too small for a floating-point number, so only ratios are computed.
     weights = {
         law: float(np.exp(logarithms[law] - logarithms[best])) if law in found else 0.0
         for law in laws

@@ -1,25 +1,25 @@
 """Tests of whether the model explains its records, by the size and the whiteness of its residuals.
 
-With the right model the mean squared whitened residual is what noise makes of it, but for chance.
-Where it is larger than chance allows, the rest, the misfit, is an error of the model. Unlike noise
-it lasts from frame to frame, and moves an estimate further than white residuals of the same size
-would. Scaling the covariance by the residual (Birge's ratio) is therefore not enough. The scores
-J^T r of stationary residuals with the autocorrelation R_k have the covariance
+With the right model, noise alone determines the mean squared whitened residual. If the residual is
+significantly larger, the excess is caused by an error of the model. Such an error is correlated
+from frame to frame, and moves an estimate further than white residuals of the same size would.
+Scaling the covariance by the residual (Birge's ratio) is therefore not enough. The scores J^T r of
+stationary residuals with the autocorrelation R_k have the covariance
 
     sum over frames i, j of J_i^T R_(i-j) J_j
 
 (Morelli and Klein, "Accuracy of aerodynamic model parameters estimated from flight test data", J.
-Guidance, Control, and Dynamics 20(1), 1997), with R_k from the residuals themselves. The model's
-share is added to what the noise makes. No residual shows the part of an error that the parameters
-take up. Where the model's error makes most of the residual, no interval can be trusted, and nothing
-counts as identified.
+Guidance, Control, and Dynamics 20(1), 1997), with R_k estimated from the residuals. The part of
+the model's error is added to the part of the noise. An error that is compensated by wrong
+parameters does not appear in the residuals. If the model's error makes most of the residual, no
+interval can be trusted, and nothing counts as identified.
 
-A model driven by the logged commands feels everything that the plant felt. With the right model its
+A model driven by the logged commands has the same input as the plant. With the right model its
 residuals are the sensor's noise, independent from frame to frame. The portmanteau test of Ljung and
-Box tells whether their autocorrelations r_k could be chance: n (n + 2) sum_k r_k² / (n - k) over
-the lags k = 1 ... L is chi-square with L degrees of freedom. A model that closes its own loop
-cannot follow what the noise did to the plant. Its residuals are coloured even if it is right, and
-are not tested.
+Box checks their autocorrelations r_k: n (n + 2) sum_k r_k² / (n - k) over the lags k = 1 ... L is
+chi-square distributed with L degrees of freedom. A model that closes its own loop cannot follow the
+effect of the noise on the plant. Its residuals are coloured even if it is right, and are not
+tested.
 """
 
 from dataclasses import dataclass
@@ -35,19 +35,18 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.files.dataset import POSE
 
 SIGNIFICANT = float(ndtri(0.999))
-"""Standard deviations above the expected residual from which on the rest is an error of the model.
-"""
+"""Excess of the residual, in standard deviations, above which the model has an error."""
 
 MISFIT_STDS = 5.0
-"""Standard deviations below the expected residual from which on the stated covariance is wrong."""
+"""Deficit of the residual, in standard deviations, above which the stated covariance is wrong."""
 
 NOISE_DECIDES = 3.0
-"""Ratio of the residual to the expected one above which the model's error decides."""
+"""Ratio of the residual to its expected value above which the model's error dominates."""
 
 REACH = 0.2
-"""Lag after which residuals are taken as independent, as a share of a record's length.
+"""Lag from which residuals are assumed independent, as a share of a record's length.
 
-Up to there correlations fade out.
+Up to this lag, a window reduces the correlations gradually to zero.
 """
 
 MISFIT = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
@@ -56,9 +55,9 @@ MISFIT = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
 
 @dataclass(frozen=True)
 class Misfit:
-    """Mean squared whitened residual of a record, and what noise alone would make of it.
+    """Mean squared whitened residual of a record, and its expected value for noise alone.
 
-    std: spread of the expected value from one experiment to the next.
+    std: standard deviation of the residual from experiment to experiment, for noise alone.
     """
 
     found: float
@@ -68,7 +67,7 @@ class Misfit:
     def __str__(self) -> str:
         return (
             f"the mean squared residual is {self.found:.3f} times the variance that the sensor "
-            f"states, where noise alone would make it {self.expected:.3f} ± {self.std:.3f}"
+            f"states, and {self.expected:.3f} ± {self.std:.3f} times is expected of noise alone"
         )
 
     @property
@@ -78,7 +77,7 @@ class Misfit:
 
     @property
     def share_of_model(self) -> float:
-        """Share of the model's error in the residual's variance, zero where it may be chance."""
+        """Share of the model's error in the residual's variance. Zero if not significant."""
         return 1 - self.expected / self.found if self.significant else 0.0
 
     @property
@@ -97,8 +96,8 @@ class Misfit:
         if self.significant:
             return (
                 f"{model} does not explain all of the record: {self}; {wrong}; the intervals are "
-                "widened by what the residuals show, but cannot know of errors that the parameters "
-                "have taken up",
+                "widened according to the residuals, but not for errors that wrong parameters "
+                "compensate",
             )
         if self.found < self.expected - MISFIT_STDS * self.std:
             return (
@@ -109,18 +108,18 @@ class Misfit:
 
 
 def misfit_of_white(residuals: Array) -> Misfit:
-    """Return the misfit of whitened residuals (n, 6) that noise alone would leave white.
+    """Return the misfit of whitened residuals (n, 6) that are white for noise alone.
 
-    Such are those of a model that is driven by the logged commands.
+    This holds for a model that is driven by the logged commands.
     """
     return Misfit(float(np.mean(residuals**2)), 1.0, float(np.sqrt(2 / residuals.size)))
 
 
 def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.bool_]) -> Array:
-    """Return the covariance (p, p) of J^T r for residuals r as correlated as those found.
+    """Return the covariance (p, p) of J^T r for residuals with their estimated autocorrelation.
 
-    residuals (n, 6) and jacobian (n, 6, p) are of the good frames, `ok` (N,). Frames between them
-    have no residual, and add nothing.
+    residuals (n, 6) and jacobian (n, 6, p) are of the good frames, `ok` (N,). Lost frames have no
+    residual, and add nothing.
     """
     count = len(ok)
     size = jacobian.shape[2]
@@ -128,19 +127,19 @@ def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.
     slopes = np.zeros((count, 6, size))
     rows[ok] = residuals
     slopes[ok] = jacobian
-    # twice as long, so that the circular correlation is the linear one
+    # Zero padding to twice the length makes the circular correlation a linear correlation.
     length = next_fast_len(2 * count, real=True)
     spectrum = rfft(rows, length, axis=0)
     correlations = (
         irfft(spectrum[:, :, None] * spectrum[:, None, :].conj(), length, axis=0) / ok.sum()
     )
     lags = np.minimum(np.arange(length), length - np.arange(length))
-    # a triangular window keeps the sum positive semidefinite
+    # A triangular window makes the sum positive semidefinite.
     fading = np.maximum(1 - lags / (REACH * count), 0.0)
     density = rfft(correlations * fading[:, None, None], axis=0)
     seen = rfft(slopes, length, axis=0)
     weighted = np.einsum("fij,fjb->fib", density, seen)
-    # the negative frequencies, which zero and Nyquist do not have
+    # Doubling accounts for the negative frequencies, which zero and Nyquist do not have.
     weighted[1 : (length + 1) // 2] *= 2
     total = np.tensordot(seen.conj(), weighted, axes=([0, 1], [0, 1])).real / length
     return np.asarray((total + total.T) / 2, dtype=float)
@@ -150,16 +149,16 @@ LAGS = 10
 """Number of lags tested, in frames."""
 
 SUSPICIOUS = 1e-4
-"""Probability of the residuals under the model below which the model is called wrong."""
+"""P-value of the residuals below which the model counts as wrong."""
 
 
 @dataclass(frozen=True)
 class Whiteness:
     """Result of the test for whiteness.
 
-    autocorrelations (6, lags): those of the pose components. p_values (6,) and p_value, of each
-    component and of all together: probability of correlations at least as large if only noise
-    remains.
+    autocorrelations (6, lags): autocorrelations of the pose components. p_values (6,) and p_value:
+    probability of correlations at least as large for noise alone, for each component and for all
+    components together.
     """
 
     autocorrelations: Array
@@ -177,8 +176,8 @@ class Whiteness:
             return ()
         parts = ", ".join(f"{name} {p:.1g}" for name, p in zip(POSE, self.p_values, strict=True))
         return (
-            "the model, driven by the logged commands, leaves residuals that follow each other "
-            f"from frame to frame: noise would do so with a probability of {self.p_value:.1g} (by "
+            "the residuals of the model, driven by the logged commands, are correlated from frame "
+            f"to frame: for noise alone this has a probability of {self.p_value:.1g} (by "
             f"component {parts}); either this model of the robot is wrong, or the errors of the "
             "camera last for several frames",
         )
@@ -187,8 +186,8 @@ class Whiteness:
 def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whiteness:
     """Test residuals (N, 6), in standard deviations, for whiteness.
 
-    Frames where `ok` (N,) is False are missing and may be NaN. Raises EstimationError with fewer
-    than ten good frames a lag.
+    Frames where `ok` (N,) is False are missing and can be NaN. Raises EstimationError with fewer
+    than ten good frames per lag.
     """
     if ok.sum() < 10 * lags:
         raise EstimationError(
@@ -203,7 +202,7 @@ def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whit
     for lag in range(1, lags + 1):
         pairs = float(present[lag:] @ present[:-lag])
         correlations[:, lag - 1] = np.sum(centred[lag:] * centred[:-lag], axis=0) / power
-        # Gaps leave fewer pairs than n - k; their number stands for it in the variance of r_k.
+        # With gaps there are fewer pairs than n - k, so the number of pairs replaces n - k.
         statistics += (count + 2) * count * correlations[:, lag - 1] ** 2 / max(pairs, 1.0)
     together = float(chdtrc(lags * len(statistics), statistics.sum()))
     return Whiteness(correlations, np.asarray(chdtrc(lags, statistics)), together)
@@ -213,8 +212,8 @@ def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whit
 class Explanation:
     """Judgement of how well a model explains its records.
 
-    misfit is that of the estimate's own residuals. driven_misfit and whiteness are those of the
-    model that the logged commands drive, which feels what the sensor's noise did to the plant.
+    misfit: misfit of the residuals of the estimate. driven_misfit and whiteness: tests of the
+    residuals of the model that is driven by the logged commands.
     """
 
     misfit: Misfit
@@ -223,16 +222,16 @@ class Explanation:
 
     @property
     def hidden(self) -> bool:
-        """True if the closed loop hides an error that the model shows under the logged commands."""
+        """True if an error dominates under the logged commands, but not in the closed loop."""
         return self.driven_misfit.decides and not self.misfit.decides
 
     @property
     def model_holds(self) -> bool:
-        """True if an error of the model makes most of neither residual."""
+        """True if no error of the model dominates either residual."""
         return not (self.misfit.decides or self.driven_misfit.decides)
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what the command-driven residuals say beyond the misfit of the estimate's own."""
+        """Return the warnings of the command-driven model that the misfit does not contain."""
         if not self.hidden:
             return self.whiteness.warnings()
         driven = self.driven_misfit.warnings("driven by the logged commands, the model")
@@ -244,8 +243,8 @@ def explanation(
 ) -> Explanation:
     """Judge a model from the command-driven problem at its own optimum (p,).
 
-    misfit: that of the estimate. rng: draws what a fit has taken out of the residuals. Raises
-    EstimationError with too few good frames.
+    misfit: misfit of the estimate. rng: generator for `white_misses`. Raises EstimationError with
+    too few good frames.
     """
     residuals, ok = _residuals(driven, parameters, rng)
     return Explanation(misfit, misfit_of_white(residuals[ok]), whiteness(residuals, ok))
@@ -256,8 +255,8 @@ def _residuals(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the whitened residuals (N, 6) of all records, and which frames (N,) are good.
 
-    Residuals are NaN where the pose was lost. The records follow each other with a gap of all lags
-    of the test for whiteness between them.
+    Residuals of lost poses are NaN. Between two records there is a gap as long as the largest lag
+    of the test for whiteness.
     """
     gap = np.full((LAGS, 6), np.nan)
     residuals = []

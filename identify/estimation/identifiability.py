@@ -1,37 +1,35 @@
-"""Identifiability of each parameter and group: whether the records identify it, and at what risk.
+"""Identifiability of each parameter and group of parameters.
 
-A quantity counts as identified when the record
+A quantity counts as identified if the record
 
-- at least halves the standard deviation that the starting guess leaves, and
-- leaves less than half of the quantity's size in doubt.
+- at least halves its prior standard deviation, and
+- leaves a standard deviation of less than half of its size.
 
-The size follows from the starting guess and not from the estimate. An estimate is noisy, and what
-is judged by it is called identified just where chance made it large. Intervals that are selected in
-this way miss the truth too often. A parameter's size is that of its guess. For friction that is
-guessed to be zero, it is a tenth of the torque that the joints hold at home. The size of a group is
-the root of the summed squares of what its members contribute. So a difference of large masses is as
-large as they are, though the guess may have it vanish. If it is known to a fraction of that, it is
-known to be small, while its own relative error may be anything.
+The size follows from the initial guess and not from the noisy estimate. A criterion with the
+estimate would select quantities that chance made large, and their intervals would miss the truth
+too often. The size of a parameter is its initial guess. For friction with a guess of zero, the size
+is a tenth of the torque that the joints hold at home. The size of a group is the root of the sum of
+squares of the contributions of its members. A difference of large masses thus has the size of these
+masses, even if the guess of the difference is zero.
 
-Groups are the base parameters, the combinations that a record can show. What is known of one
-follows from its members by linear propagation, and it is often known well where none of them is.
-Poses show the groups and the gains up to their common factor. The scale anchor adds what it
-measures. A parameter that is none of these, nor a combination of them, may be estimated with a
-small standard deviation all the same, if the guess knows the other members of a sum well enough. A
-mass that shows only in link4.Ixx - 0.0227 link4.mass is an example: it rests on the guess of
-link4.Ixx. Where errors of the guess make more than half of an estimate's variance, the estimate
-rests on the prior. It is as good as what the guess says, which is the same in every record, and its
-interval holds the truth where that of the guess does.
+Groups are the base parameters, the combinations that a record can identify. The uncertainty of a
+group follows from its members by linear propagation. A group is often known well although none of
+its members is. Poses identify the groups and the gains up to a common factor, and the scale anchor
+identifies the measured quantity. Another parameter can still have a small standard deviation, if
+the guess of the other members of its group is accurate. For example, a mass that acts only in
+link4.Ixx - 0.0227 link4.mass depends on the guess of link4.Ixx. If errors of the guess make more
+than half of the variance of an estimate, the estimate rests on the prior. Its interval then
+contains the truth only if the interval of the guess does, and further records do not help.
 
-The common factor may rest on the prior, too. Weighing a platform does not fix it where poses show
-the platform's mass only in a sum with others that are heavy. The gains tell, since poses show them
-but for this factor.
+The common factor can also rest on the prior. If poses show the platform's mass only in a sum with
+other heavy bodies, weighing the platform does not fix the factor. The gains reveal this, because
+poses determine them up to the common factor.
 
-Conditioning says how unevenly a record tells the parameters apart. The information is taken in
-units of the starting guess: an eigenvalue of one is a direction that the record shows as well as
-the guess knows it. With the guess, the information is that of all parameters. Without it, most of
-them would have none. The poses alone are therefore asked for the base parameters and the gains,
-with their common factor held, which poses never show (`prior`).
+Conditioning describes how differently well a record determines the parameters. The information is
+in units of the prior: an eigenvalue of one is a direction that the record determines as well as the
+initial guess does. The information with the prior covers all parameters. The information of the
+poses alone covers only the base parameters and the gains, because single parameters have none. The
+direction of the common factor is excluded, because poses never determine it (`prior`).
 """
 
 from dataclasses import dataclass
@@ -57,13 +55,13 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import ScaleAnchor, StartingGuess, friction, holding_torque
 
 IDENTIFIABLE_SHARE = 0.5
-"""Share of the guess's standard deviation, and of the size, that may be left in doubt.
+"""Largest standard deviation of an identified quantity, as a share of its prior and of its size.
 
-A quantity is identified if its standard deviation is below both.
+The standard deviation must be below this share of both the prior standard deviation and the size.
 """
 
 RESTS_ON_PRIOR = 0.5
-"""Share of an estimate's variance by errors of the guess above which it rests on the prior."""
+"""Share of an estimate's variance due to errors of the guess above which it rests on the prior."""
 
 FRICTION_SHARE = 0.1
 """Ordinary friction, as a share of the holding torque or force.
@@ -76,9 +74,9 @@ It is Coulomb friction, or viscous friction at 1 rad/s or 1 m/s.
 class Identifiability:
     """Criterion by which quantities are identified.
 
-    std, sizes (p,): standard deviations of the parameters in the starting guess, and their sizes,
-    SI. model_holds: False if an error of the model makes most of the residuals. Nothing is
-    identified then.
+    std, sizes (p,): standard deviations of the initial guess of the parameters, and their sizes,
+    SI. model_holds: False if an error of the model makes most of the residuals. Then nothing is
+    identified.
     """
 
     std: Array
@@ -88,7 +86,7 @@ class Identifiability:
     def judge(self, rows: Array, covariance: Array) -> NDArray[np.bool_]:
         """Return which of the quantities rows (n, p) @ parameters are identified.
 
-        covariance (p, p): that of the estimate.
+        covariance (p, p): covariance of the estimate.
         """
         left = combined_std(rows, covariance)
         before = np.sqrt(rows**2 @ self.std**2)
@@ -99,9 +97,9 @@ class Identifiability:
 def identifiability(
     guess: StartingGuess, robot: Robot, model_holds: bool = True
 ) -> Identifiability:
-    """Return the criterion that follows from a starting guess.
+    """Return the criterion that follows from an initial guess.
 
-    A guess of zero, other than of friction, has the size 1.
+    Parameters with a guess of zero, except friction, have the size 1.
     """
     held = FRICTION_SHARE * holding_torque(robot, guess.values[robot.layout.dynamic])
     unsaid = np.where(friction(robot.layout), held, 1.0)
@@ -120,11 +118,11 @@ class GroupEstimates:
     combinations : ndarray, shape (rank, p)
         Groups as combinations of the dynamic parameters.
     initial, estimate, std : ndarray, shape (rank,)
-        Values of the starting guess, estimates, and their standard deviations.
+        Initial guesses, estimates, and standard deviations of the estimates.
     identifiable : ndarray of bool, shape (rank,)
-        Groups that are identified.
+        True for identified groups.
     prior_share : ndarray, shape (rank,)
-        Share of the variance that errors of the starting guess make.
+        Share of the variance due to errors of the initial guess.
     """
 
     names: tuple[str, ...]
@@ -138,14 +136,14 @@ class GroupEstimates:
 
     @property
     def rests_on_prior(self) -> NDArray[np.bool_]:
-        """Groups (rank,) that are identified only with what the guess says of other parameters."""
+        """True for each group (rank,) that is identified only with the guess of parameters."""
         return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
 
 def group_rows(base: BaseParameters) -> Array:
     """Return the groups as combinations (rank, p) of all parameters.
 
-    The gains of the joint PID belong to none.
+    The gains of the joint PID belong to no group.
     """
     return np.pad(base.combinations, ((0, 0), (0, len(JOINT_PID))))
 
@@ -172,43 +170,43 @@ def group_estimates(
 
 
 def variance_share(rows: Array, part: Array, covariance: Array) -> Array:
-    """Return the share of the variance of rows (n, p) @ parameters that a part of it makes.
+    """Return the share (n,) of a part of the covariance in the variance of rows @ parameters.
 
-    part, covariance (p, p): the part and the whole of the parameters' covariance.
+    rows (n, p): combinations. part, covariance (p, p): the part and the whole covariance of the
+    parameters.
     """
     return np.asarray((combined_std(rows, part) / combined_std(rows, covariance)) ** 2)
 
 
 SCALE_KNOWN = 0.015
-"""Largest doubt of the common factor, as a share of it, that starting values may leave.
+"""Largest relative standard deviation of the common factor due to the initial guess.
 
-It counts where an instrument was to fix the factor.
+It is allowed without a warning if an instrument was used to fix the factor.
 """
 
 
 def scale_warnings(anchor: ScaleAnchor, left: float, prior_share: float) -> tuple[str, ...]:
-    """Return a warning if an instrument was to fix the scale, but does not.
+    """Return a warning if an instrument was used to fix the scale, but does not fix it.
 
-    Poses show the controller's gain but for the scale. left: standard deviation of the gain by
-    errors of the starting values, as a share of it. prior_share: share of its variance that they
-    make.
+    Poses determine the controller's gain up to the scale. left: relative standard deviation of the
+    gain due to errors of the initial guess. prior_share: share of these errors in its variance.
     """
     if anchor.value is None or left <= SCALE_KNOWN or prior_share <= RESTS_ON_PRIOR:
         return ()
     return (
-        f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show what was "
-        "measured only in sums with other parameters, and the starting values of these leave "
-        f"joint_pid.lp uncertain by {left:.1%}; all that is given in kg, N m or N is as uncertain: "
-        "take identification.scale_anchor = joint_gain, or state in identification.prior what else "
-        "was weighed",
+        f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show the "
+        "measured quantity only in sums with other parameters, and the initial guess of these "
+        f"leaves joint_pid.lp uncertain by {left:.1%}; values in kg, N m or N are as uncertain: "
+        "use identification.scale_anchor = joint_gain, or state further weighed masses in "
+        "identification.prior",
     )
 
 
 POOR = 1e13
-"""Condition number of the poses' information beyond which double precision is not enough.
+"""Condition number of the poses' information above which double precision is not enough.
 
-With its resolution of 1.1e-16, the variance of the least known direction has fewer than three
-digits left.
+With a resolution of 1.1e-16, the variance of the least known direction then has fewer than three
+correct digits.
 """
 
 
@@ -219,12 +217,12 @@ class Conditioning:
     Attributes
     ----------
     with_guess : float
-        Condition number with the starting guess.
+        Condition number with the initial guess.
     poses_alone : float
-        Condition number of the poses alone, infinite where rounding hides the smallest eigenvalue.
+        Condition number of the poses alone, infinite if rounding hides the smallest eigenvalue.
     directions, unshown : int
-        Number of directions of base parameters and gains, and number of those that the guess knows
-        better than the poses show them.
+        Number of directions of base parameters and gains, and number of directions that the guess
+        determines better than the poses.
     """
 
     with_guess: float
@@ -234,7 +232,7 @@ class Conditioning:
 
     @property
     def poor(self) -> bool:
-        """True if rounding decides what the poses say of the least known direction."""
+        """True if rounding affects the information about the least known direction."""
         return self.poses_alone > POOR
 
     def warnings(self) -> tuple[str, ...]:
@@ -248,9 +246,9 @@ class Conditioning:
         )
         return (
             f"the record is poorly conditioned: of {self.directions} independent combinations of "
-            f"parameters and gains, {self.unshown} are known from the starting values rather than "
-            f"from the poses (the condition number of what the poses tell is {number}); move the "
-            "robot faster, farther or longer",
+            f"parameters and gains, {self.unshown} are known from the initial guess rather than "
+            f"from the poses (the condition number of the poses' information is {number}); move "
+            "the robot faster, farther or longer",
         )
 
 
@@ -259,19 +257,19 @@ def conditioning(
 ) -> Conditioning:
     """Return the conditioning of an estimate (p,).
 
-    information (p, p): that of the poses. known (p, p): that of what is known beside them.
+    information (p, p): information of the poses. known (p, p): information of the prior.
     """
     everything = np.linalg.eigvalsh((information + known) * np.outer(guess.std, guess.std))
     count = base.combinations.shape[1]
-    # gains that the law of the drives lacks have no information
+    # Gains that the law of the drives does not read have no information.
     gains = count + np.flatnonzero(np.diag(information)[count:])
     seen = np.concatenate([base.pivots, gains])
     group_std = np.sqrt(base.combinations**2 @ guess.std[:count] ** 2)
     size = np.concatenate([group_std, guess.std[gains]])
     values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])
-    # a base parameter acts through its pivot alone, so that the pivot's column is its own
+    # A base parameter acts like its pivot, so it has the information of the pivot.
     scaled = information[np.ix_(seen, seen)] * np.outer(size, size)
-    # what is left without the direction of the common factor, that of the values themselves
+    # The direction of the common factor is the direction of the values. It is removed.
     free = null_space((values / size)[None])
     shown = np.linalg.eigvalsh(free.T @ scaled @ free)
     smallest = float(shown[0])
@@ -282,18 +280,18 @@ def conditioning(
 
 @dataclass(frozen=True)
 class Judgement:
-    """Judgement of an estimate, and what a reader must know before believing any of it.
+    """Judgement of an estimate: identifiability, intervals and warnings.
 
     Attributes
     ----------
     identifiable : ndarray of bool, shape (p,)
-        Parameters that are identified.
+        True for identified parameters.
     prior_share : ndarray, shape (p,)
-        Share of the variance that errors of the starting guess make.
+        Share of the variance due to errors of the initial guess.
     common_share : dict of ndarray, shape (p,)
-        Share that errors make which all poses of a record have in common, by kind.
+        Share of the variance due to errors that all poses have in common, by kind.
     intervals, group_intervals : ndarray, shapes (p, 2) and (rank, 2)
-        95 % intervals of parameters and groups, cut at the bounds.
+        95 % intervals of parameters and groups, truncated at the bounds.
     groups : GroupEstimates
         Estimates of the base parameters.
     conditioning : Conditioning
@@ -301,7 +299,7 @@ class Judgement:
     base_rank : int
         Number of independent groups that the references excite, by the paper's rule.
     active_bounds : tuple of str
-        What holds the estimate back.
+        Bounds that limit the estimate.
     warnings : tuple of str
         Warnings of the records, the model and the estimate.
     """
@@ -325,9 +323,9 @@ def judge(
     uncertainty: Uncertainty,
     explanation: Explanation,
 ) -> Judgement:
-    """Judge what a search found, by its uncertainty and by how well it explains the records.
+    """Judge a solution by its uncertainty and by how well it explains the records.
 
-    qr_threshold: that of `rank_by_threshold` for the groups that the references excite.
+    qr_threshold: threshold of `rank_by_threshold` for the groups that the references excite.
     """
     robot = problem.runs[0].robot
     guess = problem.guess
@@ -336,11 +334,11 @@ def judge(
     known = problem.known_information()
     criterion = identifiability(guess, robot, model_holds=explanation.model_holds)
     each = np.eye(len(estimate))
-    # every law of the drives has this gain, and poses show it but for the common factor
+    # Every law of the drives has this gain, and poses determine it up to the common factor.
     gain = robot.layout.names.index("joint_pid.lp")
     prior_share = variance_share(each, uncertainty.of_guess, uncertainty.covariance)
     gain_left = float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])
-    # commands that are torques show the scale themselves
+    # Torque commands determine the scale.
     if not uncertainty.information[gain, gain]:
         gain_left = 0.0
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)

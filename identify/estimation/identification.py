@@ -1,7 +1,7 @@
 """Identification of one record: linear warm start, output error, uncertainty, identifiability.
 
-It sees the record, the robot's geometry and starting guess, and the scenario's model side. It never
-sees the sensor, the plant's settings or the truth.
+Its input is the record, the robot's geometry and initial guess, and the scenario's model side. It
+has no access to the sensor, the plant's settings or the truth.
 """
 
 import time
@@ -49,29 +49,30 @@ def identify(
     Parameters
     ----------
     record : xarray.Dataset or sequence of them
-        One or several records of the same robot. The first brings the scale anchor.
+        One or several records of the same robot. The first record has the scale anchor.
     robot : Robot, optional
-        Robot as it is known. The default is the robot of the scenario.
+        Robot with its known geometry. The default is the robot of the scenario.
     scenario : Scenario, optional
-        Settings of the estimator. The default is the scenario that the first record carries.
+        Settings of the estimator. The default is the scenario in the first record.
     progress : Progress, optional
-        Where the progress is shown.
+        Display of the progress.
 
     Returns
     -------
     IdentificationResult
-        Estimates with their uncertainty, and what the record says of the model.
+        Estimates with their uncertainty, and tests of the model.
 
     Raises
     ------
     RecordError
-        A record misses something, such as its scenario or its scale anchor, or states a value
-        that cannot be, such as a seed that is no whole number.
+        A record is incomplete, for example without a scenario or scale anchor, or has an invalid
+        value, such as a seed that is not a whole number.
     EstimationError
-        An argument is no robot or scenario, a record is of another robot, timing or servo or
-        cannot carry an identification, or no model runs from the starting guess or the warm start.
+        An argument is not a Robot or Scenario, a record is of another robot, timing or servo or is
+        not suitable for an identification, or the model is unstable with both the initial guess
+        and the warm start.
     ScenarioError
-        The robot has no such parameter set, or no model has the starting guess.
+        The robot has no such parameter set, or no model can have the initial guess.
     dynamics.DynamicsError
         The robot cannot reach a pose of the record.
 
@@ -90,7 +91,7 @@ def identify(
     side = asked.side
     robot = side.robot
     settings = asked.settings
-    # the model can close the loop of the servo, and under any other law gets the logged commands
+    # The model can simulate only the servo. For other laws it gets the logged commands.
     by_servo = all(recorded_law(record) == SERVO for record in records)
     closed_loop = by_servo and settings.method == "closed_loop"
 
@@ -98,12 +99,12 @@ def identify(
         return output_error_problem(records, side.with_drive(law), settings)
 
     problem = output_error_problem(records, side, settings)
-    # drives that took torques had no law
+    # Drives with torque commands have no law.
     in_loop = not any(run.settings.drives.torques for run in problem.runs)
     drive = choose_drive(problem_under, side.model, progress, in_loop)
     if drive.asked:
         problem = problem_under(drive.law)
-    # with the record's seed, so that the same record has the same intervals every time
+    # With the record's seed, the same record always gives the same intervals.
     rng = mixed_generator(UNCERTAINTY, recorded_seed(records[0]))
     chosen = time.perf_counter()
     warm = linear_warm_start(problem)
@@ -116,7 +117,7 @@ def identify(
     judged = last.linearised()
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
-    # only under the logged commands are the residuals of a right model white
+    # Residuals of a right model are white only under the logged commands.
     driven = by_commands.linearised() if closed_loop else judged
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, settings.qr_threshold, solution, uncertainty, explained)
@@ -180,7 +181,9 @@ def asked_of(
 
 def _check_type(given: object, kind: type, loader: str) -> None:
     if not isinstance(given, kind):
-        raise EstimationError(f"{given!r} is no {kind.__name__}: {loader}(name or path) gives one")
+        raise EstimationError(
+            f"{given!r} is not a {kind.__name__}: {loader}(name or path) returns one"
+        )
 
 
 def output_error_problem(
@@ -188,26 +191,26 @@ def output_error_problem(
 ) -> OutputErrorProblem:
     """Return the output-error problem of one or several records.
 
-    The first record brings the scale anchor.
+    The first record has the scale anchor.
 
     Raises
     ------
     RecordError
-        A record has no scale anchor, or no such poses.
+        A record has no scale anchor, or no measured poses.
     EstimationError
-        A record does not fit, or cannot carry an identification.
+        A record does not fit, or is not suitable for an identification.
     ScenarioError
-        There is no such starting guess, or no model has it.
+        There is no parameter set for the initial guess, or no model can have the guess.
     """
     robot = side.robot
     groups = structure(robot).rigid_groups
-    # the motion depends on the groups alone, so that no other sensitivity need be integrated
+    # The motion depends only on the groups, so only their sensitivities are integrated.
     runs = tuple(replace(identified_model(record, side), groups=groups) for record in records)
     anchor = read_anchor(records[0], robot.layout)
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(
-            f"the scale anchor is a payload, and the {len(runs)} records have all the same load: "
-            "one with and one without it are needed"
+            f"the scale anchor is a payload, but the {len(runs)} records have all the same load: "
+            "a record with and a record without the load are needed"
         )
     guess = model_guess(robot, side.model, settings)
     try:
@@ -215,7 +218,7 @@ def output_error_problem(
     except DynamicsError as error:
         known = ", ".join(settings.prior) or "nothing"
         raise ScenarioError(
-            f"no model has the starting guess (set {side.model.start_parameters!r}, known "
+            f"no model can have the initial guess (set {side.model.start_parameters!r}, known "
             f"beforehand: {known}): {error}"
         ) from None
     return OutputErrorProblem(

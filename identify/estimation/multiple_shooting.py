@@ -1,16 +1,16 @@
 """Multiple shooting: fits to short segments, for models that do not run through a whole record.
 
-A model that is unstable, or that leaves the reachable set, has no output error over a record.
-Driven by the logged commands it has one over half a second, where each segment starts from a state
-of its own. A state holds coordinates of the platform, their rates, and the joint PID's integrals.
-For m coordinates and n joints these are s = 2 m + n numbers, unknown as the parameters are.
-Each segment must end where the next starts, up to what the sensor can see, so that at the optimum
-the segments make up one run.
+A model that is unstable, or that leaves the reach of the robot, has no output error over a whole
+record. Driven by the logged commands, it has an output error over segments of half a second. Each
+segment starts from its own state, which is unknown like the parameters. A state holds the
+coordinates of the platform, their rates, and the integrals of the joint PID. For m coordinates and
+n joints these are s = 2 m + n numbers. The end of each segment must agree with the start of the
+next segment within the accuracy of the sensor, so that at the optimum the segments form one run.
 
 In the linearised problem the states form a chain. They are eliminated one after the other by QR,
 which leaves a problem in the parameters alone (condensing; Bock and Plitt, "A multiple shooting
 algorithm for direct solution of optimal control problems", IFAC 1984). The step of the states
-follows from that of the parameters.
+follows from the step of the parameters.
 """
 
 from dataclasses import dataclass, field
@@ -38,21 +38,21 @@ from identify.scenario import Filter
 SEGMENT_S = 0.5
 """Length of a segment, s.
 
-It is a few periods of the joint loop, in which an unstable one does not leave the reachable set.
+It is a few periods of the joint loop. In this time an unstable loop does not leave the reach.
 """
 
 BANDWIDTH = 20.0
 """Bandwidth of the joint loop, rad/s.
 
-It turns the sensor's noise into a standard deviation of rates and integrals.
+It converts the sensor's noise into standard deviations of rates and integrals.
 """
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Frames `first` to `last` of a run, the last of which is the next segment's first.
+    """Segment of a run from frame `first` to frame `last`, the first frame of the next segment.
 
-    state_std (s,): standard deviation that the sensor's noise makes in a state.
+    state_std (s,): standard deviation of a state that corresponds to the sensor's noise.
     """
 
     run: LoopModel
@@ -63,7 +63,7 @@ class Segment:
 
     @property
     def ends_the_run(self) -> bool:
-        """True if no segment follows."""
+        """True for the last segment."""
         return self.last == len(self.run.ok) - 1
 
     @property
@@ -81,7 +81,7 @@ class Segment:
     ) -> ClosedLoopRun:
         """Simulate the model from a state (s,). The first segment starts in equilibrium.
 
-        Raises LoopFailure if the segment does not run.
+        Raises LoopFailure if the segment cannot be simulated.
         """
         run = self.run
         chart = self.chart
@@ -90,7 +90,7 @@ class Segment:
         pose = chart.pose(coordinates)
         at_rest = np.zeros(count)
         start = None
-        # the run begins in equilibrium, and no other segment does
+        # Only the first segment begins in equilibrium.
         if self.first:
             before, latencies = run.commands_before(self.first)
             start = StartState(
@@ -107,7 +107,7 @@ class Segment:
     def whitened(self, values: Array) -> Array:
         """Return pose values (frames, 6, ...) whitened and stacked, (n, ...).
 
-        Lost frames, and the frame that belongs to the next segment, are left out.
+        Lost frames and the first frame of the next segment are left out.
         """
         count = self.last - self.first + self.ends_the_run
         rows = values[:count][self.run.ok[self.first : self.first + count]]
@@ -115,7 +115,7 @@ class Segment:
 
 
 def segments(run: LoopModel) -> list[Segment]:
-    """Return the segments of a run, all of about the same length."""
+    """Return the segments of a run. All have about the same length."""
     frames = len(run.ok)
     count = max(1, round((frames - 1) / (SEGMENT_S * run.settings.timing.frame_rate_hz)))
     edges = np.linspace(0, frames - 1, count + 1).round().astype(int)
@@ -137,8 +137,8 @@ def segments(run: LoopModel) -> list[Segment]:
 def measured_states(chain: list[Segment], parameters: Array, low_pass: Filter) -> Array:
     """Return the states (segments, s) at the starts of a run's segments.
 
-    They are filtered poses and rates, and what the joint PID has integrated since the start, where
-    it held the model with parameters (p,) at rest.
+    They are filtered poses and rates, and the integrals of the joint PID. At the start of the run,
+    the integrals are those that hold the model with parameters (p,) at rest.
     """
     run = chain[0].run
     rate_hz = run.settings.timing.frame_rate_hz
@@ -166,8 +166,8 @@ def end_state(run: ClosedLoopRun, chart: Chart) -> Array:
 class MultipleShooting:
     """Least-squares problem in a robot's p parameters, for `bounded_least_squares.minimise`.
 
-    chains: segments of each record. states: those (segments, s) of each record, which follow the
-    parameters by the latest linearisation and are moved with each new one.
+    chains: segments of each record. states: states (segments, s) of each record at the latest
+    linearisation. For other parameters they are extrapolated by that linearisation.
     """
 
     problem: OutputErrorProblem
@@ -177,9 +177,9 @@ class MultipleShooting:
     _eliminated: list[list[Array]] = field(default_factory=list)
 
     def cost(self, parameters: Array) -> float:
-        """Return the sum of squared residuals of poses, continuity and what is known.
+        """Return the sum of squared residuals of poses, continuity and prior.
 
-        It is infinite where a segment does not run.
+        It is infinite if a segment cannot be simulated.
         """
         known, _ = self.problem.known(parameters)
         total = float(known @ known)
@@ -198,9 +198,9 @@ class MultipleShooting:
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
         """Return cost and condensed linearisation, see `bounded_least_squares.Problem`.
 
-        Raises LoopFailure where a segment does not run.
+        Raises LoopFailure if a segment cannot be simulated.
         """
-        # the states go along with the step that was taken, as the linearisation before has it
+        # The states make the step that the previous linearisation predicts.
         self.states = self._moved(parameters)
         self._at = parameters.copy()
         self._eliminated = []
@@ -210,14 +210,14 @@ class MultipleShooting:
         condensed = np.column_stack([known_rows, known])
         for chain, states in zip(self.chains, self.states, strict=True):
             state = states.shape[1]
-            # nothing depends on the first state: rows of one keep it where it is
+            # Nothing depends on the first state, so identity rows keep it unchanged.
             carried = np.eye(state, state + size + 1)
             eliminated = []
             for k, part in enumerate(chain):
                 following = None if part.ends_the_run else states[k + 1]
                 rows = _linearised(part, parameters, states[k], following)
                 cost += float(np.sum(rows[:, -1] ** 2))
-                # columns of the next state
+                # Columns for the next state are inserted.
                 carried = np.insert(carried, [state] * state, 0.0, axis=1)
                 triangle = np.asarray(np.linalg.qr(np.vstack([carried, rows]), mode="r"))
                 eliminated.append(triangle[:state])
@@ -237,11 +237,12 @@ class MultipleShooting:
 
 
 def _linearised(part: Segment, parameters: Array, state: Array, following: Array | None) -> Array:
-    """Return the linearised residuals of a segment, and of its continuity with the next one.
+    """Return the linearised residuals of a segment, and of its continuity with the next segment.
 
-    The next one begins at the state `following`. Columns are those of the segment's state, of the
-    following one and of the parameters, and the value. The first segment starts in equilibrium, so
-    that its state does not count.
+    The next segment begins at the state `following`. The columns are the derivatives with respect
+    to the segment's state, the following state and the parameters, and then the values. The
+    derivatives with respect to the state of the first segment are zero, because it starts in
+    equilibrium.
     """
     run = part.simulate(parameters, state, sensitivities=True)
     by_state = np.asarray(run.start_sensitivity)
@@ -257,7 +258,7 @@ def _linearised(part: Segment, parameters: Array, state: Array, following: Array
         return rows
     own = counts * end_by_state[:size, :size]
     gap = end_state(run, part.chart) - following
-    # continuity, in standard deviations of what the sensor can see of a state
+    # Continuity rows are in standard deviations of a state.
     joint = np.column_stack([own, -np.eye(size), end_by_parameters[:size], gap])
     return np.vstack([rows, joint / part.state_std[:, None]])
 

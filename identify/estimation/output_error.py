@@ -1,12 +1,12 @@
-"""Output error: measured poses against the model's under the same excitation (eq. 32, figure 3).
+"""Output error: difference of measured and modelled poses (eq. 32, figure 3).
 
 There are two ways to drive the model. In the closed loop, as in the paper, the model has the servo
 around it and follows the reference. Its ideal sensor has the same sampling, delay and hold, and
-loses the frames that the real one lost. Driven by commands, the model's joints get the logged
-commands, so that it feels what the sensor's noise did to the plant.
+loses the same frames as the real sensor. Driven by commands, the joints of the model get the logged
+commands, which contain the effect of the sensor's noise on the plant.
 
-The residuals are the pose differences of all records, whitened by the sensor's covariance, and one
-row for each thing known beside the poses: the starting guess and the scale anchor.
+The residuals are the pose differences of all records, whitened by the sensor's covariance, and a
+row for each prior information: the initial guess of each parameter and the scale anchor.
 """
 
 from collections.abc import Sequence
@@ -28,8 +28,8 @@ class OutputErrorProblem:
     """Least-squares problem in a robot's parameters over one or several records.
 
     It is solved by `bounded_least_squares.minimise`, until one of the criteria `stop` holds.
-    low_pass: filter of measured poses for the linear fits, by which a search starts. With
-    `physical` only bodies that can exist are allowed.
+    low_pass: filter of measured poses for the linear fits at the start of a search. With `physical`
+    only masses and inertias that a rigid body can have are allowed.
     """
 
     runs: tuple[LoopModel, ...]
@@ -45,14 +45,15 @@ class OutputErrorProblem:
         return parameter_bounds(self.guess, self.physical)
 
     def driven_by_commands(self) -> "OutputErrorProblem":
-        """Return the same problem with the joints driven by the logged commands."""
+        """Return a copy of the problem with joints driven by the logged commands."""
         return replace(self, runs=tuple(run.driven_by_commands() for run in self.runs))
 
     @property
     def bends(self) -> bool:
-        """True if the model is not linear in the common errors of the poses.
+        """True if the model is not linear in its common errors.
 
-        It is not within a servo, or where the latency is one of them.
+        The model is nonlinear if the servo measures poses with these errors, or if the latency is
+        one of the errors.
         """
         return any(
             run.common.latency_std or (run.common.names and not run.driven)
@@ -61,9 +62,10 @@ class OutputErrorProblem:
         )
 
     def has(self, errors: Sequence[Array], within: float) -> bool:
-        """Tell whether the model of each run contains these common errors (k,), as far as it can.
+        """Return whether the model of each run contains these common errors (k,).
 
-        It may differ from them by `within` standard deviations.
+        A difference of up to `within` standard deviations is allowed. Errors that a model cannot
+        contain are limited first.
         """
         pairs = zip(self.runs, errors, strict=True)
         return all(
@@ -72,23 +74,24 @@ class OutputErrorProblem:
         )
 
     def having(self, errors: Sequence[Array]) -> "OutputErrorProblem":
-        """Return the same problem with these common errors (k,) in the model of each run."""
+        """Return a copy of the problem with these common errors (k,) in the model of each run."""
         return replace(
             self, runs=tuple(run.having(own) for run, own in zip(self.runs, errors, strict=True))
         )
 
     def with_common_errors(self, parameters: Array) -> "OutputErrorProblem":
-        """Return the same problem with residuals that are whitened for common errors, too.
+        """Return a copy of the problem with residuals that are also whitened for common errors.
 
-        The modes of each record are those of a model with these parameters (p,). Raises LoopFailure
-        if it is unstable.
+        The modes of each record are evaluated at these parameters (p,). Raises LoopFailure if the
+        model is unstable.
         """
         return replace(self, runs=tuple(run.with_common_errors(parameters) for run in self.runs))
 
     def cost(self, parameters: Array, ahead: bool = False) -> float:
-        """Return the sum of squared whitened residuals, infinite where the model cannot run.
+        """Return the sum of squared whitened residuals. It is infinite for an unstable model.
 
-        With `ahead` it comes from the runs that `linearise` will need, if that is asked next.
+        With `ahead`, the runs include the sensitivities, so that a following call of `linearise`
+        can reuse them.
         """
         known, _ = self.known(parameters)
         total = float(known @ known)
@@ -96,7 +99,7 @@ class OutputErrorProblem:
             for run in self.runs:
                 total += float(np.sum(run.misses(parameters, ahead) ** 2))
         except DynamicsError:
-            # a search steps back from there
+            # A search then reduces its step.
             return np.inf
         return total
 
@@ -108,24 +111,24 @@ class OutputErrorProblem:
         known, known_jacobian = self.known(parameters)
         size = len(parameters)
         cost = float(known @ known)
-        # of each record only the triangle is kept, however long it is
+        # Each record is reduced to its triangular factor, which saves memory.
         triangle = np.column_stack([known_jacobian, known])
         for run in self.runs:
             residual, shown = run.shown_residuals(parameters)
             cost += float(np.sum(residual**2))
-            # factored with the few columns of the groups, and extended to all parameters then
+            # Factoring uses the few columns of the groups. Then all parameters get their columns.
             rows = triangular_factor(shown.reshape(residual.size, -1), residual.ravel())
             rows = np.column_stack([run.of_all(rows[:, :-1]), rows[:, -1]])
             triangle = triangular_factor(np.vstack([triangle, rows]))
         return cost, triangle[:size, :size], triangle[:size, size]
 
     def known_information(self) -> Array:
-        """Return the information (p, p) of what is known beside the poses."""
+        """Return the information (p, p) of the initial guess and the scale anchor."""
         _, rows = self.known(self.guess.values)
         return np.asarray(rows.T @ rows, dtype=float)
 
     def known(self, parameters: Array) -> tuple[Array, Array]:
-        """Return residuals (k,) of what is known beside the poses, and their rows (k, p).
+        """Return residuals (k,) of the initial guess and the scale anchor, and their rows (k, p).
 
         They are in standard deviations.
         """

@@ -1,10 +1,10 @@
 """Searches for the optimum of the output error, one after the other.
 
-They go from the linear warm start through the command-driven output error, which has few local
-minima, to the closed-loop output error, whose stick-slip events make narrow ones. Errors that all
-poses have in common are left to the noise at first, since far from the optimum they would hide the
-residuals that show the way. Where neither the warm start nor the starting guess gives a model that
-runs, multiple shooting finds one that does.
+The sequence is the linear warm start, the command-driven output error, which has few local minima,
+and the closed-loop output error, which has narrow local minima by stick-slip. In the first search,
+errors that all poses have in common are treated as noise, because far from the optimum they would
+hide the relevant residuals. If the model is unstable with both the warm start and the initial
+guess, multiple shooting finds a stable model.
 """
 
 from dataclasses import dataclass, replace
@@ -25,18 +25,15 @@ LINEARISATIONS = 6
 """Largest number of linearisations in the common errors."""
 
 SETTLED = 0.02
-"""Largest step of the most likely common errors, in standard deviations, after which they stay."""
+"""Change of the most likely common errors, in standard deviations, at which the loop ends."""
 
 CLOSE_ENOUGH = 1e-2
-"""Relative change of the cost at which multiple shooting ends.
-
-The searches after it go on from there.
-"""
+"""Relative change of the cost at which multiple shooting ends. Other searches follow it."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """Problem, and what the search for its optimum found.
+    """Problem, and the solution of the search for its optimum.
 
     The problem contains the common errors that are most likely at the optimum.
     """
@@ -57,8 +54,8 @@ def output_error_searches(
 ) -> dict[str, Search]:
     """Search from the warm start (p,), and return the searches by name in their order.
 
-    closed_loop: True if the last search is that of the closed loop, False if it is the
-    command-driven one. Raises EstimationError if no model runs.
+    closed_loop: True if the last search uses the closed loop, False if it uses the logged commands.
+    Raises EstimationError if no stable model is found.
     """
     found = {}
     driven = problem.driven_by_commands()
@@ -75,7 +72,7 @@ def output_error_searches(
             starts = [found["noise_alone"].solution.parameters, start, problem.guess.values]
         found["command_driven"] = searched = search_with_common_errors(driven, starts, advance)
         if closed_loop:
-            # the closed loop begins with the errors that the commands have shown
+            # The closed-loop search begins with the common errors of the command-driven search.
             problem = problem.having(
                 most_likely_errors(searched.problem, searched.solution.parameters)
             )
@@ -89,8 +86,8 @@ def search_with_common_errors(
 ) -> Search:
     """Minimise a problem with its common errors, from the best of some parameters (p,).
 
-    The model is taken as linear in the common errors about the most likely ones. The search is
-    repeated until these settle.
+    The model is linearised in the common errors about their most likely values. The search is
+    repeated until these values converge.
     """
     problem, start = _with_common_errors(problem, starts)
     solution = search(problem, start, advance)
@@ -99,7 +96,7 @@ def search_with_common_errors(
         if problem.has(errors, SETTLED):
             break
         problem = problem.having(errors).with_common_errors(solution.parameters)
-        # the progress was told of one search only
+        # The progress bar expects only one search.
         again = search(problem, solution.parameters, lambda n=1: None)
         counted = solution.evaluations + again.evaluations
         solution = replace(again, costs=solution.costs + again.costs[1:], evaluations=counted)
@@ -131,8 +128,8 @@ def search(
 ) -> Solution:
     """Minimise one output-error problem from parameters (p,), within its bounds.
 
-    shooting: form of the problem that is minimised in its place. In the end `advance` has counted
-    all iterations that the problem allows.
+    shooting: multiple-shooting form that is minimised in place of the problem. At the end,
+    `advance` has been called for all iterations that the problem allows.
     """
     bounds = problem.bounds
     found = minimise(
@@ -142,17 +139,17 @@ def search(
         np.abs(np.linalg.inv(bounds.matrix)) @ problem.guess.std,
         problem.stop,
         lambda i, cost: advance(),
-        ahead=shooting is None,  # the states of shooting follow the steps that are taken
+        ahead=shooting is None,  # the states of shooting must follow only accepted steps
     )
     advance(problem.stop.max_iterations - found.iterations)
     return replace(found, parameters=bounds.parameters(found.parameters))
 
 
 def shoot(problem: OutputErrorProblem, warm: Array, progress: Progress) -> Solution:
-    """Find parameters with which the command-driven model runs, by multiple shooting.
+    """Find parameters for a stable command-driven model by multiple shooting.
 
-    It starts from warm start or starting guess. Raises EstimationError if no model runs segment by
-    segment, or none that does so runs over the whole records.
+    The search starts from the warm start or the initial guess. Raises EstimationError if the
+    segments cannot be simulated, or if the resulting model is unstable over the whole records.
     """
     loose = replace(problem, stop=replace(problem.stop, cost_tolerance=CLOSE_ENOUGH))
     chains = [segments(run) for run in problem.runs]
@@ -166,19 +163,19 @@ def shoot(problem: OutputErrorProblem, warm: Array, progress: Progress) -> Solut
         if np.isfinite(problem.cost(solution.parameters)):
             return solution
     raise EstimationError(
-        "neither the warm start nor the starting guess gives a model that runs, nor does multiple "
-        f"shooting from them: {_why(problem, warm)}"
+        "the model is unstable with the warm start and with the initial guess, and multiple "
+        f"shooting from them finds no stable model: {_why(problem, warm)}"
     )
 
 
 def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
-    """Return the better of warm start and starting guess (p,), within the bounds.
+    """Return the better of warm start and initial guess (p,), within the bounds.
 
-    It is None if the model runs with neither.
+    It is None if the model is unstable with both.
     """
     first, second = _candidates(problem, warm)
-    # A search linearises this very problem at just these parameters, unless it is whitened for
-    # common errors first, or has other coordinates.
+    # The search first linearises at these parameters, and can reuse the sensitivities. It cannot
+    # if the problem is whitened for common errors, or if `physical` changes the coordinates.
     ahead = not problem.physical and not any(run.common.all_names for run in problem.runs)
     costs = [(problem.cost(first, ahead=ahead), first), (problem.cost(second), second)]
     cost, start = min(costs, key=lambda entry: entry[0])
@@ -190,8 +187,8 @@ def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
     start = runnable_start(problem, driven)
     if start is None:
         raise EstimationError(
-            "the closed loop runs neither with what the command-driven search found nor with the "
-            f"starting guess: {_why(problem, driven)}"
+            "the closed loop is unstable with the result of the command-driven search and with "
+            f"the initial guess: {_why(problem, driven)}"
         )
     return start
 
@@ -201,8 +198,7 @@ def _with_common_errors(
 ) -> tuple[OutputErrorProblem, Array]:
     """Return the problem with its common errors, and the best of some parameters (p,).
 
-    The modes of the errors are those of the model with these parameters. A single start is known to
-    run.
+    The modes of the errors are evaluated at the returned parameters. A single start must be stable.
     """
     if len(starts) == 1 and not any(run.common.all_names for run in problem.runs):
         return problem, problem.bounds.nearest(starts[0])

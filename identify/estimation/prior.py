@@ -1,18 +1,18 @@
-"""Prior: what is known beside the poses.
+"""Prior: knowledge of the parameters beside the poses.
 
-Starting guess. Each parameter has a standard deviation before the experiment. It is wide, but for
-parameters of which a scenario's `[identification.prior]` knows more.
+Initial guess. Before the experiment each parameter has a value with a standard deviation. It is
+wide, except for parameters in the scenario's `[identification.prior]`.
 
 Scale anchor. Multiplying every dynamic parameter and the three PID gains by the same number changes
-no pose of the closed loop (eq. 17 and 31). This common factor, which poses alone leave free, is
-fixed by one of
+no pose of the closed loop (eq. 17 and 31). Poses alone do not determine this common factor. It is
+fixed by one of these anchors:
 
     platform_mass   the platform was weighed
     joint_gain      the proportional gain of the joint PID is known
     payload         a second run with a known load on the platform (`identify.record.conditions`);
-                    the standard deviations of the load stand with that run, and widen the intervals
-                    (`covariance`)
-    prior           nothing but the starting guess, with its standard deviations
+                    the record of that run states the standard deviations of the load, which widen
+                    the intervals (`covariance`)
+    prior           only the initial guess, with its standard deviations
 """
 
 from collections.abc import Mapping
@@ -38,8 +38,8 @@ from identify.scenario.sections import Identification
 class StartingGuess:
     """Knowledge of a robot's parameters before the experiment.
 
-    values, std (p,): values and their standard deviations, SI. drive: law of the drives, whose
-    unread gains are fixed at zero.
+    values, std (p,): values and their standard deviations, SI. drive: law of the drives. Gains that
+    it does not read are fixed at zero.
     """
 
     layout: ParameterLayout
@@ -56,20 +56,17 @@ class StartingGuess:
 
     @property
     def above_zero(self) -> tuple[str, ...]:
-        """Parameters without which there is no model."""
+        """Parameters that must be above zero for a model to exist."""
         return ("platform.mass", *(f"joint_pid.{gain}" for gain in ABOVE_ZERO[self.drive]))
 
     @property
     def rows(self) -> Array:
-        """Rows (p, p) of the guess as equations of the parameters, in standard deviations."""
+        """Matrix (p, p) of the guess as equations in the parameters, in standard deviations."""
         return np.diag(1 / self.std)
 
 
 FIXED = 1e-9
-"""Standard deviation of a gain that the law of the drives does not read.
-
-It is a share of the one that the gain would have otherwise.
-"""
+"""Factor of the standard deviation of a gain that the law of the drives does not read."""
 
 
 def starting_guess(
@@ -79,11 +76,11 @@ def starting_guess(
     known: Mapping[str, PriorValue] = MappingProxyType({}),
     drive: DriveName = "pid",
 ) -> StartingGuess:
-    """Return the starting guess that follows from a parameter set of the robot file.
+    """Return the initial guess that follows from a parameter set of the robot file.
 
     relative_std: standard deviation of each parameter, as a fraction of its size. known: values and
-    standard deviations of parameters of which more is known, by name. Raises ScenarioError, with
-    the valid names, if there is no such set.
+    standard deviations that replace the guess for some parameters, by name. Raises ScenarioError,
+    with the valid names, if there is no such set.
     """
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
@@ -95,16 +92,16 @@ def starting_guess(
         values[place] = prior.value
         std[place] = prior.std
     guess = StartingGuess(robot.layout, values, std, drive)
-    # the guess holds these very arrays, and changes with them
+    # The guess refers to these arrays, so it changes with them.
     values[guess.fixed] = 0.0
     std[guess.fixed] = FIXED * std[guess.fixed]
     return guess
 
 
 def model_guess(robot: Robot, model: Model, settings: Identification) -> StartingGuess:
-    """Return the starting guess of a model, with what the settings say of its parameters.
+    """Return the initial guess of a model, with the settings' prior of single parameters.
 
-    Raises ScenarioError as `starting_guess`.
+    Raises the ScenarioError of `starting_guess`.
     """
     return starting_guess(
         robot, model.start_parameters, settings.start_std, settings.prior, model.drive_law
@@ -112,8 +109,7 @@ def model_guess(robot: Robot, model: Model, settings: Identification) -> Startin
 
 
 WEIGHTLESS = 0.01
-"""Share of the torque for an acceleration of GRAVITY up to which joints count as holding no load.
-"""
+"""Largest holding torque that counts as none, as a share of the torque to accelerate by GRAVITY."""
 
 GRAVITY = 9.81  # m/s^2
 
@@ -121,9 +117,9 @@ GRAVITY = 9.81  # m/s^2
 def holding_torque(robot: Robot, dynamic: Array) -> float:
     """Return the mean torque, N m, or force, N, that the joints hold at the home pose.
 
-    dynamic (p,): dynamic parameters. If the joints hold next to nothing, as those of a robot that
-    lies flat, it is the mean of what they need to accelerate the platform by GRAVITY along each
-    axis.
+    dynamic (p,): dynamic parameters. If the holding torque is negligible, as for a robot in a
+    horizontal plane, the mean torque to accelerate the platform by GRAVITY along each axis is
+    returned.
     """
     home = robot.home_pose
     axes = robot.geometry.chart.basis.T
@@ -139,14 +135,14 @@ def holding_torque(robot: Robot, dynamic: Array) -> float:
 def typical_sizes(layout: ParameterLayout, values: Array, torque: float) -> Array:
     """Return the size (p,) of each parameter: its own value or, for friction, the holding torque.
 
-    The torque is in N m, or N. A specification says little about friction, but a joint that rubs
-    more than it carries would be called broken.
+    The torque is in N m, or N. Data sheets rarely state friction, but friction above the holding
+    torque would mean a broken joint.
     """
     return np.where(friction(layout), torque, np.where(values > 0, values, 1.0))
 
 
 def friction(layout: ParameterLayout) -> NDArray[np.bool_]:
-    """Return which parameters (p,) are those of friction."""
+    """Return which parameters (p,) are friction parameters."""
     return np.isin(layout.names, layout.coulomb_names + layout.viscous_names)
 
 
@@ -158,7 +154,7 @@ ANCHORS = (*MEASURED_PARAMETER, "payload", "prior")
 DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 5.0}
 """Standard deviation of an ordinary instrument, by units.
 
-It is that of a platform balance, kg, or of a gain read from the controller's data.
+The instrument is a platform balance, kg, or the data of the controller for a gain.
 """
 
 
@@ -171,7 +167,8 @@ def default_std(name: str, layout: ParameterLayout) -> float:
 class ScaleAnchor:
     """Measurement that fixes the scale.
 
-    value and std are those of a parameter that was measured on its own, SI, or else None.
+    value and std: measured value of a parameter and its standard deviation, SI. They are None if no
+    parameter was measured.
     """
 
     name: str
@@ -181,8 +178,7 @@ class ScaleAnchor:
     def row(self, layout: ParameterLayout) -> tuple[Array, Array]:
         """Return the measurement as equations, in standard deviations.
 
-        They are rows (k, p) and a right side (k,), with k = 0 if no parameter was measured, or else
-        1.
+        They have a matrix (k, p) and a right side (k,). k is 1, or 0 if no parameter was measured.
         """
         if self.value is None or self.std is None:
             return np.zeros((0, len(layout.names))), np.zeros(0)
@@ -194,13 +190,13 @@ class ScaleAnchor:
 def measured_anchor(
     name: str, std: float | None, layout: ParameterLayout, true: Array, rng: np.random.Generator
 ) -> ScaleAnchor:
-    """Return the anchor as an experimenter measures it.
+    """Return a simulated measurement of the anchor.
 
-    std: standard deviation of the instrument, None for the usual one. true (p,): true parameters of
+    std: standard deviation of the instrument, None for the default. true (p,): true parameters of
     the robot.
     """
     if name not in MEASURED_PARAMETER:
-        # nothing is measured here: a load stands with the run that was made under it
+        # These anchors have no measured parameter. The record under a load states the load.
         return ScaleAnchor(name)
     spread = default_std(name, layout) if std is None else std
     measured = true[layout.names.index(MEASURED_PARAMETER[name])]
@@ -215,10 +211,10 @@ def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
 
 
 def read_anchor(record: xr.Dataset, layout: ParameterLayout) -> ScaleAnchor:
-    """Return the anchor's measurement of a robot's record.
+    """Return the measurement of the scale anchor in a robot's record.
 
-    Raises RecordError if the record has none, so that the scale of its parameters is free, or if
-    its value or standard deviation is no finite number > 0.
+    Raises RecordError if the record has no anchor, or if its value or standard deviation is not a
+    finite number > 0.
     """
     name = record.attrs.get("scale_anchor")
     if name not in ANCHORS:

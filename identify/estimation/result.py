@@ -1,6 +1,6 @@
 """Result of an identification: estimates with their uncertainty and judgement.
 
-It shows itself as a table, as JSON, in one line, and in a notebook.
+It can be shown as a table, as JSON, in one line, and in a notebook.
 """
 
 from __future__ import annotations
@@ -35,33 +35,33 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STRONGEST = 10
-"""Correlations that a result lists, of the parameters that are identified."""
+"""Number of correlations of identified parameters that a result lists."""
 
 
 @dataclass(frozen=True)
 class IdentificationResult:
-    """Parameters of a robot that one or several records show, in the order of `layout`; SI units.
+    """Parameters of a robot identified from records, in the order of `layout` and in SI units.
 
     Attributes
     ----------
     layout : ParameterLayout
         Names, places and units of the p parameters.
     nominal : Robot
-        The robot as it was known before.
+        Robot before the identification.
     drive : DriveChoice
         Law of the drives.
     initial, warm_start, estimate : ndarray, shape (p,)
-        Starting guess, linear estimate, and final estimate.
+        Initial guess, linear estimate, and final estimate.
     std, covariance : ndarray, shapes (p,) and (p, p)
-        Uncertainty of the estimate as it was without bounds.
+        Uncertainty of the estimate without regard to bounds.
     intervals : ndarray, shape (p, 2)
-        95 % intervals, cut at the bounds.
+        95 % intervals, truncated at the bounds.
     identifiable : ndarray of bool, shape (p,)
-        True where the record shows the parameter.
+        True for identified parameters.
     prior_share : ndarray, shape (p,)
-        Share of the variance that errors of the starting guess make.
+        Share of the variance due to errors of the initial guess.
     common_share : dict of ndarray, shape (p,)
-        Share of the variance by each kind of error that all poses of a record have in common.
+        Share of the variance due to each kind of error that all poses have in common.
     groups, group_intervals
         Estimates of the base parameters, and their 95 % intervals.
     base_rank : int
@@ -73,12 +73,12 @@ class IdentificationResult:
     searches, costs : tuple
         Names of the searches in their order, and the cost after each iteration of each.
     active_bounds : tuple of str
-        Bounds that hold the estimate back, such as "platform.Izz <= Ixx + Iyy".
+        Bounds that limit the estimate, such as "platform.Izz <= Ixx + Iyy".
     noise_ratio, expected_noise_ratio, noise_ratio_std : float
-        Mean squared whitened residual, its expectation under the sensor's noise alone, and the
-        standard deviation of that.
+        Mean squared whitened residual, its expected value for the sensor's noise alone, and its
+        standard deviation for noise alone.
     whiteness : Whiteness
-        Test of the residuals of the model that the logged commands drive.
+        Test of the residuals of the model that is driven by the logged commands.
     driven_estimate : ndarray, shape (p,)
         Estimate by that model, which is the final one if it was the last to be searched.
     driven_misfit : Misfit
@@ -120,12 +120,12 @@ class IdentificationResult:
 
     @property
     def robot(self) -> Robot:
-        """The identified robot, whose nominal parameters are the estimate."""
+        """Identified robot. Its nominal parameters are the estimate."""
         return self.nominal.with_parameters(self.estimate)
 
     @property
     def rests_on_prior(self) -> NDArray[np.bool_]:
-        """True for each parameter (p,) that is identified only with a guess of others."""
+        """True for each parameter (p,) that is identified only with the guess of parameters."""
         return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
     @property
@@ -135,7 +135,7 @@ class IdentificationResult:
 
     @property
     def misfit(self) -> Misfit:
-        """Comparison of the residual with what noise alone would leave."""
+        """Comparison of the residual with its expected value for noise alone."""
         return Misfit(self.noise_ratio, self.expected_noise_ratio, self.noise_ratio_std)
 
     @property
@@ -154,11 +154,11 @@ class IdentificationResult:
         )
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Table without the truth, see `table`."""
+        """Return the table without the truth, see `table`."""
         return self.table()
 
     def table(self, truth: xr.Dataset | Mapping[str, float] | None = None) -> pd.DataFrame:
-        """Table with a row for each parameter.
+        """Return a table with a row for each parameter.
 
         Parameters
         ----------
@@ -168,8 +168,9 @@ class IdentificationResult:
         Returns
         -------
         pandas.DataFrame
-            Columns unit, initial, estimate, std, low and high of the 95 % interval, identifiable.
-            With the truth also true, and holds: whether the interval holds it.
+            Columns unit, initial, estimate, std, identifiable, and the ends low and high of the
+            95 % interval. With the truth there are also the columns true and holds. The column
+            holds states whether the interval contains the truth.
 
         Raises
         ------
@@ -222,15 +223,15 @@ class IdentificationResult:
         )
 
     def save(self, path: Path | str) -> None:
-        """Write the entry "identification" of a run's result.json, which commands take."""
+        """Write a result.json with the entry "identification", which commands can read."""
         save_result(path, {"identification": self.to_dict()})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the estimates with their uncertainty for JSON, the true values left open."""
+        """Return the estimates with their uncertainty for JSON. The true values are None."""
         common = self.common_errors
         anchor = self.scale_anchor
         whiteness = self.whiteness
-        # correlations of the others tell of the starting guess rather than of the record
+        # Correlations of other parameters depend on the initial guess rather than on the record.
         identified = np.flatnonzero(self.identifiable)
         correlations = correlation_matrix(self.covariance[np.ix_(identified, identified)])
         pairs = strongest_pairs(correlations, [self.names[k] for k in identified], STRONGEST)
@@ -329,7 +330,7 @@ def result_html(result: IdentificationResult) -> str:
 
 
 def relative_uncertainty_png(result: IdentificationResult) -> bytes:
-    """Draw the change from the starting guess and the standard deviation of identified parameters.
+    """Draw the change from the initial guess and the standard deviation of identified parameters.
 
     Both are in percent of the estimate.
     """
@@ -341,7 +342,7 @@ def relative_uncertainty_png(result: IdentificationResult) -> bytes:
     figure = Figure(figsize=(7.0, 1.0 + 0.16 * len(shown)), layout="constrained")
     axes = figure.subplots()
     rows = np.arange(len(shown))
-    axes.plot(change, rows, "o", fillstyle="none", label="change from the starting guess")
+    axes.plot(change, rows, "o", fillstyle="none", label="change from the initial guess")
     axes.plot(scale * result.std[shown], rows, "s", label="standard deviation")
     axes.set_yticks(rows, [result.names[k] for k in shown], fontsize="x-small")
     axes.set(xscale="log", xlabel="percent of the estimate")

@@ -1,25 +1,25 @@
-"""Linear warm start, by which the search starts close to the optimum.
+"""Linear warm start: a linear fit that provides a start close to the optimum.
 
-The closed-loop equation is linear in everything unknown, so that one fit is enough. With the logged
-commands U and the joint coordinates theta of the measured poses, at every instant
+The closed-loop equation is linear in all unknowns, so a single linear fit is enough. With the
+logged commands U and the joint coordinates theta of the measured poses, at every instant
 
     J_ad^-T Gamma(pose, twist, twist_dot) Xi
         - lp (U - theta) - ld (U_dot - theta_dot) - li integral(U - theta) = z
 
-with z (n,) the torque that the integrators held at the start. Poses are filtered and
-differentiated. For a platform with fewer freedoms, its coordinates count, and the wrench Gamma Xi
-is balanced along these. Each row is the balance of one joint, whose dry friction is known only
-while it slips: rows of joints near rest are left out. The equation is homogeneous. The scale anchor
-and, weakly, the starting guess decide the common factor.
+with z (n,) the torque of the integrators at the start. Poses are filtered and differentiated. For a
+platform with fewer degrees of freedom, the equation holds along its coordinates. Each row is the
+torque balance of one joint. Its dry friction is known only while the joint slips, so rows of joints
+near rest are left out. The equation is homogeneous. The scale anchor and, weakly, the initial guess
+determine the common factor.
 
-That is the PID. In other laws of the drives the torque is in proportion to the gains, too, and so
-it is the sum of its derivatives with respect to the gains, times the gains. The derivatives of a
-cascade depend on ratios of the gains, for which the latest fit stands.
+This equation is for the PID. In other laws of the drives the torque is also proportional to the
+gains. It is therefore the sum of its derivatives with respect to the gains, times the gains. The
+derivatives of a cascade depend on ratios of the gains, which are taken from the previous fit.
 
-A common error of the poses of a run, or of a geometry that is known only so well, moves theta by e
-for each standard deviation. An error of the latency moves U by the way that it makes in that time.
-In the equation these errors stand with lp and with li. They are errors of the rows that go on along
-a run, lp0 e and li0 integral(e) with the gains of the starting guess, and they are marginalised
+A common error of the poses or of the geometry shifts theta by e for one standard deviation. An
+error of the latency shifts U by its motion in that time. In the equation these shifts are
+multiplied by lp, and their integrals by li. With the gains of the initial guess, the errors of the
+rows are lp0 e and li0 integral(e). They last for the whole run, and are marginalised
 (`record.stored_common_errors`).
 """
 
@@ -42,21 +42,21 @@ from identify.record.stored_common_errors import Marginal
 from identify.scenario import Filter
 
 EDGE_FRACTION = 0.02
-"""Share of the record left out at either end, where filtered derivatives are poor."""
+"""Share of the record left out at either end, where filtered derivatives are inaccurate."""
 
 SLIPPING_SHARE = 0.5
-"""Share of its RMS velocity above which a joint counts as slipping."""
+"""Velocity above which a joint counts as slipping, as a share of its RMS velocity."""
 
 REWEIGHTINGS = 3
-"""Number of solutions of a fit. Each takes the size of the residual from the one before."""
+"""Number of solutions of a fit. Each solution is weighted by the residual of the one before."""
 
 
 def linear_warm_start(problem: OutputErrorProblem) -> Array:
     """Fit parameters (p,) to the measured poses and commands of the problem's runs.
 
-    Each run has its own starting torques. What a known payload adds stands on the right side, as do
-    torques that were commanded. The residual's size is estimated from the fit itself, so that the
-    starting guess counts as much as it should.
+    Each run has its own unknown torques at the start. The effect of a known payload and commanded
+    torques are on the right side. The size of the residuals is estimated from the fit, so that the
+    initial guess has the right weight.
     """
     guess = problem.guess
     noise = 0.1
@@ -74,7 +74,7 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
         solution = bounded_fit(whitened[:, :-1], whitened[:, -1], guess, problem.anchor, lower)
         left = whitened @ np.append(solution, -1.0)
         noise = max(noise * float(np.sqrt(np.sum(left**2) / len(right))), 1e-9)
-        if law.lx:  # the columns of a cascade depend on its gains
+        if law.lx:  # the columns of a cascade depend on the gains
             law = drives.joint_law(np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
             matrix, right, common = _stacked(problem, law)
             rows = _condensed(matrix, right, common)
@@ -82,9 +82,9 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
 
 
 def _condensed(matrix: Array, right: Array, common: Array) -> Array:
-    """Return equations with their right side behind them, (rows, u + 1).
+    """Return the matrix and the right side of equations as one array (rows, u + 1).
 
-    If errors are independent it is their triangular factor, which says the same at any noise.
+    Without common errors it is reduced to its triangular factor, which is equivalent.
     """
     return np.column_stack([matrix, right]) if common.shape[1] else triangular_factor(matrix, right)
 
@@ -105,7 +105,7 @@ def _stacked(problem: OutputErrorProblem, law: JointLaw) -> tuple[Array, Array, 
         balance, slipping = joint_balance(run, run.without_gaps(), problem.low_pass, law)
         columns = balance[slipping]
         if run.settings.drives.torques:
-            # torques that were commanded need no gains: they stand on the right side
+            # Commanded torques do not depend on gains, so they are on the right side.
             columns[:, layout.joint_pid] = 0.0
             matrices.append(columns[:, :count])
             felt, _, _ = effective_command(run, problem.low_pass)
@@ -124,8 +124,8 @@ def _stacked(problem: OutputErrorProblem, law: JointLaw) -> tuple[Array, Array, 
 def _common_torques(run: LoopModel, guess: StartingGuess, low_pass: Filter) -> Array:
     """Return the torques (N, n, k), N m or N, that common errors add to the balance of every joint.
 
-    They are those of one standard deviation of each error of poses, geometry and latency, with the
-    gains of the starting guess.
+    The torques are for one standard deviation of each error of poses, geometry and latency, with
+    the gains of the initial guess.
     """
     common = run.common
     moved = []
@@ -147,14 +147,14 @@ def _common_torques(run: LoopModel, guess: StartingGuess, low_pass: Filter) -> A
 def joint_balance(
     run: LoopModel, poses: Array, low_pass: Filter, law: JointLaw
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the torque balance of every joint, and where joints slip.
+    """Return the torque balance of every joint, and the frames in which joints slip.
 
     Parameters
     ----------
     run : LoopModel
         Model of the run, with its logged commands.
     poses : ndarray, shape (N, 6)
-        Poses of the run without gaps, such as the measured ones.
+        Poses of the run without gaps, such as measured poses.
     low_pass : Filter
         Filter of poses and commands.
     law : JointLaw
@@ -163,11 +163,11 @@ def joint_balance(
     Returns
     -------
     columns : ndarray, shape (N, n, p + n)
-        Columns of the balance, N m or N per unit of each unknown. Those of the dynamic parameters
-        give the joint's torque. Those of lp, li, ld and of the starting torques come after them,
-        and give the controller's torque with the opposite sign.
+        Columns of the balance, N m or N per unit of each unknown. The columns of the dynamic
+        parameters give the joint's torque. The columns of lp, li, ld and of the torques at the
+        start follow. They give the controller's torque with the opposite sign.
     slipping : ndarray of bool, shape (N, n)
-        Frames at which a joint slips.
+        True for frames in which a joint slips.
     """
     robot = run.robot
     rate_hz = run.settings.timing.frame_rate_hz
@@ -201,10 +201,10 @@ def joint_balance(
 
 
 def effective_command(run: LoopModel, low_pass: Filter) -> tuple[Array, Array, Array]:
-    """Return the filtered command as the joints feel it, its rate, and its integral, at the frames.
+    """Return the filtered command that acts on the joints, its rate, and its integral, per frame.
 
-    The rate is that which the joint PID sees: the difference of two commands, held. A held command
-    lags by half a frame, a ramped one by a whole frame.
+    The rate is the rate in the joint PID, the held difference of two commands. A held command lags
+    by half a frame, and a ramped command by a whole frame.
     """
     commands = run.logged
     timing = run.settings.timing
@@ -215,7 +215,7 @@ def effective_command(run: LoopModel, low_pass: Filter) -> tuple[Array, Array, A
     smooth = zero_phase_filter(commands, rate_hz, low_pass.cutoff_hz, low_pass.order)
     times = np.arange(len(commands)) * period
     spline = make_interp_spline(times, smooth, k=5)
-    # mean lag of what acts, over the period that follows a command
+    # Mean lag of the acting command, over the period that follows a command.
     lag = timing.latency_s + (period if timing.hold == "linear" else period / 2)
     felt = spline(np.clip(times - lag, 0.0, None))
     rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
@@ -225,10 +225,10 @@ def effective_command(run: LoopModel, low_pass: Filter) -> tuple[Array, Array, A
 def _acted(
     commands: Array, timing: FrameTiming, low_pass: Filter, latencies: Array
 ) -> tuple[Array, Array, Array]:
-    """Return `effective_command` of commands that each arrive after a latency of its own.
+    """Return `effective_command` for commands with individual latencies.
 
-    What acts from one arrival to the next is integrated, and the filtered rates of the integrals
-    are returned.
+    The acting command is integrated from arrival to arrival, and the filtered rates of the
+    integrals are returned.
     """
     rate_hz = timing.frame_rate_hz
     period = 1.0 / rate_hz
@@ -239,8 +239,8 @@ def _acted(
 
     def felt(values: Array, ramped: float) -> Array:
         def since(which: NDArray[np.intp] | slice, duration: Array) -> Array:
-            """Return the integral of what acts, over a duration since its arrival."""
-            # at first a ramp of one frame stays behind the command
+            """Return the integral of the acting command, over a duration since its arrival."""
+            # During the first frame, a ramp lags behind the command.
             behind = np.minimum(duration, period)
             behind = behind - behind**2 / (2 * period)
             return (
@@ -259,14 +259,13 @@ def _acted(
 
 
 def first_order(samples: Array, time_constant: float, rate_hz: float) -> Array:
-    """Filter samples (N, ...) by a low-pass filter of first order, with its time constant in s.
+    """Filter samples (N, ...) by a low-pass filter of first order, with a time constant in s.
 
-    A time constant of zero changes nothing. The filter has held the value of the first sample
-    before.
+    A time constant of zero changes nothing. The filter starts in equilibrium with the first sample.
     """
     if not time_constant:
         return samples
-    # trapezoidal rule
+    # The filter is discretised by the trapezoidal rule.
     half = 0.5 / (rate_hz * time_constant)
     rest = samples[:1]
     return rest + scipy.signal.lfilter([half, half], [1 + half, half - 1], samples - rest, axis=0)
@@ -284,7 +283,7 @@ def bounded_fit(
 ) -> Array:
     """Return the unknowns (u,) >= lower of whitened equations (rows, u), with guess and anchor.
 
-    The first p unknowns are the parameters. Of those after them nothing is known beforehand.
+    The first p unknowns are the parameters. The unknowns after them have no prior.
     """
     size = matrix.shape[1]
     known_size = len(guess.values)

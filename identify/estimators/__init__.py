@@ -1,4 +1,4 @@
 """Estimators on the same record: the project's own, and those of the literature.
 
-None of them sees the sensor's inside or the truth.
+No estimator has access to the internals of the sensor or to the truth.
 """

@@ -1,25 +1,25 @@
-"""Inverse dynamics where the regression matrix has errors, too.
+"""Inverse dynamics with errors in the regression matrix.
 
 The two methods are instrumental variables and total least squares.
 
-Instrumental variables Z are the same matrix built from a simulated run of the present model. It is
-free of the measurement's noise and correlated with the true motion. The solution of Z^T (W x - tau)
-= 0 is therefore not biased where least squares is (Janot, Vandanjon, Gautier, "A generic
-instrumental variable approach for industrial robot identification", IEEE TCST 22(1), 2014). The
-model closes its own loop, since logged commands would carry the sensor's noise into the
+Instrumental variables Z are the same matrix, computed from a simulated run of the current model.
+They are free of measurement noise and correlated with the true motion. The solution of
+Z^T (W x - tau) = 0 is therefore unbiased, unlike least squares (Janot, Vandanjon, Gautier, "A
+generic instrumental variable approach for industrial robot identification", IEEE TCST 22(1), 2014).
+The model closes its own loop, because logged commands would bring the sensor's noise into the
 instruments.
 
-Plain total least squares takes the errors of all columns as alike and independent. Here they come
-from the same poses through derivatives. So their second moments are drawn: the poses are disturbed
-by the sensor's noise, and the columns follow. Of all x~ = (x, -1) the estimate minimises |A x~|^2 /
-|E x~|^2, with A = (W | tau) and E the drawn errors of A. With A = Q R, it is R^-1 times the first
-right singular vector of E R^-1 (generalised total least squares, Van Huffel and Vandewalle, "The
-total least squares problem", SIAM 1991, chapter 10).
+Plain total least squares assumes equal and independent errors of all columns. Here the errors come
+from the same poses through derivatives. Therefore their second moments are sampled: the poses are
+disturbed by random sensor noise, and the columns are computed again. The estimate x~ = (x, -1)
+minimises |A x~|^2 / |E x~|^2, with A = (W | tau) and E the sampled errors of A. With A = Q R, it is
+R^-1 times the first right singular vector of E R^-1 (generalised total least squares, Van Huffel
+and Vandewalle, "The total least squares problem", SIAM 1991, chapter 10).
 
-Directions that the motion does not show better than the starting guess are first left there
-(truncation), since the noise would otherwise rule them. All this removes the bias, but not the
-spread. Where the errors are large, the normal matrix less that of the errors is nearly singular,
-and the standard deviations say so.
+Directions that the motion does not determine better than the initial guess are fixed at the guess
+first (truncation), because noise would dominate them. All this removes the bias, but not the
+scatter. If the errors are large, the difference of the normal matrix and the matrix of the errors
+is nearly singular, and the standard deviations are large.
 """
 
 import time
@@ -50,14 +50,14 @@ MAX_ITERATIONS = 10
 """Largest number of simulated runs."""
 
 SETTLED = 0.05
-"""Share of its standard deviation below which every parameter must move at the end."""
+"""Largest last step of every parameter, as a share of its standard deviation."""
 
 
 @estimator("torque, IV", uses="poses, torque")
 def instrumental_variables(evidence: Evidence) -> Estimate:
     """Estimate with instruments from simulated runs, starting at weighted least squares.
 
-    Each run is that of the present estimate. Raises EstimationError if its model does not run.
+    Each run simulates the current estimate. Raises EstimationError if its model is unstable.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)
@@ -82,7 +82,7 @@ def instrumental_variables(evidence: Evidence) -> Estimate:
 def iv_fit(
     equations: TorqueEquations, instruments: Array, noise: Array, guess: StartingGuess
 ) -> tuple[Array, Array]:
-    """Solve Z^T (W x - tau) = 0 in whitened rows, beside the starting guess.
+    """Solve Z^T (W x - tau) = 0 in whitened rows, with the initial guess as a prior.
 
     instruments: Z (2 n, u). noise (2 n,): standard deviations of the rows, N m or N. Returns the
     unknowns x (u,) and their covariance (u, u).
@@ -91,7 +91,7 @@ def iv_fit(
     rows = equations.whitened(noise)
     z = instruments / noise[:, None]
     prior = np.eye(len(std))
-    # in units of the starting guess's standard deviations the prior is the identity
+    # In units of the prior standard deviations the prior is the identity.
     normal = (z.T @ rows.matrix) * np.outer(std, std) + prior
     moment = std * (z.T @ (rows.right - rows.matrix @ values))
     inverse = np.linalg.inv(normal)
@@ -102,12 +102,12 @@ def iv_fit(
 
 
 def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters: Array) -> Array:
-    """Return the regression matrix (2 n, u) of the model's own loop, at the equations' rows."""
+    """Return the regression matrix (2 n, u) of the simulated closed loop, for the same rows."""
     try:
         simulated = evidence.run.simulate(parameters)
     except DynamicsError as error:
         raise EstimationError(
-            f"no instruments: the model of the present estimate does not run: {error}"
+            f"no instruments: the model of the current estimate is unstable: {error}"
         ) from None
     noise_free = replace(evidence.run, logged=simulated.command)
     problem = evidence.problem
@@ -117,13 +117,13 @@ def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters
 
 
 DRAWS = 4
-"""Number of disturbed copies of a record. Each has thousands of rows to average the errors over."""
+"""Number of disturbed copies of a record. Few are enough, because each has thousands of rows."""
 
 SHOWN = 3.0
-"""Factor by which the motion must show a direction better than it was known before."""
+"""Factor by which the motion must determine a direction better than the prior."""
 
 NOT_GENERIC = 1e-12
-"""Smallest part of the right side in the singular vector with which there is a solution.
+"""Smallest entry of the right side in the singular vector for which there is a solution.
 
 It is relative to the largest entry of the vector.
 """
@@ -133,7 +133,7 @@ It is relative to the largest entry of the vector.
 def total_least_squares(evidence: Evidence) -> Estimate:
     """Estimate by total least squares with drawn errors of the columns.
 
-    Raises EstimationError if the solution is not generic: the torque column has no part in it.
+    Raises EstimationError if the solution is not generic, without a part of the torque column.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)
@@ -147,7 +147,7 @@ def total_least_squares(evidence: Evidence) -> Estimate:
     deviations = std.copy()
     dynamic = guess.layout.dynamic
     count = len(guess.values)
-    # the rows of the dynamics and those of the controller have no unknown in common
+    # Rows of the dynamics and rows of the controller have no unknown in common.
     blocks = ((slice(0, half), dynamic), (slice(half, None), slice(dynamic.stop, len(std))))
     for block, columns in blocks:
         matrix = rows.matrix[block, columns]
@@ -161,16 +161,16 @@ def total_least_squares(evidence: Evidence) -> Estimate:
 
 
 def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Array]:
-    """Solve matrix x = right by generalised total least squares in the directions shown.
+    """Solve matrix x = right by generalised total least squares in the determined directions.
 
     Parameters
     ----------
     matrix : ndarray, shape (n, p)
-        Matrix, whose rows have the standard deviation 1.
+        Matrix. Its rows have the standard deviation 1.
     right : ndarray, shape (n,)
-        Right side. Beforehand x is known to be 0 with standard deviation 1.
+        Right side. The prior of x is 0 with standard deviation 1.
     errors : ndarray, shape (draws, n, p + 1)
-        Drawn errors of (matrix | right).
+        Sampled errors of (matrix | right).
 
     Returns
     -------
@@ -180,7 +180,7 @@ def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Ar
     Raises
     ------
     EstimationError
-        The right side has no part in the singular vector.
+        The entry of the right side in the singular vector is zero.
     """
     size = matrix.shape[1]
     _, singular, directions = np.linalg.svd(matrix, full_matrices=False)
@@ -200,7 +200,7 @@ def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Ar
     solution = -shown.T @ (vector[:-1] / vector[-1])
     normal = joined[:, :-1].T @ joined[:, :-1]
     inverse = np.linalg.inv(normal - drawn[:, :-1].T @ drawn[:, :-1] / largest[0] ** 2)
-    # along directions that are left out, the variance of one remains
+    # Along truncated directions, the prior variance of one remains.
     covariance = shown.T @ (inverse @ normal @ inverse) @ shown + np.eye(size) - shown.T @ shown
     return np.asarray(solution, dtype=float), np.asarray(covariance, dtype=float)
 
@@ -208,7 +208,7 @@ def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Ar
 def _fit_block(
     matrix: Array, right: Array, errors: Array, columns: slice, values: Array, std: Array
 ) -> tuple[Array, Array]:
-    """Fit one block of unknowns, counted from the starting guess in its standard deviations."""
+    """Fit one block of unknowns, as differences from the initial guess in standard deviations."""
     block = errors[..., [*range(len(std))[columns], -1]]
     block[..., -1] -= block[..., :-1] @ values[columns]
     scale = std[columns]
@@ -218,9 +218,9 @@ def _fit_block(
 
 
 def _drawn_errors(evidence: Evidence, equations: TorqueEquations, noise: Array) -> Array:
-    """Draw errors (draws, 2 n, u + 1) of the whitened columns and right side.
+    """Sample errors (draws, 2 n, u + 1) of the whitened columns and right side.
 
-    They follow from drawn noise of poses and torques.
+    They follow from random noise of poses and torques.
     """
     rng = mixed_generator(DISTURBED_COPIES)
     run = evidence.run

@@ -1,7 +1,7 @@
-"""Interface of an estimator: what it is given, what it gives back, and finding all of them by name.
+"""Interface of an estimator: its input, its output, and the look-up of estimators by name.
 
 An estimator is a function (evidence) -> Estimate, named in `identify.own_parts` or given as
-``module:function``. The decorator `estimator` says in words what it is.
+``module:function``. The decorator `estimator` adds a description.
 """
 
 import functools
@@ -25,7 +25,7 @@ class JointChannels:
     """Measured channels of n joints.
 
     torque (N, n): means over a frame, N m or N, with standard deviation torque_std. angle (N, n):
-    those of the encoders, rad or m.
+    readings of the encoders, rad or m.
     """
 
     torque: Array
@@ -35,11 +35,11 @@ class JointChannels:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that an estimator may use.
+    """Input of an estimator.
 
-    problem: the record as an output-error problem, with starting guess and scale anchor. channels:
-    those of the joints, if there are any. known_gains (3,): lp, li and ld of the joint PID, if
-    known.
+    problem: the record as an output-error problem, with initial guess and scale anchor. channels:
+    measured channels of the joints, or None. known_gains (3,): lp, li and ld of the joint PID, or
+    None if they are unknown.
     """
 
     problem: OutputErrorProblem
@@ -48,7 +48,7 @@ class Evidence:
 
     @property
     def run(self) -> LoopModel:
-        """First record. The estimators of this package that use the joints take one record only."""
+        """First record. Estimators of this package that use joint channels read only this one."""
         return self.problem.runs[0]
 
     def joint_channels(self) -> JointChannels:
@@ -62,11 +62,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters (p,) that an estimator found, with their standard deviations if it states any.
+    """Parameters (p,) found by an estimator, with their standard deviations or None.
 
-    seconds: time without that of the standard deviations. iterations: steps of a search, or
-    solutions of a linear fit. evaluations: simulated runs of the model, of which one with
-    sensitivities counts once.
+    seconds: duration without the computation of standard deviations. iterations: steps of a search,
+    or solutions of a linear fit. evaluations: simulated runs of the model. A run with sensitivities
+    counts once.
     """
 
     parameters: Array
@@ -79,9 +79,9 @@ class Estimate:
 
 @dataclass(eq=False)
 class Estimator:
-    """Function that estimates, with a description: its title, and what it uses beside the commands.
+    """Estimating function with a title and a text of its inputs beside the commands.
 
-    It is called as the function is.
+    It is called like the function.
     """
 
     title: str
@@ -94,21 +94,21 @@ class Estimator:
     def __call__(self, evidence: Evidence) -> Estimate:
         """Return the function's estimate.
 
-        Raises EstimationError or dynamics.DynamicsError if there is none.
+        Raises EstimationError or dynamics.DynamicsError if the estimation fails.
         """
         return self.estimate(evidence)
 
 
 def estimator(title: str, uses: str) -> Callable[[Callable[[Evidence], Estimate]], Estimator]:
-    """Return a decorator that makes an estimator of a function."""
+    """Return a decorator that makes an Estimator from a function."""
     return functools.partial(Estimator, title, uses)
 
 
 def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
-    """Return the built-in estimators of these names, or all, and then those of a user's own.
+    """Return the estimators of these names, by default all built-in estimators.
 
-    Built-in ones are in the order of their table. Raises ScenarioError, with the valid names, for
-    one that does not exist or cannot be imported.
+    Built-in estimators come first, in the order of their table, then a user's own. Raises
+    ScenarioError, with the valid names, if an estimator does not exist or cannot be imported.
     """
     for name in names or ():
         check_choice(name, "estimator", ESTIMATORS)
@@ -119,12 +119,12 @@ def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
 
 def _found(name: str) -> Estimator:
     found = chosen(name, "estimator", ESTIMATORS)
-    # a built-in one fails as it should by itself
+    # Only a user's own estimator needs its errors converted.
     return found if isinstance(found, Estimator) and not is_own(name) else _own(name, found)
 
 
 def _own(name: str, function: Callable[..., Any]) -> Estimator:
-    """Return a user's own estimator, whose failures are all an EstimationError in a line."""
+    """Return a user's own estimator. All its failures become an EstimationError in one line."""
     known = (EstimationError, DynamicsError)
     told = Telling(f"estimator {name!r}", function, EstimationError, known, _check_estimate)
     title = getattr(function, "title", name)
@@ -132,7 +132,7 @@ def _own(name: str, function: Callable[..., Any]) -> Estimator:
 
 
 def _check_estimate(part: str, found: object, evidence: Evidence) -> None:
-    """Raise EstimationError unless a user's own estimator has returned what it should."""
+    """Raise EstimationError unless a user's own estimator has returned a valid Estimate."""
     if not isinstance(found, Estimate):
         raise EstimationError(f"{part} must return an Estimate, returned {type(found).__name__}")
     shape = np.shape(evidence.problem.guess.values)

@@ -5,13 +5,13 @@ With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 2
     (J_ad^-T Gamma(chi, v, v_dot) Xi)_j = tau_j
     lp (U - theta)_j + li integral(U - theta)_j + ld (U_dot - theta_dot)_j + z_j = tau_j
 
-Both stand in one system with the unknowns Xi, lp, li, ld and the starting torques z (n,). The
-measured torque gives the scale, so that no anchor is needed. What the motion does not show is left
-to the starting guess with its standard deviations.
+Both form one system with the unknowns Xi, lp, li, ld and the torques z (n,) at the start. The
+measured torque determines the scale, so no anchor is needed. Parameters that the motion does not
+excite keep the initial guess with its standard deviations.
 
-Noise in the poses gets into the regression matrix through both derivatives, and draws the estimates
-towards zero. No number of samples removes that bias. The weights of the rows follow from what each
-joint leaves unexplained (Gautier, "Dynamic identification of robots with power model", ICRA 1997).
+Noise of the poses enters the regression matrix through both derivatives, and biases the estimates
+towards zero, for any number of samples. The weights of the rows follow from the residuals of each
+joint (Gautier, "Dynamic identification of robots with power model", ICRA 1997).
 """
 
 import time
@@ -33,9 +33,9 @@ from identify.filtering import zero_phase_filter
 from identify.model.loop_model import LoopModel
 
 FREE_TORQUE = {False: 1e3, True: 1e6}
-"""Standard deviation of a starting torque, N m, or of a force of prismatic joints (True), N.
+"""Prior standard deviation of the torques at the start, N m, or forces of prismatic joints, N.
 
-It is so large that before the experiment nothing is known of it.
+It is so large that the prior has no effect. The keys are False for torques and True for forces.
 """
 
 
@@ -43,23 +43,22 @@ It is so large that before the experiment nothing is known of it.
 class TorqueEquations:
     """Linear equations matrix @ unknowns = right, in N m or N.
 
-    The first n rows are those of the dynamics, and the others those of the controller.
+    The first n rows are equations of the dynamics, and the other n rows of the controller.
 
     Attributes
     ----------
     layout : ParameterLayout
-        Layout of the parameters, which are the first of the u unknowns. The starting torques of the
-        joints come after them.
+        Layout of the parameters, the first of the u unknowns. The torques of the joints at the
+        start follow.
     matrix, right : ndarray, shapes (2 n, u) and (2 n,)
         Coefficients and right side.
     kind : ndarray of int, shape (2 n,)
-        Number of the joint in rows of its dynamics. In rows of its controller the number of joints
-        is added.
+        Index of the joint. In rows of the controller the number of joints is added.
     correlation : float
-        Number of samples for each independent one. A low-pass filter of cutoff f leaves 2 f
-        of these a second.
+        Number of samples per independent sample. After a low-pass filter with cutoff f there are
+        2 f independent samples per second.
     slipping : ndarray of bool, shape (N, joints)
-        Frames and joints that the rows are of.
+        True for the frames and joints of the rows.
     """
 
     layout: ParameterLayout
@@ -70,7 +69,7 @@ class TorqueEquations:
     slipping: NDArray[np.bool_]
 
     def residual(self, unknowns: Array) -> Array:
-        """Return the torques (2 n,) that the equations leave unexplained."""
+        """Return the residual torques (2 n,) of the equations."""
         return np.asarray(self.matrix @ unknowns - self.right, dtype=float)
 
     def whitened(self, noise: Array) -> "TorqueEquations":
@@ -87,9 +86,9 @@ def torque_equations(
 ) -> TorqueEquations:
     """Return the equations of poses (N, 6) and torques (N, n) of a run with its logged commands.
 
-    The torques are in N m or N. problem: filter, and gains of a cascade about which its torque is
-    linear. slipping (N, n): frames and joints of the rows. The default is those at which a joint
-    slips.
+    The torques are in N m or N. problem: provides the filter, and the gains of a cascade about
+    which its torque is linearised. slipping (N, n): frames and joints of the rows, by default all
+    frames in which a joint slips.
     """
     low_pass = problem.low_pass
     rate_hz = run.settings.timing.frame_rate_hz
@@ -103,10 +102,10 @@ def torque_equations(
     others = slice(layout.dynamic.stop, None)
     matrix = np.zeros((2 * len(columns), columns.shape[1]))
     matrix[: len(columns), dynamic] = columns[:, dynamic]
-    # the balance holds the controller's torque with the opposite sign
+    # The balance has the controller's torque with the opposite sign.
     matrix[len(columns) :, others] = -columns[:, others]
     joint = np.nonzero(rows)[1]
-    # the torque of a known payload stands on the right side
+    # The torque of a known payload is on the right side.
     right = np.concatenate([felt - columns[:, dynamic] @ run.payload[dynamic], felt])
     correlation = max(1.0, rate_hz / (2 * low_pass.cutoff_hz))
     kind = np.concatenate([joint, joint + layout.joints])
@@ -114,12 +113,12 @@ def torque_equations(
 
 
 def lower_bounds(layout: ParameterLayout) -> Array:
-    """Return lower bounds (u,): zero for parameters and gains, none for starting torques."""
+    """Return lower bounds (u,): zero for parameters and gains, -inf for torques at the start."""
     return np.concatenate([np.zeros(len(layout.names)), np.full(layout.joints, -np.inf)])
 
 
 def prior_of(guess: StartingGuess) -> tuple[Array, Array]:
-    """Return values (u,) and standard deviations (u,) of the unknowns before the experiment."""
+    """Return prior values (u,) and prior standard deviations (u,) of the unknowns."""
     joints = guess.layout.joints
     free = FREE_TORQUE[guess.layout.prismatic]
     return np.append(guess.values, np.zeros(joints)), np.append(guess.std, np.full(joints, free))
@@ -128,14 +127,14 @@ def prior_of(guess: StartingGuess) -> tuple[Array, Array]:
 def nearest_admissible(
     layout: ParameterLayout, unknowns: Array, information: Array, scale: Array
 ) -> Array:
-    """Return the unknowns (u,) within their bounds that are nearest to given ones.
+    """Return the unknowns (u,) within their bounds that are nearest to given unknowns.
 
-    The metric is that of the information matrix (u, u). scale (u,): sizes of the unknowns.
+    The metric is the information matrix (u, u). scale (u,): sizes of the unknowns.
     """
     lower = lower_bounds(layout)
     if (unknowns >= lower).all():
         return unknowns
-    # least squares with |factor x|^2 as the metric
+    # Least squares with the metric |factor x|^2.
     factor = np.linalg.cholesky(information * np.outer(scale, scale)).T
     solved = lsq_linear(
         factor, factor @ (unknowns / scale), bounds=(lower / scale, np.inf), method="bvls"
@@ -144,12 +143,12 @@ def nearest_admissible(
 
 
 SMALLEST_NOISE_N_M = 1e-9
-"""Least standard deviation of a row, by which residuals of zero can be divided."""
+"""Smallest standard deviation of a row, which avoids a division by zero."""
 
 
 @estimator("torque, LS", uses="poses, torque")
 def least_squares(evidence: Evidence) -> Estimate:
-    """Estimate by ordinary least squares, in which all joints count alike."""
+    """Estimate by ordinary least squares, with the same weight for all joints."""
     return _solved(evidence, time.perf_counter(), weighted=False)
 
 
@@ -163,10 +162,10 @@ def weighted_least_squares(evidence: Evidence) -> Estimate:
 def encoder_route(evidence: Evidence) -> Estimate:
     """Estimate by weighted least squares on poses from encoders and forward kinematics.
 
-    This is the conventional route, which knows nothing of the camera. Forward kinematics of a
-    parallel robot has no closed form. Newton's method solves all instants at once, each from the
-    desired pose there, which the robot is never far from. The note says how long that took. Raises
-    EstimationError if the angles belong to no pose near the desired one.
+    This is the conventional method without a camera. Forward kinematics of a parallel robot has no
+    closed form. Newton's method solves all instants at once, each from its desired pose, which is
+    always near the true pose. The note states the time for this. Raises EstimationError if there is
+    no pose for the angles near the desired pose.
     """
     began = time.perf_counter()
     run = evidence.run
@@ -183,7 +182,7 @@ def _solved(
 ) -> Estimate:
     """Return the estimate of a fit to the measured poses, or to others (N, 6).
 
-    began: time, from `time.perf_counter`, at which the estimation began.
+    began: beginning of the estimation, from `time.perf_counter`.
     """
     equations = measured_equations(evidence, poses)
     guess = evidence.problem.guess
@@ -213,11 +212,11 @@ def fit_equations(
     """Return the unknowns (u,) of the equations, and the standard deviations (2 n,) of the rows.
 
     The standard deviations, N m or N, come from the residuals of each joint, if weighted, or else
-    of all joints. They account for the correlation by the filter.
+    of all joints together. They account for the correlation by the filter.
     """
-    # without weights joints count alike, but dynamics and controller have residuals of their own
+    # Without weights there are only two groups, the rows of dynamics and of controllers.
     groups = equations.kind if weighted else equations.kind // equations.layout.joints
-    # N m or N: a first value, which weighs the starting guess only
+    # First value, N m or N. It only affects the weight of the initial guess.
     noise = np.full(len(equations.right), 0.1)
     for _ in range(REWEIGHTINGS):
         rows = equations.whitened(noise)
@@ -229,9 +228,9 @@ def fit_equations(
 
 
 def row_noise(equations: TorqueEquations, unknowns: Array, groups: NDArray[np.intp]) -> Array:
-    """Return standard deviations (2 n,) with which rows may be taken as independent.
+    """Return standard deviations (2 n,) with which rows can be treated as independent.
 
-    They are the RMS residual of each row's group, times the root of the samples' correlation.
+    They are the RMS residual of each row's group, times the square root of `correlation`.
     """
     squares = equations.residual(unknowns) ** 2
     rms = np.sqrt(np.bincount(groups, squares) / np.maximum(np.bincount(groups), 1))
@@ -239,7 +238,7 @@ def row_noise(equations: TorqueEquations, unknowns: Array, groups: NDArray[np.in
 
 
 def information(rows: TorqueEquations, guess: StartingGuess) -> Array:
-    """Return the information (u, u) of whitened rows and the starting guess."""
+    """Return the information (u, u) of whitened rows and the initial guess."""
     _, std = prior_of(guess)
     return np.asarray(rows.matrix.T @ rows.matrix + np.diag(1 / std**2), dtype=float)
 

@@ -1,6 +1,7 @@
-"""Output error in its variants, and its linear warm start alone.
+"""Estimators by output error, and by its linear warm start alone.
 
-The variants are that of the paper, one driven by the logged commands, and one with known gains.
+The variants of the output error are the paper's closed loop, the model driven by the logged
+commands, and the closed loop with known gains.
 """
 
 import time
@@ -18,7 +19,7 @@ from identify.progress import SilentProgress
 from identify.random_streams import ROUTES_UNCERTAINTY, mixed_generator
 
 KNOWN = 1e-6
-"""Relative standard deviation of a gain that is known."""
+"""Relative standard deviation of a known gain."""
 
 
 @estimator("output error, unknown PID", uses="poses")
@@ -50,7 +51,7 @@ def known_pid(evidence: Evidence) -> Estimate:
     values = guess.values.copy()
     std = guess.std.copy()
     gains = guess.layout.joint_pid
-    # gains that the law does not read stay fixed at zero
+    # Gains that the law does not read remain fixed at zero.
     read = ~guess.fixed[gains]
     values[gains] = np.where(read, evidence.known_gains, 0.0)
     std[gains] = np.where(read, KNOWN * np.abs(evidence.known_gains), std[gains])
@@ -72,7 +73,7 @@ def warm_start_alone(evidence: Evidence) -> Estimate:
 def _searched(problem: OutputErrorProblem, closed_loop: bool) -> Estimate:
     began = time.perf_counter()
     warm = linear_warm_start(problem)
-    # the last search is the estimator's own, and those before it lead there
+    # The last search gives the estimate. The searches before it provide its start.
     found = list(output_error_searches(problem, warm, closed_loop, SilentProgress()).values())
     seconds = time.perf_counter() - began
     last = found[-1].solution

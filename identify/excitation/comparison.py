@@ -22,7 +22,7 @@ from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
 
 COMPARISON_REFINEMENT = 10
-"""Factor by which margins are sampled more finely than constraints during a search."""
+"""Factor by which limits are sampled more finely here than during a search."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Entries of all methods, with the time [s] to make the candidates and functions they share."""
+    """Entries of all methods. The preparation of common candidates and functions is timed in s."""
 
     criterion: str
     seed: int
@@ -76,16 +76,16 @@ class Comparison:
 
 
 def compare_methods(design: Design, known: Knowledge, seed: int, progress: Progress) -> Comparison:
-    """Search with every method, and judge what each finds by its information.
+    """Run the search of every method, and judge the results by their information.
 
     Raises the errors of `design_trajectories`.
     """
     robot = design.robot
-    # The evolutionary method needs a population, and the gradient's needs whole periods.
+    # The evolutionary method needs a population, and the gradient method needs whole periods.
     count = max(design.settings.candidates, FEWEST_MEMBERS)
     settings = design.settings.model_copy(update={"method": "gradient", "candidates": count})
     design = replace(design, settings=settings)
-    # Compiled first, so that no method's time contains it.
+    # Compilation comes first, so that no method's time contains it.
     with progress.stage("compile the robot", 1) as advance:
         prepare(robot)
         advance()
@@ -131,7 +131,10 @@ POINTS = 1000
 
 
 def comparison_figure(robot: Robot, settings: Excitation, comparison: Comparison) -> Figure:
-    """Draw position, orientation and joints over one period, one column a method, limits dashed."""
+    """Draw position, orientation and joints over one period, one column per method.
+
+    Limits are dashed.
+    """
     figure = Figure(figsize=(5 * len(comparison.entries), 9), layout="constrained")
     panels = figure.subplots(3, len(comparison.entries), sharex=True, sharey="row", squeeze=False)
     time = np.linspace(0.0, 1.0 / settings.fundamental_hz, POINTS)

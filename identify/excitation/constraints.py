@@ -1,19 +1,20 @@
 """Constraints on an exciting trajectory, as CasADi expressions of pose and pose rate.
 
-Every constraint is written as the share of its limit that is used. A trajectory is admissible if
-all shares lie between -1 and 1.
+Every constraint is expressed as a used share of its limit. A trajectory is admissible if all shares
+lie between -1 and 1.
 
     box           distance from home over the amplitude that the scenario allows, by coordinate
-    travel        joint coordinate over the travel limit less the margin, by leg
-    velocity      joint velocity over the largest allowed, by leg
-    leverage      least leverage of J_a1 over the leverage, by leg (see `dynamics.workspace`)
-    conditioning  2-norm condition number of the scaled J_a2 over its limit. The expressions
-                  have that of a Schatten norm, which is smooth and 0 to 3 % above
-    visibility    angle to grazing, and place in the image, of four stickers a plane and both
+    travel        joint coordinate over the travel limit minus the margin, by leg
+    velocity      joint velocity over the largest allowed velocity, by leg
+    leverage      smallest allowed leverage of J_a1 over the leverage, by leg (see
+                  `dynamics.workspace`)
+    conditioning  2-norm condition number of the scaled J_a2 over its limit; the expressions use
+                  the condition number in a Schatten norm, which is smooth and 0 to 3 % larger
+    visibility    angle to grazing, and place in the image, of four stickers per plane for both
                   cameras; left out if the whole box is proved to be in sight
 
-The form of the trajectory makes it start at home and at rest. It ends there because the run lasts
-whole periods.
+By its form, the trajectory starts at home and at rest. It ends there because the run lasts whole
+periods.
 """
 
 from collections.abc import Collection
@@ -38,9 +39,9 @@ from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory, box_of
 
 STICKERS_A_PLANE = 4
-"""Number of stickers of each plane that both cameras can look for at every pose.
+"""Number of stickers per plane that must be visible to both cameras at every pose.
 
-A plane that has fewer needs all of them.
+If a plane has fewer stickers, all of them must be visible.
 """
 
 PLANES = "ABC"
@@ -49,9 +50,10 @@ CONDITIONING = "conditioning"
 
 
 def required_stickers(sight: SightLines, home: Array) -> list[int]:
-    """Return the stickers of each plane that must stay visible: those that face both cameras best.
+    """Return the stickers that must stay visible: those of each plane that face the cameras best.
 
-    Raises TrajectoryError, naming the plane, if too few can be looked for even at home.
+    Raises TrajectoryError if too few stickers of a plane are visible at home. The message names the
+    plane.
     """
     uses = np.array(_functions(sight, range(len(sight.platform.sticker_ids)))(home)).reshape(
         -1, 2, 3
@@ -65,19 +67,20 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
         needed = min(STICKERS_A_PLANE, int(on_plane.sum()))
         if len(able) < needed:
             raise TrajectoryError(
-                f"visibility: both cameras can look for {len(able)} stickers of plane {plane} at "
+                f"visibility: {len(able)} stickers of plane {plane} are visible to both cameras at "
                 f"the home pose, {needed} are needed"
             )
-        # A stable sort chooses the same of equally good stickers on every machine.
+        # With a stable sort, the choice among equally good stickers is the same on all machines.
         chosen += able[np.argsort(worst[able], kind="stable")][:needed].tolist()
     return chosen
 
 
 def sight_uses(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
-    """Return the shares of visibility that stickers use at a pose.
+    """Return the used shares of the limits of visibility for stickers at a pose.
 
-    Each sticker has six rows, three for each camera: grazing incidence, and the image across and
-    up. Beyond +-1 the camera cannot look for the sticker. Lens distortion is left out.
+    Each sticker has six rows, three for each camera: grazing incidence, and the horizontal and
+    vertical place in the image. Beyond +-1 the sticker is not visible to the camera. Lens
+    distortion is neglected.
     """
     platform = sight.platform
     rows = []
@@ -95,10 +98,10 @@ def sight_uses(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
 
 
 def within_sight(sight: SightLines, stickers: list[int], home: Array, box: Array) -> bool:
-    """Tell whether the stickers stay in sight in a whole box (6,) [m, rad] about home.
+    """Return whether the stickers are proved visible in a whole box (6,) [m, rad] about home.
 
-    The proof bounds how far a sticker moves and turns, so that no pose has to be tried. False means
-    that the bounds do not suffice.
+    The proof uses bounds of the motion and rotation of each sticker. False means that these bounds
+    do not suffice, and not that a sticker is invisible.
     """
     turn = float(box[3:].sum())
     uses = np.array(_functions(sight, stickers)(home)).reshape(-1, 2, 3)
@@ -110,13 +113,13 @@ def within_sight(sight: SightLines, stickers: list[int], home: Array, box: Array
         sight.rig.cameras, sight.cameras_from_base, uses.swapaxes(0, 1), strict=True
     ):
         seen = apply(move, places)
-        # The sticker may come this near to the camera, where a shift moves its image most.
+        # Smallest possible depth of the sticker, at which a shift moves its image most.
         nearest = seen[:, 2] - shifts
         if (nearest <= 0).any():
             return False
-        # A sticker that shifts is seen from another side, as if it had turned.
+        # A shift changes the direction of sight, like a rotation of the sticker.
         turned = turn + np.arcsin(np.minimum(1.0, shifts / np.linalg.norm(seen, axis=1)))
-        # From the share used at home back to the angle of incidence.
+        # Angle of incidence at home, from the used share of its limit.
         angle = np.arccos(1 - use[:, 0] * (1 - GRAZING)) + turned
         moved = (
             (shifts / nearest)[:, None]
@@ -141,16 +144,16 @@ SQUARINGS = 6
 def condition_number(matrix: ca.SX) -> ca.SX:
     """Return the condition number of a square matrix in a norm near the 2-norm.
 
-    It is never below that of the 2-norm, and for six rows at most 3 % above it.
+    It is never below the condition number in the 2-norm, and for six rows at most 3 % above it.
     """
     inverse = ca.solve(matrix, ca.SX.eye(matrix.rows()))
     return _schatten_norm(matrix) * _schatten_norm(inverse)
 
 
 def _schatten_norm(matrix: ca.SX) -> ca.SX:
-    """Schatten norm (sum of sigma^p)^(1/p) over the singular values.
+    """Return the Schatten norm (sum of sigma^p)^(1/p) over the singular values.
 
-    Every power is scaled to trace one, so it cannot overflow.
+    Every power is scaled to trace one, so that it cannot overflow.
     """
     power = ca.densify(matrix.T @ matrix)
     logarithm = 0
@@ -171,7 +174,7 @@ class Limit:
     name : str
         Name of the constraint.
     share : casadi.SX
-        Shares of the limit that are used, one row an entry of ``limit``.
+        Used shares of the limit, one row per entry of ``limit``.
     limit : tuple of float
         Limits in their unit.
     unit : str
@@ -194,8 +197,8 @@ class Limit:
 class Worst:
     """Instant at which a trajectory comes nearest to a limit.
 
-    Value and limit are in ``unit``. ``share`` is the share of the limit that is used, ``who`` the
-    leg, coordinate or sticker, and ``time_s`` the time [s].
+    Value and limit are in ``unit``. ``share`` is the used share of the limit, ``who`` the leg,
+    coordinate or sticker, and ``time_s`` the time [s].
     """
 
     name: str
@@ -207,7 +210,7 @@ class Worst:
     time_s: float
 
     def excess(self) -> float:
-        """Return the share used, infinite if a leg is out of reach."""
+        """Return the used share. It is infinite if a leg is out of reach."""
         return np.inf if np.isnan(self.share) else self.share
 
     def __str__(self) -> str:
@@ -221,7 +224,7 @@ class Worst:
 class MotionConstraints:
     """Constraints on the motion of a robot.
 
-    Raises TrajectoryError, with value, limit and leg, if even the home pose breaks them. Raises
+    Raises TrajectoryError, with value, limit and leg, if the home pose violates a limit. Raises
     ScenarioError for settings of another kind of actuators.
     """
 
@@ -269,7 +272,7 @@ class MotionConstraints:
             Limit(CONDITIONING, condition_number(link_rows) / most, (most,), "", ("",)),
         ]
         self._box_units = chart.units
-        # Many rows, which a search need not evaluate where no pose of the box can break them.
+        # Visibility has many rows, so it is left out if all poses of the box are visible.
         if not self.always_in_sight:
             names = [
                 f"sticker {sight.platform.sticker_ids[k]}, {side} camera, {what}"
@@ -283,19 +286,19 @@ class MotionConstraints:
 
     @cached_property
     def shares(self) -> ca.Function:
-        """Function (pose, pose rate) (6,) -> shares used of all limits, in their order."""
+        """Function (pose, pose rate) (6,) -> used shares of all limits, in their order."""
         return self.shares_of([limit.name for limit in self.limits])
 
     def shares_of(self, names: Collection[str]) -> ca.Function:
         """Return the function `shares` for some of the limits."""
         rows = ca.vertcat(*[limit.share for limit in self.limits if limit.name in names])
-        # The limits share most of the kinematics, which is then evaluated once.
+        # `cse` evaluates the kinematics once that the limits have in common.
         return ca.Function("shares", [self._pose, self._rate], ca.cse([rows]))
 
     def worst(self, trajectory: FourierTrajectory, times: Array) -> list[Worst]:
-        """Return where a trajectory, sampled at `times` (N,) [s], comes nearest to each limit.
+        """Return the instants at which a trajectory comes nearest to each limit.
 
-        A share of NaN means out of reach.
+        The trajectory is sampled at `times` (N,) [s]. A share of NaN means out of reach.
         """
         poses = trajectory.pose(times)
         rates = trajectory.pose_rate(times)
@@ -306,9 +309,9 @@ class MotionConstraints:
         for limit in self.limits:
             block = np.abs(used[:, first : first + len(limit.who)])
             if limit.name == CONDITIONING:
-                # The exact 2-norm replaces the smooth norm that a search needs.
+                # The check uses the exact 2-norm in place of the smooth norm of the search.
                 block = condition[:, None] / limit.limit[0]
-            # argmax takes the first NaN for the largest: a pose out of reach is the worst.
+            # argmax returns the first NaN, so a pose out of reach is the worst.
             row, who = np.unravel_index(np.argmax(block), block.shape)
             share = float(block[row, who])
             bound = limit.limit[who]
@@ -325,8 +328,8 @@ class MotionConstraints:
     ) -> list[Worst]:
         """Return `worst` of an admissible trajectory.
 
-        Raises TrajectoryError otherwise. It names constraint, leg, value, limit and time of the
-        worst violation.
+        Raises TrajectoryError for other trajectories. The message names constraint, leg, value,
+        limit and time of the worst violation.
         """
         found = self.worst(trajectory, times)
         broken = [w for w in found if not w.share <= 1 + tolerance]
@@ -338,17 +341,17 @@ class MotionConstraints:
 
 
 def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:
-    """Raise TrajectoryError if the home pose breaks a limit of the robot."""
+    """Raise TrajectoryError if the home pose violates a limit of the robot."""
     try:
         check_motion(robot, robot.home_pose, travel_margin=margin, **settings.singularity_limits)
     except DynamicsError as error:
-        raise TrajectoryError(f"{robot.name} may not even be at home: {error}") from error
+        raise TrajectoryError(f"{robot.name} violates a limit already at home: {error}") from error
 
 
 def check_periods(settings: Excitation) -> None:
     """Raise TrajectoryError if a run is not a whole number of periods.
 
-    It could not end at home and at rest.
+    Such a run would not end at home and at rest.
     """
     if not is_whole_periods(settings.duration_s, settings.fundamental_hz):
         periods = settings.duration_s * settings.fundamental_hz

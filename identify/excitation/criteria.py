@@ -1,23 +1,23 @@
-"""Criteria of exciting trajectories, and that of the paper, the observability index (eq. 39).
+"""Criteria of exciting trajectories, among them the paper's observability index (eq. 39).
 
 A criterion is a function (robot, scenario, unknowns, typical) -> Criterion, named in
 `identify.own_parts` or given as ``module:function``. `typical` is the z of a trajectory that
-excites all parameters. A criterion may take its scale from it.
+excites all parameters. It can be used to scale the criterion.
 
-The observability index is the geometric mean of the singular values of H over sqrt(m). Of the p
-columns of H only those of the base parameters are independent: H = H_1 C with the pivot columns H_1
-and the base combinations C (rank, p). The product of the nonzero singular values is therefore
-sqrt(det(H_1^T H_1) det(C C^T)), whichever pivots were chosen, and
+The observability index is the geometric mean of the singular values of H over sqrt(m). Only the
+columns of the base parameters are linearly independent: H = H_1 C with the pivot columns H_1 and
+the base combinations C (rank, p). The product of the nonzero singular values is therefore
+sqrt(det(H_1^T H_1) det(C C^T)), for any choice of pivots, and
 
     ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(m) / 2.
 
-The rank (zeta in the paper) is that of the robot and not of a trajectory, so all trajectories are
-judged on the same subspace. As in the paper, the columns of H are not scaled, and only the dynamic
-parameters count, not the gains of the joint controller.
+The rank (zeta in the paper) depends on the robot and not on the trajectory, so all trajectories are
+judged on the same subspace. As in the paper, the columns of H are not scaled, and the gains of the
+joint controller are not included.
 
-H_1 is divided by the triangular factor R of one trajectory. This takes out the units of the
-parameters and keeps H_1^T H_1 well conditioned. The inverse of R is rounded to numbers on which all
-processors agree, and the constant belongs to the rounded inverse.
+H_1 is divided by the triangular factor R of one trajectory. This removes the units of the
+parameters and makes H_1^T H_1 well conditioned. The inverse of R is rounded to numbers on which all
+processors agree, and the constant is computed from the rounded inverse.
 
 A run of whole periods is sampled over one period, because the index does not depend on their
 number. Any other run is sampled from start to end.
@@ -42,9 +42,9 @@ from identify.trajectory import FourierTrajectory
 
 SMOOTHING_RAD_S = 0.02
 SMOOTHING_M_S = 0.002
-"""Velocity v_s in tanh(theta_dot / v_s), which replaces the sign where derivatives are needed.
+"""Velocity v_s in tanh(theta_dot / v_s), a differentiable replacement of the sign.
 
-A velocity changes by about this much between two samples.
+A velocity changes by about this amount between two samples.
 """
 
 
@@ -62,10 +62,10 @@ class Criterion:
     value : casadi.Function
         Function z -> logarithm of the criterion.
     smooth : casadi.Function
-        The same with derivatives everywhere.
+        Differentiable approximation of `value`.
     judge : callable, optional
-        Better measure by which the few results of a gradient search are ranked; larger is better.
-        It raises TrajectoryError for a trajectory that cannot be judged.
+        More accurate measure by which the results of a gradient search are ranked; larger is
+        better. It raises TrajectoryError for a trajectory that cannot be judged.
     """
 
     value: ca.Function
@@ -76,7 +76,7 @@ class Criterion:
 def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
     """Return the scenario's criterion.
 
-    Raises ScenarioError, with the valid names, if there is none of its name.
+    Raises ScenarioError, with the valid names, if there is no criterion of this name.
     """
     name = scenario.excitation.criterion
     make = chosen(name, "excitation.criterion", CRITERIA)
@@ -95,7 +95,7 @@ def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: 
 def _check_made(part: str, made: object, *given: Any) -> None:
     """Raise ScenarioError if the object made by a user's own function is not a criterion of z.
 
-    The function was given robot, scenario, unknowns and typical z.
+    given: arguments of the function, which are robot, scenario, unknowns and typical z.
     """
     unknowns, typical = given[2:]
     if not isinstance(made, Criterion):
@@ -109,7 +109,7 @@ def _check_made(part: str, made: object, *given: Any) -> None:
         if sizes != (1, 1) or function.numel_in(0) != unknowns.size or function.numel_out(0) != 1:
             raise ScenarioError(f"{wanted}, has {function}")
         if np.isnan(float(function(typical))):
-            raise ScenarioError(f"{wanted}, which is NaN at an admissible trajectory")
+            raise ScenarioError(f"{wanted}, but its value is NaN at an admissible trajectory")
     if made.judge is not None and not callable(made.judge):
         raise ScenarioError(f"{part} must have a function for judge, or None")
 
@@ -123,7 +123,7 @@ def _judged(part: str, value: object, trajectory: FourierTrajectory) -> None:
 def observability(
     robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array
 ) -> Criterion:
-    """Return the observability index (eq. 39) of the run that the scenario plays."""
+    """Return the observability index (eq. 39) of the scenario's run as a criterion."""
     duration_s = scenario.excitation.duration_s
     value, smooth = (
         log_observability(robot, unknowns, duration_s, typical, v)
@@ -141,9 +141,9 @@ def log_observability(
 ) -> ca.Function:
     """Return the function z -> ln O_in (eq. 39) of a run of `duration_s`.
 
-    Its value is -inf or NaN if the run is too short to show every base parameter. `typical` is the
-    z of a trajectory that excites all parameters, and only sets the scale. `smoothing` [rad/s or
-    m/s] smooths the sign of Coulomb friction, which makes the function differentiable.
+    Its value is -inf or NaN if the run is too short to identify every base parameter. `typical` is
+    the z of a trajectory that excites all parameters. It is used only for scaling. `smoothing`
+    [rad/s or m/s] smooths the sign of Coulomb friction and makes the function differentiable.
     """
     base = structure(robot)
     times = played_times(unknowns.fundamental_hz, unknowns.harmonics, duration_s)
@@ -176,10 +176,10 @@ def log_index(columns: ca.MX, combinations: Array, typical: Array, samples: int)
 
 
 def _rounded_triangle(inverse: Array) -> Array:
-    """Round an inverse triangle as `agreed` does, and keep it regular.
+    """Round an inverse triangular factor by `agreed`, without making it singular.
 
-    A motion that hardly shows some parameter has entries so large that others on the diagonal are
-    rounded to zero. These are rounded by their own size.
+    If a motion hardly excites some parameter, entries can be so large that other diagonal entries
+    would be rounded to zero. These are rounded relative to their row up to the diagonal.
     """
     rounded = agreed(inverse)
     for k in np.flatnonzero(np.diag(rounded) == 0.0):
@@ -190,7 +190,7 @@ def _rounded_triangle(inverse: Array) -> Array:
 def observability_index(logarithm: ca.Function, z: Array) -> float:
     """Return O_in (eq. 39) of a trajectory's z from the function of `log_observability`.
 
-    It is 0 if a base parameter does not show.
+    It is 0 if a base parameter is not excited.
     """
     value = float(logarithm(z))
     return 0.0 if np.isnan(value) else float(np.exp(value))

@@ -1,4 +1,4 @@
-"""Design of a run's trajectories: the exciting one, and unseen random ones."""
+"""Design of a run's trajectories: the exciting trajectory, and random validation trajectories."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ from identify.scenario.sections import Validation
 from identify.trajectory import FourierTrajectory, TrajectorySet, check_travel, random_trajectory
 
 ATTEMPTS = 50
-"""Average number of random trajectories that are tried for each admissible one."""
+"""Largest number of random trajectories per admissible trajectory, on average."""
 
 Check = Callable[[FourierTrajectory, Array], object]
-"""Function that raises TrajectoryError for a trajectory that breaks a limit at times (N,) [s]."""
+"""Function that raises TrajectoryError if a trajectory violates a limit at times (N,) [s]."""
 
 
 def drawn_trajectory(
@@ -46,14 +46,14 @@ def admissible_trajectories(
     seed: np.random.SeedSequence,
     check: Check = lambda trajectory, times: None,
 ) -> list[FourierTrajectory]:
-    """Draw random trajectories that keep the travel, avoid singularities and pass `check`.
+    """Draw random trajectories within the travel and without singularities that pass `check`.
 
-    The travel is that of the robot less the scenario's margin.
+    The travel is the robot's travel minus the scenario's margin.
 
-    Raises TrajectoryError, with the last reason, if too few of them do.
+    Raises TrajectoryError, with the last reason, if too few trajectories are admissible.
     """
     rng = np.random.default_rng(seed)
-    # Denser than a search samples, as limits can be broken between its instants.
+    # The samples are denser than in a search, because limits can be violated between them.
     rate_hz = 4 * SAMPLES_PER_HARMONIC * settings.harmonics * settings.fundamental_hz
     t = np.arange(round(duration_s * rate_hz) + 1) / rate_hz
     accepted: list[FourierTrajectory] = []
@@ -79,9 +79,9 @@ def admissible_trajectories(
 
 
 RANDOM_TOLERANCE = 1e-3
-"""Share by which random trajectories may exceed a limit.
+"""Share by which random trajectories are allowed to exceed a limit.
 
-They fill the box only as closely as they were sampled for it.
+They are scaled to the box at sampled times, and can exceed it slightly between these times.
 """
 
 
@@ -92,11 +92,11 @@ class Design:
     Attributes
     ----------
     robot : Robot
-        Robot that is to follow them.
+        Robot that shall follow the trajectories.
     settings : Excitation
-        Form of the trajectories, and how the exciting one is searched.
+        Form of the trajectories, and the search method of the exciting trajectory.
     unseen : Validation
-        Number and length of the unseen trajectories.
+        Number and length of the validation trajectories.
     limits : MotionConstraints
         Limits of the motion.
     criterion : callable
@@ -111,11 +111,11 @@ class Design:
     criterion: Callable[[Unknowns, Array], Criterion]
 
     def check(self, trajectory: FourierTrajectory, times: Array) -> None:
-        """Raise TrajectoryError for a random trajectory that breaks a limit at times (N,) [s]."""
+        """Raise TrajectoryError if a random trajectory violates a limit at times (N,) [s]."""
         self.limits.check(trajectory, times, RANDOM_TOLERANCE)
 
     def candidates(self, count: int, seed: int) -> list[FourierTrajectory]:
-        """Draw the random trajectories from which a search starts or chooses."""
+        """Draw the random candidates of a search."""
         settings = self.settings
         return admissible_trajectories(
             self.robot, settings, settings.duration_s, count, child(seed, EXCITATION), self.check
@@ -151,8 +151,8 @@ def design_trajectories(
     Each kind has its own stream of the seed.
 
     Raises ScenarioError if there is no such criterion. Raises TrajectoryError if no random
-    trajectory of this amplitude keeps the limits, if a search needs a whole number of periods and
-    has none, or if a search finds nothing.
+    trajectory of this amplitude is within the limits, if a search needs a whole number of periods
+    but the run has none, or if a search finds nothing.
     """
     progress = progress or SilentProgress()
     settings = design.settings
@@ -177,7 +177,7 @@ def design_trajectories(
 
 
 def unseen_trajectories(design: Design, seed: int) -> tuple[FourierTrajectory, ...]:
-    """Return the validation trajectories, for which nothing is searched."""
+    """Return the validation trajectories. They are random, without a search."""
     drawn = child(seed, UNSEEN)
     unseen = design.unseen
     return tuple(

@@ -1,15 +1,15 @@
 """D-optimality of the output error, in the simulated closed loop and in its linearisation.
 
-Let J = d(poses)/d(p parameters) be the sensitivities of the closed loop at the starting guess and
-Sigma the covariance that the sensor states. With the prior knowledge (starting guess, the
-scenario's prior of single parameters, scale anchor),
+Let J = d(poses)/d(p parameters) be the sensitivities of the closed loop at the initial guess and
+Sigma the covariance that the sensor states. With the prior (initial guess, the scenario's prior of
+single parameters, scale anchor),
 
     W = sum over frames J^T Sigma^-1 J + prior,
     D = (det(S W S))^(1 / (2 p)),    S = diag(prior deviations).
 
-D is the factor by which the experiment narrows the prior, as a geometric mean over all directions
-of the parameter space. It has no unit. The motion that the sensor's noise causes through the servo
-is left out.
+D is the factor by which the experiment reduces the prior standard deviations, as a geometric mean
+over all directions of the parameter space. It has no unit. Motion due to the sensor's noise in the
+servo is neglected.
 
 The simulation gives D of a trajectory, but no exact derivative with respect to it. Searches
 therefore use D in the loop linearised about rest at home. Let s = i omega, C = kp + kd s + ki / s
@@ -23,8 +23,8 @@ where E maps pose rates to twists. It follows a reference x_d as
 
     x = T x_d,    T = S L J_theta C exp(-s t_d).
 
-Friction counts with its viscous part only. Poses, wrenches and Jacobians are those along the
-platform's coordinates.
+Only viscous friction is included. Poses, wrenches and Jacobians are along the platform's
+coordinates.
 
 The robot thus follows each harmonic of the trajectory with a known lag, and the sensitivities are
 filtered columns of the torque regressor along that motion. Let Y be its Fourier coefficients at a
@@ -32,8 +32,8 @@ harmonic, tau = Y Xi the torques, and e = tau / L the joint error that the PID n
 
     d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
 
-One steady-state period stands for all, so the start of the run is left out. So are the terms of
-cascaded drives beyond those of a PID.
+One steady-state period represents the whole run, so the transient at the start is neglected. The
+terms of cascaded drives beyond those of a PID are also neglected.
 """
 
 from dataclasses import dataclass
@@ -67,7 +67,7 @@ from identify.trajectory import FourierTrajectory
 def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
     """Return D as a criterion.
 
-    Searches use D of the linearised loop. Their results are judged by that of the simulated loop.
+    Searches use D of the linearised loop. Their results are judged by D of the simulated loop.
     """
     covariance = expected_covariance(
         scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes
@@ -87,9 +87,9 @@ class Knowledge:
     Attributes
     ----------
     start : str
-        Name of the parameter set that the guess is made of.
+        Name of the parameter set of the guess.
     guess : StartingGuess
-        Starting guess of the parameters.
+        Initial guess of the parameters.
     settings : LoopSettings
         Loop of the model.
     times : ndarray, shape (N,)
@@ -111,7 +111,7 @@ class Knowledge:
 def knowledge(
     side: ModelSide, settings: Identification, times: Array, covariance: Array
 ) -> Knowledge:
-    """Return what is known before a run: the model's starting guess, its prior and the anchor.
+    """Return the knowledge before a run: the model's initial guess, its prior and the anchor.
 
     The run has frames at times (N,) [s], and poses have the covariance (6, 6).
     """
@@ -122,7 +122,7 @@ def knowledge(
     if anchor in MEASURED_PARAMETER:
         place = layout.names.index(MEASURED_PARAMETER[anchor])
         std = settings.anchor_std or default_std(anchor, layout)
-        # In units of the prior's deviation, as all of this matrix.
+        # The matrix is in units of the prior standard deviations.
         prior[place, place] += (guess.std[place] / std) ** 2
     start = side.model.start_parameters
     return Knowledge(start, guess, side.settings, times, covariance, prior)
@@ -131,7 +131,7 @@ def knowledge(
 def log_information(robot: Robot, known: Knowledge, trajectory: FourierTrajectory) -> float:
     """Return ln D of a trajectory.
 
-    Raises TrajectoryError if the model with the starting guess is unstable on it.
+    Raises TrajectoryError if the model with the initial guess is unstable on this trajectory.
     """
     reference = trajectory.reference(known.times)
     try:
@@ -165,7 +165,7 @@ def torque_response(
 ) -> ComplexArray:
     """Return S (K, m, n), coordinates per torque or force, at s = i omega (K,) [1/s].
 
-    The parameters have shape (p,). No s may be zero.
+    The parameters have shape (p,). No s must be zero.
     """
     home = robot.home_pose
     xi = parameters[robot.layout.dynamic]
@@ -179,7 +179,7 @@ def torque_response(
     stiffness = (
         robot.static_torque(home + steps, xi) - robot.static_torque(home - steps, xi)
     ).T / (2 * STEP)
-    # The last digits of the quotient are noise, which differs between processors.
+    # The last digits of the quotient differ between processors, so it is rounded.
     stiffness = agreed(stiffness, RESPONSE_BITS)
     damping = parameters[robot.layout.viscous][:, None] * joint_rates
     loop = pid_response(robot, parameters, s) * (1 + servo_response(settings, s))
@@ -190,7 +190,7 @@ def torque_response(
 def tracking_response(
     robot: Robot, parameters: Array, settings: LoopSettings, s: ComplexArray
 ) -> ComplexArray:
-    """Return T (K, m, m) from desired to actual coordinates, as `torque_response`."""
+    """Return T (K, m, m) from desired to actual coordinates. See `torque_response`."""
     gain = pid_response(robot, parameters, s) * servo_response(settings, s)
     drive = np.multiply.outer(gain, robot.coordinate_jacobian(robot.home_pose))
     return np.asarray(torque_response(robot, parameters, settings, s) @ drive)
@@ -205,7 +205,7 @@ def servo_response(settings: LoopSettings, s: ComplexArray) -> ComplexArray:
 
 
 HARMONICS_SEEN = 8
-"""Multiple of the trajectory's highest harmonic up to which sensitivities count."""
+"""Multiple of the trajectory's highest harmonic up to which sensitivities are included."""
 
 
 def log_linear_information(
@@ -213,7 +213,7 @@ def log_linear_information(
 ) -> ca.Function:
     """Return the function z -> ln D in the linearised loop.
 
-    `smoothing` is as in `log_observability`.
+    For `smoothing` see `log_observability`.
     """
     z = ca.MX.sym("z", unknowns.size)
     rows = sensitivity_spectrum(robot, unknowns, known.settings, known.guess.values, z, smoothing)
@@ -230,7 +230,7 @@ def log_linear_information(
 
 
 def harmonics(unknowns: Unknowns) -> ComplexArray:
-    """Return s = i omega (K,) [1/s] of the harmonics that count."""
+    """Return s = i omega (K,) [1/s] of the included harmonics."""
     order = np.arange(1, HARMONICS_SEEN * unknowns.harmonics + 1)
     return np.asarray(2j * np.pi * unknowns.fundamental_hz * order, dtype=complex)
 
@@ -269,7 +269,7 @@ def sensitivity_spectrum(
 
 
 def _real_filter(response: ComplexArray) -> ca.DM:
-    """Block-diagonal matrix (2 n K, 2 m K) that applies a complex response to real rows.
+    """Return the block-diagonal matrix (2 n K, 2 m K) that applies a complex response to real rows.
 
     It maps rows (Re y_k, Im y_k) to (Re x_k, Im x_k) with x_k = response_k y_k.
     """

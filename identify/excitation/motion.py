@@ -7,8 +7,8 @@ of their amplitudes,
 
     q(t) = home + D Z B_0(t)^T,    q_dot(t) = D Z B_1(t)^T,    q_ddot(t) = D Z B_2(t)^T.
 
-Every trajectory that starts smoothly at home is thus one vector z of 2 m (n - 1) numbers, and each
-z is one trajectory.
+Trajectories with a smooth start at home thus correspond one-to-one to vectors z of 2 m (n - 1)
+numbers.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from identify.trajectory import FourierTrajectory, box_of, from_home
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Unknowns of a trajectory on a chart, whose home is the start.
+    """Unknowns of a trajectory that starts at the home of a chart.
 
     ``box`` (m,) [m, rad] scales the coordinates, and ``harmonics`` is n.
     """
@@ -53,7 +53,7 @@ class Unknowns:
 
     @property
     def columns(self) -> int:
-        """Number of free directions of a coordinate, 2 (n - 1)."""
+        """Number of free directions per coordinate, 2 (n - 1)."""
         return 2 * (self.harmonics - 1)
 
     @property
@@ -62,9 +62,9 @@ class Unknowns:
         return self.coordinates * self.columns
 
     def basis(self, t: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return the bases (N, k) at times ``t`` (N,) [s], where k = ``columns``.
+        """Return the bases B_0, B_1 [1/s] and B_2 [1/s²] at times ``t`` (N,) [s].
 
-        They are B_0 without unit, B_1 [1/s] and B_2 [1/s²].
+        Each has the shape (N, k), where k = ``columns``. B_0 has no unit.
         """
         order = np.arange(1, self.harmonics + 1, dtype=float)
         w0 = 2 * np.pi * self.fundamental_hz
@@ -97,7 +97,7 @@ class Unknowns:
         ).ravel()
 
     def _directions(self) -> tuple[Array, Array]:
-        """Orthonormal coefficient directions (n, n - 1) of the sines and of the cosines."""
+        """Return orthonormal coefficient directions (n, n - 1) of the sines and of the cosines."""
         order = np.arange(1, self.harmonics + 1, dtype=float)
         return null_space(np.ones((1, self.harmonics))), null_space(order[None])
 
@@ -112,28 +112,28 @@ def unknowns(chart: Chart, settings: Excitation) -> Unknowns:
 
 
 SAMPLES_PER_HARMONIC = 20
-"""Number of poses in a period of the highest harmonic that a criterion samples."""
+"""Number of sampled poses of a criterion per period of the highest harmonic."""
 
 
 def sample_times(fundamental_hz: float, harmonics: int, refinement: int = 1) -> Array:
     """Return instants (N,) [s] over one period of the fundamental.
 
-    They avoid its ends, where the robot rests.
+    They exclude the ends of the period, at which the robot rests.
     """
     count = refinement * SAMPLES_PER_HARMONIC * harmonics
     return np.asarray((np.arange(count) + 0.5) / (count * fundamental_hz), dtype=float)
 
 
 def is_whole_periods(duration_s: float, fundamental_hz: float) -> bool:
-    """Tell whether a run is a whole number of periods, at least one, up to rounding."""
+    """Return whether a run is a whole number of periods, at least one, up to rounding."""
     periods = duration_s * fundamental_hz
     return round(periods) >= 1 and abs(periods - round(periods)) <= 1e-9 * periods
 
 
 def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Array:
-    """Return instants (N,) [s], as dense as `sample_times`, over the played part of a trajectory.
+    """Return instants (N,) [s], as dense as `sample_times`, over the run of a trajectory.
 
-    For whole periods this is one period, since the motion repeats. Otherwise it is the whole run.
+    If the run is a whole number of periods, they cover one period, because the motion repeats.
     """
     if is_whole_periods(duration_s, fundamental_hz):
         return sample_times(fundamental_hz, harmonics)
@@ -144,7 +144,7 @@ def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Ar
 def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca.MX]:
     """Return poses, pose rates and pose accelerations, each (6, N), of z at `times` (N,) [s].
 
-    The basis is rounded to numbers on which all processors agree. This moves the platform by less
+    The basis is rounded to numbers on which all processors agree. This changes the position by less
     than a nanometre.
     """
     matrix = ca.reshape(z, unknowns.columns, unknowns.coordinates).T
@@ -156,19 +156,19 @@ def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca
 
 
 RESPONSE_BITS = 16
-"""Bits of a linearised loop's response on which processors agree.
+"""Number of bits to which the response of a linearised loop is rounded.
 
-They are few because the response rests on difference quotients.
+It is small because the response is computed by difference quotients.
 """
 
 
 def tracked_motion(
     unknowns: Unknowns, z: ca.MX, times: Array, tracking: NDArray[np.complex128]
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """Return the steady-state motion, as `motion`, of a robot that follows z with a lag.
+    """Return the steady-state motion of a robot that follows z with a lag.
 
     `tracking` (harmonics, m, m) is the complex gain of the loop at each harmonic. The mean is
-    followed exactly.
+    followed exactly. For the returned arrays see `motion`.
     """
     speeds = 2j * np.pi * unknowns.fundamental_hz * np.arange(1, unknowns.harmonics + 1)
     period = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
@@ -196,10 +196,10 @@ def regressor(
     """Return the function (pose, rate, acceleration) (6,) -> transposed regressor (p, m) or (p, n).
 
     It is the regressor of the wrench (eq. 25) along the m coordinates, or of the n actuators'
-    torques. With J the Jacobian of the joints along the m coordinates, the former is J^T times the
-    latter. The sign of Coulomb
-    friction has no derivative: `smoothing` replaces it by tanh(theta_dot / v_s) with v_s in rad/s,
-    or m/s where actuators slide. None keeps the sign.
+    torques. With J the Jacobian of the joints along the m coordinates, the wrench is J^T times the
+    torques. The sign of Coulomb friction has no derivative. `smoothing` replaces it by
+    tanh(theta_dot / v_s) with v_s in rad/s, or m/s for sliding actuators. With None the sign is
+    used.
     """
     pose, rate, acceleration = (ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration"))
     to_twist = pose_rate_to_twist(pose)

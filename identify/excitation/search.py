@@ -1,7 +1,7 @@
-"""Searches for the most exciting trajectory: best random one, differential evolution, and IPOPT.
+"""Searches for the most exciting trajectory: random candidates, differential evolution, and IPOPT.
 
-All maximise a criterion within the constraints of the motion, and begin with the same random
-candidates. To add one, write a function of the form `Search` and name it in `SEARCHES`.
+All searches maximise a criterion within the constraints of the motion, and begin with the same
+random candidates. To add a search, write a function of type `Search` and add it to `SEARCHES`.
 """
 
 from collections.abc import Callable
@@ -26,9 +26,9 @@ CHECK_REFINEMENT = 8
 """Factor by which constraints are sampled more finely in the final check than during a search."""
 
 CLEARANCE = (np.pi / (SAMPLES_PER_HARMONIC * CHECK_REFINEMENT)) ** 2 / 2
-"""Share of every limit that stays unused.
+"""Share of every limit that remains unused.
 
-The highest harmonic can rise by this much between the instants of the check.
+The highest harmonic can rise by this share between the instants of the check.
 """
 
 
@@ -60,19 +60,18 @@ class SearchProblem:
         return sample_times(self.unknowns.fundamental_hz, self.unknowns.harmonics, CHECK_REFINEMENT)
 
     def worst(self, z: Array) -> list[Worst]:
-        """Return where z comes nearest to each limit, at the instants of the check."""
+        """Return the instants of the check at which z comes nearest to each limit."""
         return self.constraints.worst(self.unknowns.trajectory(z), self.check_times)
 
     def is_admissible(self, z: Array) -> bool:
-        """Tell whether z keeps all limits with the clearance."""
+        """Return whether z is within all limits, with the clearance."""
         return all(w.share <= 1 - CLEARANCE for w in self.worst(z))
 
     def drawn_in(self, z: Array) -> Array:
-        """Return the largest multiple of z, at most z itself, that is admissible.
+        """Return the largest admissible multiple of z with a factor of at most one.
 
-        The home pose is admissible, and z shrinks towards it.
-
-        Raises TrajectoryError, naming the constraint, if not even a thousandth of z is admissible.
+        A smaller factor shrinks the motion towards the home pose, which is admissible. Raises
+        TrajectoryError if a thousandth of z is not admissible. The message names the constraint.
         """
         if self.is_admissible(z):
             return z
@@ -86,7 +85,7 @@ class SearchProblem:
                 outside = middle
             if outside < 1e-3:
                 worst = max(self.worst(middle * z), key=Worst.excess)
-                raise TrajectoryError(f"no start is admissible, not even close to home: {worst}")
+                raise TrajectoryError(f"the start is not admissible, even close to home: {worst}")
         return inside * z
 
 
@@ -99,11 +98,11 @@ class SearchResult:
     z : ndarray
         Unknowns of the trajectory.
     log_value : float
-        Logarithm of its criterion.
+        Logarithm of the criterion.
     evaluations, gradients : int
-        Evaluations of the criterion and of its gradient.
+        Number of evaluations of the criterion and of its gradient.
     iterations : int
-        Iterations or generations.
+        Number of iterations or generations.
     reason : str
         Reason why the search stopped.
     """
@@ -136,19 +135,19 @@ STALLED = 1e-10
 """Relative spread of the population's values at which evolution stops, as in the paper."""
 
 FEWEST_MEMBERS = 5
-"""Least size of the population: differential evolution combines members with others."""
+"""Smallest size of the population, because differential evolution combines several members."""
 
 MOST_MEMBERS = 32
-"""Largest size of the population. More members cost more convergence than they improve."""
+"""Largest size of the population. Larger populations converge too slowly."""
 
 RECOMBINATION = 0.9
 """Share of the unknowns that a trial takes from its mutant.
 
-It is the best of those tried with MOST_MEMBERS.
+It is the best of several values that were tried with MOST_MEMBERS.
 """
 
 NOT_ADMISSIBLE = 1e6
-"""Cost of a member that breaks a limit, beyond any value of a criterion."""
+"""Cost of a member that violates a limit, larger than any value of a criterion."""
 
 
 def evolve(
@@ -156,10 +155,10 @@ def evolve(
 ) -> SearchResult:
     """Search by differential evolution from the best candidates.
 
-    Each coordinate of a member is scaled until it fills the box, as in a random trajectory. The
-    size is then no unknown, and no limit on the amplitude has to be found by chance. An admissible
-    member beats one that is not. Of two members that are not admissible, the one with the smaller
-    violation wins.
+    Each coordinate of a member is scaled so that it fills the box, as in a random trajectory. The
+    amplitude is thus not an unknown. An admissible member is always better than a member that is
+    not admissible. Of two members that are not admissible, the member with the smaller violation
+    is better.
 
     Raises TrajectoryError if there are too few candidates.
     """
@@ -178,7 +177,7 @@ def evolve(
             init=np.array([filling.member(z) for z in candidates[:MOST_MEMBERS]]),
             maxiter=generations,
             tol=STALLED,
-            # The polish of SciPy follows gradients, and this cost jumps at every limit.
+            # SciPy's polish needs gradients, but this cost has a jump at every limit.
             polish=False,
             recombination=RECOMBINATION,
             rng=np.random.default_rng(seed),
@@ -198,18 +197,18 @@ class _Filling:
         self._shares = problem.constraints.shares.map(len(problem.times))
 
     def member(self, z: Array) -> Array:
-        """Return the member, within -1 and 1, of a z."""
+        """Return the member for a z, with entries between -1 and 1."""
         matrix = z.reshape(self._problem.unknowns.coordinates, -1)
         return np.asarray((matrix / np.abs(matrix).max(axis=1, keepdims=True)).ravel())
 
     def fill(self, member: Array) -> Array:
-        """Return z of a member: each coordinate scaled to fill the box."""
+        """Return the z of a member. Each coordinate is scaled to fill the box."""
         matrix = member.reshape(self._problem.unknowns.coordinates, -1)
         largest = np.abs(matrix @ self._offset.T).max(axis=1)
         return np.asarray((matrix / np.where(largest > 0, largest, 1.0)[:, None]).ravel())
 
     def cost(self, member: Array) -> float:
-        """Return minus the logarithm of the criterion, or a large cost if a limit is broken."""
+        """Return minus the logarithm of the criterion, or a large cost if a limit is violated."""
         z = self.fill(member)
         unknowns = self._problem.unknowns
         matrix = z.reshape(unknowns.coordinates, -1)
@@ -218,29 +217,29 @@ class _Filling:
             unknowns.box[:, None] * (matrix @ self._offset.T), axis=0
         )
         rates = lifted(unknowns.box[:, None] * (matrix @ self._rate.T), axis=0)
-        # The first rows are the box, which members fill exactly.
+        # The first rows are the box. All members fill it exactly.
         shares = np.array(self._shares(poses, rates))[unknowns.coordinates :]
         worst = float(np.abs(shares).max())
-        # Out of reach (NaN) costs most, and a larger violation costs more than a smaller one.
+        # The cost grows with the violation, and is largest out of reach (NaN).
         if not worst <= 1:
             return NOT_ADMISSIBLE * (2 if np.isnan(worst) else 2 - 1 / worst)
         value = self._problem.value(z)
         return -value if np.isfinite(value) else NOT_ADMISSIBLE
 
 
-MOST_ITERATIONS = 150  # of IPOPT
+MOST_ITERATIONS = 150  # largest number of iterations of IPOPT
 
 TOLERANCE = 1e-4
-"""Relative tolerance of IPOPT. Further digits of an optimum do not excite more."""
+"""Relative tolerance of IPOPT. A more accurate optimum does not excite noticeably more."""
 
 INTERIOR = 0.98
-"""Share of the limits to which a start is drawn in, so that the interior-point method can move."""
+"""Factor that moves a start inside the limits, which an interior-point method needs."""
 
 FAR = 0.5
-"""Share of a limit below which a start does not yet count it."""
+"""Used share of a limit below which the limit is left out at first."""
 
 ALWAYS = "box"
-"""Limit that always counts. Without it a criterion grows without end."""
+"""Limit that is always included. Without it a criterion would be unbounded."""
 
 
 STARTS = 3
@@ -252,16 +251,17 @@ def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progre
     """Return the best result of IPOPT from the best candidates.
 
     Criterion and constraints have exact derivatives. The Hessian is approximated from gradients
-    (limited memory): a criterion with 48 unknowns then converges in some tens of iterations, and an
-    exact Hessian of a regressor costs more than it saves. There are several starts because the
+    (limited memory). A criterion with 48 unknowns then converges in some tens of iterations, while
+    an exact Hessian of a regressor would take longer. There are several starts because the
     criterion has many local optima.
 
-    Limits that a start is far from are left out at first. Those that the result breaks are added,
-    and IPOPT continues. A trajectory that exceeds a limit between the instants of the constraints
-    is drawn in towards home until it is admissible at the finer instants of the check.
+    Limits far from a start are left out at first. If the result violates such limits, they are
+    added, and IPOPT continues. If a trajectory exceeds a limit between the instants of the
+    constraints, it is shrunk towards home until it is admissible at the finer instants of the
+    check.
 
-    Starts and problem are rounded to numbers on which all processors agree, and IPOPT's own linear
-    algebra is the same on all. So are its steps and its result.
+    Starts and problem are rounded to numbers on which all processors agree, and IPOPT's linear
+    algebra is the same on all processors. The result is therefore the same, too.
 
     Raises TrajectoryError if no start is admissible, or with IPOPT's reasons if it finds nothing.
     """
@@ -279,13 +279,13 @@ def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progre
         raise TrajectoryError(
             f"IPOPT found no trajectory from any of {len(starts)} starts: {', '.join(reasons)}"
         )
-    # The climb may maximise an approximation. The judge ranks by the real criterion.
+    # IPOPT maximises an approximation of some criteria, so the judge ranks the results.
     judge = problem.criterion.judge
     return max(found, key=lambda one: judge(one.trajectory(problem)) if judge else one.log_value)
 
 
 def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
-    """Result of IPOPT from one start. Its value is -inf if IPOPT failed."""
+    """Return the result of IPOPT from one start. Its value is -inf if IPOPT failed."""
     counted = {ALWAYS} | _used(problem, z, FAR)
     values = gradients = iterations = 0
     while True:
@@ -304,26 +304,26 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
             return SearchResult(
                 admissible, problem.value(admissible), values, gradients, iterations, reason
             )
-        # Climb on with the broken limits, from a point inside all of them.
+        # Continue with the violated limits, from a point inside all limits.
         counted = counted | broken
         z = INTERIOR * admissible
 
 
 @one_thread
 def _solve(solver: ca.Function, z: Array) -> tuple[dict[str, ca.DM], dict[str, Any]]:
-    """Solution of IPOPT from z, and its statistics."""
+    """Return the solution of IPOPT from z, and its statistics."""
     done = solver(x0=z, lbg=-1.0, ubg=1.0)
-    raise_noted()  # IPOPT takes Ctrl-C for an evaluation that failed
+    raise_noted()  # IPOPT treats Ctrl-C as a failed evaluation
     return done, solver.stats()
 
 
 def _used(problem: SearchProblem, z: Array, share: float) -> set[str]:
-    """Names of the limits of which z uses more than a share."""
+    """Return the names of limits whose used share is larger than `share`."""
     return {worst.name for worst in problem.worst(z) if not worst.share <= share}
 
 
 def _solver(problem: SearchProblem, counted: set[str]) -> ca.Function:
-    """IPOPT solver that keeps the shares of the limits `counted` between -1 and 1."""
+    """Return an IPOPT solver with the used shares of the limits `counted` between -1 and 1."""
     z = ca.MX.sym("z", problem.unknowns.size)
     poses, rates, _ = motion(problem.unknowns, z, problem.times)
     shares = problem.constraints.shares_of(counted).map(len(problem.times))(poses, rates)
@@ -331,7 +331,7 @@ def _solver(problem: SearchProblem, counted: set[str]) -> ca.Function:
         "print_time": False,
         "ipopt": {
             "print_level": 0,
-            # No banner.
+            # "sb" suppresses the banner.
             "sb": "yes",
             "hessian_approximation": "limited-memory",
             "max_iter": MOST_ITERATIONS,

@@ -1,12 +1,12 @@
 """Simulated torque sensors and encoders at the joints, an optional addition to the experiment.
 
-The visual experiment does without them. The estimators of the literature need them. Their channels
-have a file of their own beside the record.
+The visual experiment does not need them, but estimators of the literature do. Their readings are
+stored in a separate file beside the record.
 
 The torque is the mean over one frame around the instant of exposure. Under a held command the joint
-controller's torque is a sawtooth. A sample at each frame would always see the same tooth, half a
-jump off the mean, which looks like viscous friction. A real instrument has an anti-aliasing filter
-for this.
+controller's torque is a sawtooth in time. Samples at the frames would always fall on the same point
+of the sawtooth, half a jump from the mean, which would look like viscous friction. A real
+instrument has an anti-aliasing filter for this.
 """
 
 from dataclasses import dataclass
@@ -46,12 +46,12 @@ ATTRIBUTES = {
     False: ("torque_noise_N_m", "encoder_noise_rad", "encoder_resolution_rad"),
     True: ("force_noise_N", "encoder_noise_m", "encoder_resolution_m"),
 }
-"""Names of the instruments' figures: False where actuators turn, True where they slide."""
+"""Names of the instruments' figures, by False for turning and True for sliding actuators."""
 
 SAME_INSTANT = 1e-9
-"""Tolerance, in frames, within which a command counts as arriving with an exposure.
+"""Tolerance, in frames, within which a command counts as arriving at the instant of an exposure.
 
-The torque of the plant is recorded after such a command has acted.
+The recorded torque of the plant includes the effect of such a command.
 """
 
 
@@ -59,7 +59,8 @@ The torque of the plant is recorded after such a command has acted.
 class JointInstruments:
     """Torque sensor and encoder of each joint. The units are N and m if the actuators slide.
 
-    The defaults are 1 % of the holding torque of 2 to 3 N m of `rss6`, and an encoder of 17 bits.
+    The defaults are a torque noise of 1 % of the holding torque of `rss6`, 2 to 3 N m, and an
+    encoder of 17 bits.
 
     Attributes
     ----------
@@ -68,7 +69,7 @@ class JointInstruments:
     encoder_noise : float
         Standard deviation of one reading of the angle, rad.
     encoder_resolution : float
-        Step of the encoder, rad; 0 for none.
+        Quantisation step of the encoder, rad. 0 means no quantisation.
     prismatic : bool
         True if the actuators slide.
 
@@ -97,9 +98,9 @@ class JointInstruments:
 
 TURNING = JointInstruments()
 SLIDING = JointInstruments(0.5, 1e-6, 1e-6, prismatic=True)
-"""Instruments of actuators that slide.
+"""Instruments of sliding actuators.
 
-They have 1 % of a holding force of some 50 N, and scales that read a micrometre.
+The force noise is 1 % of a holding force of about 50 N, and the scales have steps of a micrometre.
 """
 
 
@@ -111,8 +112,8 @@ def instruments_of(
 ) -> JointInstruments:
     """Return the instruments of a robot's joints.
 
-    Noises (N m and rad, or N and m) and the number of bits of the encoder replace the usual figures
-    where they are given. The bits divide a turn, or the whole travel.
+    If given, the noises (N m and rad, or N and m) and the number of bits of the encoder replace the
+    defaults. The bits divide a turn, or the whole travel of a sliding joint.
     """
     usual = SLIDING if robot.layout.prismatic else TURNING
     whole = 2 * (robot.travel_limit if robot.layout.prismatic else pi)
@@ -145,7 +146,7 @@ def measure_joints(
     rng : numpy.random.Generator
         Source of the noise.
     latencies : ndarray, shape (N,), optional
-        Latency of each frame's command, s. The default is that of the timing.
+        Latency of each frame's command, s. The default is the latency of the timing.
     """
     at_encoder = "motor_angle" if "motor_angle" in truth else "joint_angle"
     angle = truth[at_encoder].values
@@ -177,9 +178,10 @@ def frame_mean(
 ) -> Array:
     """Return the torque (N, n) averaged over one frame around each sample.
 
-    The sampled torque jumps with each command by lp dU + ld dU_dot, or by ld dU_dot where commands
-    ramp. A jump at a time s from a sample, within half a frame T, acts for T/2 - s of the mean,
-    while the sample has it whole or not at all. The difference is taken off the sample.
+    The torque jumps with each command by lp dU + ld dU_dot, or by ld dU_dot if commands ramp. A
+    jump at a time s from a sample, within half a frame T, acts during T/2 - s of the averaging
+    interval. The sample contains either the whole jump or nothing of it. The difference is
+    subtracted from the sample.
 
     Parameters
     ----------
@@ -188,7 +190,7 @@ def frame_mean(
     command : ndarray, shape (N, n)
         Commands of the frames.
     start : ndarray, shape (n,)
-        Command before the first one.
+        Command before the first frame.
     gains : ndarray, shape (2,)
         Gains lp and ld.
     timing : Timing

@@ -21,16 +21,16 @@ from identify.scenario import Timing
 from identify.scenario.plant_sections import FILTERED, Control
 
 FASTEST = 1.0
-"""Bandwidth of computed_torque with an observer, times the time between two frames.
+"""Default bandwidth of computed_torque with an observer, times the frame period.
 
-Its gains may then double before the loop is lost. At the noise of the present sensors, a slower
-loop is further from the motion.
+The gains can then double before the loop becomes unstable. With the noise of the built-in sensors,
+a slower loop has larger tracking errors.
 """
 
 FASTEST_UNSEEN = 0.5
-"""Bandwidth of computed_torque without an observer, times the delay from the motion to its torque.
+"""Default bandwidth of computed_torque without an observer, times the delay of the torque.
 
-The delay is the latency, half a frame of hold, and one frame of difference quotient.
+The delay is the sum of the latency, half a frame of hold, and one frame of difference quotient.
 """
 
 
@@ -50,7 +50,7 @@ class Seen:
     Attributes
     ----------
     measure : callable
-        ``measure(frame, t, pose, rate)``, as `SensorInLoop.measure`.
+        Function ``measure(frame, t, pose, rate)`` like `SensorInLoop.measure`.
     noise : callable
         Covariance (6, 6) of the noise of a frame's pose.
     common : ndarray, shape (6, 6)
@@ -69,11 +69,11 @@ class KnownModel:
     Attributes
     ----------
     parameters : ndarray, shape (p,)
-        Parameters of its model, SI.
+        Parameters of the law's model, SI.
     drive : DriveName, optional
-        Law of the drives. The default is that of the scenario's model.
+        Law of the drives. The default is the law in the scenario's model.
     doubt : float
-        Uncertainty of the torques, see `inverse_dynamics.Model`.
+        Relative standard uncertainty of the torques, see `inverse_dynamics.Model`.
     """
 
     parameters: Array
@@ -99,7 +99,7 @@ def prepared(
     Parameters
     ----------
     plant : Plant
-        Plant that is to follow.
+        Plant that shall follow the motion.
     law : str
         Name of the law, or ``module:function``.
     known : KnownModel
@@ -109,13 +109,13 @@ def prepared(
     seen : Seen
         Measurement in the loop.
     latencies : ndarray, shape (frames,), optional
-        Latencies of the commands, s, as the law knows them. The default is that of the timing.
+        Latencies of the commands, s, that the law knows. The default is the latency of the timing.
 
     Raises
     ------
     ScenarioError
-        If the law is unknown or needs torques that the drives do not take, or if the actuators
-        cannot hold the platform.
+        If the law is unknown, if it needs torque commands but the drives do not accept them, or if
+        the actuators cannot hold the platform.
     TrajectoryError
         If the motion leaves reach or travel. The message names time and leg.
     SimulationError
@@ -130,7 +130,7 @@ def prepared(
     try:
         check_motion(robot, desired, times, **plant.runs.limits)
     except DynamicsError as error:
-        raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
+        raise TrajectoryError(f"the robot cannot follow {motion.name}: {error}") from error
     settings = loop.side.settings
     if known.drive is not None:
         filter_time = loop.filter_time if known.drive == FILTERED else None
@@ -157,10 +157,10 @@ def prepared(
         raise ScenarioError(f"law {law!r} must return a LawInLoop, returned {type(found).__name__}")
     if found.drives.torques and not loop.control.torque_access:
         raise ScenarioError(
-            f"law {law} sets torques, which the drives of {robot.name} do not take: "
-            "control.torque_access = false; feedforward needs joint commands only"
+            f"law {law} sets torques, but the drives of {robot.name} do not accept them: "
+            "control.torque_access = false; feedforward needs only joint commands"
         )
-    # The feedback of this law goes through the model, and a wrong one can make it unstable.
+    # The feedback of this law uses the model, so a wrong model can make it unstable.
     if law == "computed_torque":
         check_torque_gains(model, settings, desired[0], asked)
     if isinstance(found.controller, EveryFrame):
@@ -169,14 +169,14 @@ def prepared(
 
 
 def _telling(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of a law. A user's own function reports its errors in one line."""
+    """Return a function of a law. Errors of a user's own function are reported in one line."""
     return Telling(f"law {law!r}", asked, SimulationError) if is_own(law) else asked
 
 
 def feedback(control: Control, timing: Timing) -> Feedback:
-    """Return the loop gains that are asked of computed_torque."""
+    """Return the bandwidth, damping and observer setting for computed_torque."""
     period = timing.frame_period_s
-    # Latency, half a frame of hold, and one frame of difference quotient.
+    # The delay is the latency, half a frame of hold, and one frame of difference quotient.
     delay = timing.latency_s + 1.5 * period
     fastest = FASTEST / period if control.observer else FASTEST_UNSEEN / delay
     return Feedback(control.bandwidth_rad_s or fastest, control.damping, control.observer)

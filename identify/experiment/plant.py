@@ -1,6 +1,6 @@
-"""True robot of a scenario in its simulated loop, and the load that it carries.
+"""True robot of a scenario in its simulated loop, and the load on its platform.
 
-Its geometry, friction law and drives may differ from those that the estimator knows.
+Its geometry, friction law and drives can differ from those that the estimator knows.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from identify.scenario.sections import Geometry, Payload, Rig
 
 @dataclass(frozen=True)
 class KnownLoop:
-    """Closed loop as an experimenter knows it, who has not seen the plant.
+    """Closed loop as an experimenter without knowledge of the plant knows it.
 
     Attributes
     ----------
     side : ModelSide
         Nominal robot and the loop around its model.
     prior : mapping of str to PriorValue
-        Parameters that are known better, by name.
+        More accurate priors of single parameters, by name.
     filter_time : float or None
-        Time constant of drives with a filter, s, where one is stated.
+        Time constant of drives with a filter, s, if one is stated.
     control : Control
-        What is asked of control laws, and what the drives take.
+        Settings of control laws, and limits of the drives.
     """
 
     side: ModelSide
@@ -67,20 +67,20 @@ class KnownLoop:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What all runs of a plant have in common, whatever the motion.
+    """Settings of all runs of a plant.
 
     Attributes
     ----------
     timing : Timing
         Frames and latencies.
     limits : mapping of str to float
-        Limits that keep the robot away from singularities, as `check_travel` takes them.
+        Limits that keep the robot away from singularities, for `check_travel`.
     rig : Rig
-        How the cameras move, and who watches them.
+        Errors and drift of the cameras, and the drift watch.
     anchor, anchor_std : str, float or None
         Measurement that fixes the scale of the parameters, and its standard deviation.
     scenario_toml : str
-        Text of the scenario, which records keep.
+        Text of the scenario for the records.
     """
 
     timing: Timing
@@ -93,7 +93,7 @@ class RunSettings:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """The true robot in its loop. `identify.setup` makes it of a scenario.
+    """The true robot in its loop. `identify.setup` makes it from a scenario.
 
     Attributes
     ----------
@@ -104,15 +104,15 @@ class Plant:
     parameters : ndarray, shape (p,)
         True parameters, SI.
     settings : LoopSettings
-        True loop, whose joints may be elastic.
+        True loop. Its joints can be elastic.
     switches : PlantSwitches
-        What was asked of the plant. Its truth keeps them.
+        Settings of the plant. They are stored with the truth.
     loop : KnownLoop
         Loop as control laws know it.
     runs : RunSettings
-        What all runs of the plant have in common.
+        Settings of all runs of the plant.
     geometry_covariance : ndarray, shape (g, g), optional
-        Covariance of the true geometry about the known one, where that is calibrated.
+        Covariance of the true geometry about the known geometry, if that is calibrated.
     """
 
     nominal: Robot
@@ -125,9 +125,9 @@ class Plant:
     geometry_covariance: Array | None = None
 
     def check(self) -> None:
-        """Raise an error, with the evidence, if the plant cannot be simulated or stay at home.
+        """Check that the plant can be simulated and stand still at home.
 
-        The error is a dynamics.DynamicsError, or the ScenarioError of `holding`.
+        Raises dynamics.DynamicsError, or the ScenarioError of `holding`.
         """
         self._settings_at(self.parameters, self.nominal.home_pose)
         self.holding(self.nominal.home_pose)
@@ -135,7 +135,7 @@ class Plant:
     def holding(self, pose: Array) -> Array:
         """Return the actuators' torques or forces (n,) at rest at a pose (6,).
 
-        Raises ScenarioError if one exceeds the torque limit.
+        Raises ScenarioError if an actuator would exceed the torque limit.
         """
         robot = self.robot
         limit = self.settings.drives.torque_limit
@@ -144,7 +144,7 @@ class Plant:
         unit = robot.layout.unit("joint1.coulomb")
         if limit is not None and abs(torque[leg]) > limit:
             raise ScenarioError(
-                f"leg {leg + 1} of {robot.name} takes {abs(torque[leg]):.4g} {unit} to stand "
+                f"leg {leg + 1} of {robot.name} needs {abs(torque[leg]):.4g} {unit} to stand "
                 "still at the start, limit "
                 f"control.torque_limit_{unit.replace(' ', '_')} = {limit:g}"
             )
@@ -163,11 +163,11 @@ class Plant:
         Parameters
         ----------
         reference : Reference
-            Desired motion, one row a frame.
+            Desired motion, one row per frame.
         sensor : Sensor
             Source of the measured poses.
         latencies : ndarray, shape (frames,), optional
-            Latency of each frame's command, s. The default is that of the timing.
+            Latency of each frame's command, s. The default is the latency of the timing.
         load : ndarray, shape (p,), optional
             Change of the parameters by the load on the platform.
         law : LawInLoop, optional
@@ -176,21 +176,21 @@ class Plant:
         Returns
         -------
         ClosedLoopRun
-            One row a frame.
+            Run with one row per frame.
 
         Raises
         ------
         LoopFailure
-            If the robot leaves its reach. Under the servo, the message adds the verdict of the
-            linear map of the loop.
+            If the robot leaves its reach. Under the servo, the message adds whether the linearised
+            loop is stable.
         DynamicsError
-            As for `dynamics.closed_loop.simulate_servo`.
+            Errors of `dynamics.closed_loop.simulate_servo`.
         """
         parameters = self.parameters if load is None else self.parameters + load
         settings = self._settings_at(parameters, reference.poses[0])
         known = None if self.robot is self.nominal else self.nominal
         law = law or LawInLoop()
-        # Whether commands are torques is the law's choice, and all else of the drives the plant's.
+        # The law decides whether commands are torques. All other drive settings are the plant's.
         settings = replace(settings, drives=replace(settings.drives, torques=law.drives.torques))
         given = (self.robot, parameters, reference, settings)
         try:
@@ -204,14 +204,14 @@ class Plant:
                 latencies=latencies,
             )
         except LoopFailure as error:
-            # The linear map describes the servo alone.
+            # The linearised loop describes only the servo.
             if law.controller is not None and not law.by_servo:
                 raise
             said = stability.verdict(self.nominal, parameters, settings, reference.poses[0])
             raise LoopFailure(f"{error}; {said}", error.frame, error.saturated) from None
 
     def without_latency(self) -> Plant:
-        """Return the plant in a loop, and with a law that knows of it, that loses no time."""
+        """Return the plant in a loop without latency. Control laws know that there is none."""
         none = ("latency_s", "latency_jitter_s", "latency_std_s", "dropout")
         timing = self.runs.timing.model_copy(update=dict.fromkeys(none, 0.0))
         settings, known = (
@@ -226,7 +226,7 @@ class Plant:
         )
 
     def truth(self, run: ClosedLoopRun) -> xr.Dataset:
-        """Return the truth of a run: motion, parameters without a load, and model mismatch."""
+        """Return the truth of a run: motion, parameters without load, and model mismatch."""
         truth = build_truth(
             time=run.time,
             pose=run.pose,
@@ -240,7 +240,7 @@ class Plant:
             mismatch=self._mismatch(run),
             prismatic=self.robot.layout.prismatic,
         )
-        # The drive gains are among the parameters already.
+        # The drive gains are already among the parameters.
         switches = self.switches.model_dump(exclude_none=True, exclude={"drive_gains"})
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 
@@ -256,7 +256,7 @@ class Plant:
         return found
 
     def _settings_at(self, parameters: Array, pose: Array) -> LoopSettings:
-        """Settings with enough steps a frame for the vibration of elastic joints."""
+        """Return the settings with enough steps per frame for the vibration of elastic joints."""
         settings = self.settings
         springs = self.settings.elasticity
         if springs is None:
@@ -267,7 +267,7 @@ class Plant:
 
 
 def with_springs(settings: LoopSettings, nominal: Robot, switches: PlantSwitches) -> LoopSettings:
-    """Return the settings of a loop with the elastic joints that a plant asks for, if it does."""
+    """Return the settings of a loop with the elastic joints of a plant, if it has any."""
     stiffness = of_actuators(nominal, switches, "joint_stiffness")
     if stiffness is None:
         return settings
@@ -277,8 +277,8 @@ def with_springs(settings: LoopSettings, nominal: Robot, switches: PlantSwitches
 
 
 def true_parameters(nominal: Robot, switches: PlantSwitches) -> Array:
-    """Return the true parameters (p,): those of a named set, with the drive gains of the plant."""
-    # Of this guess only the values count, whatever its spread.
+    """Return the true parameters (p,): a named set with the drive gains of the plant."""
+    # Only the values of this guess are used, so its standard deviation is arbitrary.
     values = starting_guess(nominal, switches.parameters, 1.0, drive=switches.drive).values
     layout = nominal.layout
     for name, gain in switches.drive_gains.items():
@@ -291,11 +291,11 @@ def true_robot(
 ) -> Robot:
     """Return the robot with its true geometry.
 
-    A geometry that no calibration covers has the errors that the plant states. If this run
-    calibrates it, the offsets of the encoders are added. If it was calibrated before, the true
-    geometry is drawn about the calibrated one with its covariance.
+    Without a calibration the geometry has the errors that the plant states. If this run calibrates
+    the geometry, the offsets of the encoders are added. With an earlier calibration, the true
+    geometry is drawn at random about the calibrated geometry, with its covariance.
 
-    Raises ScenarioError if the plant states errors for a geometry that was calibrated before.
+    Raises ScenarioError if the plant states errors and there is an earlier calibration.
     """
     if known.covariance is None:
         return misplaced(nominal, switches)
@@ -306,7 +306,7 @@ def true_robot(
             raise ScenarioError(
                 f"plant.{name} = {getattr(switches, name):g} with geometry.known = "
                 f"{calibration.known!r}: the true geometry is drawn from the covariance of "
-                "that calibration; set one of both"
+                "that calibration; set only one of the two"
             )
     drawn = np.random.default_rng(child(seed, TRUE_GEOMETRY)).standard_normal(len(known.covariance))
     return known.robot.moved(factor(known.covariance) @ drawn)
@@ -315,9 +315,9 @@ def true_robot(
 def true_deviations(
     robot: Robot, switches: PlantSwitches, calibration: Geometry, seed: int
 ) -> Array:
-    """Return the deviations (g,) of the true geometric numbers from the nominal ones, m and rad.
+    """Return the deviations (g,) of the true from the nominal geometric numbers, m and rad.
 
-    They include the offsets of the encoders, which are drawn from the seed.
+    They include the offsets of the encoders, which are drawn with the seed.
     """
     drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
     true = misplaced(robot, switches).geometry
@@ -328,7 +328,7 @@ def true_deviations(
 
 def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:
     """Return the robot with the geometric errors that a scenario's plant states."""
-    # A seed of its own, so that runs with other noise are of the same robot.
+    # The geometry has a separate seed, so that runs with other noise have the same robot.
     rng = np.random.default_rng(plant.geometry_seed)
     geometry = nominal.geometry.with_errors(
         plant.geometry_error_m, rng, plant.length_error_m, plant.axis_error_rad
@@ -352,8 +352,8 @@ class PlatformLoad:
 def drawn_load(layout: ParameterLayout, load: Payload, rng: np.random.Generator) -> PlatformLoad:
     """Draw a known load.
 
-    The true values scatter about the stated ones with the stated standard deviations. Draws with a
-    negative value are repeated.
+    The true values scatter about the stated values with the stated standard deviations. Draws with
+    a negative value are repeated.
     """
     stated = payload_vector(layout, load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
     std = payload_vector(

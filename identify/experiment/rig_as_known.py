@@ -1,8 +1,8 @@
 """Stereo rig as the estimator knows it.
 
-It is known exactly, as calibrated from pictures of a board, or with a stated covariance: that of a
-calibration file, or that of a calibration by fifteen photographs. The cameras that take the
-pictures are always those of the sensor file.
+It is known exactly, from a calibration with pictures of a board, or with a stated covariance. The
+covariance comes from a calibration file, or from a calibration with fifteen photographs. The true
+cameras are always those of the sensor file.
 """
 
 from dataclasses import replace
@@ -29,31 +29,30 @@ from identify.progress import Progress, SilentProgress
 from identify.scenario.sections import Rig
 
 LARGEST_RATIO = 1.5
-"""Largest ratio of focal lengths, and of baselines, of two rigs that count as alike."""
+"""Largest ratio of focal lengths, or of baselines, at which two rigs count as the same."""
 ANGLE = np.deg2rad(10.0)
-"""Largest angle [rad] between the right cameras, or the baselines, of two rigs that are alike."""
+"""Largest angle [rad] between right cameras, or between baselines, of rigs that are the same."""
 SHARE = 0.1
-"""Largest distance of the principal points of such rigs, as a share of the image's size."""
+"""Largest distance of principal points of rigs that are the same, as a share of the image size."""
 
 
 def known_rig(
     section: Rig, file: SensorFile, rng: np.random.Generator, progress: Progress | None = None
 ) -> KnownRig | None:
-    """Return the rig of a sensor file as a scenario's section says that the estimator knows it.
+    """Return the rig of a sensor file as the estimator knows it, according to a scenario's section.
 
-    None stands for exact knowledge.
+    None means that the rig is known exactly. With `calibrated`, the true cameras take pictures of a
+    board, and are calibrated from these pictures. With a path, or `photographs`, the rig is drawn
+    at random from the covariance of such a calibration.
 
-    With `calibrated`, the true cameras take pictures of a board, from which they are calibrated.
-    With a path, or `photographs`, the rig is drawn from the covariance of such a calibration.
-
-    Raises ScenarioError for a file that holds no calibration, or one of another rig. Raises
-    CalibrationError if the pictures do not determine the cameras.
+    Raises ScenarioError for a file without a calibration, or with a calibration of another rig.
+    Raises CalibrationError if the pictures do not determine the cameras.
     """
     rig, _ = rig_from_file(file.rig)
     if section.exact:
         return None
     exposure = section.right_later_std_s
-    # The cameras are known, and only when the right one exposes is not.
+    # The cameras are known exactly, except for the delay of the right camera's exposure.
     if section.known == "exact":
         return KnownRig(rig, np.zeros((len(PARAMETER_NAMES),) * 2), exposure)
     if section.known == "calibrated":
@@ -74,7 +73,7 @@ def calibrated_rig(
 ) -> KnownRig:
     """Calibrate the rig of a sensor file from pictures of a board of dots.
 
-    The analytic renderer draws them.
+    The analytic renderer draws the pictures.
     """
     source = cmmsim.Sensor(file, renderer="analytic")
     rig = source.rig
@@ -94,7 +93,7 @@ def calibrated_rig(
 
 
 def _as_read(image: NDArray[np.unsignedinteger[Any]], noise: CameraNoise) -> NDArray[np.uint8]:
-    """An image (h, w) in 8 bits, as pictures of a board are read from files."""
+    """Return an image (h, w) with 8 bits, like pictures of a board from files."""
     if image.dtype == np.uint8:
         return image
     return np.asarray(np.round(image * (255.0 / noise.white_level)), dtype=np.uint8)
@@ -103,8 +102,8 @@ def _as_read(image: NDArray[np.unsignedinteger[Any]], noise: CameraNoise) -> NDA
 def stated_covariance(path: Path, rig: StereoRig) -> Array:
     """Return the covariance (24, 24) of a rig's parameters from a calibration.json.
 
-    Raises ScenarioError if there is no such file, if it holds no calibration, or if that is of
-    another rig. The message says what differs and by how much.
+    Raises ScenarioError if there is no such file, if it holds no calibration, or if the calibration
+    is of another rig. The message states the difference.
     """
     try:
         text = read_text(path, str(path), ScenarioError)
@@ -127,8 +126,8 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
         )
     if size != [rig.left.width, rig.left.height]:
         raise ScenarioError(
-            f"rig.known = {str(path)!r} is of cameras with {size} px, the sensor's have "
-            f"{[rig.left.width, rig.left.height]}"
+            f"rig.known = {str(path)!r} is of cameras with {size} px, but the sensor's cameras "
+            f"have {[rig.left.width, rig.left.height]}"
         )
     if not np.isfinite(matrix).all():
         raise ScenarioError(f"rig.known = {str(path)!r}: its covariance is not finite")
@@ -141,7 +140,7 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
 
 
 def _other_rig(estimates: Array, rig: StereoRig) -> str:
-    """Difference between calibrated parameters (24,) and a rig; empty if they are alike."""
+    """Return a difference between calibrated parameters (24,) and a rig, or an empty text."""
 
     def both(name: str) -> tuple[float, float]:
         index = PARAMETER_NAMES.index(name)
@@ -166,10 +165,10 @@ def _other_rig(estimates: Array, rig: StereoRig) -> str:
             if not abs(there - here) < SHARE * size:
                 return f"{name} is {there:.5g} there, {here:.5g} of the sensor"
     along = np.arccos(np.clip(places[0][1] @ places[1][1] / np.prod(lengths), -1.0, 1.0))
-    for what, angle in (("the right camera looks", turned), ("the right camera stands", along)):
+    for what, angle in (("right camera", turned), ("baseline", along)):
         if not angle < ANGLE:
             return (
-                f"{what} {np.rad2deg(angle):.0f} degrees beside where that of the sensor does, "
-                "from the left one"
+                f"the direction of the {what}, seen from the left camera, differs by "
+                f"{np.rad2deg(angle):.0f} degrees from the sensor"
             )
     return ""

@@ -1,4 +1,4 @@
-"""Experiment: the true plant runs a trajectory with the sensor in the loop, and its record is kept.
+"""Experiment: the true plant follows a trajectory with the sensor in the loop, and is recorded.
 
 All random numbers come from the streams of `identify.random_streams`.
 """
@@ -38,15 +38,15 @@ from identify.scenario.sections import Payload, Rig
 from identify.trajectory import FourierTrajectory, check_travel
 
 PAYLOAD_RUN = 1_000_000
-"""Number of the run under a payload, beyond all others."""
+"""Number of the run under a payload, larger than all other numbers of runs."""
 
 
 @dataclass(frozen=True)
 class Latencies:
-    """Latencies (frames,) [s] of the commands of a run. None stands for those of the scenario.
+    """Latencies (frames,) [s] of the commands of a run. None means the scenario's latency.
 
-    ``true`` are those that act. ``known`` are those that a control law and the record see, which
-    lack the unknown error of their mean.
+    ``true`` are the true latencies. ``known`` are the latencies for control law and record, without
+    the unknown error of their mean.
     """
 
     true: Array | None = None
@@ -55,7 +55,7 @@ class Latencies:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One run: the record that the experimenter sees, and the truth."""
+    """Record and truth of one run."""
 
     record: xr.Dataset
     truth: xr.Dataset
@@ -113,11 +113,11 @@ def run_plant(
     run : int
         Number of the run; 0 is the excitation.
     advance : callable
-        Receiver of the progress, once a frame.
+        Function that is called once per frame.
     load : PlatformLoad, optional
         Load on the platform.
     law : str
-        Name of the control law. It knows the scenario's starting model and the stated load.
+        Name of the control law. It knows the scenario's initial guess and the stated load.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def run_plant(
     """
     runs = plant.runs
     times = runs.timing.frame_times(duration_s)
-    # Refused here and not at the frame itself, as images take minutes.
+    # The whole trajectory is checked before the run, because images take minutes.
     check_travel(plant.nominal, trajectory, times, **runs.limits)
     reference = trajectory.reference(times)
     delay_right_camera(sensor, runs.rig, seed)
@@ -142,7 +142,7 @@ def run_plant(
     if law != SERVO:
         motion = NamedMotion("the trajectory", trajectory, duration_s)
         start = plant.loop.side.model
-        # The law knows no more than an experimenter: starting model and stated load.
+        # The law knows only the initial guess and the stated load, like an experimenter.
         guess = starting_guess(
             plant.nominal, start.start_parameters, 1.0, plant.loop.prior, start.drive_law
         )
@@ -156,7 +156,7 @@ def run_plant(
     rng = np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
     if not runs.rig.exact and isinstance(sensor, cmmsim.Sensor) and done.measured_ok.any():
-        # An exposure that is late shifts a pose by its rate, so the rates are needed, too.
+        # A late exposure shifts a pose in proportion to its rate, so rates are needed.
         poses = without_gaps(done.measured, done.measured_ok)
         rates = spline_derivatives(poses, runs.timing.frame_rate_hz)[0]
         found = sensor.common_errors(poses, rates)
@@ -183,9 +183,9 @@ def delay_right_camera(sensor: PoseSensor, rig: Rig, seed: int) -> None:
 
 
 def _watched(sensor: PoseSensor, rig: Rig, frames: int) -> DriftWatch | None:
-    """Let the cameras drift during a run of this many frames, and return their watch.
+    """Let the cameras drift during a run of this many frames, and return the drift watch.
 
-    It is None where nothing can be watched: for poses by planes, or a sensor without images.
+    It is None for poses by planes and for a sensor without images.
     """
     if not isinstance(sensor, cmmsim.Sensor):
         return None
@@ -218,7 +218,7 @@ def _record(
     seed: int,
     latencies: Array | None,
 ) -> xr.Dataset:
-    """Record of a run with the known latencies (frames,) [s]; None stands for the scenario's."""
+    """Return the record of a run. latencies (frames,) [s]: None means the scenario's latency."""
     if latencies is None:
         latencies = np.full(len(run.time), plant.runs.timing.latency_s)
     record = recording.build_record(
@@ -239,5 +239,5 @@ def _record(
     store_robot(record, plant.nominal)
     if plant.geometry_covariance is not None:
         store_geometry_covariance(record, plant.nominal, plant.geometry_covariance)
-    # Twenty reasons are enough to see why frames were lost.
+    # The first twenty reasons show why frames were lost.
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))

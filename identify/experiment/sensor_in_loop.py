@@ -28,11 +28,11 @@ from identify.random_streams import CALIBRATION, TEACHING, stream_seed
 from identify.scenario.sections import Rig
 
 OFF_PLATFORM_M = 0.05
-"""Largest distance of a leg's end from the platform that the sensor sees, and of both homes, m."""
+"""Largest distance, m, of a leg's end from the platform in the sensor file, and of both homes."""
 
 
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
-    """Return the meshes [m] of the bodies of all legs, by their names. They can hide stickers.
+    """Return the meshes [m] of the bodies of all legs, by name. The bodies can hide stickers.
 
     A rod lies along its z axis and begins at its first joint.
     """
@@ -41,7 +41,7 @@ def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
 
 @lru_cache(maxsize=4)
 def _meshes(geometry: RobotGeometry) -> dict[str, trimesh.Trimesh]:
-    """Meshes of a geometry, cached because the rows of a study mostly have the same robot."""
+    """Return the meshes of a geometry. They are cached for studies with a single robot."""
     return {
         part.name: cmmsim.rod(
             float(np.linalg.norm(np.diff(part.segment.rod, axis=0))), part.segment.radius
@@ -52,7 +52,7 @@ def _meshes(geometry: RobotGeometry) -> dict[str, trimesh.Trimesh]:
 
 @lru_cache(maxsize=16)
 def _drawn(geometry: RobotGeometry) -> tuple[list[Part], tuple[str, ...], NDArray[np.int_]]:
-    """Parts of a geometry sorted by body, their names, and their indices in the legs' order."""
+    """Return the parts of a geometry sorted by body, their names, and their unsorted indices."""
     parts = parts_of(geometry).all
     places = sorted(range(len(parts)), key=lambda place: parts[place].body)
     return (
@@ -74,22 +74,22 @@ def robot_transforms(robot: Robot, pose: Array) -> PlacedBodies:
 
 @dataclass(frozen=True)
 class SensorPlan:
-    """Sensor that an experiment is to have.
+    """Description of the sensor of an experiment.
 
     Attributes
     ----------
     name : str
         Name in messages.
     file : SensorFile
-        Its file, with the changes and the timing of the experiment.
+        Sensor file, with the changes and the timing of the experiment.
     renderer : str
-        What draws its images.
+        Renderer of the images.
     method : str
-        How poses are found in them.
+        Method of the pose measurement.
     rig : Rig
-        How well the cameras are known, how they move, and who watches them.
+        Knowledge, errors and drift of the cameras, and the drift watch.
     frames : int
-        Frames over which the cameras drift before a run says how many it has.
+        Default number of frames over which the cameras drift.
     """
 
     name: str
@@ -101,13 +101,13 @@ class SensorPlan:
 
     @property
     def sight(self) -> SightLines:
-        """Stickers and cameras, as far as they decide which stickers can be looked for."""
+        """Stickers and cameras, for the decision which stickers are visible."""
         return SightLines(
             marked_body("platform", self.file.platform), *rig_from_file(self.file.rig)
         )
 
     def covariance(self, pose: Array) -> Array:
-        """Return the covariance (6, 6) [m, rad] that the sensor states of a pose (6,) at rest."""
+        """Return the covariance (6, 6) [m, rad] that the sensor states for a pose (6,) at rest."""
         sensor = cmmsim.Sensor(self.file, 0, self.method, renderer="analytic")
         return stated_covariance(sensor, self.sight, pose)
 
@@ -120,7 +120,7 @@ class SensorPlan:
     ) -> cmmsim.Sensor:
         """Make the sensor, with its rig errors and the legs of a robot in view.
 
-        A process should make only one, because the sensor owns the renderer.
+        A process should make only one sensor, because the sensor owns the renderer.
 
         Parameters
         ----------
@@ -136,13 +136,13 @@ class SensorPlan:
         Raises
         ------
         ScenarioError
-            If the platform that the sensor sees is not the robot's.
+            If the platform in the sensor file is not the robot's platform.
         """
         check_platform(robot, self.file, self.name)
         sensor = cmmsim.Sensor(
             self.file, seed, self.method, taught, renderer=self.renderer, known=known
         )
-        # These move the true cameras alone; the estimator keeps those that it was given.
+        # These calls move only the true cameras, and not the cameras that the estimator knows.
         sensor.move_rig(self.rig.errors, self.rig.right_later_s or 0.0)
         sensor.drift_rig(self.rig.drift, self.frames)
         sensor.add_bodies(robot_meshes(robot))
@@ -151,8 +151,8 @@ class SensorPlan:
     def untaught(self, robot: Robot, seed: int, progress: Progress | None = None) -> cmmsim.Sensor:
         """Make the sensor of a run, before teaching.
 
-        The seed of the run decides its noise in teaching, and the error of the known rig. Raises
-        as `make` and `known_rig`.
+        The noise of the teaching and the error of the known rig depend on the seed of the run.
+        Raises the errors of `make` and `known_rig`.
         """
         rng = np.random.default_rng(stream_seed(seed, CALIBRATION))
         known = known_rig(self.rig, self.file, rng, progress)
@@ -166,7 +166,7 @@ class SensorPlan:
 
 
 def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
-    """Teach the frames of a sensor, and report the progress in hundredths."""
+    """Teach the frames of a sensor, and report the progress in per cent."""
     with progress.stage("teach the sensor", 100) as advance:
         shown = 0
 
@@ -181,7 +181,7 @@ def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
 def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
     """Return the distances (n,) [m] of the legs' ends outside the platform of a sensor file.
 
-    The second value is the distance [m] between the home of that platform and the robot's.
+    The second value is the distance [m] between the home of this platform and the robot's home.
     """
     body = marked_body("platform", file.platform)
     cuts = file.platform.cuts
@@ -192,34 +192,34 @@ def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
 
 
 def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
-    """Raise ScenarioError if the platform of a sensor file is not the robot's.
+    """Raise ScenarioError if the platform of a sensor file is not the robot's platform.
 
-    It is not if a leg ends too far outside of it, or if its home is elsewhere. The message names
-    leg and distance.
+    This is the case if a leg ends too far outside the platform, or if the homes differ. The message
+    names leg and distance.
     """
     outside, away = platform_distances(robot, file)
     leg = int(np.argmax(outside))
     if outside[leg] > OFF_PLATFORM_M:
         raise ScenarioError(
             f"platform joint {leg + 1} of {robot.name} is {outside[leg]:.3g} m outside of the "
-            f"platform that sensor {sensor} sees, limit {OFF_PLATFORM_M:g} m: its [platform] has "
-            "to be that of the robot"
+            f"platform that sensor {sensor} sees, limit {OFF_PLATFORM_M:g} m: [platform] of the "
+            "sensor must describe the platform of the robot"
         )
     if away > OFF_PLATFORM_M:
         raise ScenarioError(
-            f"{robot.name} is at home {away:.3g} m from where sensor {sensor} has its platform at "
-            f"home, limit {OFF_PLATFORM_M:g} m: platform.home has to be that of the robot"
+            f"home of {robot.name} is {away:.3g} m from platform.home of sensor {sensor}, limit "
+            f"{OFF_PLATFORM_M:g} m: platform.home must be the home of the robot"
         )
 
 
 class PoseSensor(Protocol):
-    """Sensor in the loop: `cmmsim.Sensor`, or an object that answers as it does.
+    """Sensor in the loop: `cmmsim.Sensor`, or an object with the same methods.
 
-    A sensor with `sees_bodies = False` is not told where the robot's legs are, which saves time.
+    For a sensor with `sees_bodies = False`, the places of the legs are not computed.
     """
 
     def start_run(self, seed: int) -> None:
-        """Begin a new run with noise of its own."""
+        """Begin a new run with new noise."""
 
     def measure(
         self,
@@ -235,10 +235,10 @@ class PoseSensor(Protocol):
 
 
 class SensorInLoop:
-    """Sensor for the closed loop: a measured pose (6,) a frame, or None if the platform was lost.
+    """Sensor for the closed loop, with a log.
 
-    It keeps the covariances (6, 6) of all frames (NaN where lost), the reasons of lost frames, and
-    the seconds that rendering and measuring took.
+    The log holds the covariances (6, 6) of all frames (NaN where lost), the reasons of lost frames,
+    and the duration of rendering and measuring in seconds.
     """
 
     def __init__(
@@ -255,7 +255,7 @@ class SensorInLoop:
 
     @property
     def common(self) -> Array:
-        """Covariance (6, 6), from teaching, of the error that all poses near home share."""
+        """Covariance (6, 6) of the common error by teaching of all poses near home."""
         taught = getattr(self._sensor, "taught", None)
         return (
             np.zeros((6, 6))
@@ -264,11 +264,11 @@ class SensorInLoop:
         )
 
     def measure(self, frame: int, t: float, pose: Array, rate: Array) -> Array | None:
-        """Measure the platform at its true pose and rate. Only the renderer sees these.
+        """Return the measured pose (6,) at a true pose and rate, or None if the platform is lost.
 
-        The rate blurs the picture of an exposure that is not instantaneous.
+        Only the renderer uses the true pose. The rate causes motion blur.
         """
-        # The places of the legs are not counted as time of the sensor.
+        # Computing the places of the legs does not count as time of the sensor.
         bodies = robot_transforms(self._robot, pose) if self._sees_bodies else None
         began = time.perf_counter()
         measured = self._sensor.measure(pose, bodies, rate)

@@ -1,4 +1,4 @@
-"""Truth of a simulated run, in its own netCDF group. Only validation and reports open it."""
+"""Truth of a simulated run, in its own netCDF group. Only validation and reports read it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,20 +39,20 @@ MISMATCH: Variables = {
     "base_joint_error": (
         ("joint", "axis"),
         "m",
-        "true joint centre B on the base less the nominal one",
+        "true minus nominal joint centre B on the base",
     ),
     "platform_joint_error": (
         ("joint", "axis"),
         "m",
-        "true joint centre A on the platform less the nominal one",
+        "true minus nominal joint centre A on the platform",
     ),
     "motor_angle": (
         ("time", "joint"),
         "rad",
-        "place of the motor of an elastic joint, which its encoder reads",
+        "motor coordinate of an elastic joint, which the encoder measures",
     ),
 }
-"""Variables of a plant that is not the nominal robot with rigid joints."""
+"""Additional variables of a plant that differs from the nominal robot with rigid joints."""
 
 
 def build_truth(
@@ -122,7 +122,7 @@ def read_truth(path: Path | str, run: str = "") -> xr.Dataset:
 def read_truth_runs(path: Path | str) -> list[xr.Dataset]:
     """Read the truth of all runs of a file, in their order.
 
-    Raises RecordError as `read_truth`, or if there are no runs.
+    Raises the RecordError of `read_truth`, or RecordError if there are no runs.
     """
     return [read_truth(path, name) for name in run_names(path)]
 
@@ -159,9 +159,9 @@ def check_truth(truth: xr.Dataset, source: str) -> xr.Dataset:
 
 @xr.register_dataset_accessor("truth")
 def truth_of(record: xr.Dataset) -> xr.Dataset:
-    """Truth of a record, from the file that its attribute ``path`` names: ``record.truth``.
+    """Return the truth of a record, ``record.truth``, from the file in its attribute ``path``.
 
-    Raises RecordError where there is no such file, or where it holds the truth of another record.
+    Raises RecordError if there is no such file, or if it holds the truth of another record.
     """
     path = record.attrs.get("path")
     if path is None:
@@ -171,7 +171,7 @@ def truth_of(record: xr.Dataset) -> xr.Dataset:
         )
     if digest(read(path)) != digest(record):
         raise RecordError(
-            f"{path} holds another record by now, and the truth of that; "
-            "setup.run(path=...) keeps each record in a file of its own"
+            f"{path} now holds another record and its truth; "
+            "use setup.run(path=...) to store each record in a separate file"
         )
     return read_truth(path)

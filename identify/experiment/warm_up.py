@@ -28,7 +28,7 @@ Task = Callable[[], None]
 
 
 def compile_robots(robots: tuple[Robot, ...], progress: Progress) -> None:
-    """Compile robots and the loop around them, unless that has been done."""
+    """Compile robots and the loop around them, unless they are compiled already."""
     with progress.stage("compile the robot", 2 * len(robots)) as advance:
         for robot in robots:
             _ = robot.functions
@@ -42,10 +42,10 @@ def warm_up(
 ) -> None:
     """Compile the code of the runs of a plant, and of further robots, into the caches on disk.
 
-    Each task has a process of its own, because LLVM compiles on one core. All cores are used.
+    Each task has its own process, because LLVM compiles on one core. All cores are used.
 
     Raises the errors of a run before its first frame, IdentifyError if a process dies, and
-    WriteError if code cannot be kept.
+    WriteError if code cannot be stored.
     """
     tasks: dict[str, Task] = {
         "the robot": partial(_compile_plant, plant),
@@ -62,7 +62,7 @@ def _compile_plant(plant: Plant) -> None:
 
 
 def _compile_sensor(plant: Plant, planned: SensorPlan) -> None:
-    """Teach the sensor and measure some frames, with its own renderer and the analytic one."""
+    """Teach the sensor and measure some frames, with the planned and the analytic renderer."""
     motion = _nearby(plant)
     rate_hz = plant.runs.timing.frame_rate_hz
     for renderer in dict.fromkeys((planned.renderer, "analytic")):
@@ -77,7 +77,7 @@ def _compile_named(name: str) -> None:
 
 
 def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
-    """Do named tasks, each in a new process, as many at a time as there are cores."""
+    """Run named tasks, each in a new process, with one process per core at a time."""
     spawn = get_context("spawn")
     unkept = spawn.SimpleQueue()
     waiting = [
@@ -89,7 +89,7 @@ def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
         while waiting or running:
             while waiting and len(running) < cores():
                 running.append(waiting.pop(0))
-                # Ctrl-C then reaches this process alone, which kills the others.
+                # Only this process gets Ctrl-C, and then kills the others.
                 with deaf_offspring():
                     running[-1].start()
             wait([process.sentinel for process in running])
@@ -109,7 +109,7 @@ def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
 
 
 def _do(task: Task, unkept: "SimpleQueue[str]") -> None:
-    """Do a task, and put what it warns of code that cannot be kept into a queue."""
+    """Run a task, and put its warnings about code that cannot be stored into a queue."""
     end_with_parent()
     with warnings.catch_warnings(record=True) as given:
         task()

@@ -1,4 +1,4 @@
-"""Run of `cmmsim geometry`: choose poses, measure them, calibrate, and judge on unseen poses."""
+"""Run of `cmmsim geometry`: choose poses, measure, calibrate, and validate on other poses."""
 
 import numpy as np
 
@@ -29,10 +29,10 @@ def run_geometry(
     Raises
     ------
     EstimationError
-        If the loops do not close, or if there are too few poses. The message then says how many
+        If the loops do not close, or if there are too few poses. The message states how many poses
         are needed and for which numbers.
     RecordError
-        If the encoders read something else than the joints.
+        If the encoder readings do not fit the poses.
     UnreachablePoseError
         If a measured pose is out of reach.
     """
@@ -53,14 +53,14 @@ def run_geometry(
     else:
         plan = setup.sensor_plan
         nothing = np.zeros((6, 6))
-        # Before teaching, its errors are not known, and the frames count as exact.
+        # The errors of teaching are unknown before it, so the frames count as exact.
         taught = settings.frames == "taught"
         frames = FrameKnowledge(nothing, nothing) if taught else FrameKnowledge.none()
         covariance = plan.covariance(robot.home_pose) / settings.frames_per_pose
         designer = _designer(robot, settings, limits, frames, covariance, plan.sight)
         chosen, among = _choose(designer, settings, seed, progress)
         true = true_deviations(robot, setup.scenario.plant, settings, seed)
-        # Refuses poses out of reach before the sensor is taught, which takes time.
+        # This raises an error for poses out of reach before the slow teaching of the sensor.
         true_poses(robot, true, chosen.joints, chosen.poses)
         sensor = plan.taught(robot, seed, progress)
         data, lost = stand_at(
@@ -85,7 +85,7 @@ def _designer(
     covariance: Array,
     sight: SightLines | None,
 ) -> Designer:
-    """Designer of pose sets within the limits of motions, for a covariance of a pose's mean."""
+    """Return the designer of pose sets. covariance: covariance of a mean pose."""
     model = PoseModel(
         robot, Tolerance(settings.tolerance_m, settings.tolerance_rad).of(robot), frames
     )
@@ -100,7 +100,7 @@ def _designer(
 def _choose(
     designer: Designer, settings: Geometry, seed: int, progress: Progress
 ) -> tuple[Candidates, Candidates]:
-    """Poses to measure, and the candidates from which they were chosen."""
+    """Return the poses to measure, and the candidates from which they were chosen."""
     rng = np.random.default_rng(child(seed, STATIC_POSES))
     with progress.stage("choose poses", settings.poses + 1) as advance:
         among = designer.candidates(max(settings.candidates, settings.poses), rng)

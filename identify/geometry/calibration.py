@@ -1,17 +1,18 @@
 """Geometry of a robot from static poses, by least squares on the pose at which its loops close.
 
 The model of a measured pose is z = base o f(joints, geometry) o platform + noise. Here f is the
-pose at which the loops close with the joint coordinates that the encoders read. Base and platform
-are the small errors of the two frames from teaching. The unknowns are the geometric numbers
+pose at which the loops close for the measured joint coordinates. Base and platform are the small
+errors of the two frames from teaching. The unknowns are the geometric numbers
 (`dynamics.legs.geometric_numbers`) and the twelve numbers of the frames. Other errors that all
-poses have in common, such as those of the cameras, join them as columns.
+poses have in common, such as errors of the cameras, are further unknowns.
 
 Each unknown has a prior: the stated tolerance of a machine part about its nominal value, or the
 covariance of teaching. Errors of the encoders enter the covariance of the pose through the loops. A
-number that poses cannot show keeps its nominal value, with the tolerance for a standard deviation.
+number that the poses do not determine keeps its nominal value, with the tolerance as its standard
+deviation.
 
-A joint's offset acts like its zero angle, or like its base joint along the slide. The numbers of a
-calibrated robot are those with which its encoders are right.
+An encoder offset has the same effect as a change of the zero angle, or of the base joint along the
+slide. The calibrated geometry contains these offsets, so that it agrees with the encoders.
 """
 
 from dataclasses import dataclass
@@ -32,13 +33,13 @@ from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 OBSERVABLE = 1 / 3
 """Largest standard deviation, as a share of the tolerance, of a number that the poses determine.
 
-The prior then is a ninth of the information, and hardly moves an interval.
+The prior then has at most a ninth of the information, and hardly affects an interval.
 """
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Standard deviations of geometric numbers: places and lengths [m], turns [rad]."""
+    """Standard deviations of geometric numbers: positions and lengths [m], angles [rad]."""
 
     m: float
     rad: float
@@ -52,9 +53,9 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class PoseModel:
-    """Model of poses by unknowns u (g + 12,), the geometric numbers and the errors of the frames.
+    """Model of poses with unknowns u (g + 12,), the geometric numbers and the errors of the frames.
 
-    The unknowns are in units of their prior: each has mean zero and variance one before the poses.
+    The unknowns are in units of their prior: each has the prior mean zero and variance one.
     """
 
     robot: Robot
@@ -88,9 +89,10 @@ class PoseModel:
         )
 
     def columns(self, joints: Array, closed: Array, unknowns: Array) -> tuple[Array, Array]:
-        """Return the derivatives of the coordinates (m) of measured poses.
+        """Return the derivatives of the m coordinates of measured poses.
 
-        They are with respect to the unknowns (N, m, g + 12) and to the joints (N, m, n).
+        The first array (N, m, g + 12) is with respect to the unknowns, and the second (N, m, n)
+        with respect to the joints.
         """
         free = list(self.robot.geometry.chart.freedoms)
         by_numbers, by_joints = self.closure.derivatives(closed, joints, self.split(unknowns)[0])
@@ -99,7 +101,7 @@ class PoseModel:
 
 
 def seen_between(poses: Array, frames: Array) -> Array:
-    """Return poses (N, 6) as measured between frames with errors (12,), m and rad.
+    """Return the measured poses for true poses (N, 6) and errors (12,) of the frames, m and rad.
 
     The errors are [dt, dphi] of the base, then of the platform.
     """
@@ -131,11 +133,11 @@ class Calibration:
     nominal : Robot
         Robot before the calibration.
     deviations : ndarray, shape (g,)
-        Deviations from its geometric numbers, m and rad.
+        Deviations from the nominal geometric numbers, m and rad.
     frames : ndarray, shape (12,)
         Errors of the two frames, m and rad.
     joint_covariance : ndarray, shape (g + 12, g + 12)
-        Covariance of both.
+        Covariance of the deviations and the errors of the frames together.
     prior_std : ndarray, shape (g,)
         Tolerances.
     noise_ratio : float
@@ -144,7 +146,7 @@ class Calibration:
     noise_ratio_std : float
         Standard deviation of this ratio.
     frames_known : bool
-        False if the places of the frames were unknown.
+        False if the poses of the frames were unknown.
     """
 
     nominal: Robot
@@ -169,7 +171,7 @@ class Calibration:
 
     @property
     def observable(self) -> NDArray[np.bool_]:
-        """Numbers (g,) that the poses determine."""
+        """True for each geometric number (g,) that the poses determine."""
         return np.asarray(self.std <= OBSERVABLE * self.prior_std)
 
     @property
@@ -180,10 +182,10 @@ class Calibration:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Whitened residuals of the poses, with the unknowns below them as residuals of their prior.
+    """Least-squares problem: whitened residuals of the poses, then residuals of the prior.
 
     The unknowns are those of the model, then the errors that all poses have in common. The effect
-    of an encoder's error on a pose is taken at the nominal geometry.
+    of an encoder's error on a pose is computed at the nominal geometry.
     """
 
     model: PoseModel
@@ -191,7 +193,7 @@ class _Fit:
 
     @property
     def nothing(self) -> Array:
-        """Unknowns before the poses: zero."""
+        """Prior mean of the unknowns: zero."""
         return np.zeros(len(self.model.scale) + self.data.common_errors.shape[2])
 
     def residuals(self, unknowns: Array) -> Array:
@@ -231,14 +233,14 @@ class _Fit:
 
 
 def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibration:
-    """Estimate the geometry of a robot, about its nominal one, from static poses.
+    """Estimate the geometry of a robot from static poses, with the nominal geometry as prior.
 
     Raises EstimationError if the loops do not close with the encoders' readings, or if the search
     does not converge.
     """
     model = PoseModel(robot, tolerance.of(robot), data.frames)
     fit = _Fit(model, data)
-    # Unknowns are in units of their prior, so one tolerance serves all.
+    # Unknowns are in units of their prior, so a single tolerance is enough.
     limit = 1e-10
     none = fit.nothing
     try:
@@ -248,19 +250,19 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
     except DynamicsError as error:
         raise EstimationError(f"the poses do not fit robot {robot.name}: {error}") from error
     if not found.success:
-        raise EstimationError(f"the search for the geometry did not end: {found.message}")
+        raise EstimationError(f"the search for the geometry did not converge: {found.message}")
     rows = found.jac[: -len(none)]
     own = len(model.scale)
     spread = np.linalg.inv(found.jac.T @ found.jac)
     covariance = model.scale @ spread[:own, :own] @ model.scale.T
-    # The trace counts the unknowns that the poses rather than the prior determine.
+    # The trace is the effective number of unknowns that the poses determine.
     spare = max(len(rows) - float(np.sum(spread * (rows.T @ rows))), 1.0)
     deviations, frames = model.split(found.x[:own])
     return Calibration(
         nominal=robot,
         deviations=deviations,
         frames=frames,
-        # Rounding must not make it asymmetric.
+        # This removes asymmetry by rounding.
         joint_covariance=(covariance + covariance.T) / 2,
         prior_std=model.tolerance,
         noise_ratio=float(np.sum(found.fun[: len(rows)] ** 2) / spare),
@@ -272,8 +274,8 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
 def whiteners(covariances: Array, by_joints: Array, joint_std: Array) -> Array:
     """Return the matrices (N, m, m) that whiten the residuals of the coordinates.
 
-    The covariance is that of the measured pose (N, m, m) plus that of the encoders' errors, which
-    act through d(coordinates)/d(joints) (N, m, n).
+    The covariance is the sum of the covariance of the measured pose (N, m, m) and of the effect of
+    the encoders' errors. These act through d(coordinates)/d(joints) (N, m, n), `by_joints`.
     """
     encoders = by_joints * joint_std
     return np.asarray(

@@ -10,10 +10,10 @@ from identify.errors import RecordError
 from identify.geometry.static_poses import StaticPoses
 
 WRONG = 0.2
-"""Largest share of a joint's motion that a geometry within its tolerances leaves unexplained."""
+"""Largest allowed difference of a joint's motion, as a share of its expected motion."""
 
 STILL = 0.1
-"""Share of the travel. A joint that moves less is judged as if it moved this far."""
+"""Smallest reference for the difference of a joint's motion, as a share of the travel."""
 
 UNITS = {
     False: {
@@ -24,17 +24,15 @@ UNITS = {
     },
     True: {"in mm": 1e3, "in um": 1e6, "in inches": 1 / 0.0254, "taken for mm": 1e-3},
 }
-"""Factors of readings in a wrong unit: False where actuators turn, True where they slide."""
+"""Factors of readings in wrong units, by False for turning and True for sliding actuators."""
 
 
 def check_encoders(robot: Robot, data: StaticPoses) -> None:
-    """Raise RecordError if joints do not move as the nominal robot's do at the measured poses.
+    """Compare the readings of the encoders with the nominal joint coordinates at the poses.
 
-    The message says what fits: the opposite sign, another unit, or another joint's readings. An
-    offset is no fault.
-
-    Raises UnreachablePoseError, naming leg and pose, for a pose that the nominal robot cannot
-    reach.
+    Raises RecordError if a joint moves differently. The message states what would fit: the opposite
+    sign, another unit, or the readings of another joint. A constant offset is allowed. Raises
+    UnreachablePoseError, naming leg and pose, for a pose that the nominal robot cannot reach.
     """
     chart = robot.geometry.chart
     poses = chart.pose(chart.coordinates(data.poses))
@@ -51,7 +49,7 @@ def check_encoders(robot: Robot, data: StaticPoses) -> None:
         said = "; ".join(
             f"{robot.joint_names[k]} {_what_fits(robot, moves, readings, k)}" for k in wrong
         )
-        raise RecordError(f"encoders do not read what {robot.name} does: {said}")
+        raise RecordError(f"encoder readings do not fit the motion of {robot.name}: {said}")
 
 
 def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
@@ -69,7 +67,7 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
         for sign in (1, -1)
         for other in range(readings.shape[1])
     ]
-    # Of equal fits the simplest wins, as False sorts before True.
+    # Among equal fits the simplest is chosen, because False sorts before True.
     left, swapped, opposite, unit, other = min(found)
     if left > WRONG:
         off = _left(moves[:, joint], readings[:, joint], still)
@@ -81,9 +79,9 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
 
 
 def _left(expected: Array, read: Array, still: float) -> float:
-    """Norm of the unexplained motion over that of the expected one.
+    """Return the norm of the unexplained motion, relative to the expected motion.
 
-    The latter counts as at least that of a joint with an RMS motion of `still`.
+    The RMS of the expected motion is at least `still`.
     """
     least = still * len(expected) ** 0.5
     return float(np.linalg.norm(read - expected) / max(float(np.linalg.norm(expected)), least))

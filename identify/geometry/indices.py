@@ -2,11 +2,11 @@
 
 - `determinant`: minus the logarithm of the determinant of the information, Borm and Menq's O1,
   which is D-optimality (Int. J. Robot. Res. 10(1), 1991).
-- `prediction`: mean error with which the calibrated robot misses the candidates' poses, which is
-  I-optimality.
+- `prediction`: mean expected error of the calibrated robot at the candidates' poses
+  (I-optimality).
 - `noise_amplification`: s_1 / s_r^2 of the extreme singular values of the whitened columns, the
-  inverse of Nahvi and Hollerbach's index (ICRA 1996). It covers the combinations that all
-  candidates together determine, because no choice changes anything about the others.
+  inverse of Nahvi and Hollerbach's index (ICRA 1996). It covers only combinations that all
+  candidates together determine, because the other combinations do not depend on the choice.
 """
 
 from abc import ABC, abstractmethod
@@ -18,11 +18,11 @@ from identify.arrays import Array
 from identify.geometry.calibration import OBSERVABLE
 
 EXTREMES = 24
-"""Number of the best and of the worst determined directions of the first judgement."""
+"""Number of best and of worst determined directions that the first ranking uses."""
 PROMISING = 16
-"""Number of candidates that are then judged exactly."""
+"""Number of best candidates of the first ranking for which the index is computed exactly."""
 HARDLY = 10.0
-"""Information about a direction below which its prior, with information one, still counts."""
+"""Information about a direction below which the direction counts as hardly determined."""
 
 
 class ObservabilityIndex(ABC):
@@ -30,13 +30,13 @@ class ObservabilityIndex(ABC):
 
     @abstractmethod
     def value(self, information: Array) -> tuple[float, Array]:
-        """Return the index, and minus its derivative with respect to the information (u, u)."""
+        """Return the index, and its negative derivative with respect to the information (u, u)."""
 
     @abstractmethod
     def best(self, columns: Array, information: Array) -> int:
-        """Return the pose that improves the index of this information most.
+        """Return the number of the pose that improves the index of this information most.
 
-        ``columns`` (N, m, u) are the whitened columns of the poses to choose from.
+        ``columns`` (N, m, u) are the whitened columns of the candidate poses.
         """
 
 
@@ -56,7 +56,7 @@ class Determinant(ObservabilityIndex):
 class Prediction(ObservabilityIndex):
     """Mean squared error of the candidates' coordinates, each in units of its noise.
 
-    ``weight`` (u, u) is its quadratic form in the unknowns.
+    ``weight`` (u, u) is the matrix of this quadratic form in the unknowns.
     """
 
     weight: Array
@@ -84,7 +84,7 @@ class NoiseAmplification(ObservabilityIndex):
 
     @classmethod
     def among(cls, information: Array) -> "NoiseAmplification":
-        """Return the index for candidates with this information (u, u) together."""
+        """Return the index for candidates with this total information (u, u)."""
         values, vectors = np.linalg.eigh(information)
         return cls(vectors[:, values > OBSERVABLE**-2])
 
@@ -98,11 +98,11 @@ class NoiseAmplification(ObservabilityIndex):
         )
 
     def best(self, columns: Array, information: Array) -> int:
-        """Return the pose that improves the index most.
+        """Return the number of the pose that improves the index most.
 
-        While some direction is hardly determined, the determinant decides instead. The index is
-        first bounded in the space of the extreme directions. The most promising candidates are
-        then judged exactly.
+        While a direction is hardly determined, the determinant is used in place of this index. The
+        candidates are first ranked by a bound of the index in the space of the extreme directions.
+        Then the index is computed exactly for the best candidates.
         """
         within = self.told.T @ information @ self.told
         values, vectors = np.linalg.eigh(within)
@@ -117,18 +117,18 @@ class NoiseAmplification(ObservabilityIndex):
 
 
 def _eigenvalues(information: Array, columns: Array) -> Array:
-    """Eigenvalues (N, k), ascending, of an information (k, k) plus that of each of N poses."""
+    """Return ascending eigenvalues (N, k) of an information (k, k) plus that of each pose."""
     return np.asarray(np.linalg.eigvalsh(information + columns.swapaxes(1, 2) @ columns))
 
 
 def _spread(columns: Array, information: Array) -> tuple[Array, Array]:
-    """Columns of each pose times the covariance, and the covariance of its noisy coordinates."""
+    """Return columns of each pose times the covariance, and covariances of its coordinates."""
     spread = columns @ np.linalg.inv(information)
     return spread, np.eye(columns.shape[1]) + spread @ columns.swapaxes(1, 2)
 
 
 def chosen_index(criterion: str, information: Array, candidates: int) -> ObservabilityIndex:
-    """Return the index of a criterion for candidates with information (u, u) together."""
+    """Return the index of a criterion for candidates with this total information (u, u)."""
     if criterion == "determinant":
         return Determinant()
     if criterion == "noise_amplification":

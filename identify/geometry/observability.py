@@ -1,4 +1,4 @@
-"""Observability of a geometry: combinations that poses cannot show, and number of poses needed."""
+"""Observability of a geometry: undetermined combinations, and number of poses needed."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ from identify.errors import EstimationError
 from identify.geometry.calibration import OBSERVABLE
 
 SMALL = 0.05
-"""Share of the largest coefficient below which a combination leaves a number out."""
+"""Share of the largest coefficient below which a number is left out of a combination."""
 
 LONG_ENOUGH = 0.5
-"""Share of the largest remaining length at which a number can name a combination."""
+"""Smallest length of the column of a pivot, as a share of the largest remaining length."""
 
 
 def untold(covariance: Array, prior_std: Array) -> Array:
@@ -27,14 +27,14 @@ def untold(covariance: Array, prior_std: Array) -> Array:
 def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) -> tuple[str, ...]:
     """Return the combinations that poses do not determine, such as `a + 0.5 b`.
 
-    If these numbers move together by such amounts (m and rad), no pose changes enough to show it.
-    Each combination begins with a number of its own.
+    If the numbers change together by these amounts (m and rad), the measured poses hardly change.
+    Each combination begins with a number that no other combination contains.
     """
     directions = untold(covariance, prior_std)
     if not len(directions):
         return ()
     pivots = _pivots(directions)
-    # In this basis each combination has one pivot, with coefficient one, that no other has.
+    # In this basis each combination has its own pivot, with coefficient one.
     rows = np.linalg.solve(directions[:, pivots], directions)
     return tuple(
         _expression(names, row * prior_std / prior_std[pivot], np.abs(row), pivot)
@@ -43,9 +43,9 @@ def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) ->
 
 
 def _pivots(directions: Array) -> list[int]:
-    """Well-separated pivot columns, as many as there are rows.
+    """Return well-separated pivot columns, as many as there are rows.
 
-    In order, the first column that is long enough is taken.
+    Each pivot is the first column that is long enough.
     """
     left = directions.copy()
     pivots = list[int]()
@@ -71,7 +71,8 @@ def _expression(names: tuple[str, ...], coefficients: Array, sizes: Array, pivot
 def posterior(information: Array, scale: Array, count: int) -> Array:
     """Return the covariance (g, g) [m and rad] of the first `count` = g unknowns, the geometry.
 
-    The information (u, u) of the poses is about unknowns in units of their prior, which is added.
+    information (u, u): information of the poses about unknowns in units of their prior. The prior
+    is added here.
     """
     covariance = scale @ np.linalg.inv(information + np.eye(len(scale))) @ scale.T
     return np.asarray(covariance[:count, :count])
@@ -82,8 +83,8 @@ def check_enough(
 ) -> None:
     """Raise EstimationError if the poses have fewer equations than numbers to determine.
 
-    ``information`` (u, u) is that of many poses, about all unknowns in units of their prior. The
-    message says how many poses are needed and which numbers are the hardest to determine.
+    ``information`` (u, u) is the information of many poses about all unknowns, in units of their
+    prior. The message states how many poses are needed and which numbers are hardest to determine.
     """
     names = robot.geometry.number_names
     rows = len(robot.coordinate_names)
@@ -100,6 +101,6 @@ def check_enough(
     missing = told - poses * rows
     raise EstimationError(
         f"{poses} poses that differ give {poses * rows} equations for {told} combinations of the "
-        f"{len(names)} geometric numbers of {robot.name} that poses can tell: at least {needed} "
-        f"are needed; missing: {missing}, hardest to tell: {shown}"
+        f"{len(names)} geometric numbers of {robot.name} that poses can determine: at least "
+        f"{needed} are needed; missing: {missing}, hardest to determine: {shown}"
     )

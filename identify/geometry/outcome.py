@@ -1,4 +1,4 @@
-"""Outcome of a geometry calibration: figures, calibrated robot, poses, and a page of text."""
+"""Outcome of a geometry calibration: figures, calibrated robot, poses, and a text."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -47,13 +47,13 @@ class GeometryOutcome:
     lost_frames : int
         Number of lost frames.
     true : ndarray, shape (g,), or None
-        True deviations, if they are simulated.
+        True deviations in a simulation.
     unseen : Candidates
-        Poses that were not measured, by which the result is judged.
+        Validation poses, which were not measured.
     chosen : Candidates or None
-        Poses that were chosen, if they are simulated.
+        Chosen poses in a simulation.
     among : Candidates
-        Candidates from which they were chosen.
+        Candidates for the choice of poses.
     """
 
     scenario: Scenario
@@ -68,13 +68,10 @@ class GeometryOutcome:
     among: Candidates
 
     def write(self, folder: Path, pictures: Mapping[str, Any] | None = None) -> None:
-        """Write the files of the outcome into a folder, all or none.
+        """Write the files of the outcome into a folder: all files, or none.
 
         They are geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and
-        scenario.toml.
-
-        All or none are written. ``pictures`` are further figures and texts by the names of their
-        files.
+        scenario.toml. ``pictures`` are further figures and texts by file name.
         """
         robot = self.calibration.robot
         description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
@@ -150,10 +147,10 @@ class GeometryOutcome:
         off = (found.noise_ratio - 1) / found.noise_ratio_std
         if off > NOISY:
             said.append(
-                f"the poses miss the calibrated robot by {np.sqrt(found.noise_ratio):.2f} times "
-                f"what is stated of sensor and encoders ({off:.0f} standard deviations more than "
-                "chance): intervals are too short, or the robot is not what "
-                f"{found.nominal.name} says, as where legs bend or joints have play"
+                f"the residuals of the poses are {np.sqrt(found.noise_ratio):.2f} times the stated "
+                f"noise of sensor and encoders ({off:.0f} standard deviations more than chance): "
+                "the intervals are too short, or the robot differs from the model of "
+                f"{found.nominal.name}, for example by elastic legs or play in joints"
             )
         missing = 0 if self.chosen is None else len(self.chosen) - len(self.data)
         if missing:
@@ -164,7 +161,7 @@ class GeometryOutcome:
         return said
 
     def _judged(self) -> dict[str, Any]:
-        """Expected errors of poses that were not measured, and true errors if they are known."""
+        """Return expected errors of the validation poses, and true errors if they are known."""
         found = self.calibration
         robot = self.calibration.nominal
         closure = self.model.closure
@@ -173,13 +170,13 @@ class GeometryOutcome:
         columns = closure.derivatives(poses, joints, found.deviations)[0]
         covariance = found.covariance
         if not found.frames_known:
-            # An error of the geometry is then in the frames, too: only their sum is known.
+            # Errors of geometry and frames are then correlated, so both are included.
             of_frames = frame_columns(robot, poses)[:, list(robot.geometry.chart.freedoms)]
             columns = np.concatenate([columns, of_frames], axis=2)
             covariance = found.joint_covariance
         judged = {"expected": self._spread(columns, covariance)}
         if self.true is None:
-            # NaN becomes null in the file: without the truth there is no such figure.
+            # Without the truth there is no such figure. NaN becomes null in the file.
             return judged | {"unseen": rms_figures(np.full((1, 6), np.nan))}
         stands = true_poses(robot, self.true, joints, poses)
         predicted = seen_between(closure.poses(joints, found.deviations, poses), found.frames)
@@ -189,7 +186,7 @@ class GeometryOutcome:
         }
 
     def _compared(self, chosen: Candidates) -> dict[str, Any]:
-        """Expected errors of unseen poses after the chosen poses, and after random ones."""
+        """Return expected errors of validation poses after chosen poses and after random poses."""
         count = len(chosen)
         sets = {"chosen": chosen, "random": self.among.of(list(range(count)))}
         if len(self.among) >= 2 * count:
@@ -197,7 +194,7 @@ class GeometryOutcome:
         return {name: self._left_by(one) for name, one in sets.items()}
 
     def _by_count(self, most: int) -> list[dict[str, Any]]:
-        """Expected errors of unseen poses after growing numbers of random poses, up to `most`."""
+        """Return expected errors of validation poses for numbers of random poses up to `most`."""
         rows = len(self.calibration.nominal.coordinate_names)
         fewest = -(-len(self.calibration.deviations) // rows)
         largest = max(fewest, min(most, len(self.among)))
@@ -213,30 +210,30 @@ class GeometryOutcome:
         )
 
     def _spread(self, columns: Array, covariance: Array) -> dict[str, list[float]]:
-        """Expected RMS errors for columns (N, m, u) and a covariance (u, u) of the unknowns."""
+        """Return expected RMS errors for columns (N, m, u) and a covariance (u, u) of unknowns."""
         spread = np.sqrt(np.einsum("nmu,uv,nmv->nm", columns, covariance, columns))
         return rms_figures(self.calibration.nominal.geometry.chart.lifted(spread))
 
 
 def geometry_markdown(entry: dict[str, Any]) -> str:
-    """Return the result in words and a table."""
+    """Return the result as text and a table, in Markdown."""
     told = [name for name, one in entry["parameters"].items() if one["observable"]]
     lines = [
         f"# Geometry of {entry['robot']}",
         "",
         f"From {entry['poses']} static poses of {entry['frames_per_pose']} frames each; "
-        f"{entry['lost_frames']} frames were lost. The poses tell {len(told)} of "
-        f"{len(entry['parameters'])} geometric numbers; the others stay where the robot file has "
-        "them, give or take the stated tolerance.",
+        f"{entry['lost_frames']} frames were lost. The poses determine {len(told)} of "
+        f"{len(entry['parameters'])} geometric numbers; the others keep the values of the robot "
+        "file, with the stated tolerance.",
         "",
-        f"Residuals are {np.sqrt(entry['noise_ratio']):.3f} times what is stated of sensor and "
+        f"Residuals are {np.sqrt(entry['noise_ratio']):.3f} times the stated noise of sensor and "
         "encoders.",
     ]
     lines += [f"\nWarning: {text}." for text in entry["warnings"]]
     said = {
-        "uncalibrated": "Before the calibration, poses that were not measured are missed by",
-        "unseen": "After it, they are missed by",
-        "expected": "Expected from the covariance of the geometry",
+        "uncalibrated": "Error of validation poses before the calibration",
+        "unseen": "Error of validation poses after the calibration",
+        "expected": "Expected error from the covariance of the geometry",
     }
     figures = {
         f"{text} (root mean square)": entry[key] for key, text in said.items() if key in entry
@@ -248,14 +245,14 @@ def geometry_markdown(entry: dict[str, Any]) -> str:
     }
     for key, one in entry.get("selection", {}).items():
         figures[
-            f"What {one['poses']} {names[key]} are expected to leave beside the error of teaching"
+            f"Expected error after {one['poses']} {names[key]}, without the error of teaching"
         ] = one
     for text, one in figures.items():
         if np.isfinite(one["position_rms_um"]).all():
             lines += ["", f"{text}: {_figures(one)}."]
     lines += [
         "",
-        "| number | nominal | true | estimate | standard deviation | told |",
+        "| number | nominal | true | estimate | standard deviation | determined |",
         "|---|--:|--:|--:|--:|---|",
     ]
     for name, one in entry["parameters"].items():
@@ -270,16 +267,16 @@ def geometry_markdown(entry: dict[str, Any]) -> str:
     if entry["cannot_be_told"]:
         lines += [
             "",
-            "Combinations that these poses cannot tell (numbers that move together, and no pose "
-            "shows it):",
+            "Combinations that these poses do not determine (the poses hardly change if the "
+            "numbers change together):",
             "",
         ]
         lines += [f"- {text}" for text in entry["cannot_be_told"]]
         if entry["frames"] == "unknown":
             lines += [
                 "",
-                "Nothing was known of the frames of base and platform: their places are among "
-                "these.",
+                "The frames of base and platform were unknown: these combinations include their "
+                "poses.",
             ]
     return "\n".join(lines) + "\n"
 

@@ -1,8 +1,8 @@
 """Selection of static poses by an observability index over candidates within the travel.
 
-The index (see `indices`) is that of the information about geometry and frames together. Poses are
-taken one by one from the candidates (greedy) and exchanged until none is better. Then all move
-together in joint space along the gradient of the index, within the travel.
+The index (see `indices`) is computed from the information about geometry and frames together. Poses
+are chosen one by one from the candidates (greedy) and exchanged until no exchange improves the
+index. Then all poses are optimised together in joint space by a gradient search.
 """
 
 from dataclasses import dataclass
@@ -25,20 +25,23 @@ from identify.progress import Advance
 STEP = 1e-5
 """Step of the difference quotients behind the gradient, as a share of the travel."""
 GRADIENT_STEPS = 40
-"""Largest number of steps of one search along the gradient."""
+"""Largest number of steps of one gradient search."""
 ROUNDS = 4
-"""Largest number of such searches. Each holds the poses that the one before led beyond a limit."""
+"""Largest number of gradient searches.
+
+Poses that violated a limit after a search are fixed in the next search.
+"""
 EXCHANGES = 3
 """Largest number of exchange passes over all poses."""
 TRIALS = 40
-"""Largest number of random joint coordinates that are drawn for each wanted candidate."""
+"""Largest number of random joint coordinates per candidate."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits on where a robot may stand: travel (rad or m), singularities and visibility.
+    """Limits of static poses: travel (rad or m), singularities and visibility.
 
-    Visibility counts only if ``sight`` is given.
+    Visibility is checked only if ``sight`` is given.
     """
 
     robot: Robot
@@ -48,7 +51,7 @@ class Limits:
     sight: SightLines | None
 
     def allowed(self, poses: Array) -> NDArray[np.bool_]:
-        """Tell for each pose (N, 6) whether the robot may stand there."""
+        """Return for each pose (N, 6) whether it is within the limits."""
         measures = measure(self.robot, poses)
         good = measures.reachable & (np.abs(measures.theta) <= self.travel * (1 + 1e-9)).all(axis=1)
         good &= measures.leverage.min(axis=1) >= self.least_leverage
@@ -99,8 +102,8 @@ class Candidates:
 class Designer:
     """Designer of pose sets for a model.
 
-    ``covariance`` (6, 6) is that of a pose's mean and ``joint_std`` (n,) that of the encoders'
-    readings. ``criterion`` names the index.
+    ``covariance`` (6, 6) is the covariance of the mean pose, and ``joint_std`` (n,) the standard
+    deviation of the encoders' mean readings. ``criterion`` names the index.
     """
 
     model: PoseModel
@@ -110,9 +113,9 @@ class Designer:
     criterion: str = "determinant"
 
     def candidates(self, count: int, rng: np.random.Generator) -> Candidates:
-        """Draw random joint coordinates within the travel whose poses are allowed.
+        """Draw random joint coordinates within the travel, with poses within the limits.
 
-        Raises EstimationError if too few are.
+        Raises EstimationError if there are too few such poses.
         """
         kept_joints: list[Array] = []
         kept_poses: list[Array] = []
@@ -132,8 +135,8 @@ class Designer:
         if len(joints) < count:
             raise EstimationError(
                 f"only {len(joints)} of {count * TRIALS} random joint coordinates of {robot.name} "
-                f"within its travel ({travel:.3g} {robot.layout.joint_unit}) are poses where it "
-                f"may stand and be seen; {count} are wanted"
+                f"within its travel ({travel:.3g} {robot.layout.joint_unit}) are poses within all "
+                f"limits and visible; {count} are needed"
             )
         return self.seen(joints, poses)
 
@@ -151,9 +154,9 @@ class Designer:
     def greedy(
         self, among: Candidates, count: int, advance: Advance = lambda n=1: None
     ) -> Candidates:
-        """Choose the best candidates one by one, then exchange them until no other is better.
+        """Choose the best candidates one by one, then exchange them until no exchange is better.
 
-        The same candidate may be chosen twice.
+        The same candidate can be chosen twice.
         """
         index = self.index(among)
         chosen = list[int]()
@@ -167,8 +170,8 @@ class Designer:
         for _ in range(EXCHANGES):
             before = list(chosen)
             for place in range(count):
-                # Sum anew: a difference of two sums would lose the directions with little
-                # information.
+                # The sum is computed again, because a difference of two sums would lose directions
+                # with little information.
                 information = prior + own[chosen[:place] + chosen[place + 1 :]].sum(axis=0)
                 chosen[place] = index.best(among.columns, information)
             if chosen == before:
@@ -176,10 +179,9 @@ class Designer:
         return among.of(chosen)
 
     def moved(self, chosen: Candidates, among: Candidates) -> Candidates:
-        """Return the poses after a search along the gradient of the index in joint space.
+        """Return the poses after a gradient search of the index in joint space.
 
-        Their index is no worse than before. A pose that would move to a place that is not allowed
-        keeps its old place.
+        Their index is not worse than before. A pose that would violate a limit is not moved.
         """
         index = self.index(among)
         held = np.zeros(len(chosen), dtype=bool)
@@ -203,7 +205,10 @@ class Designer:
     def _along_gradient(
         self, chosen: Candidates, held: NDArray[np.bool_], index: ObservabilityIndex
     ) -> Array:
-        """Joint coordinates (N, n) within the travel with the best index nearby, some held."""
+        """Return joint coordinates (N, n) at a nearby optimum of the index, within the travel.
+
+        Rows that are `held` do not move.
+        """
         shape = chosen.joints.shape
         travel = self.limits.travel
         near = chosen.poses
@@ -214,7 +219,7 @@ class Designer:
             poses = self._poses(joints, near)
             if not np.isfinite(poses).all():
                 return np.inf, np.zeros(values.size)
-            # The next closure starts here, so that it stays on the same assembly mode.
+            # The next closure starts here, and thus finds the same assembly mode.
             near = poses
             at = self.seen(joints, poses)
             found, spread = index.value(at.with_prior)
@@ -244,5 +249,5 @@ class Designer:
         return chosen_index(self.criterion, among.information, len(among))
 
     def _poses(self, joints: Array, start: Array) -> Array:
-        """Poses (N, 6) of the nominal robot; NaN where the loops do not close."""
+        """Return the poses (N, 6) of the nominal robot. They are NaN if the loops do not close."""
         return self.model.closure.nearest(joints, np.zeros(len(self.model.tolerance)), start)

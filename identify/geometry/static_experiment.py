@@ -1,8 +1,8 @@
-"""Simulated calibration: encoders and sensor read a robot that stands still with a wrong geometry.
+"""Simulated calibration: encoders and sensor measure a robot with geometry errors at rest.
 
-Its joints go where they are sent, in the coordinates of its encoders. The platform then stands
-where the true geometry puts it, and an encoder's offset is part of that geometry. Poses are
-measured through images, or drawn with the noise that the sensor states for one image.
+The joints move to commanded coordinates of the encoders. The pose of the platform follows from the
+true geometry, which includes the offsets of the encoders. Poses are measured through images, or
+drawn with the noise that the sensor states for one image.
 """
 
 from collections.abc import Mapping
@@ -30,13 +30,13 @@ from identify.record.stored_common_errors import CommonErrors, kind_of
 from identify.scenario.sections import Geometry
 
 FIRST_POSE_RUN = 2_000_000
-"""Number of the sensor's run at the first pose, beyond those of all motions."""
+"""Number of the sensor's run at the first pose, larger than the numbers of all motions."""
 
 
 REST = 1e-3
-"""Share of the travel by which friction keeps joints from where they are sent.
+"""Largest difference between commanded and actual joint coordinates, as a share of the travel.
 
-The encoders read where they stop.
+It is caused by friction. The encoders read the actual coordinates.
 """
 
 
@@ -44,7 +44,8 @@ The encoders read where they stop.
 class Encoders:
     """Encoders of a robot's joints, rad or m.
 
-    They have noise of one reading, a step, and a standard deviation of their offsets.
+    noise: standard deviation of one reading. resolution: quantisation step. offset: standard
+    deviation of the offsets.
     """
 
     noise: float
@@ -52,14 +53,15 @@ class Encoders:
     offset: float
 
     def mean_std(self, readings: int) -> float:
-        """Return the standard deviation of the mean of readings of a joint that stands still.
+        """Return the standard deviation of the mean of readings of a joint at rest.
 
-        The rounding error is a sawtooth, and noise smooths it. Its k-th harmonic is 1 / (pi k)
-        steps high. The mean of readings with noise of s steps keeps exp(-2 (pi k s)^2) of it.
+        The quantisation error is a sawtooth function of the joint coordinate. Its k-th harmonic has
+        the amplitude 1 / (pi k) steps. Averaging readings with noise of s steps reduces it by the
+        factor exp(-2 (pi k s)^2).
         """
         if not self.resolution:
             return self.noise / readings**0.5
-        # Harmonics fall off as 1 / k^2, so thirty are enough.
+        # The squared harmonics decrease as 1 / k^2, so thirty are enough.
         waves = np.pi * np.arange(1, 30)
         steps = self.noise / self.resolution
         kept = self.resolution**2 * np.sum(np.exp(-4 * (waves * steps) ** 2) / waves**2) / 2
@@ -82,9 +84,9 @@ def encoders_of(robot: Robot, settings: Geometry) -> Encoders:
 
 
 def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> Array:
-    """Return the poses (N, 6) of the true robot when its encoders show joints (N, n).
+    """Return the poses (N, 6) of the true robot for encoder readings `joints` (N, n).
 
-    Raises EstimationError, naming the pose, for one that it cannot reach.
+    Raises EstimationError if the robot cannot reach a pose. The message names the pose.
     """
     try:
         return Closure(robot.geometry).poses(joints, deviations, start)
@@ -103,7 +105,7 @@ class Sighted:
     covariances : ndarray, shape (N, 6, 6)
         Covariances of the means.
     seen : ndarray, shape (N,)
-        Poses with at least one frame.
+        True for poses with at least one measured frame.
     lost : int
         Number of lost frames.
     """
@@ -119,8 +121,9 @@ def measured(
 ) -> Sighted:
     """Measure poses through images.
 
-    Only the share of the stated variance that frames at rest scatter by is averaged. Constant
-    errors, such as those of drawing and detection, stay whole in the covariance of the mean.
+    Averaging reduces only the part of the stated variance that appears as scatter of frames at
+    rest. Constant errors, for example of rendering and detection, remain in the covariance of the
+    mean.
     """
     means = np.full_like(poses, np.nan)
     stated = np.full((len(poses), 6, 6), np.nan)
@@ -130,7 +133,7 @@ def measured(
     with progress.stage("measure poses", len(poses) * frames) as advance:
         for row, pose in enumerate(poses):
             bodies = robot_transforms(robot, pose)
-            # A stream for each pose, so that a lost frame does not shift the noise of the others.
+            # Each pose has its own stream, so a lost frame does not change the noise at others.
             sensor.start_run(stream_seed(seed, NOISE, FIRST_POSE_RUN + row))
             values, covariances = _frames_at(sensor, pose, bodies, frames)
             advance(frames)
@@ -143,7 +146,7 @@ def measured(
                 scatter += float(np.sum(away * weighted)) / away.shape[1]
                 spare += len(values) - 1
     seen = counts > 0
-    # A single frame shows no scatter, and then nothing averages.
+    # Single frames show no scatter, and then the variance is not reduced.
     share = min(scatter / spare, 1.0) if spare else 0.0
     kept = 1 - share * (1 - 1 / np.maximum(counts, 1))
     lost = int(len(poses) * frames - counts.sum())
@@ -153,9 +156,10 @@ def measured(
 def _frames_at(
     sensor: cmmsim.Sensor, pose: Array, bodies: Mapping[str, Array], frames: int
 ) -> tuple[Array, Array]:
-    """Poses (k, 6) and covariances (k, 6, 6) of the frames that were not lost at a pose.
+    """Return poses (k, 6) and covariances (k, 6, 6) of the measured frames at a pose.
 
-    Whole images are searched until one gives a pose. All later frames look for stickers near it.
+    Whole images are searched until a pose is found. All later frames look for stickers near this
+    pose.
     """
     left = frames
     while left:
@@ -183,13 +187,13 @@ def drawn(
 ) -> Sighted:
     """Draw measured poses without images.
 
-    One frame at each pose gives its covariance. The mean of `frames` frames is drawn with that over
-    `frames`. One error of the frames, with the covariance of teaching, and one of inexact cameras
-    are drawn for all poses.
+    The stated covariance of one frame at each pose, divided by `frames`, is the covariance of the
+    drawn mean. Errors of the frames, with the covariance of teaching, and errors of inexact cameras
+    are drawn once for all poses.
     """
     taught = sensor.taught
     known = FrameKnowledge(taught.base_covariance, taught.platform_covariance)
-    # One draw: what teaching got wrong is wrong in the same way at all poses.
+    # Errors of teaching are the same at all poses, so they are drawn once.
     offset = known.root @ rng.standard_normal(12)
     covariances = np.full((len(poses), 6, 6), np.nan)
     seen = np.zeros(len(poses), dtype=bool)
@@ -210,7 +214,7 @@ def drawn(
 def camera_errors(sensor: cmmsim.Sensor, poses: Array) -> Array | None:
     """Return the shift (N, 6, k) of poses (N, 6) at rest by k independent camera errors.
 
-    Each error has variance one and is the same for all poses. None stands for exact cameras.
+    Each error has variance one and is the same for all poses. None means exact cameras.
     """
     if sensor.method != "registration":
         return None
@@ -234,7 +238,7 @@ def stand_at(
     seed: int,
     progress: Progress,
 ) -> tuple[StaticPoses, int]:
-    """Measure the true robot where it stops when it is sent to joint coordinates (N, n).
+    """Measure the true robot at rest after it has moved to joint coordinates (N, n).
 
     Parameters
     ----------
@@ -245,20 +249,20 @@ def stand_at(
     sensor : cmmsim.Sensor
         Taught sensor.
     sight : SightLines
-        Its sight.
+        Stickers and cameras of the sensor, for the visibility.
     deviations : ndarray, shape (g,)
-        True geometric numbers less the nominal ones.
+        True minus nominal geometric numbers.
     joints, start : ndarray, shapes (N, n) and (N, 6)
-        Joint coordinates, and the poses of the nominal robot there.
+        Joint coordinates, and the corresponding poses of the nominal robot.
     seed : int
         Seed of the experiment.
     progress : Progress
-        Receiver of the progress.
+        Display of the progress.
 
     Returns
     -------
     tuple of StaticPoses and int
-        Readings at the poses that were seen, and the number of lost frames.
+        Readings at the measured poses, and the number of lost frames.
 
     Raises
     ------

@@ -12,21 +12,21 @@ from identify.errors import RecordError
 from identify.files.run_folder import load_result
 
 UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
-"""Standard deviation (6,) of an unknown frame, m and rad, beyond any placement of a robot."""
+"""Standard deviation (6,) of an unknown frame, m and rad. It is larger than realistic errors."""
 
 APART = 10.0
-"""Standard deviations of the encoders by which different poses differ in some joint."""
+"""Smallest difference of different poses in some joint, in standard deviations of the encoder."""
 
 ROUNDING = 1e-9
-"""Least difference of joint coordinates of different poses, rad or m."""
+"""Smallest difference of different poses in some joint, rad or m."""
 
 
 @dataclass(frozen=True)
 class FrameKnowledge:
     """Covariances (6, 6) [m, rad] of the small errors [dt, dphi] of a measured pose's two frames.
 
-    Those of the base are in base axes, those of the platform in platform axes. They are one draw
-    for all poses.
+    Errors of the base are in base axes, and errors of the platform in platform axes. They are the
+    same for all poses.
     """
 
     base: Array
@@ -34,7 +34,7 @@ class FrameKnowledge:
 
     @classmethod
     def none(cls) -> "FrameKnowledge":
-        """Return the knowledge of frames of which nothing is known."""
+        """Return the covariances of unknown frames."""
         return cls(np.diag(UNKNOWN_FRAME**2), np.diag(UNKNOWN_FRAME**2))
 
     @property
@@ -49,14 +49,14 @@ class FrameKnowledge:
 
 @dataclass(frozen=True)
 class StaticPoses:
-    """Readings at poses where a robot stood.
+    """Measurements of a robot at static poses.
 
     Attributes
     ----------
     joints : ndarray, shape (N, n)
-        Joint coordinates that its encoders read, rad or m.
+        Joint coordinates measured by encoders, rad or m.
     joint_std : ndarray, shape (n,)
-        Their standard deviations.
+        Standard deviations of the joint coordinates.
     poses : ndarray, shape (N, 6)
         Measured poses, each the mean of some frames, m and rad.
     covariances : ndarray, shape (N, 6, 6)
@@ -64,8 +64,8 @@ class StaticPoses:
     frames : FrameKnowledge
         Knowledge of the frames of the measurement.
     common : ndarray, shape (N, 6, k), optional
-        Shift of each pose by further independent errors of variance one that all poses share,
-        such as those of inexact cameras.
+        Shift of each pose by further independent errors of variance one that all poses have in
+        common, for example of inexact cameras.
     """
 
     joints: Array
@@ -85,7 +85,7 @@ class StaticPoses:
 
     @property
     def different(self) -> int:
-        """Number of poses that differ in the encoders' readings by more than their noise."""
+        """Number of poses that differ in the encoder readings by more than the noise."""
         apart = np.maximum(APART * self.joint_std, ROUNDING)
         kept = self.joints[:0]
         for joints in self.joints:
@@ -128,7 +128,7 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
     joints = robot.layout.joints
     if unit not in (None, robot.layout.joint_unit):
         raise RecordError(
-            f"{path}: joint_unit is {unit!r}, joints of {robot.name} are in "
+            f"{path}: joint_unit is {unit!r}, but joints of {robot.name} are in "
             f"{robot.layout.joint_unit}"
         )
 
@@ -169,7 +169,7 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
 
 
 def _columns(rows: Any) -> int:
-    """Length of the first of the innermost of nested lists; one if there is none."""
+    """Return the length of the first innermost list of nested lists, or one without such a list."""
     try:
         return len(rows[0][0])
     except (TypeError, LookupError):
@@ -188,6 +188,6 @@ def _check_covariances(name: str, matrices: Array, strictly: bool) -> None:
         why = (
             "is not symmetric"
             if skewed[row]
-            else f"has the eigenvalue {least[row]:.2g} as correlations, must be > 0"
+            else f"has correlations with the eigenvalue {least[row]:.2g}, which must be > 0"
         )
-        raise RecordError(f"{name}, number {row + 1}, {why}: no covariance")
+        raise RecordError(f"{name}, number {row + 1}, {why}: it is not a covariance")

@@ -1,6 +1,6 @@
-"""Camera images of a pose, cut to the robot, and the stickers that are found in them.
+"""Camera images of a pose, cropped to the robot, and the detected stickers.
 
-The detector is that of the project.
+The detector is the detector of `cmmsim`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,12 +16,12 @@ from identify.arrays import Array
 from identify.scene.workcell import Workcell
 
 MARGIN_PX = 24.0
-"""Margin around stickers and bodies, in the part of the images that is shown."""
+"""Margin around bodies and stickers in the shown part of the images, px."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """Stickers of one body, k of them, that were found in both images.
+    """The k stickers of one body that were found in both images.
 
     Attributes
     ----------
@@ -30,10 +30,10 @@ class Found:
     centres
         Centres (2, k, 2) in the whole images, in px.
     shapes
-        Matrices (2, k, 2, 2) that map the unit disc to the detected ellipses, in px. None where the
-        detector states none.
+        Matrices (2, k, 2, 2) that map the unit disc to the detected ellipses, in px. None if the
+        detector does not return ellipses.
     expected
-        Images (2, k, 2) of the true places, in px.
+        Projections (2, k, 2) of the true places into the images, in px.
     points, covariances
         Triangulated points (k, 3), in m, and their covariances (k, 3, 3), in m², in the base frame.
     """
@@ -63,7 +63,7 @@ class StereoView:
 class StereoEye:
     """Sensor of a workcell that draws images at given poses, and finds the stickers in them.
 
-    Nothing is taught: a sticker is searched near its nominal place.
+    The sensor is not taught: a sticker is searched near its nominal place.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class StereoEye:
     renderer
         "analytic", which needs no OpenGL, or "pyrender".
     region
-        First pixels (2, 2) and side, in px, of the part that is shown; None for the whole images.
+        First pixels (2, 2) and side, in px, of the shown part; None for the whole images.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class StereoEye:
         """
         drawn = self._sensor.look(pose, self._cell.obstacles(pose))
         if self._region is not None and self._sensor.renderer == "analytic":
-            # The analytic renderer can draw a part alone, without the rest of the image.
+            # The analytic renderer can draw only a part of the image, which is faster.
             corners, side = self._region
             images: NDArray = drawn.windows(corners[:, None], side)[:, 0]
         else:
@@ -107,7 +107,7 @@ class StereoEye:
                 images = _Cut(images, np.zeros_like(corners)).windows(corners[:, None], side)[:, 0]
         cut = _Cut(images, corners)
         found = {body.name: self._found(cut, pose, k) for k, body in enumerate(self._cell.bodies)}
-        # The sensor may have more grey levels than the eight bits of a page's image.
+        # The sensor can have more grey levels than the eight bits of images on the page.
         white = self._sensor.noise.white_level
         return StereoView(
             pose, np.asarray(images * (255.0 / white), dtype=np.uint8), corners, found
@@ -136,10 +136,10 @@ class StereoEye:
 def stereo_view(
     cell: Workcell, pose: Array | None = None, seed: int = 0, renderer: str = "analytic"
 ) -> StereoView:
-    """Draw the camera images of a workcell, cut to the robot, and find the stickers in them.
+    """Draw the camera images of a workcell, cropped to the robot, and find the stickers in them.
 
-    The pose (6,) is by default home, and ``seed`` is that of the noise. The renderer "pyrender"
-    needs OpenGL. Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
+    The default pose (6,) is home. ``seed`` is the seed of the noise. The renderer "pyrender" needs
+    OpenGL. Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
     """
     at = cell.home if pose is None else np.asarray(pose, dtype=float)
     return StereoEye(cell, seed, renderer, region_of(cell, [at])).look(at)
@@ -148,7 +148,7 @@ def stereo_view(
 def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_], int]:
     """Return a square part of both images that shows both bodies at all poses (6,).
 
-    It is given by its first pixels (2, 2) and its side, in px.
+    The returned values are its first pixels (2, 2) and its side, in px.
     """
     assert cell.rig is not None
     rig, camera_from_base = cell.rig
@@ -159,14 +159,14 @@ def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_],
     size = np.array([[camera.width, camera.height] for camera in rig.cameras])
     low = np.clip(pixels.min(axis=1) - MARGIN_PX, 0, size - 1)
     high = np.clip(pixels.max(axis=1) + MARGIN_PX, 0, size - 1)
-    # One size for both images, so that they can be shown side by side.
+    # Both images have the same size, so that they can be shown side by side.
     side = int(min(np.ceil((high - low).max()), size.min()))
     corners = np.clip(np.rint(0.5 * (low + high - side)), 0, size - side).astype(int)
     return corners, side
 
 
 class _Cut:
-    """Parts of two images, which are read as if they were whole."""
+    """Parts of two images that can be read with coordinates of the whole images."""
 
     def __init__(self, images: NDArray, corners: NDArray[np.int_]) -> None:
         self._images = images

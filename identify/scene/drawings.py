@@ -1,7 +1,7 @@
 """Matplotlib figures of the scene and of the camera images, for print as PDF, SVG or PNG.
 
-Things of different colour also differ in brightness or have a word, so that the figures can be read
-without colour.
+Elements with different colours also differ in brightness or have a label, so that the figures can
+be read without colour.
 """
 
 import matplotlib.patheffects as effects
@@ -34,7 +34,7 @@ ARROWS = 3000.0
 """Factor that enlarges errors of a hundredth of a pixel, so that they can be seen."""
 
 CAMERA_M = np.array([0.05, 0.04, 0.12])
-"""Half width, half height and length of the box that stands for a camera, in m."""
+"""Half width, half height and length of the box that represents a camera, in m."""
 
 FRUSTUM_M = 0.30
 """Distance in front of a camera up to which its field of view is drawn, in m."""
@@ -51,9 +51,9 @@ def scene_figure(
 ) -> Figure:
     """Draw the robot and both cameras.
 
-    The robot has its legs and stickers. The cameras have their field of view, and rays to the
-    stickers that both can see. No OpenGL is needed. Raises dynamics.UnreachablePoseError or
-    dynamics.ChartError.
+    The robot is drawn with legs and stickers, and the cameras with their field of view and rays to
+    the stickers that both cameras can see. No OpenGL is needed. Raises
+    dynamics.UnreachablePoseError or dynamics.ChartError.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def scene_figure(
     size
         Width and height, in inches.
     rays, labels
-        Flags whether to draw them.
+        Whether rays and labels are drawn.
     """
     figure = Figure(figsize=size, layout="constrained")
     draw_scene(figure.add_subplot(), cell, _at(cell, pose), view or View(), rays, labels)
@@ -96,9 +96,8 @@ def overview_figure(
 ) -> Figure:
     """Draw the scene, and beside it both camera images with the detected ellipses.
 
-    The scene has the pose of ``view``, and is seen from the direction ``towards``. ``size`` and
-    ``arrows`` are as in `stereo_figure`. Raises dynamics.UnreachablePoseError or
-    dynamics.ChartError.
+    The scene has the pose of ``view``, and is seen from the direction ``towards``. For ``size`` and
+    ``arrows`` see `stereo_figure`. Raises dynamics.UnreachablePoseError or dynamics.ChartError.
     """
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplot_mosaic([["scene", "left"], ["scene", "right"]], width_ratios=[2.6, 1.0])
@@ -128,7 +127,7 @@ def draw_scene(
     for camera in cell.cameras:
         _camera(painter, camera)
         for sticker in cell.seen(pose) if rays else ():
-            # A little before the platform, lest its faces cover the end of the ray.
+            # `towards` prevents the faces of the platform from covering the end of the ray.
             painter.line(np.array([camera.centre, sticker]), RAY, 0.45, alpha=0.55, towards=0.02)
     _triad(painter, axes, labels)
     painter.paint(axes)
@@ -167,7 +166,7 @@ def _explain(figure: Figure, view: StereoView, arrows: float | None) -> None:
 def show_image(axes: Axes, view: StereoView, side: int) -> None:
     """Draw one image at its place in the whole image, in px.
 
-    It is brightened, so that dark bodies show in print.
+    It is brightened, so that dark bodies are visible in print.
     """
     image = view.images[side]
     x, y = view.corners[side]
@@ -185,7 +184,7 @@ def show_image(axes: Axes, view: StereoView, side: int) -> None:
 def brightened(image: Array) -> Array:
     """Return grey values (h, w) uint8 for a screen or for paper.
 
-    They are square roots, which show what is dark.
+    They are scaled square roots, which make dark parts visible.
     """
     return np.asarray(np.sqrt(image / 255.0) * 255.0, dtype=np.uint8)
 
@@ -212,7 +211,7 @@ def _solid(painter: Painter, body: Solid, place: Array) -> None:
     turned = body.normals @ place[:3, :3].T
     for centre, normal in zip(apply(place, body.places), turned, strict=True):
         painter.disc(centre, normal, body.ring_radius, DARK, 0.03)
-        # Small stickers are drawn larger than they are, so that they show in print.
+        # Small stickers are drawn enlarged, so that they are visible in print.
         painter.disc(centre, normal, max(body.radius, 0.45 * body.ring_radius), BRIGHT, 0.031)
 
 
@@ -240,7 +239,7 @@ def _camera(painter: Painter, camera: ViewingCamera) -> None:
 
 
 def _triad(painter: Painter, axes: Axes, labels: bool) -> None:
-    """Draw the axes of the base, 0.15 m long, over everything: they lie within the robot."""
+    """Draw the axes of the base, 0.15 m long, over all bodies, because they lie in the robot."""
     for name, direction in zip("xyz", np.eye(3), strict=True):
         ends = np.array([np.zeros(3), 0.15 * direction])
         painter.line(ends, DARK, 1.4, towards=1.0)
@@ -265,7 +264,7 @@ def _labels(painter: Painter, axes: Axes, cell: Workcell, solids: list[Array]) -
         )
     for body, vertices, side in zip(cell.bodies, solids, (-1, 1), strict=False):
         flat = painter.pixels(vertices)
-        # The name stands at the vertex furthest to its side, where it hides least.
+        # The label is at the outermost vertex, where it hides least.
         end = flat[np.argmax(side * flat[:, 0])]
         align = "left" if side > 0 else "right"
         axes.annotate(
@@ -296,7 +295,7 @@ def _ellipses(axes: Axes, view: StereoView, side: int, body: str, arrows: float 
         linewidths=0.6,
     )
     if arrows is not None and len(centres):
-        # Enlarged, because errors of a hundredth of a pixel would not show.
+        # Errors of a hundredth of a pixel are visible only if enlarged.
         errors = arrows * (centres - found.expected[side])
         axes.quiver(
             *centres.T,

@@ -1,7 +1,7 @@
 """Bodies of a workcell as one binary glTF file.
 
-The page's three.js, Blender and other programs open it. Its nodes have the names of bodies and
-legs. Lengths are in m, in the base frame with z up.
+three.js on the replay page, Blender and other programs can open it. Its nodes have the names of
+bodies and legs. Lengths are in m, in the base frame with z up.
 """
 
 import numpy as np
@@ -24,8 +24,8 @@ ABOVE_M = 0.0004
 def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
     """Return a workcell as glTF, with its platform at a pose (6,), by default home.
 
-    The nodes are "platform" and "base" with their stickers, one for each body of a leg, and "left
-    camera" and "right camera". A body of a leg is a rod along its z axis from its origin. Raises
+    The nodes are "platform" and "base" with their stickers, each body of a leg, and "left camera"
+    and "right camera". A body of a leg is a rod along its z axis from its origin. Raises
     dynamics.UnreachablePoseError or dynamics.ChartError.
     """
     at = cell.home if pose is None else pose
@@ -34,7 +34,7 @@ def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
         _add(scene, body.name, body.vertices, body.faces, SOLIDS[body.name], place)
         _add_stickers(scene, body)
     for part, ends in zip(cell.parts, cell.rods(at), strict=True):
-        # Upright, so that the page can place a rod anew in each frame by one matrix.
+        # Rods are upright, so that the page can place a rod in each frame by one matrix.
         mesh = trimesh.creation.cylinder(part.segment.radius, segment=_upright(ends), sections=20)
         colour = leg_colour(cell, part.leg, part.body)
         _add(scene, part.name, mesh.vertices, mesh.faces, colour, rod_transform(*ends))
@@ -76,8 +76,8 @@ def _add(
     place: Array,
     parent: str | None = None,
 ) -> None:
-    """Add a body without normals, so that a viewer shades each face by itself."""
-    # The colours of glTF are linear, those of matplotlib are sRGB.
+    """Add a body without normals, so that a viewer shades each face separately."""
+    # glTF has linear colours, and matplotlib has sRGB colours.
     linear = [((share + 0.055) / 1.055) ** 2.4 for share in to_rgb(colour)]
     material = PBRMaterial(
         baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9, name=name

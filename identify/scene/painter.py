@@ -1,8 +1,8 @@
 """Painter of bodies as shaded polygons in perspective, for vector graphics without OpenGL.
 
-The polygons are drawn from far to near. Large faces and long lines are cut into pieces, so that the
-order of the pieces' middles is the order in which they hide each other. Where two bodies pierce
-each other, this is right to the size of a piece.
+The polygons are drawn from far to near. Large faces and long lines are cut into small pieces, so
+that sorting by the distance of their centres is correct. If two bodies intersect, the result is
+correct to the size of a piece.
 """
 
 from collections.abc import Sequence
@@ -24,15 +24,15 @@ LIGHT = np.array([0.35, -0.55, 0.76])
 """Direction from the scene to the light, in the base frame. Its length does not matter."""
 
 SHADE = 0.62
-"""Brightness of a face without light, where one that faces the light has one."""
+"""Brightness of a face without light. A face towards the light has the brightness one."""
 
 
 @dataclass(frozen=True)
 class View:
     """Direction and distance from which a scene is seen.
 
-    The azimuth is counted from the x axis about z. The distance is taken from the middle of the
-    scene, in sizes of the scene.
+    The azimuth is the angle from the x axis about z. The distance is measured from the middle of
+    the scene, in sizes of the scene.
     """
 
     azimuth_deg: float = -50.0
@@ -41,7 +41,10 @@ class View:
 
 
 class Painter:
-    """Collector of shapes, which it draws into axes. Centre (3,) and size of the scene are in m."""
+    """Painter that collects shapes and draws them into axes.
+
+    Centre (3,) and size of the scene are in m.
+    """
 
     def __init__(self, view: View, centre: Array, size: float) -> None:
         azimuth, elevation = np.deg2rad([view.azimuth_deg, view.elevation_deg])
@@ -70,7 +73,7 @@ class Painter:
         Their corners run counter-clockwise, seen from outside. They are drawn as if they were
         nearer by ``towards``, in m.
         """
-        # A large face has no single distance by which to be sorted.
+        # Large faces are divided, because they cannot be sorted by a single distance.
         corners, pieces = trimesh.remesh.subdivide_to_size(vertices, faces, self._piece)
         triangles = np.asarray(corners)[np.asarray(pieces)]
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -90,7 +93,7 @@ class Painter:
     ) -> None:
         """Add the edges of a convex body that belong to its visible faces."""
         body = trimesh.Trimesh(vertices, faces, process=True)
-        # Edges between triangles of one plane are none of the body's.
+        # Edges between triangles in the same plane are not edges of the body.
         sharp = body.face_adjacency_angles > 1e-3
         normals = body.face_normals
         middles = body.triangles_center
@@ -102,10 +105,10 @@ class Painter:
     def disc(
         self, centre: Array, normal: Array, radius: float, colour: str, towards: float
     ) -> None:
-        """Add a flat disc, if its outward normal (3,) points to the viewer."""
+        """Add a flat disc, if its outward normal (3,) points towards the viewer."""
         if normal @ (self._eye - centre) <= 0:
             return
-        # The axis most across the normal gives the best conditioned cross product.
+        # The coordinate axis with the largest angle to the normal gives the best conditioning.
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
         turn = np.linspace(0, 2 * np.pi, 20, endpoint=False)[:, None]
@@ -124,7 +127,7 @@ class Painter:
             self._add(middle, flat[k : k + 2], None, to_rgba(colour, alpha), width, towards)
 
     def paint(self, axes: Axes) -> None:
-        """Draw everything that was added into axes of equal scale, without a frame."""
+        """Draw all added shapes into axes of equal scale, without a frame."""
         # The painter's algorithm: near pieces are drawn over far ones.
         self._pieces.sort(key=lambda piece: -piece[0])
         polygons, filled, lines, widths = zip(*(piece[1:] for piece in self._pieces), strict=True)

@@ -1,8 +1,8 @@
 """Page that replays a motion: one HTML file that opens without a network.
 
-It shows the scene, the images and the curves. The scene is drawn by three.js, as trimesh carries
-it, and moved by the scripts in `replay_page/`. Poses go into the page in double precision, so that
-it shows what the files say.
+It shows the scene, the images and the curves. The copy of three.js in trimesh draws the scene, and
+the scripts in `replay_page/` move it. Poses are stored in the page in double precision, so that it
+shows the exact values of the files.
 """
 
 import base64
@@ -31,16 +31,16 @@ PARTS = Path(__file__).parent / "replay_page"
 SCRIPTS = ("scene.js", "curves.js", "images.js", "player.js")
 
 KEY_FRAMES = 24
-"""Number of frames with images, which take most of the time and half of the file."""
+"""Number of frames with images. Images need most of the time and half of the file."""
 
 IMAGE_QUALITY = 45
-"""Quality of the images, as JPEG counts it. An image takes some 30 kB.
+"""JPEG quality of the images. An image has about 30 kB.
 
-WebP would be half as large, but take as long to write as the image takes to draw.
+WebP would be half as large, but writing it would take as long as rendering the image.
 """
 
 CONFIDENCE = 2.7955
-"""Standard deviations that hold 95 % of a normal distribution in space."""
+"""Radius of the ball with 95 % of a normal distribution in space, in standard deviations."""
 
 LIBRARY_ENDS = "THREE.GLTFLoader=GLTFLoader;})();"
 """End of the libraries in the page that trimesh writes. Its own viewer follows."""
@@ -49,7 +49,7 @@ LIBRARY_ENDS = "THREE.GLTFLoader=GLTFLoader;})();"
 def write_page(path: Path | str, motion: Motion, progress: Progress | None = None) -> None:
     """Write the page of a motion, whole or not at all.
 
-    Before anything is drawn, it is tried whether the file can be written.
+    Before the drawing, a check is made whether the file can be written.
 
     Raises
     ------
@@ -65,8 +65,11 @@ def write_page(path: Path | str, motion: Motion, progress: Progress | None = Non
 
 
 def page(motion: Motion, progress: Progress) -> str:
-    """Return the page of a motion as one HTML text. Raises as `write_page`, but for WriteError."""
-    # A short motion has fewer frames than there may be images.
+    """Return the page of a motion as one HTML text.
+
+    Raises the errors of `write_page` except WriteError.
+    """
+    # For a motion with fewer frames than KEY_FRAMES, `unique` removes repeated frames.
     frames = np.unique(np.linspace(0, len(motion.time) - 1, KEY_FRAMES).round().astype(int))
     with progress.stage("draw the replay", 2 + len(frames) * _has_images(motion)) as advance:
         rods = np.array([motion.cell.rods(pose) for pose in motion.drawn])
@@ -100,26 +103,26 @@ def page(motion: Motion, progress: Progress) -> str:
 def three_js() -> str:
     """Return the text of three.js with its loader of glTF files and its controls by the mouse.
 
-    It is taken from the page that trimesh writes. Raises IdentifyError if the installed trimesh
-    carries it otherwise.
+    It is extracted from a page that trimesh writes. Raises IdentifyError if the page of the
+    installed trimesh has another form.
     """
-    # Any scene will do: only the libraries of its page are kept.
+    # The scene is arbitrary, because only the libraries of its page are used.
     whole = scene_to_html(trimesh.Scene(trimesh.creation.box()))
     library, found, _ = whole.partition("<script>")[2].partition(LIBRARY_ENDS)
     if not found:
         raise IdentifyError(
-            f"trimesh {trimesh.__version__} carries no three.js that this version of cmmsim knows"
+            f"trimesh {trimesh.__version__} contains no three.js that this version of cmmsim knows"
         )
     return library + found
 
 
 def _has_images(motion: Motion) -> bool:
-    """Tell whether there are cameras, and a truth that they can see."""
+    """Return whether images can be drawn, which needs cameras and true poses."""
     return motion.cell.sensor is not None and TRUE in motion.poses
 
 
 def _views(motion: Motion, frames: Array) -> Any:
-    """Yield the frames with their stereo views, as far as there are images."""
+    """Yield the frames with their stereo views, or nothing if there are no images."""
     if not _has_images(motion):
         return
     chosen = motion.poses[TRUE][frames]
@@ -129,7 +132,7 @@ def _views(motion: Motion, frames: Array) -> Any:
 
 
 def _data(motion: Motion, rods: Array) -> dict[str, Any]:
-    """Return all that the page's scripts read, except the images."""
+    """Return the data of the page's scripts without the images."""
     cell = motion.cell
     bodies = {body.name: {"ids": body.ids, "places": body.places.tolist()} for body in cell.bodies}
     cameras = [
@@ -140,7 +143,7 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
         }
         for camera in cell.cameras
     ]
-    # Single precision suffices for what is only drawn; poses are also written as numbers.
+    # Single precision is enough for drawings. Poses are also displayed as numbers.
     return {
         "frames": len(motion.time),
         "time": _numbers(motion.time, "f8"),
@@ -159,7 +162,7 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
 
 
 def _look(frame: int, view: StereoView) -> dict[str, Any]:
-    """Return what the page shows of a stereo view."""
+    """Return the data of a stereo view for the page."""
     return {
         "frame": frame,
         "images": [_jpeg(image) for image in view.images],
@@ -181,9 +184,9 @@ def _stickers(found: Found) -> dict[str, Any]:
 
 
 def _shapes(covariances: Array) -> Array:
-    """Return matrices (n, 3, 3) that map the unit ball to the ellipsoids that hold 95 %.
+    """Return matrices (n, 3, 3) that map the unit ball to the 95 % ellipsoids of covariances.
 
-    They are NaN where a covariance is.
+    A matrix is NaN if its covariance is NaN.
     """
     known = np.isfinite(covariances).all(axis=(1, 2))
     shapes = np.full_like(covariances, np.nan)
@@ -199,14 +202,14 @@ def png(figure: Figure) -> bytes:
 
 
 def _numbers(values: Array, kind: str) -> str:
-    """Encode numbers as the page reads them: little-endian, in base64."""
+    """Encode numbers for the page: little-endian, in base64."""
     return base64.b64encode(np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()).decode()
 
 
 def _jpeg(image: Array) -> str:
     """Return a grey image as a data URL.
 
-    The page brightens it. Doing that here would spend the file on noise.
+    The page brightens the image. A brightened image would need a larger file because of its noise.
     """
     encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, IMAGE_QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(encoded.tobytes()).decode()}"

@@ -28,15 +28,15 @@ STARTING = "starting"
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Motion of a workcell over N frames. A scene without a run has one frame, at home.
+    """Motion of a workcell over N frames. A scene without a run has a single frame at home.
 
     Attributes
     ----------
     time
         Times (N,), in s.
     poses
-        Poses (N, 6) [m, rad] named "true", "measured", "identified" and "starting". They are NaN in
-        frames without a pose.
+        Poses (N, 6) [m, rad] named "true", "measured", "identified" and "starting" (initial guess).
+        They are NaN in frames without a pose.
     covariance
         Covariances (N, 6, 6) of the measured poses, NaN where a frame was lost.
     seed
@@ -46,7 +46,7 @@ class Motion:
     title
         Title of the page.
     notes
-        Sentences about what is missing.
+        Sentences about missing data.
     """
 
     cell: Workcell
@@ -62,15 +62,15 @@ class Motion:
     def drawn(self) -> Array:
         """Poses (N, 6) in which the robot is drawn.
 
-        They are the true ones. Where these are not known, they are the last measured ones,
-        projected to the robot's degrees of freedom.
+        They are the true poses. If the truth is unknown, each is the last measured pose, projected
+        to the robot's degrees of freedom.
         """
         if TRUE in self.poses:
             return self.poses[TRUE]
         measured = self.poses[MEASURED]
         robot = self.cell.robot
         good = np.asarray(np.isfinite(measured).all(axis=1))
-        # Index of the last measured frame, or of the first one for the frames before it.
+        # Index of the last measured frame. Frames before the first measured frame use that frame.
         last = np.maximum.accumulate(np.where(good, np.arange(len(good)), good.argmax()))
         return measured[last] if robot is None else robot.pose(robot.coordinates(measured[last]))
 
@@ -83,7 +83,7 @@ def motion_at_home(cell: Workcell, renderer: str = "analytic") -> Motion:
 
 
 def motion_names(run: RunFolder) -> list[str]:
-    """Return the names of a run's motions: "excitation", and "run01", ... of the unseen ones."""
+    """Return the names of a run's motions: "excitation", and "run01", ... of the validation."""
     unseen = len(RunFiles(run).validation) if run.validation.is_file() else 0
     return [EXCITATION, *(run_name(number) for number in range(1, unseen + 1))]
 
@@ -99,7 +99,7 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
         A file is damaged or of an older version, there is no such motion, or the files are not of
         one run.
     dynamics.RobotFileError, EstimationError
-        The robot's file is gone, or is another one than that of the record.
+        The robot's file is missing, or differs from the robot of the record.
     """
     run = RunFolder(Path(folder))
     run.require("scenario.toml", "experiment.nc")
@@ -114,13 +114,15 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
     truth = _truth(run, name)
     if truth is None:
         notes.append(
-            "The record holds no truth, so no image can be drawn: the robot stands where it was "
-            "measured."
+            "The record holds no truth, so no images can be drawn, and the robot is shown at "
+            "the measured poses."
         )
     else:
         seen = {TRUE: truth} | seen
     seen |= _models(run, files, name, len(record["time"]), notes)
-    what = "exciting trajectory" if name == EXCITATION else f"unseen trajectory {names.index(name)}"
+    what = "exciting trajectory"
+    if name != EXCITATION:
+        what = f"validation trajectory {names.index(name)}"
     if TRUE not in seen and not np.isfinite(seen[MEASURED]).all(axis=1).any():
         raise RecordError(
             f"{run.path} has neither a truth nor one measured frame: there is no pose to show"
@@ -145,7 +147,7 @@ def _cell(run: RunFolder, record: xr.Dataset, notes: list[str]) -> Workcell:
 
 def _truth(run: RunFolder, name: str) -> Array | None:
     """Return the true poses (N, 6) of a motion, or None if its file holds none."""
-    # Unseen runs share a file, where each has a group; the excitation has a file of its own.
+    # Validation runs are groups of one file. The excitation has a separate file.
     path, group = (run.experiment, "") if name == EXCITATION else (run.validation, name)
     inside = f"{group}/{TRUTH_GROUP}" if group else TRUTH_GROUP
     return true_poses(read_truth(path, group)) if inside in group_names(path) else None
@@ -154,9 +156,10 @@ def _truth(run: RunFolder, name: str) -> Array | None:
 def _models(
     run: RunFolder, files: RunFiles, name: str, frames: int, notes: list[str]
 ) -> dict[str, Array]:
-    """Return the poses (N, 6) of the identified and the starting model.
+    """Return the poses (N, 6) of the identified model and of the initial guess.
 
-    A note tells why there are none. Raises RecordError if they do not belong to the record.
+    If there are none, a note states the reason. Raises RecordError if they do not belong to the
+    record.
     """
     missing = "so no model is shown; this command adds it: cmmsim validate --out"
     if not run.model.is_file() or not run.result.is_file():
@@ -165,9 +168,7 @@ def _models(
     result = load_result(run.result)
     # Identifying again drops the entry of the validation, whose models are then outdated.
     if "validation" not in result:
-        notes.append(
-            f"The run has been identified anew and not been validated since, {missing} {run.path}."
-        )
+        notes.append(f"The run was identified again and not validated since, {missing} {run.path}.")
         return {}
     files.check_made_of("experiment.nc", run.model.name, result=result)
     if name not in files.model or files.model[name].sizes["time"] != frames:

@@ -26,7 +26,7 @@ from identify.errors import ScenarioError
 from identify.experiment.sensor_in_loop import check_platform, robot_meshes, robot_transforms
 
 PLATE_M = 0.012
-"""Half the thickness of the plate that stands for a platform with known joints only, in m."""
+"""Half the thickness, in m, of the plate drawn for a platform of which only joints are known."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Solid:
     vertices
         Vertices (n, 3).
     faces
-        Triangles (m, 3), whose corners run counter-clockwise, seen from outside.
+        Triangles (m, 3). Their corners run counter-clockwise, seen from outside.
     ids
         Names (k,) of the stickers.
     places, normals
@@ -59,7 +59,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class ViewingCamera:
-    """Camera at its place, given by base_from_camera (4, 4).
+    """Camera with its pose base_from_camera (4, 4).
 
     Its axes are x right, y down and z forward.
     """
@@ -78,7 +78,8 @@ class ViewingCamera:
 
         They are in the base frame, in m, clockwise from the top left corner of the image.
         """
-        # The outer edges of the image: the centre of its first pixel is (0, 0).
+        # The edges of the image have half-integer coordinates, because the centre of the first
+        # pixel is (0, 0).
         right = self.lens.width - 0.5
         low = self.lens.height - 0.5
         pixels = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
@@ -112,10 +113,7 @@ class Workcell:
 
     @cached_property
     def bodies(self) -> tuple[Solid, ...]:
-        """The platform, in its own frame.
-
-        With a sensor also the body that carries the stickers of the base, in the base frame.
-        """
+        """Platform in its own frame and, with a sensor, base with stickers in the base frame."""
         if self.sensor is None:
             assert self.robot is not None
             return (_plate("platform", self.robot.geometry.platform_joints),)
@@ -144,14 +142,14 @@ class Workcell:
 
     @cached_property
     def frame(self) -> Array:
-        """Lines (n, 2, 3) from one leg's joint on the base to the next one's.
+        """Lines (n, 2, 3) between neighbouring base joints of the legs.
 
         They are in m, in the base frame. There are none without a robot.
         """
         if self.robot is None:
             return np.zeros((0, 2, 3))
         joints = self.robot.geometry.base_joints
-        # Joints in the order of their angle about their middle, so that lines do not cross.
+        # Joints are sorted by their angle about their centre, so that lines do not cross.
         away = joints - joints.mean(axis=0)
         around = joints[np.argsort(np.arctan2(away[:, 1], away[:, 0]))]
         return np.stack([around, np.roll(around, -1, axis=0)], axis=1)
@@ -173,14 +171,13 @@ class Workcell:
         )
 
     def seen(self, pose: Array) -> Array:
-        """Return the places (k, 3) of the platform's stickers that both cameras can look for.
+        """Return the places (k, 3) of the platform's stickers that are visible to both cameras.
 
-        They are in m, in the base frame, at a pose (6,). Bodies between a sticker and a camera are
-        not considered.
+        They are in m, in the base frame, at a pose (6,). Occlusion by other bodies is neglected.
         """
         if self.rig is None or self.sensor is None:
             return np.zeros((0, 3))
-        # The sensor looks for stickers at their nominal places; they are drawn at the true ones.
+        # Visibility is decided at nominal places, but the true places are returned.
         lines = SightLines(self.marked("platform"), *self.rig)
         return apply(pose_to_transform(pose), self.bodies[0].places[lines.visible(pose)])
 
@@ -200,7 +197,7 @@ class Workcell:
     def obstacles(self, pose: Array) -> Mapping[str, Array]:
         """Return base_from_body (4, 4) of the legs' bodies by name, at a pose (6,).
 
-        These bodies may hide stickers.
+        These bodies can hide stickers.
         """
         return {} if self.robot is None else robot_transforms(self.robot, pose)
 
@@ -209,7 +206,7 @@ def workcell(robot: Robot | None = None, sensor: SensorFile | None = None) -> Wo
     """Return the workcell of a robot, of the file of a sensor, or of both.
 
     `cmmsim.files.read_sensor_file` reads the file of a sensor. Raises ScenarioError if neither is
-    given, or if the platform that the sensor sees is not the robot's.
+    given, or if the platform in the sensor file is not the robot's platform.
     """
     if robot is None and sensor is None:
         raise ScenarioError("a scene needs a robot, a sensor, or both")
@@ -239,7 +236,7 @@ def _marked(name: str, file: SensorFile, stream: int) -> Solid:
 
 
 def _plate(name: str, joints: Array) -> Solid:
-    """Return a plate around joints (n, 3), for a platform of which nothing else is known."""
+    """Return a plate around joints (n, 3), for a platform without a further description."""
     around = PLATE_M * np.vstack([np.eye(3), -np.eye(3)]) * np.array([1.5, 1.5, 1.0])
     points = (joints[:, None] + around).reshape(-1, 3)
     hull = ConvexHull(points)

@@ -16,10 +16,7 @@ from identify.experiment.run import Latencies
 USUAL = Latencies()
 
 NEARLY_EXACT = 1e-3
-"""Share of the noise's covariance that is stated for exact poses.
-
-An observer cannot divide by a covariance of zero.
-"""
+"""Factor of the stated covariance for exact poses, because an observer needs a covariance > 0."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +24,8 @@ class Followed:
     """Run of a robot that follows a motion.
 
     ``desired`` (N, 6) are the desired poses. ``expected`` are the coordinates (N, m) and
-    covariances (N, m, m) that the observer predicted of each frame before it was measured, or None
-    without an observer.
+    covariances (N, m, m) that the observer predicted for each frame before its measurement. They
+    are None without an observer.
     """
 
     run: ClosedLoopRun
@@ -49,8 +46,8 @@ class Followed:
     def normalised_squared_error(self, robot: Robot) -> float | None:
         """Return the normalised squared error of the observer's predictions.
 
-        It is the mean of e^T P^-1 e / m, where e are the errors against the robot's true
-        coordinates and P is their predicted covariance. None without an observer.
+        It is the mean of e^T P^-1 e / m, with the errors e of the predicted coordinates and their
+        predicted covariance P. It is None without an observer.
         """
         if self.expected is None:
             return None
@@ -62,11 +59,11 @@ class Followed:
 def by_drawing(
     covariance: Array, lost: NDArray[np.bool_], rng: np.random.Generator, exact: bool = False
 ) -> Seen:
-    """Return a measurement by drawn poses, instead of a sensor.
+    """Return a measurement that draws poses at random, in place of a sensor.
 
-    The poses are drawn about the true ones with a covariance (6, 6), and there is none at lost
-    frames (N,). With ``exact`` they are the true ones, and are stated as nearly exact: an observer
-    that takes them as noisy would make less of them than it can.
+    The poses scatter about the true poses with a covariance (6, 6). Lost frames (N,) have no pose.
+    With ``exact`` the poses are the true poses, and their stated covariance is nearly zero, so that
+    an observer trusts them.
     """
     # All frames are drawn at once, so that a lost frame does not shift the noise of later ones.
     factor = np.linalg.cholesky(covariance)
@@ -91,8 +88,8 @@ def follow(
 ) -> Followed:
     """Follow a motion under a law that knows a model.
 
-    ``latencies`` replace those of the scenario. Raises what `prepared` does, and LoopFailure if the
-    loop is lost.
+    ``latencies`` replace the latencies of the scenario. Raises the errors of `prepared`, and
+    LoopFailure if the loop is unstable.
     """
     in_loop = prepared(plant, law, known, motion, seen, latencies.known)
     times = plant.runs.timing.frame_times(motion.duration_s)

@@ -1,6 +1,6 @@
 """Motions to follow, all from rest.
 
-They are unseen Fourier trajectories, a circle, a square with corners, and a user's own poses.
+They are the Fourier trajectories of the validation, a circle, a square, and a user's own poses.
 Circle and square lie in the first two coordinates of the platform, within the box of the scenario's
 excitation. They start at home.
 """
@@ -57,9 +57,9 @@ class AlongCoordinates:
 
 
 def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMotion]:
-    """Return the unseen trajectories of a design, a circle and a square.
+    """Return the validation trajectories of a design, a circle and a square.
 
-    With a file ``own``, return only the motion through its poses, see `read_motion`. Raises
+    With a file ``own``, only the motion through its poses is returned, see `read_motion`. Raises
     TrajectoryError.
     """
     robot = design.robot
@@ -75,7 +75,7 @@ def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMot
     box = box_of(
         robot.geometry.chart, limits.position_amplitude_m, limits.orientation_amplitude_rad
     )
-    # A turn takes the period of the highest harmonic, so that a circle is as fast as that.
+    # A turn takes one period of the highest harmonic.
     turn_s = 1 / (limits.fundamental_hz * limits.harmonics)
     found.append(NamedMotion("circle", circle(robot, float(box[0]) / 2, turn_s), duration))
     found.append(NamedMotion("corner", square(robot, float(box[:2].min()), duration / 5), duration))
@@ -125,9 +125,8 @@ def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
 def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
     """Return a motion along a square from home.
 
-    It goes along the first coordinate, then the second, and back. Each edge takes ``edge_s``, in s,
-    and goes from rest to rest as a polynomial of fifth degree. The jerk is at most 60 side /
-    edge_s^3.
+    It goes along the first coordinate, then the second, and back. Each edge takes ``edge_s``, in s.
+    It is a polynomial of fifth degree from rest to rest, with a jerk of at most 60 side / edge_s^3.
     """
     home = robot.coordinates(robot.home_pose)
     corners = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
@@ -164,10 +163,10 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
     Parameters
     ----------
     path
-        File with the columns t, x, y, z, alpha, beta, gamma, in s, m and rad. A spline of fifth
-        degree goes through the poses. It is at rest and without acceleration at both ends.
+        File with the columns t, x, y, z, alpha, beta, gamma, in s, m and rad. The motion is a
+        spline of fifth degree through the poses, at rest and without acceleration at both ends.
     robot
-        Robot that is to follow the motion.
+        Robot that shall follow the motion.
     fastest
         Largest speed of a joint, in rad/s or m/s.
 
@@ -176,7 +175,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
     TrajectoryError
         The file cannot be read, columns are missing, there are too few rows, the times do not begin
         at 0 or do not increase, numbers are not finite, the platform cannot have a pose, or a step
-        between rows asks a joint for more speed.
+        between rows needs a larger joint speed.
     """
     try:
         # Spreadsheets write a byte order mark, which utf-8-sig skips.
@@ -187,7 +186,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
         raise TrajectoryError(f"cannot read the motion {path}: {error}") from None
     header = [name.strip() for name in lines[0]] if lines else []
     if len(header) == 1 and ";" in header[0]:
-        raise TrajectoryError(f"{path}: cells are separated by commas, and these by semicolons")
+        raise TrajectoryError(f"{path}: cells are separated by semicolons, and must be by commas")
     missing = [name for name in COLUMNS if name not in header]
     if missing:
         raise TrajectoryError(
@@ -211,7 +210,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
             f"{path}, row {row + 1}: {','.join(lines[row + 1])!r} are not all finite numbers"
         )
     if times[0] != 0 or not (np.diff(times) > 0).all():
-        # The first row whose time does not exceed the one before.
+        # First row with a time that does not increase.
         row = int(np.argmin(np.diff(times, prepend=-1.0) > 0)) if times[0] == 0 else 0
         raise TrajectoryError(
             f"{path}, row {row + 1}: t is {times[row]:g}; times must begin at 0 and increase"
@@ -227,7 +226,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
     end = float(times[-1])
 
     def held(order: int) -> Callable[[Array], Array]:
-        # After the end the platform stands: its place stays, and its derivatives are zero.
+        # After the end the platform stands still: the pose is constant, derivatives are zero.
         derivative = spline.derivative(order)
         return lambda t: (
             derivative(np.clip(t, 0.0, end))
@@ -239,10 +238,9 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
 
 
 def _check_jumps(path: Path, robot: Robot, times: Array, poses: Array, fastest: float) -> None:
-    """Raise TrajectoryError for a step between rows that is too fast for a joint.
+    """Raise TrajectoryError if a step between rows is too fast for a joint.
 
-    Poses out of reach have no joint coordinates, and are left to the caller that follows the
-    motion.
+    Poses out of reach have no joint coordinates. They are not checked here.
     """
     steps = np.diff(times)
     unit = robot.layout.joint_unit

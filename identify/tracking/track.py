@@ -1,6 +1,6 @@
 """Comparison of laws and models on the same motions.
 
-It gives the tracking error, the effort, and the shares of the error by cause.
+The results are the tracking error, the effort, and the shares of the error by cause.
 """
 
 from collections.abc import Sequence
@@ -37,20 +37,20 @@ from identify.tracking.following import Followed, by_drawing, follow
 from identify.tracking.motions import motions
 
 MODELS = ("initial", "identified", "true")
-"""Names of the models: the scenario's starting model, the identified one, and the true plant."""
+"""Names of the models: the scenario's initial guess, the identified model, and the true plant."""
 
 FIRST_RUN = 2_000_000
-"""Number of the first run, so that its random streams differ from those of all others."""
+"""Number of the first run. It differs from all other runs, and so do its random streams."""
 
 EXACT = ("sensor", "model", "latency")
-"""Parts that are made exact, one by one, to find their share of the error."""
+"""Parts that are made exact, one at a time, to determine their share of the error."""
 
 PARTS = ("position", "orientation")
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """Comparison to be run: all laws with all models, by name, on all motions."""
+    """Task of a comparison: all laws with all models, by name, on all motions."""
 
     plant: Plant
     sensor: cmmsim.Sensor
@@ -73,16 +73,16 @@ def track(
     Parameters
     ----------
     run_folder
-        Folder of a whole run, whose estimates are the identified model. With None, the robot is
-        identified first, as the scenario says.
+        Folder of a finished run. Its estimates are the identified model. With None, the robot is
+        identified first, according to the scenario.
     own
-        CSV file with poses to follow instead of the usual motions.
+        CSV file with poses to follow in place of the standard motions.
 
     Raises
     ------
     ScenarioError, TrajectoryError, RecordError
-        The scenario, a motion or the run folder does not fit. Errors of an identification are
-        raised as they are.
+        The scenario, a motion or the run folder does not fit. Errors of the identification are also
+        raised.
     """
     scenario = setup.scenario
     seed = setup.seed
@@ -90,19 +90,19 @@ def track(
     followed = motions(setup.design, seed, own)
     if run_folder and "identified" not in models:
         raise ScenarioError(
-            f"--run {run_folder} holds the identified model, and only {', '.join(models)} is "
-            "asked for"
+            f"--run {run_folder} gives the identified model, but only {', '.join(models)} is "
+            "requested"
         )
     if set(laws) == {"pid"}:
-        # This law knows no model, so that none has to be identified.
+        # This law knows no model, so no model has to be identified.
         models = ["initial"]
     known = {name: known_model(plant, name) for name in models if name != "identified"}
     if run_folder and "identified" in models:
         known["identified"] = model_of_run(plant, run_folder, scenario.robot)
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
-    # Any model will do to find out whether a law can follow a motion.
+    # The check whether a law can follow a motion works with any model.
     true = known_model(plant, "true")
-    # A law that cannot follow a motion is refused before the sensor is taught, which takes long.
+    # The check comes before the teaching of the sensor, which takes long.
     for law in laws:
         for motion in followed:
             prepared(plant, law, true, motion, unseen)
@@ -178,7 +178,10 @@ def model_of_result(found: IdentificationResult) -> KnownModel:
 
 
 def _fitted_doubt(misfit: Misfit | None) -> float:
-    """Return the doubt of an identified model: that of a guess unless it explains the record."""
+    """Return the torque uncertainty of an identified model.
+
+    If the model does not explain the record, it is the uncertainty of a guess.
+    """
     return VAGUE if misfit is None or misfit.significant else FITTED
 
 
@@ -195,8 +198,8 @@ def follow_by_images(
     """Follow a motion under a law with a model, with images in the loop.
 
     Noise and latencies depend on the seed and on the motion's number. The mean latency and the
-    delay between the exposures depend on the seed alone. The second value is what the loop saw.
-    Raises as `follow`.
+    delay between the exposures depend only on the seed. The second returned value is the
+    measurement in the loop. Raises the errors of `follow`.
     """
     delay_right_camera(sensor, plant.runs.rig, seed)
     seen = by_images(
@@ -242,7 +245,7 @@ def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dic
             if isinstance(error, LoopFailure):
                 frames += error.frame
                 saturated += error.saturated
-            # A lost run has figures up to the frame at which it was lost, and no errors.
+            # A failed run has figures up to the frame of its failure, and no errors.
             told = {
                 "failed": f"{motion.name}: {error}",
                 "frames": frames,
@@ -279,14 +282,15 @@ def _shares(
 ) -> dict[str, Any]:
     """Return the shares of the squared error by cause, for position and orientation.
 
-    A share is what goes when sensor, model or latency is made exact. The rest has no such cause.
-    The poses of these runs are drawn with the noise that the sensor stated.
+    A share is the part of the error that disappears with an exact sensor, an exact model or zero
+    latency. The rest completes the sum to one. The measured poses of these runs are drawn with the
+    noise that the sensor stated.
     """
     base = _drawn(task, law, known, covariance, None, advance)
     shares = {}
     for what in EXACT:
         exact = _drawn(task, law, known, covariance, what, advance)
-        # A component that does not move has no error, and a lost run has NaN.
+        # A component without motion has no error, and a failed run has NaN.
         with np.errstate(invalid="ignore", divide="ignore"):
             left = [
                 np.nansum(exact[part]) / np.nansum(base[part])
@@ -312,7 +316,7 @@ def _drawn(
     timing = plant.runs.timing
     squares = []
     for number, motion in enumerate(task.motions):
-        # The same noise for every cause, so that the differences are those of the cause.
+        # All causes have the same noise, so that it does not affect their differences.
         rng = np.random.default_rng(child(task.seed, TRACKED, number))
         lost = rng.random(timing.frames(motion.duration_s)) < timing.dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")

@@ -1,18 +1,18 @@
-"""Comparison of estimators on one record against one truth, which only this module shows them.
+"""Comparison of estimators on one record, by their errors against the truth.
 
-The figures of merit are those of Leboutet et al., "Inertial parameter identification in robotics: a
+The figures of merit follow Leboutet et al., "Inertial parameter identification in robotics: a
 survey" (Applied Sciences 11(9), 2021; their toolbox is BIRDy): distance of the parameters, distance
 of the output, time, iterations and model evaluations.
 
 Single parameters cannot be compared, because no motion separates them. The parameter distance is
-the RMS relative error of the base parameters that the record shows. These follow from the
-information at the true parameters, so that no estimator chooses its own examination. The few base
-parameters that are barely shown dominate this RMS, and a fit that leans on the starting guess may
-then look best. The median, that of an ordinary base parameter, therefore stands beside it. The
-gains of the joint PID have their own column.
+the RMS relative error of the base parameters that the record identifies. These are selected by the
+information at the true parameters, so that the selection does not depend on an estimator. A few
+barely identified base parameters dominate this RMS, and can favour a fit close to the initial
+guess. Therefore the median of the relative errors is also listed. The gains of the joint PID have
+their own column.
 
-The pose distance is that of the closed-loop model from the true plant on unseen trajectories, as
-the RMS of the worst axis and run.
+The pose distance is the RMS difference of the closed-loop model and the true plant on validation
+trajectories, for the worst axis and run.
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,13 +60,13 @@ class Examination:
     Attributes
     ----------
     side : ModelSide
-        Robot and loop as they are known.
+        Robot and loop as the estimator knows them.
     true : ndarray, shape (p,)
         True parameters.
     combinations : ndarray, shape (k, p)
-        Combinations of the dynamic parameters that the record shows.
+        Combinations of the dynamic parameters that the record identifies.
     unseen : tuple of (record, truth)
-        Unseen runs of the plant.
+        Validation runs of the plant.
     """
 
     side: ModelSide
@@ -75,7 +75,7 @@ class Examination:
     unseen: tuple[tuple[xr.Dataset, xr.Dataset], ...]
 
     def group_errors(self, parameters: Array) -> Array:
-        """Return the relative errors (k,) of the base parameters that the record shows."""
+        """Return the relative errors (k,) of the base parameters that the record identifies."""
         dynamic = self.side.robot.layout.dynamic
         true = self.combinations @ self.true[dynamic]
         return np.asarray(
@@ -85,8 +85,8 @@ class Examination:
     def pose_distance(self, parameters: Array) -> tuple[float, float]:
         """Return the RMS pose error of the worst axis and run, um and urad.
 
-        It is NaN if the model's loop is unstable, or if no model can have the parameters, such as a
-        gain of zero.
+        It is NaN if the model's loop is unstable, or if no model can have the parameters, for
+        example a gain of zero.
         """
         rows = []
         for record, truth in self.unseen:
@@ -106,19 +106,19 @@ class Score:
     Attributes
     ----------
     name, title, uses : str
-        Estimator, and the data that it uses.
+        Name and title of the estimator, and the data that it uses.
     group_distance, group_median : float
         RMS and median of the relative errors of the base parameters.
     gain_distance : float
         RMS of the relative errors of the gains.
     position_um, orientation_urad : float
-        RMS pose errors of the worst axis and run on unseen trajectories.
+        RMS pose errors of the worst axis and run on validation trajectories.
     seconds : float
         Duration of the estimation.
     iterations, evaluations : int
         Iterations and model evaluations.
     note : str
-        Remark, such as the reason of a failure. All figures then are NaN.
+        Remark, such as the reason of a failure. After a failure all figures are NaN.
     parameters, std : ndarray, shape (p,), optional
         Estimates and their standard deviations.
     names : tuple of str
@@ -151,11 +151,10 @@ def compare_on_run(
 ) -> tuple[list[Score], xr.Dataset]:
     """Score estimators on the record of a run.
 
-    Joint instruments are simulated from its truth, and returned with the scores. Estimators that
-    need the joint PID have its true gains.
+    Joint instruments are simulated from its truth, and their readings are returned with the scores.
+    Estimators that need the joint PID get its true gains.
 
-    Raises RecordError for files that are damaged, and EstimationError for a record whose commands
-    are torques.
+    Raises RecordError for damaged files, and EstimationError for a record with torque commands.
     """
     folder = files.folder
     record = files.experiment
@@ -163,7 +162,7 @@ def compare_on_run(
     truth = read_truth(folder.experiment)
     if takes_torques(record):
         raise EstimationError(
-            "the commands of this record are torques, and the estimators compared need joint "
+            "the commands of this record are torques, but the compared estimators need joint "
             "commands: record the excitation under excitation.law = pid or feedforward"
         )
     robot = known_geometry(load_robot(scenario.robot), scenario.geometry, folder.path).robot
@@ -210,7 +209,7 @@ def compare_on_record(
 ) -> list[Score]:
     """Score estimators on a record with its truth and the channels of its joints.
 
-    They are also judged on unseen (record, truth) pairs.
+    They are also judged on (record, truth) pairs of validation runs, `unseen`.
     """
     record, truth = experiment
     known = true_parameters(truth)
@@ -227,34 +226,37 @@ def examination(
     true: Array,
     unseen: Sequence[tuple[xr.Dataset, xr.Dataset]],
 ) -> Examination:
-    """Set up the examination from the true parameters (p,) and unseen (record, truth) pairs.
+    """Set up the examination from true parameters (p,) and (record, truth) pairs of validation.
 
-    Raises EstimationError if the record shows no base parameter, or if there is no unseen run.
+    Raises EstimationError if the record identifies no base parameter, or if there is no validation
+    run.
     """
     if not unseen:
-        raise EstimationError("no unseen trajectory to judge the estimators on")
+        raise EstimationError("there is no validation run by which to judge the estimators")
     robot = side.robot
     base = structure(robot)
     driven = evidence.problem.driven_by_commands()
-    # A fixed seed: the choice of the judged parameters must not depend on chance.
+    # With a fixed seed, the choice of the judged parameters is always the same.
     uncertainty = estimate_uncertainty(driven, true, np.random.default_rng(0))
     guess = evidence.problem.guess
     groups = group_estimates(base, guess, identifiability(guess, robot), true, uncertainty)
-    # The relative error of a difference that almost vanishes is meaningless.
+    # The relative error of an almost vanishing difference is meaningless.
     shown: NDArray[np.bool_] = groups.identifiable & (
         groups.std < IDENTIFIABLE_SHARE * np.abs(groups.estimate)
     )
     if not shown.any():
-        raise EstimationError("the record shows no base parameter: there is nothing to compare")
+        raise EstimationError(
+            "the record identifies no base parameter: there is nothing to compare"
+        )
     return Examination(side, true, base.combinations[shown], tuple(unseen))
 
 
 def compare(
     evidence: Evidence, asked: Examination, estimators: Mapping[str, Estimator], progress: Progress
 ) -> list[Score]:
-    """Score the starting guess and each estimator.
+    """Score the initial guess and each estimator.
 
-    An estimator that fails has the reason in its note.
+    The note of a failed estimator states the reason.
     """
     guess = evidence.problem.guess
     start = Estimator(START, "", lambda given: Estimate(guess.values, guess.std))
@@ -275,7 +277,7 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
     layout = asked.side.robot.layout
     pid = layout.joint_pid
     groups = asked.group_errors(found.parameters)
-    # A gain of zero is one that the drive law does not read.
+    # Gains that the drive law does not read are zero, and are left out.
     read = np.flatnonzero(asked.true[pid]) + pid.start
     gains = found.parameters[read] / asked.true[read] - 1
     distances = (
@@ -300,16 +302,16 @@ def _rms(values: Array) -> float:
 
 PANELS = (
     ("base parameters", "median error [%]", "group_median", 100.0),
-    ("unseen position", "worst RMS [um]", "position_um", 1.0),
-    ("unseen orientation", "worst RMS [urad]", "orientation_urad", 1.0),
+    ("validation position", "worst RMS [um]", "position_um", 1.0),
+    ("validation orientation", "worst RMS [urad]", "orientation_urad", 1.0),
     ("time", "seconds", "seconds", 1.0),
 )
 
 
 def estimators_figure(scores: Sequence[Score]) -> "Figure":
-    """Draw the scores on logarithmic axes, one panel a figure of merit.
+    """Draw the scores on logarithmic axes, one panel per figure of merit.
 
-    A figure that does not exist, such as that of an unstable model, has no point.
+    A missing figure, for example of an unstable model, has no point.
     """
     from matplotlib.figure import Figure  # rows of studies compare and draw nothing
 

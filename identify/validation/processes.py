@@ -1,4 +1,4 @@
-"""Work shared out among processes of this machine that never outlive their command."""
+"""Work distributed to processes of this machine. The processes end with their command."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -18,15 +18,15 @@ def mapped(
     *tasks: Iterable[Any],
     start: Callable[[], object] | None = None,
 ) -> Iterator[Iterator[R]]:
-    """Yield what a function makes of tasks, in their order, computed in new processes.
+    """Yield the results of a function for each task, in their order, computed in new processes.
 
-    The processes never hear Ctrl-C. They end at once when an exception such as Ctrl-C leaves the
-    block, and when this process is gone.
+    Ctrl-C is blocked in the processes. They end at once when an exception such as Ctrl-C leaves the
+    block, or when this process has ended.
 
     Parameters
     ----------
     count : int, optional
-        Number of processes. None means one a core.
+        Number of processes. None means one process per core.
     function : callable
         Function of one item of each of the tasks.
     *tasks : iterables
@@ -34,7 +34,7 @@ def mapped(
     start : callable, optional
         Function that each process calls first.
     """
-    resource_tracker.ensure_running()  # its start in the deaf block would unblock Ctrl-C
+    resource_tracker.ensure_running()  # a later start would unblock Ctrl-C
     others = set(active_children())
     with ProcessPoolExecutor(count, get_context("spawn"), _begin, (start,)) as pool:
         try:

@@ -1,6 +1,6 @@
-"""Validation of plant and models on trajectories that the estimator never saw (section 4.3).
+"""Validation: plant and models on trajectories that were not used for the estimate (section 4.3).
 
-It also predicts how far apart the two should be.
+The expected difference of plant and model is also predicted.
 """
 
 from __future__ import annotations
@@ -59,15 +59,16 @@ def run_unseen(
 ) -> list[Experiment]:
     """Run a plant with images in the loop on every trajectory, each for a duration.
 
-    The work is spread over `workers` processes; None means one a core. Every run has its own noise
-    stream, and all share the taught frames, so the results do not depend on the workers.
+    The work is distributed to `workers` processes. None means one process per core. Every run has
+    its own noise stream, and all runs share the taught frames, so the results do not depend on the
+    number of workers.
     """
     how = (plant, sensor, taught, duration_s, seed)
     workers = workers or cores()
     numbers = range(1, len(trajectories) + 1)
     frames = plant.runs.timing.frames(duration_s) * len(trajectories)
     with progress.stage("validate", frames) as advance:
-        # A pool would only add the start of a process.
+        # For a single process no pool is needed.
         if workers == 1 or len(trajectories) == 1:
             worker = _Worker(*how)
             return [
@@ -92,9 +93,9 @@ def model_run(
     reference: Reference,
     latencies: Array | None = None,
 ) -> Array:
-    """Return the poses (N, 6) of the model on a reference; NaN throughout if its loop is unstable.
+    """Return the poses (N, 6) of the model on a reference. All are NaN if its loop is unstable.
 
-    ``latencies`` (N,) [s] are those of its commands, by default that of the timing.
+    ``latencies`` (N,) [s] are the latencies of its commands, by default the latency of the timing.
 
     Raises dynamics.DynamicsError for parameters of another shape or outside their range, and for
     poses out of reach.
@@ -106,10 +107,11 @@ def model_run(
 
 
 def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> Array:
-    """Return the poses (N, 6) of the model on the motion of a record; NaN if it is unstable.
+    """Return the poses (N, 6) of the model on the motion of a record.
 
-    The latencies are those that the record logs. The model runs in the servo's loop if that made
-    the record, and under the logged commands if another law did.
+    All poses are NaN if the model is unstable. The latencies are taken from the record. If the
+    record was made under the servo, the model simulates the servo. Otherwise the logged commands
+    drive the model.
 
     Raises the errors of `model_run`.
     """
@@ -125,9 +127,9 @@ def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> A
 
 
 REPETITIONS = 4
-"""Number of repeated experiments a motion.
+"""Number of repeated experiments per motion.
 
-With hundreds of frames each they give the noise's share of a deviation to 5 %.
+With hundreds of frames each, they determine the effect of noise to 5 %.
 """
 
 
@@ -135,17 +137,17 @@ With hundreds of frames each they give the noise's share of a deviation to 5 %.
 class PosePrediction:
     """Predicted poses of the plant with their covariance.
 
-    Three causes separate the plant from the model:
+    The poses of plant and model differ for three reasons:
 
     - The parameters are uncertain. Their covariance C acts through the exact sensitivities S of
       the model's poses as S C S^T.
-    - The sensor's noise moves the plant through the servo, which no model can foresee. Its
-      covariance is sampled by repeated experiments on the identified model, and is taken as
-      constant along the motion.
-    - All measured poses have errors in common, as far as the record states them, and so does the
-      geometry. The servo takes the platform to where such an error does not show, with the same
-      draw all along the motion. Poses and covariance contain what the record of the
-      identification reveals of that draw.
+    - The sensor's noise moves the plant through the servo, which no model can predict. The
+      covariance of this motion is sampled by repeated experiments on the identified model, and is
+      assumed constant along the motion.
+    - All measured poses have common errors that the record states, and the geometry has errors. The
+      servo compensates such an error in the measured pose, and thereby shifts the platform. The
+      error is constant along the motion. Poses and covariance contain its estimate from the record
+      of the identification.
 
     Attributes
     ----------
@@ -154,10 +156,11 @@ class PosePrediction:
     poses : ndarray, shape (N, 6)
         Predicted poses, m and rad.
     covariance : ndarray, shape (N, 6, 6)
-        Covariance of the plant's true poses about them; zero where the chart forbids motion.
+        Covariance of the plant's true poses about the predicted poses. It is zero along directions
+        in which the platform cannot move.
     slopes : ndarray, shape (N, 6, p), optional
-        Sensitivities of the poses. They exist if the poses depend on reference and latencies
-        alone, such as where no frame is lost and poses have no errors in common.
+        Sensitivities of the poses. They are given only if no frame is lost, poses have no common
+        errors, the platform carries no load, and the servo drives the model.
     """
 
     chart: Chart
@@ -173,9 +176,9 @@ class PosePrediction:
     def normalised_squared_error(self, true: Array) -> float:
         """Return the mean over the frames of e^T P^-1 e / m.
 
-        The error e of the true poses (N, 6) is taken in the m coordinates of the platform. The
-        figure is near one if the covariance P is right. Errors of parameters last for the whole
-        motion, so the figure of a single run spreads widely about one.
+        The error e of the true poses (N, 6) is expressed in the m coordinates of the platform. The
+        result is near one if the covariance P is right. Errors of parameters last for the whole
+        motion, so the result of a single run scatters widely about one.
         """
         free = self.chart.basis
         errors = (true - self.poses) @ free
@@ -192,8 +195,8 @@ def predict_poses(
 ) -> PosePrediction:
     """Predict a run with estimated parameters.
 
-    Of the run, only the reference, the sensor's covariance and the lost frames count, not the
-    measured poses.
+    The prediction uses the reference, the sensor's covariance and the lost frames of the run, but
+    not its measured poses.
 
     Parameters
     ----------
@@ -202,12 +205,12 @@ def predict_poses(
     parameters : ndarray, shape (p,)
         Estimates.
     covariance : ndarray, shape (p, p) or (p + k, p + k)
-        Their covariance, followed by that of the learned errors.
+        Covariance of the estimates, or of the estimates and the learned errors.
     rng : numpy.random.Generator
         Source of the noise of the repeated experiments.
     learned : mapping, optional
-        Estimates, by name, of k errors that the poses of this run share with those of the record.
-        If the names are not those of the run, its own statement of these errors is used.
+        Estimates, by name, of k common errors of this run and of the record of the identification.
+        If the names differ from the errors of the run, the prior of the run's errors is used.
 
     Raises
     ------
@@ -238,15 +241,15 @@ def predict_poses(
 def _known_in_common(
     run: LoopModel, covariance: Array, parameters: int, learned: Mapping[str, float]
 ) -> tuple[Array, Array, Array]:
-    """Knowledge of the errors that a run's poses have in common.
+    """Return the knowledge of the common errors of a run's poses.
 
-    Returns the most likely values (k,) of the independent numbers that make up these errors, the
-    matrix (k, k) from known numbers to them, and the covariance (p + k, p + k) of parameters and
-    known numbers.
+    The first array (k,) holds the most likely values of the independent numbers of these errors.
+    The second is the matrix (k, k) from known numbers to these numbers. The third is the covariance
+    (p + k, p + k) of parameters and known numbers.
     """
     names = run.common.all_names
     if names and tuple(learned) == names:
-        # The factor has no inverse where the covariance lacks full rank.
+        # The factor has no inverse if the covariance lacks full rank.
         root = np.asarray(np.linalg.pinv(run.common.whole_factor))
         return root @ np.array([*learned.values()]), root, covariance
     each = np.eye(len(names))
@@ -265,12 +268,12 @@ def predicted_runs(
 ) -> list[PosePrediction]:
     """Predict the plant on the references of records from the identified model.
 
-    The parameters (p,) have covariance (p, p). ``learned`` is as in `predict_poses`. A prediction
-    is NaN throughout if the loop is unstable, or if too few frames were measured to know the
+    The parameters (p,) have covariance (p, p). For ``learned`` see `predict_poses`. All poses of a
+    prediction are NaN if the loop is unstable, or if too few frames were measured to determine the
     sensor's noise.
 
-    Raises RecordError or EstimationError for a record that is damaged, or is of another robot,
-    timing or servo. Raises dynamics.DynamicsError for parameters that no model can have.
+    Raises RecordError or EstimationError for a record that is damaged, or of another robot, timing
+    or servo. Raises dynamics.DynamicsError for parameters that no model can have.
     """
     groups = structure(side.robot).rigid_groups
     predictions = []
@@ -292,7 +295,7 @@ def predicted_runs(
 
 
 class _Worker:
-    """Plant and sensor of one process, which keeps the renderer."""
+    """Plant and sensor of one process. The renderer is reused for all runs."""
 
     def __init__(
         self, plant: Plant, sensor: SensorPlan, taught: cmmsim.Taught, duration_s: float, seed: int
@@ -320,7 +323,7 @@ def _start_worker(
     duration_s: float,
     seed: int,
 ) -> None:
-    # A process of a pool can only keep its state in the module.
+    # A process of a pool can store its state only in module variables.
     global _worker, _counter
     _worker = _Worker(plant, sensor, taught, duration_s, seed)
     _counter = counter
@@ -336,7 +339,7 @@ def _run_in_worker(number: int, trajectory: FourierTrajectory) -> Experiment:
 
 @contextmanager
 def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
-    """Pass the count of the workers on to the progress bar until the context ends."""
+    """Update the progress bar with the count of the workers until the context ends."""
     done = 0
     ended = threading.Event()
 
@@ -360,12 +363,12 @@ def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
 def errors_of_model(parameters: ArrayLike, plant: Plant, design: Design, seed: int) -> Array:
     """Return the pose errors (runs, N, 6) [m, rad] of a model against the plant.
 
-    Both run on the unseen trajectories of a seed, each with its own friction law and steps. An
-    ideal sensor closes both loops, so the errors come only from the parameters (p,) and from what
-    the model leaves out. They are NaN if, and only if, the model's loop is unstable.
+    Both run on the validation trajectories of a seed, each with its own friction law and steps. An
+    ideal sensor closes both loops, so the errors are caused only by the parameters (p,) and by
+    effects that the model lacks. They are NaN if, and only if, the model's loop is unstable.
 
     Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
-    range. Raises TrajectoryError if no unseen trajectory keeps the robot's limits.
+    range. Raises TrajectoryError if no validation trajectory is within the robot's limits.
     """
     robot = plant.nominal
     settings = plant.loop.side.settings

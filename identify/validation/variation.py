@@ -1,15 +1,16 @@
-"""Variation of the estimates from one trajectory to the next (table 5 of the paper).
+"""Variation of the estimates from trajectory to trajectory (table 5 of the paper).
 
-The robot is identified from each of several runs alone. The paper gives no formula for its
+The robot is identified from each of several runs separately. The paper gives no formula for its
 "variation measure". Here it is the standard deviation of a parameter's estimates in per cent of
-their mean, over the parameters that every run identifies. Beside it stands the value that the runs'
-own intervals let one expect. As in the paper, all runs share one weighing of the platform and one
-teaching of the sensor, so errors of these do not vary.
+their mean, for the parameters that every run identifies. It is compared with the value that is
+expected from the standard deviations of the runs. As in the paper, all runs share one weighing of
+the platform and one teaching of the sensor, so their errors do not contribute.
 
-The masses of the links of `rss6` vary most. Accelerations show them. By the information of designed
-runs at the true parameters, without noise in the servo, the worst one is known to 4.6, 3.5 and 3.1
-% from 20, 40 and 60 s at the paper's fundamental of 0.1 Hz. From 20 s at 0.3 Hz, which uses the
-whole velocity limit of 2 rad/s, it is known to 2.4 %. Faster is worth more than longer.
+The masses of the links of `rss6` vary most, because they act only through accelerations. By the
+information of designed runs at the true parameters, without noise in the servo, the worst mass is
+known to 4.6, 3.5 and 3.1 % from 20, 40 and 60 s at the paper's fundamental of 0.1 Hz. From 20 s at
+0.3 Hz, with the whole velocity limit of 2 rad/s, it is known to 2.4 %. A faster motion is thus
+better than a longer motion.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FEWEST_RUNS = 3
-"""Least number of runs of which a standard deviation is meaningful."""
+"""Smallest number of runs for a meaningful standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,9 @@ class Variation:
     variation : ndarray, shape (p,)
         Standard deviations of the estimates over the size of their means.
     expected : ndarray, shape (p,)
-        The same, as the runs' own standard deviations predict it.
+        Expected variation according to the standard deviations of the runs.
     identified : ndarray of bool, shape (p,)
-        Parameters that every run identifies.
+        True for parameters that every run identifies.
     runs : int
         Number of runs.
     """
@@ -72,7 +73,7 @@ class Variation:
         )
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """Return a table with one row a parameter: mean, variation, expected, identified."""
+        """Return a table with one row per parameter: mean, variation, expected, identified."""
         import pandas as pd
 
         columns = {
@@ -126,7 +127,7 @@ def identify_each(
     identify: Callable[[xr.Dataset], IdentificationResult],
     progress: Progress,
 ) -> list[IdentificationResult]:
-    """Identify from each record alone.
+    """Identify from each record separately.
 
     Raises the errors of `identify`, and EstimationError if there are too few records.
     """

@@ -1,4 +1,4 @@
 """Checks of a robot without a sensor, and of a sensor without a robot.
 
-A robot's model is compared with MuJoCo, and its workspace is mapped.
+They include the comparison of a robot's model with MuJoCo, and maps of its workspace.
 """

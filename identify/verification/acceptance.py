@@ -67,7 +67,8 @@ class Standard:
     key
         Name in ``acceptance.json``.
     steps
-        Function that returns the number of steps in a volume, and refuses one without room.
+        Function that returns the number of steps in a volume. It refuses a volume without room for
+        the test.
     test
         Function that runs the test.
     figures
@@ -89,7 +90,7 @@ def prepare(
     standard: str,
     limit_um: float,
 ) -> AcceptanceRun:
-    """Prepare a run, and check everything that can be wrong before anything is drawn.
+    """Prepare a run, and check all arguments before any image is drawn.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def prepare(
     renderer
         Renderer of the images, or None for the sensor's default.
     volume
-        Sides of the measuring volume, see `parse_volume`, or None for the largest that is seen.
+        Sides of the measuring volume, see `parse_volume`, or None for the largest visible cube.
     standard
         Name of a test, or ``all``.
     limit_um
@@ -110,7 +111,7 @@ def prepare(
     ------
     CmmError
         The sensor, renderer or standard is unknown, the limit is not a positive number, or the
-        volume is not seen, breaks a rule or lacks room for the bar.
+        volume is not visible, violates a rule of the standard or has no room for the bar.
     """
     if not (math.isfinite(limit_um) and limit_um > 0.0):
         raise AcceptanceError(
@@ -188,7 +189,7 @@ def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
     largest = test.largest
     errors = 1e6 * test.errors
     single = 1e6 * test.single_errors
-    # The lengths of a line share its first sticker, so that only the lines are independent.
+    # All lengths of a line begin at the same sticker, so only different lines are independent.
     line_means = 1e6 * np.array(
         [np.mean([length.error for length in test.of_line(line.name)]) for line in test.lines]
     )
@@ -225,7 +226,7 @@ def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
 
 
 def _bar(test: BarTest, run: AcceptanceRun) -> dict[str, Any]:
-    # A random stream of its own, so that intervals do not depend on what else was drawn.
+    # A separate random stream makes the intervals independent of other draws.
     rng = mixed_generator(RESAMPLING, run.under_test.seed)
     return {
         "bar_length_mm": 1e3 * LENGTH,

@@ -1,6 +1,6 @@
 """Report of acceptance tests for ``acceptance.md``.
 
-Its tables hold the results beside published figures. A text says what may be compared.
+Its tables show the results beside published figures. A text explains which figures are comparable.
 """
 
 from typing import Any
@@ -18,18 +18,17 @@ MAGNITUDES = (
     ("distance_um", "distance of the ends [um]"),
 )
 COMPARABLE = """\
-What is comparable: the NIST figures are of the same kind as our bar test, the relative error of
-markers at both ends of a rigid bar. The length test follows the rules of the guideline, so its
-errors mean what such a test's errors mean.
+Comparable figures: the NIST figures and our bar test both state the relative error of markers at
+the two ends of a rigid bar. The length test follows the rules of the guideline, so its errors have
+the same meaning as in such a test.
 
-What is not: the published figures belong to real instruments, each in its own volume and test, with
-warm-up, air, real lenses, calibration errors and real targets. Ours are of a simulated sensor whose
-camera figures were chosen, which knows its own calibration exactly, and whose artefacts are
-certified without error, in the volume stated above. A figure published as ± is to be held against
-our largest error, not against an RMS. The position error of our bar contains the orientation error
-of its first end times the bar's length; its distance error does not. Our latency is what the sensor
-file asks for: the test shows that the reports keep it, and says nothing about how fast an
-instrument is.
+Differences: the published figures are of real instruments, each in its own volume and test, with
+warm-up, air, real lenses, calibration errors and real targets. Our figures are of a simulated
+sensor with chosen camera properties, an exactly known calibration and artefacts without error, in
+the volume stated above. A figure published as ± must be compared with our largest error, not with
+an RMS. The position error of our bar contains the orientation error of its first end times the
+length of the bar; its distance error does not. Our latency is set in the sensor file: the test
+shows that the reports have this latency, and does not measure the speed of an instrument.
 """
 
 
@@ -54,10 +53,7 @@ def acceptance_markdown(entry: dict[str, Any]) -> str:
 
 
 def length_table(test: dict[str, Any]) -> Table:
-    """Return the lengths of the seven lines and their errors.
-
-    Each line has its lengths, the longest as a share of the space diagonal, and its errors.
-    """
+    """Return a table of the seven measuring lines with their lengths and errors."""
     rows = []
     for line in test["lines"]:
         errors = [length["error_um"] for length in line["lengths"]]
@@ -85,7 +81,7 @@ def length_table(test: dict[str, Any]) -> Table:
 def bar_table(test: dict[str, Any]) -> Table:
     """Return the statistics of the relative pose error of the bar's ends.
 
-    The bar stands or moves. Intervals are those of 95 %.
+    The rows are for the standing and the moving bar. Intervals are 95 % intervals.
     """
     rows = []
     for state in ("standing", "moving"):
@@ -136,7 +132,7 @@ def latency_table(test: dict[str, Any]) -> Table:
 
 
 def published_table(entry: dict[str, Any]) -> Table:
-    """Return our figures above the published ones of the same quantity."""
+    """Return a table with our figures above the published figures of the same quantity."""
     ours = _our_figures(entry)
     rows = []
     # A dictionary keeps the order of the published figures.

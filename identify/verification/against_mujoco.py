@@ -1,13 +1,13 @@
 """Comparison of this model with MuJoCo, as in the paper's model validation (section 4.1).
 
-The control loop is that of the paper's figure 7, and the result is drawn like its figure 8. On both
-engines, the same joint PID (eq. 31) follows the joint coordinates of the same exciting trajectory
-(eq. 37). The torques come from each engine's own motion. This model runs in the closed loop of the
-experiments, driven by commands. MuJoCo runs `mj_step` on the exported MJCF.
+The control loop is the loop of the paper's figure 7, and the result is drawn like its figure 8. In
+both engines, the same joint PID (eq. 31) follows the joint coordinates of the same exciting
+trajectory (eq. 37). In each engine the torques follow from its own motion. This model runs in the
+closed loop of the experiments, driven by commands. MuJoCo runs `mj_step` on the exported MJCF.
 
 MuJoCo integrates by RK4, with the stiffness and damping of the PID inside its integrator, so that
-its discretisation error stays far below the differences of interest. Only the integral part is
-constant over a step of 0.25 ms, at its value in the middle of the step.
+its discretisation error is far below the differences of interest. Only the integral part is
+constant over a step of 0.25 ms, with its value in the middle of the step.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ from identify.trajectory import FourierTrajectory
 
 PARAMETER_SET = "initial"
 DURATION_S = 10.0
-# Differences from the start of the run have decayed by then.
+# Time after which transients from the start of the run have decayed.
 STEADY_FROM_S = 2.0
 COMMAND_RATE_HZ = 200.0
 STEPS_PER_COMMAND = 4
@@ -57,9 +57,9 @@ PAPER = {
 class EngineRuns:
     """Motion of both engines over time (N,) [s].
 
-    Poses (N, 6) [m, rad] are those of this model, of MuJoCo and of the reference. Actuator torques
-    or forces (N, n) [N m, N] are those of this model and of MuJoCo. ``closure`` (N,) [m] is the
-    closure error of MuJoCo's loops, and ``spin`` (N,) [rad/s] the spin of its links.
+    Poses (N, 6) [m, rad] are given for this model, MuJoCo and the reference. Actuator torques or
+    forces (N, n) [N m, N] are given for this model and MuJoCo. ``closure`` (N,) [m] is the closure
+    error of MuJoCo's loops, and ``spin`` (N,) [rad/s] the spin of its links.
     """
 
     time: Array
@@ -81,8 +81,7 @@ class EngineRuns:
 def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
     """Run both engines with the parameter set `initial`, without its friction.
 
-    The paper's table 1 has no friction either. Raises DynamicsError or TrajectoryError as
-    `compare_engines`.
+    The paper's table 1 has no friction either. Raises the errors of `compare_engines`.
     """
     values = robot.parameter_sets[PARAMETER_SET].vector.copy()
     values[robot.layout.coulomb] = 0.0
@@ -99,7 +98,7 @@ def compare_engines(
 ) -> EngineRuns:
     """Run both engines on the exciting trajectory, each with its own parameters.
 
-    These are the dynamic parameters (p,) and the gains lp, li and ld.
+    The parameters are the dynamic parameters and the gains lp, li and ld.
 
     Raises
     ------
@@ -108,7 +107,7 @@ def compare_engines(
     TrajectoryError
         No exciting trajectory of this amplitude stays inside the robot's travel.
     """
-    # First of all: MuJoCo is optional, and if it is missing, nothing has to run.
+    # MuJoCo is optional. If it is missing, this raises an error before anything runs.
     import_mujoco()
     progress = progress or SilentProgress()
     time = np.arange(round(duration_s * COMMAND_RATE_HZ) + 1) / COMMAND_RATE_HZ
@@ -118,7 +117,7 @@ def compare_engines(
         trajectory = exciting_trajectory(robot)
         reference = closed_loop.Reference(trajectory.pose(time), trajectory.pose_rate(time))
         commands = robot.inverse_kinematics(reference.poses)
-        # Without gains, the servo leaves the joints to the commands.
+        # With zero gains of the servo, only the commands drive the joints.
         settings = closed_loop.LoopSettings(
             closed_loop.ServoGains(0.0, 0.0, 0.0),
             closed_loop.FrameTiming(COMMAND_RATE_HZ, hold="linear"),
@@ -128,7 +127,7 @@ def compare_engines(
             robot, model_parameters, reference, settings, commands
         )
         advance()
-    # Inertias of table 1 break the triangle inequality in ways that do not change the motion.
+    # Inertias of table 1 violate the triangle inequality, without an effect on the motion.
     chosen = mujoco_parameters[robot.layout.dynamic]
     joints = robot.layout.joints
     mjcf = mjcf_text(robot, chosen, allow_unphysical_inertia=True, solver=SOLVER)
@@ -159,7 +158,7 @@ def compare_engines(
 def exciting_trajectory(robot: Robot) -> FourierTrajectory:
     """Return the first random trajectory of eq. 37 that stays inside the travel.
 
-    It is always the same for a robot.
+    It is always the same for the same robot.
     """
     period_s = 1 / EXCITATION.fundamental_hz
     return admissible_trajectories(robot, EXCITATION, period_s, 1, np.random.SeedSequence(0))[0]
@@ -178,10 +177,10 @@ def _mujoco_rows(
     hold.
     """
     lp, li, ld = parameters[robot.layout.joint_pid]
-    # A whole number of steps a command.
+    # The number of steps per command is an integer.
     steps = round(1 / (COMMAND_RATE_HZ * engine.timestep))
     dt = 1 / (COMMAND_RATE_HZ * steps)
-    # The run starts at rest: the integral part holds the weight.
+    # The run starts at rest, where the integral part holds the weight.
     integral = robot.static_torque(reference.poses[0], parameters[robot.layout.dynamic]) / li
     engine.put(reference.poses[0], np.zeros(6))
     engine.feed_back(lp, ld)
@@ -191,7 +190,7 @@ def _mujoco_rows(
         torque = lp * (before - engine.joints) + ld * (rate - engine.joint_rates) + li * integral
         yield np.concatenate([engine.pose, torque, [engine.closure_error, engine.link_spin]])
         for step in range(steps):
-            # MuJoCo subtracts lp * joints and ld * rates itself, so that only the rest is applied.
+            # MuJoCo subtracts lp * joints and ld * rates itself, so only the rest is applied.
             wanted = before + rate * (step + 0.5) * dt
             start = engine.joints
             engine.step(lp * wanted + ld * rate + li * (integral + dt / 2 * (wanted - start)))
@@ -203,11 +202,11 @@ def _mujoco_rows(
 class Verdict:
     """Largest differences between the engines.
 
-    The "max" ones are those of the whole run, the "steady" ones those from STEADY_FROM_S on. They
-    are given as distances of the platform [µm], lengths of the vector of Euler angle differences
-    [µrad] and differences of actuator torque or force [N m, N]. Closure error [µm] and link spin
-    [rad/s] are MuJoCo's. The tracking errors [µm, µrad] are those of this model against its
-    reference, which the PID leaves.
+    Figures with "max" are for the whole run, and figures with "steady" from STEADY_FROM_S on. They
+    are distances of the platform [µm], norms of the vector of Euler angle differences [µrad] and
+    differences of actuator torque or force [N m, N]. Closure error [µm] and link spin [rad/s] are
+    those of MuJoCo. The tracking errors [µm, µrad] are the differences of this model from its
+    reference.
     """
 
     position_max_um: float

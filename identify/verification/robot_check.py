@@ -1,8 +1,8 @@
-"""Check of a robot before it is built or run: each question with its number and its limit.
+"""Check of a robot before it is built or run. Each finding has a value and a limit.
 
-Over the travel, random joint coordinates within the travel limit are followed from home to the pose
-that the robot has with them. The loop is judged at home, by its linear map from frame to frame,
-without dry friction.
+For checks over the travel, the pose for random joint coordinates within the travel limit is found
+by following the joints from home. The loop is checked at home, by its linear map from frame to
+frame, without dry friction.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,15 +31,15 @@ SAMPLES = 2000
 """Number of random joint coordinates over the travel."""
 
 UNFELT = 1e-9
-"""Largest relative change of an acceleration that counts as none."""
+"""Largest relative change of an acceleration that counts as zero."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Answer to one question.
+    """Result of one check.
 
-    ``ok`` is true if the value is within its limit, or if there is no limit. ``leg`` is the leg
-    1..n that it concerns, or None if it concerns no single one. ``text`` is a sentence.
+    ``ok`` is true if the value is within its limit, or if there is no limit. ``leg`` is the number
+    1..n of the leg concerned, or None if no single leg is concerned. ``text`` is a sentence.
     """
 
     check: str
@@ -51,26 +51,26 @@ class Finding:
     text: str
 
     def entry(self) -> dict[str, Any]:
-        """Return the finding as it stands in JSON."""
+        """Return the finding as a JSON entry."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Loop in which a robot is checked, and sensor in front of which it stands.
+    """Loop and sensor with which a robot is checked.
 
     Attributes
     ----------
     settings : LoopSettings
         Servo, timing, friction and drives.
     control : Control
-        Bandwidth and damping of the servo that is to be designed, if one is asked for.
+        Requested bandwidth and damping for the design of the servo, if any.
     feedback : Feedback
-        Gains that are asked of computed_torque.
+        Bandwidth and damping of computed_torque.
     limits : Excitation
-        Limits of leverage and condition.
+        Limits of leverage and condition number.
     sensor, sensor_file : str and SensorFile
-        Sensor as its user names it, and its file.
+        Name of the sensor for messages, and its file.
     """
 
     settings: closed_loop.LoopSettings
@@ -85,7 +85,7 @@ def check_robot(
     robot: Robot, parameters: Array, around: Surroundings, progress: Progress | None = None
 ) -> list[Finding]:
     """Return all findings about a robot with all its parameters."""
-    # Each question is a function, so that progress is shown between them.
+    # Each check is a function, so that progress can be shown between checks.
     questions: list[Callable[[], Iterator[Finding]]] = [
         lambda: _freedoms(robot),
         lambda: _travel(robot, around.limits),
@@ -113,7 +113,7 @@ def _freedoms(robot: Robot) -> Iterator[Finding]:
 
 
 def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
-    """Judge the robot at home and over the travel, as `workspace.check_motion` does."""
+    """Check the robot at home and over the travel, with the limits of `workspace.check_motion`."""
     unit = robot.layout.joint_unit
     limit = robot.travel_limit
     at_home = workspace.measure(robot, robot.home_pose)
@@ -151,7 +151,7 @@ def _extremes(
     condition = float(np.max(measures.platform_condition))
     text = (
         f"largest condition of the platform side (J_a2) {where} is {condition:.3g}; at "
-        "infinity it moves unheld"
+        "infinity the platform can move with fixed joints"
     )
     yield Finding(f"condition {where}", condition <= most, condition, most, "1", None, text)
 
@@ -165,10 +165,11 @@ def _assembly(robot: Robot) -> Iterator[Finding]:
     modes = robot.assembly_modes()
     home = robot.home_pose
     text = (
-        f"{len(modes)} assembly modes found with the joints as at home, no leg folded the other way"
+        f"{len(modes)} assembly modes found with the joint coordinates of home, without folding a "
+        "leg the other way"
     )
     if len(modes) > 1:
-        # The first mode is home itself, and the others follow by their distance from it.
+        # The first mode is home. The other modes are sorted by their distance from home.
         turn = Rotation.from_euler("XYZ", home[3:]).inv() * Rotation.from_euler("XYZ", modes[1, 3:])
         text += (
             f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and "
@@ -201,9 +202,9 @@ def _visible(robot: Robot) -> Iterator[Finding]:
 
 
 def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
-    """Judge the inertias.
+    """Check the inertias.
 
-    Those that no rigid body can have are a fault only if possible ones would change the motion.
+    Impossible inertias are a fault only if their correction would change the motion.
     """
     inertias = physical_inertias(robot.layout, parameters, allow_changes=True)
     effects = {}
@@ -214,7 +215,7 @@ def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
     text = "all bodies can exist"
     leg = None
     if inertias.changes:
-        # The body whose correction changes accelerations most names the leg of the finding.
+        # The finding names the leg of the body with the largest effect of its correction.
         worst = robot.layout.bodies.index(max(effects, key=effects.__getitem__))
         leg = next(
             (leg + 1 for leg, bodies in enumerate(robot.layout.of_leg) if worst in bodies), None
@@ -222,9 +223,9 @@ def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
         felt = (
             f"accelerations change by up to {100 * largest:.2g} %"
             if largest > UNFELT
-            else "no motion feels it"
+            else "no motion changes"
         )
-        text = f"no rigid body has these, and {felt}: {'; '.join(grouped(inertias.changes))}"
+        text = f"no rigid body has these; corrected, {felt}: {'; '.join(grouped(inertias.changes))}"
     yield Finding("inertias", largest <= UNFELT, largest, UNFELT, "1", leg, text)
 
 
@@ -249,17 +250,17 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     gains = settings.servo
     text = (
         f"the servo's gains, kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = "
-        f"{gains.ki:.4g} 1/s, may be {factor:.3g} times as large until the loop is lost"
+        f"{gains.ki:.4g} 1/s, can be {factor:.3g} times as large until the loop is unstable"
     )
     if not factor > 0:
-        text = "the loop is lost with any gains of the servo"
+        text = "the loop is unstable with any gains of the servo"
     elif factor < 1:
-        text = text.replace("may be", "must be")
-        text = text.replace(" until the loop is lost", " for the loop to hold")
+        text = text.replace("can be", "must be")
+        text = text.replace(" until the loop is unstable", " for a stable loop")
     yield Finding("gain margin", factor > 1, factor, 1.0, "1", None, text)
     rate = stability.lowest_frame_rate(*arguments)
     text = (
-        f"the loop holds from {rate:.3g} Hz on with this latency"
+        f"the loop is stable from {rate:.3g} Hz on with this latency"
         if rate > 0
         else "no frame rate makes it stable"
     )
@@ -269,9 +270,9 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
 
 
 def _designed(robot: Robot, parameters: Array, around: Surroundings) -> Iterator[Finding]:
-    """Judge the gains of both loops.
+    """Check the gains of the servo and of computed_torque.
 
-    Gains of the servo are also designed, if a bandwidth and a damping are asked for.
+    If a bandwidth and a damping are requested, gains of the servo are also designed.
     """
     settings = around.settings
     home = robot.home_pose
@@ -293,7 +294,7 @@ def _designed(robot: Robot, parameters: Array, around: Surroundings) -> Iterator
     bandwidth: float | None = found.bandwidth
     if found.radius >= 1:
         bandwidth = None
-        text = "a loop that is lost has no bandwidth"
+        text = "an unstable loop has no bandwidth"
     yield Finding("bandwidth", found.radius < 1, bandwidth, None, "rad/s", None, text)
     wanted = control.servo_bandwidth_rad_s
     if wanted is not None:
@@ -303,7 +304,7 @@ def _designed(robot: Robot, parameters: Array, around: Surroundings) -> Iterator
             text = (
                 f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give a "
                 f"bandwidth of {made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, "
-                f"{made.gain_margin:.3g} times these gains lose the loop"
+                f"{made.gain_margin:.3g} times these gains make the loop unstable"
             )
             yield Finding(
                 "servo by design", made.radius < 1, made.gain_margin, 1.0, "1", None, text
@@ -318,19 +319,19 @@ def _designed(robot: Robot, parameters: Array, around: Surroundings) -> Iterator
         "is stable below 1"
     )
     if torques.radius < 1:
-        text += f"; {torques.gain_margin:.3g} times these gains lose it"
+        text += f"; {torques.gain_margin:.3g} times these gains make it unstable"
     yield Finding("computed torque", torques.radius < 1, torques.radius, 1.0, "1", None, text)
     known = limit if limit > 0 else None
     most = f"up to {limit:.3g} rad/s" if limit > 0 else "with no bandwidth"
     text = f"computed_torque is stable {most}"
-    # Commands come once a frame, so that no bandwidth above half the frame rate is searched.
+    # Commands come once per frame, so bandwidths above half the frame rate are not searched.
     if limit == nyquist:
-        text = f"computed_torque may have up to {nyquist:.3g} rad/s, half the frame rate"
+        text = f"computed_torque is stable up to {nyquist:.3g} rad/s, half the frame rate"
     yield Finding("torque bandwidth", w <= limit, w, known, "rad/s", None, text)
 
 
 def _seen(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
-    """Judge whether the platform that a sensor sees is the robot's."""
+    """Check whether the platform in a sensor file is the robot's platform."""
     outside, away = platform_distances(robot, file)
     leg = int(np.argmax(outside))
     limit = OFF_PLATFORM_M

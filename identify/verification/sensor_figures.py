@@ -26,20 +26,20 @@ from cmmsim.geometry.pose import apply, invert
 from identify.reporting.figures import panel_grid
 from identify.verification.acceptance import AcceptanceRun
 
-# Two corners of a box share an edge if they differ in one coordinate.
+# Two corners of a box are connected by an edge if they differ in one coordinate.
 EDGES = [(a, b) for a in range(8) for b in range(a) if np.sum(CORNERS[a] != CORNERS[b]) == 1]
 
 ARROW_SHARE = 0.06
 """Length of an arrow for a residual of three sigma, as a share of the image width."""
 
 GRID = 25
-"""Number of points along the width of the image at which distortion is drawn."""
+"""Number of points along the width of the image in drawings of the distortion."""
 
 
 def acceptance_figures(run: AcceptanceRun) -> dict[str, Figure]:
     """Return the figures of the tests that were run, by name.
 
-    There are two of the lengths, two of the bar and one of the latency.
+    There are two figures of the lengths, two of the bar and one of the latency.
     """
     figures = {}
     if length := run.found.get("vdi"):
@@ -110,7 +110,7 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
         true = np.array([1e3 * length.true for length in lengths])
         single = 1e6 * np.array([length.measured - length.true for length in lengths])
         shown = axes.plot(true, [1e6 * length.error for length in lengths], "o-", label=line.name)
-        # Shifted by up to a few mm, so that the dots of the seven lines do not hide each other.
+        # Dots are shifted by a few mm, so that the seven lines do not hide each other.
         axes.plot(
             true[:, None] + 1.5 * (number - 3),
             single,
@@ -134,7 +134,7 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
 def bar_figure(test: BarTest) -> Figure:
     """Draw the relative pose error of the bar over time, and its distribution.
 
-    Published limits stand beside the distribution.
+    Published limits are drawn with the distribution.
     """
     figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(2, 2, width_ratios=(3, 2))
@@ -236,10 +236,7 @@ def residual_figure(found: Calibration) -> Figure:
 
 
 def coverage_figure(found: Calibration) -> Figure:
-    """Draw the board points of all used images.
-
-    Where there are none, the distortion is extrapolated.
-    """
+    """Draw the board points of all used images. Without points the distortion is extrapolated."""
     figure, panels = _image_panels(found, "board points of all used images")
     for k, axes in enumerate(panels):
         seen = found.sightings[k]
@@ -251,7 +248,7 @@ def coverage_figure(found: Calibration) -> Figure:
 
 
 def distortion_figure(found: Calibration) -> Figure:
-    """Draw how far the lenses move each point of the image, in px.
+    """Draw the shift of each image point by the lens distortion, in px.
 
     White crosses are the principal points.
     """
@@ -261,7 +258,7 @@ def distortion_figure(found: Calibration) -> Figure:
         x, y = np.meshgrid(np.arange(0.0, camera.width, step), np.arange(0.0, camera.height, step))
         pixels = np.stack([x, y], axis=-1)
         ideal, known = camera.undistort(pixels)
-        # Far from the centre, a distortion may have no inverse.
+        # Far from the centre, the distortion can have no inverse.
         moved = np.where(known[..., None], pixels - ideal, np.nan)
         length = np.linalg.norm(moved, axis=-1)
         shown = axes.pcolormesh(x, y, length, shading="nearest", cmap="viridis")
@@ -288,7 +285,7 @@ def _image_panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
 def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
     """Draw the RMS error of the detectors against the noise, in logarithmic scales.
 
-    Each radius, tilt and point spread has a panel. That of the working point is the first.
+    There is one panel for each radius, tilt and point spread. The working point comes first.
     """
     views = list(dict.fromkeys(_view(score.condition) for score in scores))
     figure, panels = panel_grid(len(views), 4.5, 3.2, above=0.8, sharey=True)
@@ -320,7 +317,7 @@ def _condition_panel(axes: Axes, scores: Sequence[Score]) -> None:
     )
     for name in dict.fromkeys(score.detector for score in scores):
         mine = sorted((s for s in scores if s.detector == name), key=lambda s: s.condition.noise)
-        # The error is infinite where every sticker was lost, which is not drawn.
+        # The error is infinite if every sticker was lost. Such points are not drawn.
         error = np.array([s.rms_px for s in mine])
         at = [100.0 * s.condition.noise for s in mine]
         axes.plot(

@@ -21,10 +21,10 @@ POINTS = 101
 """Number of grid points along each side of a map."""
 
 JOINT_SAMPLES = 20_000
-"""Number of random joint vectors from which the extremes over the travel are taken."""
+"""Number of random joint vectors for the extremes over the travel."""
 
 COLUMNS = 3
-"""Number of maps beside each other in a figure."""
+"""Number of columns of maps in a figure."""
 
 AXES = ("x_m", "y_m", "z_m", "alpha_rad", "beta_rad", "gamma_rad")
 
@@ -42,8 +42,8 @@ class WorkspacePlane:
     horizontal, vertical
         Grid lines (n,) [m or rad].
     travel_share, condition
-        Used share of the travel limit and condition of the joint Jacobian (n, n), with a row for
-        each entry of ``vertical``. They are NaN out of reach.
+        Used share of the travel limit and condition number of the joint Jacobian, each (n, n), with
+        a row for each entry of ``vertical``. They are NaN out of reach.
     reach_margin
         Margin (n, n) of the worst leg.
     """
@@ -60,7 +60,7 @@ class WorkspacePlane:
 
     @property
     def allowed(self) -> Array:
-        """Flags (n, n) of poses that all legs reach with their joints within the travel limit."""
+        """True (n, n) for poses that all legs reach with their joints within the travel limit."""
         return np.asarray(self.travel_share <= 1)
 
 
@@ -68,9 +68,10 @@ class WorkspacePlane:
 class WorkspaceMap:
     """Maps of a robot's workspace.
 
-    ``ranges`` (m, 2) [m, rad from home] is the range of each coordinate of the platform alone.
-    ``home`` and ``travel`` are the measures at home, and of those of JOINT_SAMPLES random joint
-    vectors within travel that have a pose. ``unit`` is that of the joints.
+    ``ranges`` (m, 2) [m, rad from home] is the range of each coordinate of the platform, with the
+    other coordinates at home. ``home`` holds the measures at home. ``travel`` holds the measures at
+    JOINT_SAMPLES random joint vectors within the travel, without vectors that have no pose.
+    ``unit`` is the unit of the joints.
     """
 
     robot: str
@@ -83,7 +84,7 @@ class WorkspaceMap:
     travel: workspace.WorkspaceMeasures
 
     def summary(self) -> dict[str, Any]:
-        """Return the map in numbers, for JSON. Units are in the names."""
+        """Return the figures of the maps for JSON. Units are in the names."""
         return {
             "robot": self.robot,
             f"travel_limit_{self.unit}": self.home.travel_limit,
@@ -107,11 +108,12 @@ def map_workspace(
     """Map planes of poses around home.
 
     The planes are x-y at three heights, or at three angles for a planar platform, and alpha-beta at
-    three gamma. Those that the platform cannot move in are left out. The other components are those
-    of home.
+    three gamma. Planes in which the platform cannot move are left out. The other components have
+    their values at home.
 
-    A side reaches as far from home as the travel of the most sensitive joint allows, by the
-    Jacobian at home. In rotation, it reaches 1.3 times as far over the characteristic length.
+    The half side of a plane is the displacement at which the most sensitive joint reaches its
+    travel limit, according to the Jacobian at home. For angles it is 1.3 times this displacement
+    divided by the characteristic length.
     """
     progress = progress or SilentProgress()
     length = robot.geometry.characteristic_length
@@ -162,13 +164,16 @@ def _plane(
 
 
 def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[float, float]:
-    """Return how far a pose component goes down and up from home until a joint is at its limit."""
+    """Return the largest negative and positive change of a pose component from home.
+
+    At these changes a joint reaches its limit.
+    """
     steps = np.linspace(0, 3 * side, points)
     ends = []
     for sign in (-1.0, 1.0):
         poses = robot.home_pose + sign * steps[:, None] * np.eye(6)[axis]
         share = workspace.measure(robot, poses).travel_share
-        # A share that is NaN is out of reach, and outside too.
+        # NaN means out of reach, and counts as outside.
         outside = ~(share <= 1)
         last = max(int(np.argmax(outside)) - 1, 0) if outside.any() else -1
         ends.append(sign * float(steps[last]))
@@ -242,7 +247,7 @@ def _panel(axes: Axes, plane: WorkspacePlane, values: np.ndarray, norm: Normaliz
         (plane.reach_margin, 0.0, "--", "k"),
     ):
         finite = field[np.isfinite(field)]
-        # A level that is nowhere reached has no contour, and matplotlib would warn.
+        # Matplotlib would warn about a level without a contour.
         if finite.size and finite.min() < level < finite.max():
             axes.contour(
                 across, up, field, [level], linestyles=style, colors=colour, linewidths=1.5

@@ -98,7 +98,7 @@ def test_a_sample_whose_interval_holds_the_limit_is_undecided(project):
     assert ends["few seen"] == "-11% undecided"
     assert not [name for name in ("good", "seen", "open", "value") if "undecided" in ends[name]]
     done.stdout.fnmatch_lines(
-        ["undecided: passed, as the interval contains the limit; more values would decide"]
+        ["undecided: passed, because the interval contains the limit; more values would decide"]
     )
 
 
@@ -174,7 +174,7 @@ def test_saving_never_loses_the_figures_of_another_session(project, saved):
         [
             "not saved as before: *before.json holds figures that were not measured now "
             "(*::test_pose[[]registration]: "
-            "pose; *::test_sensor: bias, seen); take another name, or remove that file"
+            "pose; *::test_sensor: bias, seen); use another name, or remove that file"
         ]
     )
     assert saved.read_bytes() == whole
@@ -244,11 +244,11 @@ def test_with_xdist_the_table_and_the_file_are_the_same(project, pytester):
         ),
         (
             ["--accuracy-save", "../x"],
-            "'../x' is no name for saved figures: use up to 100 letters, digits, *",
+            "'../x' is not a valid name for saved figures: use up to 100 letters, digits, *",
         ),
         (
             ["--accuracy-save", "full.json"],
-            "'full.json' is no name for saved figures: use 'full', *",
+            "'full.json' is not a valid name for saved figures: use 'full', *",
         ),
         (
             ["--accuracy-save", "x", "--accuracy-dir", "/proc/none"],

@@ -292,8 +292,11 @@ def test_a_calibration_of_another_rig_or_one_that_is_none_is_refused_in_one_line
     for changes, words in (
         ({"left.fx_px": 5000.0}, "left.fx_px is"),
         ({"left.cx_px": -900.0}, "left.cx_px is"),
-        ({"right_from_left.ry_rad": -1.2}, "the right camera looks 68 degrees beside"),
-        ({"right_from_left.tz_m": 0.5}, "the right camera stands"),
+        (
+            {"right_from_left.ry_rad": -1.2},
+            "direction of the right camera, seen from the left camera, differs by 68 degrees",
+        ),
+        ({"right_from_left.tz_m": 0.5}, "direction of the baseline"),
         ({"image_size_px": 3}, "cameras with 3 px"),
         ({"covariance": negative}, "left.fx_px is negative"),
         ({"covariance": {"names": [], "matrix": []}}, "not of the 24 parameters"),

@@ -228,6 +228,6 @@ def test_a_record_of_which_no_law_gives_a_model_is_refused_with_the_reasons():
 
     with pytest.raises(
         EstimationError,
-        match="no law of the drives gives a model that runs: pid: nothing under pid; ",
+        match="the model is unstable under every law of the drives: pid: nothing under pid; ",
     ):
         choose_drive(problem_of, quick(**{"model.drive": "auto"}).model, SilentProgress())

@@ -185,7 +185,7 @@ def test_what_is_missing_or_unknown_is_said_before_anything_is_written(
     ):
         find_estimators(["warm_start", "best"])
     assert list(find_estimators(["torque_ls", "closed_loop"])) == ["closed_loop", "torque_ls"]
-    with pytest.raises(EstimationError, match="no unseen trajectory"):
+    with pytest.raises(EstimationError, match="no validation run"):
         examination(seen, side_of(quick()), truth(), [])
     (tmp_path / "scenario.toml").write_text(quick().to_toml(), encoding="utf-8")
     (tmp_path / "experiment.nc").write_bytes((folder / "experiment.nc").read_bytes())

@@ -314,6 +314,6 @@ def test_box_that_is_said_to_be_in_sight_is_and_sight_counts_where_that_is_not_p
         lost += not sight.visible(pose)[chosen].all()
     assert 10 < lost < 90
     with pytest.raises(
-        TrajectoryError, match=r"visibility: both cameras can look for \d stickers of plane [ABC]"
+        TrajectoryError, match=r"visibility: \d stickers of plane [ABC] are visible to both cameras"
     ):
         MotionConstraints(robot, QUICK.excitation, narrowed(12.0))

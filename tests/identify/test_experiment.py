@@ -286,7 +286,7 @@ def test_the_residuals_say_that_the_model_is_wrong(switch):
     result = _identified(**switch)
     assert result.whiteness.p_value < SUSPICIOUS
     assert result.noise_ratio > 1.05
-    assert any("residuals that follow each other" in said for said in result.warnings)
+    assert any("are correlated from frame to frame" in said for said in result.warnings)
 
 
 @pytest.mark.slow

@@ -393,7 +393,7 @@ def test_what_no_model_has_an_anchor_that_is_unknown_or_incomplete_and_what_is_n
         match=r"_std is None, must be .* in N m/rad: .*joint_gain measures joint_pid.lp",
     ):
         read_anchor(half, LAYOUT)
-    with pytest.raises(EstimationError, match="'rss6' is no Robot: dynamics"):
+    with pytest.raises(EstimationError, match="'rss6' is not a Robot: dynamics"):
         identify(record, "rss6", quick())
-    with pytest.raises(EstimationError, match="'quick' is no Scenario: identify"):
+    with pytest.raises(EstimationError, match="'quick' is not a Scenario: identify"):
         identify(record, rss6(), "quick")

@@ -201,7 +201,7 @@ def test_a_calibration_done_before_is_read_and_the_true_robot_is_drawn_about_it(
     assert np.mean(np.square(errors)) == pytest.approx(2e-5**2, rel=0.25)
     assert build_plant(scenario).nominal.geometry == read.robot.geometry
     misplaced = scenario.with_overrides({"plant.geometry_error_m": 1e-4})
-    assert "set one of both" in refusal(ScenarioError, build_plant, misplaced)
+    assert "set only one of the two" in refusal(ScenarioError, build_plant, misplaced)
 
 
 def test_what_is_no_calibration_of_this_robot_is_refused_in_one_line(tmp_path):

@@ -78,7 +78,7 @@ def test_a_record_of_torques_shows_base_parameters_without_the_gains():
     assert not result.identifiable[GAINS].any()
     np.testing.assert_allclose(result.estimate[GAINS], result.initial[GAINS], rtol=1e-9)
     assert not result.to_dict()["drive"]["in_loop"]
-    assert any("the drives took torques" in warning for warning in result.warnings)
+    assert any("the commands are torques" in warning for warning in result.warnings)
 
 
 @pytest.mark.slow

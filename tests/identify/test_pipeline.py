@@ -179,7 +179,7 @@ def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
     out, err = capfd.readouterr()
     assert out == ""
     assert all(line.startswith("warning: ") for line in err.splitlines())
-    assert "leaves residuals that follow each other" in err
+    assert "are correlated from frame to frame" in err
     result = load_result(run.result)
     assert "chance of such residuals" in missed(result)
     assert result["identification"]["noise_ratio"] > 1.05

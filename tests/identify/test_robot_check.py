@@ -126,7 +126,7 @@ def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read
         "2 of 21 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
     )
     assert (
-        "and the actuators have 3 N m; inertias: no rigid body has these, and accelerations "
+        "and the actuators have 3 N m; inertias: no rigid body has these; corrected, accelerations "
         "change by up to" in said
     )
     assert len(said) < 400

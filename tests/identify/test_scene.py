@@ -179,7 +179,7 @@ def test_what_a_run_lacks_is_left_out_and_said(run_folder):
     save_result(
         run_folder.result, {name: entry for name, entry in result.items() if name != "validation"}
     )
-    assert "not been validated since" in read_motion(run_folder.path).notes[0]
+    assert "and not validated since" in read_motion(run_folder.path).notes[0]
     run_folder.model.unlink()
     motion = read_motion(run_folder.path)
     assert "not validated yet" in motion.notes[0]

@@ -44,7 +44,7 @@ def test_a_setup_runs_the_experiment_that_one_call_does_and_runs_it_again(setup,
 def test_a_record_finds_its_own_truth_and_no_other(setup, record, tmp_path):
     xr.testing.assert_identical(record.truth, read_truth(record.attrs["path"]))
     moved = record.assign(command=record["command"] + 1e-9)
-    with pytest.raises(RecordError, match=r"holds another record by now"):
+    with pytest.raises(RecordError, match=r"now holds another record"):
         moved.truth  # noqa: B018
     nowhere = record.drop_attrs() if hasattr(record, "drop_attrs") else record.copy()
     nowhere.attrs = {}

@@ -301,5 +301,7 @@ def test_a_model_that_no_segment_bears_is_named():
     wild = truth().copy()
     wild[64:] *= [1e4, 1e4, 1e-4]
     hopeless = replace(problem, guess=replace(problem.guess, values=wild))
-    with pytest.raises(EstimationError, match=r"nor does multiple shooting.*frame"):
+    with pytest.raises(
+        EstimationError, match=r"multiple shooting from them finds no stable model.*frame"
+    ):
         shoot(hopeless, wild, SilentProgress())

@@ -121,7 +121,7 @@ def test_a_file_without_a_column_or_that_the_platform_cannot_follow_is_refused(t
     path.write_text("\ufeff" + whole, encoding="utf-8")  # as spreadsheets write it
     assert read_motion(path, rss6(), FASTEST).duration_s == 2.0
     path.write_text(whole.replace(",", ";"))
-    assert "by commas, and these by semicolons" in refusal(
+    assert "separated by semicolons, and must be by commas" in refusal(
         TrajectoryError, read_motion, path, rss6(), FASTEST
     )
     path.write_text(whole.replace("gamma", "yaw"))
@@ -135,7 +135,7 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
     said = refusal(
         TrajectoryError, follow, plant(), "pid", rss6().nominal_parameters, motion, seen()
     )
-    assert "the robot may not follow own" in said
+    assert "the robot cannot follow own" in said
     assert "of leg" in said
     assert "at t = " in said
 
@@ -184,7 +184,7 @@ def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
             "pid",
             {"control.torque_limit_N_m": 3.0},
             ScenarioError,
-            "leg 6 of rss6 takes 3.042 N m to stand still at",
+            "leg 6 of rss6 needs 3.042 N m to stand still at",
         ),
     ],
     ids=["access", "gains", "blind", "fast", "name", "own", "raises", "weak"],
@@ -398,8 +398,11 @@ def test_the_identified_model_is_that_of_a_run(tmp_path):
         (["--model", "best"], "unknown model 'best'; valid: initial, identified, true, or all"),
         (["--law", "mpc"], "unknown law 'mpc'"),
         (["--motion", "no.csv"], "cannot read the motion no.csv: No such file"),
-        (["--run", "."], "--run . holds the identified model, and only true is asked for"),
-        (["--law", "computed_torque", "--set", "control.torque_access=false"], "do not take"),
+        (["--run", "."], "--run . gives the identified model, but only true is requested"),
+        (
+            ["--law", "computed_torque", "--set", "control.torque_access=false"],
+            "do not accept them",
+        ),
     ],
     ids=["model", "law", "motion", "run", "torques"],
 )
