@@ -281,7 +281,7 @@ SAVED = '{"format": "cmmsim accuracy", "schema": 1, "name": "x", "seed": 0'
     [
         ("{", "cannot be read as JSON: *"),
         ("[1]", "holds no accuracy figures (no entry format = 'cmmsim accuracy')"),
-        (SAVED.replace("1", "2") + "}", "has schema 2, this version reads 1"),
+        (SAVED.replace("1", "2") + "}", "has schema 2, but this version reads 1"),
         (SAVED + "}", "figures: Field required *"),
         (
             SAVED + ', "figures": [{"test": "t", "name": "n", "value": NaN, "unit": "", "better": '

@@ -337,7 +337,7 @@ def test_poses_survive_their_file_and_a_damaged_one_is_refused(tmp_path, rss6):
     bent[3, 0, 0] *= -1
     for entries, said in (
         ({"poses": whole["poses"][:5]}, "poses must be finite and of shape (60, 6), got (5, 6)"),
-        ({"joint_unit": "deg"}, "joint_unit is 'deg', joints of rss6 are in rad"),
+        ({"joint_unit": "deg"}, "joint_unit is 'deg', but joints of rss6 are in rad"),
         ({"covariances": bent.tolist()}, "covariances, number 4"),
         ({"joint_std": [-1.0] * 6}, "must be >= 0"),
         ({"common": [[1.0], 2.0]}, "common must be numbers of shape (60, 6, 1)"),
