@@ -13,7 +13,7 @@ Images from elsewhere
     Tracker(sensor.estimator).measure(images)                  -> Measurement, frame after frame
 
 Cameras that drift
-    Sensor.drift_rig({"right.cx_px": 0.1}, frames)  moves the true rig; the estimator is not told
+    Sensor.drift_rig({"right.cx_px": 0.1}, frames)  moves the true rig, not the estimator's rig
     Sensor.watch_drift()                            -> DriftWatch, whose `finding` names a change
 
 Geometry
@@ -109,7 +109,7 @@ __all__ = [
     *_HOME,
 ]
 
-# A type checker would take every name for one that this module knows.
+# Hidden from type checkers, which would otherwise accept any name of this module.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:

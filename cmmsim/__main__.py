@@ -1,7 +1,7 @@
-"""The command `cmmsim`, and a warning where another package `identify` stands in the place of ours.
+"""The command `cmmsim`, and a warning if another package is imported as `identify`.
 
-A package on PyPI has the same name. Where it is installed, nothing of our `identify` can be found.
-The command therefore begins here, in the only module of this package that knows `identify`.
+A package on PyPI has the same name. If it is installed, it hides our `identify`. The command
+therefore begins here, in the only module of this package that knows `identify`.
 """
 
 import sys

@@ -104,7 +104,7 @@ def own_part(option: str, name: str) -> Any:
 
 @dataclass(frozen=True)
 class Telling:
-    """A function of a user's own whose errors are told in one line, with their place in its file.
+    """A user's own function. Its errors are reported in one line with their place in its file.
 
     ``part`` is its name in messages. ``refusal`` is the class of the error that is raised, and
     ``known`` are classes that pass unchanged. ``check`` is called with the part's name, the result

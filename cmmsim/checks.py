@@ -1,6 +1,6 @@
 """Checks of arguments and of entries in TOML files.
 
-A value is taken as it was meant, or refused by a message that says what was got and what is wanted.
+A value is either accepted, or refused with a message that states the given and the wanted value.
 """
 
 import operator

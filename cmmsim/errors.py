@@ -10,7 +10,7 @@ LONGEST = 4000
 
 
 class CmmError(ValueError):
-    """Base class of everything that this package refuses.
+    """Base class of errors for arguments and files that this package refuses.
 
     The message is one line.
 

@@ -1,6 +1,7 @@
-"""An instrument: what a sensor is before it measures.
+"""Instrument: the part of a sensor that does not measure.
 
-It has its true cameras before the true scene, what is known of the cameras, and what it was taught.
+It holds the true cameras and scene, the known parameters of the cameras, and the result of
+teaching.
 """
 
 from __future__ import annotations
@@ -216,7 +217,7 @@ class Instrument:
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
         """Register further rigid bodies that may hide stickers.
 
-        They are drawn where ``obstacles`` of `Sensor.look` says.
+        The argument ``obstacles`` of `Sensor.look` places them in an exposure.
 
         Parameters
         ----------
@@ -236,7 +237,7 @@ class Instrument:
         self.true_cameras.add_bodies(meshes)
 
     def move_rig(self, changes: Mapping[str, float], right_later: float = 0.0) -> None:
-        """Change the true rig; the estimator is not told.
+        """Change the true rig; the estimator's known rig does not change.
 
         Parameters
         ----------
@@ -260,12 +261,13 @@ class Instrument:
         self.true_cameras.move(changes, right_later)
 
     def drift_rig(self, changes: Mapping[str, float], frames: int) -> None:
-        """Change the true rig evenly in each run from now on; the estimator is not told.
+        """Change the true rig evenly in each run from now on; the estimator's known rig does not
+        change.
 
         Parameters
         ----------
         changes : mapping of str to float
-            Amounts by name, as of `move_rig`. Without any, the rig does not drift.
+            Amounts by name, as in `move_rig`. An empty mapping ends the drift.
         frames : int
             Number of frames from the first to the last change.
 
@@ -285,7 +287,7 @@ class Instrument:
         self.true_cameras.drift(changes, frames)
 
     def common_errors(self, poses: ArrayLike, rates: ArrayLike) -> CommonErrors:
-        """Return the errors of rig and taught frames that all poses have in common.
+        """Return the errors of the rig and of the taught frames that all poses have in common.
 
         Parameters
         ----------
@@ -354,7 +356,7 @@ class StickerView:
     def settings(self, noise: CameraNoise, centre_error_px: float) -> DetectionSettings:
         """Settings of the search for stickers in windows.
 
-        ``centre_error_px`` is what drawing leaves in a centre.
+        ``centre_error_px`` is the error of a sticker's centre that the renderer causes, px rms.
         """
         timing = self.file.timing
         return DetectionSettings(

@@ -32,7 +32,7 @@ def load_sensor(
     seed : int
         Seed of teaching, and of the noise of the first run.
     method : {"registration", "planes"}
-        Method by which a pose is made of the stickers.
+        Method that computes a pose from the stickers.
     taught : Taught, optional
         Result of an earlier teaching of the same cameras and bodies.
     progress : callable, optional
@@ -40,9 +40,9 @@ def load_sensor(
     renderer : {"pyrender", "analytic", "auto", "statistical"}, optional
         Renderer instead of the one that the file names.
     changes : mapping, optional
-        Entries instead of the file's, by dotted key.
+        Entries that replace the file's entries, by dotted key.
     known : KnownRig, optional
-        Rig that measures, where it is another than the one that draws.
+        Rig that the estimator uses, if it differs from the file's rig, which forms the images.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Many frames at once: drawn, read and measured in blocks, on all cores.
 
-Windows are read, ellipses fitted and stickers triangulated as those of one exposure with all the
-stickers; each exposure is then solved for itself.
+Windows are read, ellipses are fitted and stickers are triangulated for all exposures together. Each
+exposure is then solved separately.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Frames:
 
 
 def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[ManySeen]:
-    """Measure frames block by block; their movement is taken for known.
+    """Measure frames block by block, with their movement assumed known.
 
     The number of threads that share the blocks changes nothing in the result.
     """

@@ -38,12 +38,12 @@ class Sensor(Instrument):
     Parameters
     ----------
     file : SensorFile
-        Content of a sensor file. Its cameras are those that draw.
+        Content of a sensor file. Its cameras form the images.
     seed, method, taught, progress, renderer
         As of `load_sensor`.
     known : KnownRig, optional
-        Cameras that measure, where they are known otherwise than as those that draw. A taught
-        sensor measures with the cameras that were known at teaching.
+        Rig that the estimator uses, if it differs from the file's rig, which forms the images. With
+        ``taught``, the estimator uses the rig that was known at teaching.
 
     Raises
     ------
@@ -79,7 +79,7 @@ class Sensor(Instrument):
     def start_run(self, seed: int) -> None:
         """Begin a new run: new noise, and the next measurement searches the whole images.
 
-        Every frame has a noise stream of its own, so that a dropped one changes nothing in the
+        Every frame has its own noise stream, so a dropped frame does not change the noise of
         others.
 
         Parameters
@@ -114,7 +114,7 @@ class Sensor(Instrument):
         obstacles: Mapping[str, Array] | None = None,
         pose_rate: ArrayLike | None = None,
     ) -> StereoImages | DrawnStickers:
-        """Take one exposure, which is drawn as far as it is read.
+        """Take one exposure. Only the parts of the images that are read are drawn.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class Sensor(Instrument):
         Returns
         -------
         StereoImages or DrawnStickers
-            Images, or what would be found in them.
+            Images, or for the renderer "statistical" the stickers that would be detected in them.
 
         Raises
         ------
@@ -165,7 +165,7 @@ class Sensor(Instrument):
         Parameters
         ----------
         pose, obstacles, pose_rate
-            As of `look`, which also says what is raised.
+            As in `look`, which also lists the errors.
 
         Returns
         -------
@@ -193,13 +193,13 @@ class Sensor(Instrument):
     ) -> Measurement:
         """Measure the platform in one frame.
 
-        The measured pose is that in the middle of the exposure. A frame that drops out is lost
-        without being looked at.
+        The result is the pose in the middle of the exposure. A frame that drops out is lost, and no
+        image is formed.
 
         Parameters
         ----------
         pose, obstacles, pose_rate
-            As of `look`, which also says what is raised. Only the renderer is told them.
+            As in `look`, which also lists the errors. Only the renderer uses them.
 
         Returns
         -------
@@ -231,13 +231,13 @@ class Sensor(Instrument):
         return measured
 
     def watch_drift(self, base: bool = False, chance: float = CHANCE) -> DriftWatch:
-        """Watch from now on whether the rig still is as it was taught, in each run for itself.
+        """Watch from now on, in each run separately, whether the rig has moved since teaching.
 
         Parameters
         ----------
         base : bool
-            Look at the base's stickers as well. That takes twice the time, and shows smaller
-            movements, and those of the whole rig.
+            True to observe the base's stickers as well. This takes twice the time. It shows smaller
+            movements, and also movements of the whole rig.
         chance : float
             Probability of a false alarm in a run.
 
@@ -255,7 +255,7 @@ class Sensor(Instrument):
         >>> watch = sensor.watch_drift()
         """
         self._require_registration("drift is told from")
-        # Errors of a centre that are not noise stay while it stands still.
+        # A centre's systematic errors stay constant while the sticker stands still.
         offset = float(np.hypot(self.settings.centre_error_px, self.observer.detector.bias_px))
         period = 1.0 / self.timing.frame_rate
         self._watch = DriftWatch(self._geometry, self._known, period, chance, offset, base)
@@ -270,19 +270,19 @@ class Sensor(Instrument):
     ) -> MeasuredPoses:
         """Measure the platform in many frames at once, on all cores.
 
-        Each frame has noise and dropout of its own. The noise is as large as that of `measure`,
-        but its numbers are others. The rig does not drift.
+        Each frame has its own noise and dropout. The noise has the same covariance as in `measure`,
+        but different random numbers. The rig does not drift.
 
         Parameters
         ----------
         poses : array_like, shape (N, 6)
-            Poses, one frame each, m and rad.
+            Poses, one per frame, m and rad.
         pose_rates : array_like, shape (N, 6), optional
             Time derivatives of the poses.
         obstacles : mapping of str to ndarray, shape (4, 4), optional
             Places of bodies that stand still, as of `look`.
         near : array_like, shape (N, 6), optional
-            Poses near which stickers are looked for, instead of the true ones.
+            Poses near which stickers are searched, instead of the true poses.
 
         Returns
         -------
@@ -291,7 +291,7 @@ class Sensor(Instrument):
         Raises
         ------
         ShapeError
-            If poses, rates or ``near`` are not such rows.
+            If poses, rates or ``near`` are not rows of six finite numbers.
 
         Examples
         --------
@@ -322,14 +322,14 @@ class Sensor(Instrument):
         return found.without(self._dropout_rng.random(len(at)) < self.timing.dropout)
 
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
-        """Measure a platform at rest in many frames, of which none drops out.
+        """Measure a platform at rest in many frames, without dropouts.
 
         Without images, stickers are looked for in windows as well.
 
         Parameters
         ----------
         poses, near : array_like, shape (N, 6)
-            Poses, and poses near which stickers are looked for, m and rad.
+            True poses, and poses near which stickers are searched, m and rad.
 
         Returns
         -------
@@ -338,7 +338,7 @@ class Sensor(Instrument):
         Raises
         ------
         ShapeError
-            If poses or ``near`` are not such rows.
+            If poses or ``near`` are not rows of six finite numbers.
 
         Examples
         --------
@@ -370,7 +370,7 @@ class Sensor(Instrument):
         """Return a tracker, which measures frame after frame."""
         if self.renderer != STATISTICAL.name or self.method != "registration":
             return Tracker(self.estimator)
-        # Late, as numba takes time to import.
+        # Imported late, because numba takes time to import.
         from cmmsim.without_images.statistical_tracker import StatisticalTracker
 
         return StatisticalTracker(self.estimator)

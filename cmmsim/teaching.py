@@ -8,9 +8,9 @@ stickers on different parts of a pixel, which averages out the image formation's
 The centres are always those of the maximum-likelihood fit, whatever detector the sensor measures
 with. The base is seen at one pose only, so that a detector's bias would stay in every pose.
 
-The windows in which stickers are looked for hold the largest image of a sticker. That is either the
-image at the nearest place of work, which is taken for a fifth nearer than the rig's target, or the
-largest that both cameras see at teaching.
+The search windows hold the largest image of a sticker. This is the larger of two images: the one at
+the nearest working distance, assumed a fifth nearer than the rig's target, and the largest one that
+both cameras see at teaching.
 """
 
 from collections.abc import Callable
@@ -65,8 +65,8 @@ WINDOW_SHARE = 7 / 6
 class TeachingPlan:
     """Plan of teaching.
 
-    It has the quality of the views of the base, the quality and number of those of the platform,
-    and the sizes of windows in px.
+    It states the quality of the base's views, the quality and number of the platform's views, and
+    the sizes of windows in px.
     """
 
     base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))
@@ -197,8 +197,8 @@ class Teacher:
     def _platform_views(
         self, rough: Array, path: Array, rng: np.random.Generator, report: Callable[[int], None]
     ) -> list[StickerObservation]:
-        """Observe the platform along the teaching path, each time where the views before lead
-        to.
+        """Observe the platform along the teaching path, near the pose predicted from the views
+        before.
         """
         places = self.platform.nominal
         last = rough
@@ -316,7 +316,7 @@ def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]
 
 @dataclass(frozen=True)
 class WindowSizes:
-    """Sides in px of windows, and of the part around the bright spot that is fitted.
+    """Sides in px of windows, and of the fitted part around the bright spot.
 
     ``growth`` is the fitted part's side over that for the smallest stickers.
     """
@@ -326,7 +326,7 @@ class WindowSizes:
     growth: float
 
     def plan(self) -> TeachingPlan:
-        """Return a teaching plan whose windows have grown alike."""
+        """Return a teaching plan with windows enlarged by the same factor."""
         plan = TeachingPlan()
         names = ("base_window", "first_window", "platform_window")
         return replace(

@@ -19,10 +19,10 @@ EXPECTED_SHARE = 0.7
 class Tracker:
     """Tracker that measures frame after frame, and remembers the last two poses.
 
-    Where the prediction fails, the whole frame is searched at once. Where that finds fewer
-    stickers, the prediction's finds stand. Moving stickers are fitted as the exposure smears them,
-    at the speed since the last frame. In the first frame of a run, and in the first after a loss,
-    the smear itself tells the speed.
+    If the prediction fails, the whole frame is searched. If this search finds fewer stickers than
+    the predicted windows, the stickers in the predicted windows are used. Moving stickers are
+    fitted with the smear of the exposure at the speed since the last frame. In the first frame of a
+    run, and in the first after a loss, the speed is estimated from the smear.
 
     Parameters
     ----------
@@ -96,14 +96,14 @@ class Tracker:
         return measurement
 
     def miss(self) -> None:
-        """Pass a frame that nobody saw: the movement is assumed to go on."""
+        """Skip a frame without an image; the movement is assumed to continue."""
         if self._last is not None:
             self._last = self._predicted()
 
     def _tracked(self, images: StereoImages) -> tuple[Measurement, Array] | None:
         """Return the measurement in the predicted windows.
 
-        It is None without a prediction, or where the prediction did not hold.
+        The result is None without a prediction, or if the predicted windows give no pose.
         """
         if self._last is None:
             return None

@@ -35,9 +35,7 @@ from cmmsim.without_images.sticker_scene import StickerScene
 
 @dataclass(frozen=True)
 class Drift:
-    """Changes (24,) of the rig's parameters that come evenly from the first to the last of some
-    frames.
-    """
+    """Changes (24,) of the rig's parameters that grow evenly over a number of frames."""
 
     changes: Array
     frames: int
@@ -45,7 +43,7 @@ class Drift:
     def after(self, frame: int) -> Array:
         """Return the changes (24,) at a frame, counted from 0.
 
-        The cameras stay where the last one leaves them.
+        After the last frame of the drift, the changes stay constant.
         """
         return min(frame / (self.frames - 1), 1.0) * self.changes
 
@@ -53,7 +51,7 @@ class Drift:
 class TrueCameras:
     """Both cameras, and platform and base with their stickers at their true places.
 
-    The methods are those of `Sensor`, which says what they take and raise.
+    `Sensor` describes the arguments and errors of methods with the same names.
     """
 
     def __init__(
@@ -185,7 +183,7 @@ class TrueCameras:
     def _drawing(self) -> VirtualStereoCamera:
         """Return cameras that draw.
 
-        Stickers are drawn first, because what they hide need not be drawn.
+        Stickers are drawn first, so that surfaces hidden behind them need not be drawn.
         """
         file = self._file
         patches = [p for body in self.scene for p in body.stickers] + [

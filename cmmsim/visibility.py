@@ -1,6 +1,6 @@
 """Stickers of the platform that both cameras can look for at a pose, and the stated accuracy there.
 
-A sticker can be looked for when it lies in both images, a detection window away from their edges,
+A sticker can be searched when it lies in both images, at least a detection window from their edges,
 and neither camera sees it at grazing incidence. Obstacles are not considered.
 """
 

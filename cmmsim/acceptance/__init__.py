@@ -1,8 +1,8 @@
 """Acceptance tests of the sensor in the style of standards.
 
 VDI/VDE 2634-1 tests lengths, ASTM E3064-16 a moving bar, and ASTM E3124 latency. The artefacts are
-imaged by the sensor's own virtual cameras, and measured by its own detection and triangulation. The
-truth about them serves only to judge the result.
+imaged by the sensor's own virtual cameras, and measured by its own detection and triangulation.
+Their true sizes and poses are used only to judge the result.
 """
 
 from cmmsim.acceptance.artefacts import SensorUnderTest

@@ -102,8 +102,8 @@ def _side(
 def rigid_bar() -> Platform:
     """Return the sensor-file section of the bar, with a cluster of six stickers at each end.
 
-    To the sensor each cluster is a rigid body of its own. The clusters differ, so that one cannot
-    be taken for the other.
+    The sensor measures each cluster as a separate rigid body. The clusters differ, so that the
+    sensor cannot confuse them.
     """
     return board(
         ((-0.190, -0.115, 0.110, 0.186), (0.006, -0.010, 0.010, -0.004)),
@@ -113,7 +113,7 @@ def rigid_bar() -> Platform:
 
 
 def bar_ends(bar: MarkedBody) -> tuple[MarkedBody, MarkedBody]:
-    """Return the clusters at -x and at +x as bodies with axes like the bar's.
+    """Return the clusters at -x and at +x as bodies whose axes are parallel to those of the bar.
 
     Their origins lie on the bar's axis, ``LENGTH`` apart.
     """
@@ -165,9 +165,9 @@ class SensorUnderTest:
     renderer: str | None = None
 
     def facing(self, artefact: Platform, stream: int) -> Sensor:
-        """Return the sensor before an artefact in place of its platform.
+        """Return the sensor with an artefact in place of its platform.
 
-        ``stream`` keeps the noise of the tests apart.
+        Different values of ``stream`` give independent noise.
         """
         sensor = Sensor(artefact_file(self.file, artefact), self.seed, renderer=self.renderer)
         sensor.start_run(self.seed + 1000 * stream)

@@ -1,9 +1,9 @@
 """Latency in the style of ASTM E3124: the time from a motion to the report of its pose.
 
 A body moves on a circle, and a reference with an exact clock knows its true place. Each reported
-pose is compared with the true motion at the time of its report: the motion must be set back by the
-latency to fit the reports. Frames are tracked one after the other and not measured many at once,
-because the tracker is part of the instrument under test.
+pose is compared with the true motion at the time of its report. The latency is the time shift of
+the motion that fits the reports best. Frames are tracked one after the other, because the tracker
+is part of the instrument under test.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def estimate_latency(
 
 
 def require_room(volume: MeasuringVolume) -> None:
-    """Raise AcceptanceError unless the bar finds room for its circle."""
+    """Raise AcceptanceError unless the body's circle fits into the volume."""
     needed = 2.0 * np.array([HALF_LENGTH + RADIUS, HALF_WIDTH + RADIUS, 0.0])
     if np.any(needed > volume.size):
         raise AcceptanceError(
@@ -149,7 +149,7 @@ def latency_test(
     def motion(times: Array) -> Array:
         return apply(volume.base_from_volume, _circle(times))
 
-    # A body that is not found at all is told before any frame is tracked.
+    # An error about a body that is not found is raised before any frame is tracked.
     locate(estimator, sensor.look(pose(0.0)))
     tracker = Tracker(estimator)
     taken = np.arange(frames) / sensor.timing.frame_rate
@@ -183,7 +183,8 @@ def _circle(times: Array) -> Array:
 def _coarse_delay(reported: Array, positions: Array, motion: Motion, largest: float) -> float:
     """Return the best of a grid of common delays.
 
-    The variance of the residuals is what is left after the best constant offset.
+    The best delay has the smallest variance of the residuals, after the best constant offset is
+    removed.
     """
     grid = np.linspace(0.0, largest, 101)
     misfit = [np.var(positions - motion(reported - delay), axis=0).sum() for delay in grid]

@@ -2,8 +2,8 @@
 
 An artefact with a row of six stickers stands on each measuring line. The distances of five of them
 from the first are the test lengths. A length is the mean of a few exposures of the standing
-artefact. Its error is the measured length less the certified one, and its magnitude must stay
-within a limit. Sphere form and spacing are not tested: the targets are flat stickers.
+artefact. Its error is the measured length minus the certified length. The magnitude of the error
+must stay within a limit. Sphere form and spacing are not tested: the targets are flat stickers.
 """
 
 from collections.abc import Callable

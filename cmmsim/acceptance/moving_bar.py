@@ -1,15 +1,14 @@
 """Relative pose error of a moving rigid bar in the style of ASTM E3064-16.
 
-The bar moves along two rasters in three orientations, after standing still where each begins. One
-raster goes to and fro along the volume's x axis while it advances along y; the other exchanges
-these axes. A bar that points at the cameras hides its flat stickers. The third orientation
-therefore leans only ``TOWARDS_DEPTH`` out of the image plane. In addition the bar turns smoothly
-about all its axes.
+The bar moves along two rasters in three orientations, after standing still at the start of each
+raster. One raster goes to and fro along the volume's x axis while it advances along y; the other
+exchanges these axes. A bar that points at the cameras hides its flat stickers. The third
+orientation therefore leans only ``TOWARDS_DEPTH`` out of the image plane. In addition the bar turns
+smoothly about all its axes.
 
 The sensor measures the poses of the clusters at both ends in the same exposure. Their certified
 relative pose is compared with the measured one, for the standing and for the moving bar. Frames are
-tracked one after the other and not measured many at once, because the tracker is part of the
-instrument under test.
+tracked one after the other, because the tracker is part of the instrument under test.
 """
 
 from collections.abc import Callable
@@ -117,9 +116,7 @@ def room_of_bar(along: Array) -> Array:
 
 
 def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
-    """Return the six paths of a volume. Raises AcceptanceError when the bar does not find room in
-    it.
-    """
+    """Return the six paths of a volume. Raises AcceptanceError if the bar does not fit into it."""
     paths = tuple(
         BarPath(f"raster {raster}, bar {name}", axis, along, volume)
         for raster, axis in RASTERS.items()
@@ -138,12 +135,12 @@ def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
 class BarRun:
     """One run of the bar, which begins to move at time 0.
 
-    ``time`` (n,) s are the measured frames. ``errors`` (n, 6) are those of the relative pose,
-    [shift, turn] in axes of the first end, m and rad. ``distance_errors`` (n,) are those of the
-    ends' distance, m. ``variance_ratios`` (n,) are squared errors in units of the stated
-    covariance, divided by 6. ``lost`` counts frames in which an end was not measured.
-    ``given_up`` says why the run ended after GIVEN_UP of them in a row; its other frames count as
-    lost.
+    ``time`` (n,) holds the times of the measured frames, s. ``errors`` (n, 6) are the errors of the
+    relative pose, [shift, turn] in axes of the first end, m and rad. ``distance_errors`` (n,) are
+    the errors of the distance between the ends, m. ``variance_ratios`` (n,) are squared errors in
+    units of the stated covariance, divided by 6. ``lost`` counts frames in which an end was not
+    measured. ``given_up`` is the reason why the run ended after GIVEN_UP lost frames in a row. The
+    remaining frames then count as lost.
     """
 
     name: str
@@ -207,8 +204,8 @@ def bar_test(
 ) -> BarTest:
     """Move the bar along the six paths of a volume; ``advance`` is called after each.
 
-    ``seconds`` of motion are measured from the start of each path. Raises AcceptanceError when the
-    bar does not find room or is not found in the first images.
+    ``seconds`` of motion are measured from the start of each path. Raises AcceptanceError if the
+    bar does not fit into the volume, or is not found in the first images.
     """
     sensor = under_test.facing(rigid_bar(), STREAM)
     rate = sensor.timing.frame_rate
@@ -228,7 +225,7 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
     """Measure the bar at ``times`` (n,) s of a path; it stands still before time 0."""
     estimators = [estimator_of(sensor, end) for end in bar_ends(sensor.platform)]
     for estimator in estimators:
-        # An end that is not found at all is told before any frame is tracked.
+        # An error about an end that is not found is raised before any frame is tracked.
         locate(estimator, sensor.look(path.pose(0.0)))
     trackers = [Tracker(estimator) for estimator in estimators]
     rows = []

@@ -1,7 +1,7 @@
 """Statistics of errors with 95 % intervals, and the published figures that stand beside ours.
 
-Published figures are those of makers and laboratories for real instruments. Each comes with its own
-test, volume and targets; none of them was measured here.
+Makers and laboratories published the figures for real instruments. Each figure has its own test,
+volume and targets. None was measured here.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ class Statistics:
 def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statistics:
     """Return the statistics of magnitudes (n,) of errors.
 
-    Neighbours are not independent, so ``block`` of them are drawn together; scipy.stats.bootstrap
-    draws single values only. Raises ShapeError for no values and for values that are not finite.
+    Neighbouring values are not independent, so they are resampled in blocks of ``block`` values;
+    scipy.stats.bootstrap resamples single values only. Raises ShapeError for no values and for
+    values that are not finite.
     """
     _require_finite(values)
     starts = rng.integers(0, len(values), (RESAMPLES, -(-len(values) // block)))

@@ -21,11 +21,11 @@ from cmmsim.files.schema import Rig
 from cmmsim.geometry.pose import Array, apply, frozen, invert, rigid, transform_to_pose
 from cmmsim.geometry.stereo_rig import StereoRig
 
-# The corners stay this far inside the images: room for the width of the artefacts.
+# Distance of the corners from the image edges, which leaves space for the artefacts' width.
 MARGIN_PX = 40.0
 # the front face stays beyond a fifth of the way from the baseline to the target
 LARGEST_SHARE = 0.8
-# m: in a smaller volume, the stickers of an artefact do not find room.
+# m: the stickers of an artefact do not fit into a smaller volume.
 SMALLEST_SIZE = 0.1
 CORNERS = frozen(list(product((-0.5, 0.5), repeat=3)))
 FEWEST_LINES = 7
@@ -52,8 +52,8 @@ LINES = {
 class MeasuringVolume:
     """Cuboid with sides ``size`` (3,) along x, y and z, m.
 
-    ``base_from_volume`` (4, 4) has its origin in the middle. ``distance`` is that of the middle
-    from the middle of the baseline, m.
+    ``base_from_volume`` (4, 4) has its origin in the middle. ``distance`` is the distance of the
+    origin from the middle of the baseline, m.
     """
 
     base_from_volume: Array

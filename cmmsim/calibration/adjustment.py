@@ -6,9 +6,9 @@ them. Intrinsics that are not free keep their start values.
 
 Levenberg and Marquardt's method solves the normal equations. A board pose is seen by its own view
 only, so the poses are eliminated view by view (Schur complement), which leaves the reduced normal
-matrix N of the free intrinsics and of right_from_left. All pixels count alike, and their variance
-sigma² is estimated from the residuals. The covariance of independent errors is sigma² N^-1; it is
-enlarged where the points of a view share their errors.
+matrix N of the free intrinsics and of right_from_left. All pixels have equal weight, and their
+variance sigma² is estimated from the residuals. The covariance of independent errors is sigma²
+N^-1; it is enlarged where the points of a view share their errors.
 """
 
 from collections.abc import Callable
@@ -120,9 +120,9 @@ class Adjustment:
     ``residuals`` (m, 2) of each camera are measured minus computed pixels, and ``sigma_px`` is the
     estimated standard deviation of a pixel coordinate. ``covariance`` (24, 24) belongs to the left
     and right intrinsics (9 each) and to the small error [dt, dphi] of right_from_left;
-    ``independent_covariance`` would hold if no points of a view erred alike. ``condition`` is that
-    of N scaled to a unit diagonal. ``freedom`` is the number of observations minus unknowns, and
-    ``shared`` describes errors that points of a view share.
+    ``independent_covariance`` assumes independent errors of all points. ``condition`` is the
+    condition number of N scaled to a unit diagonal. ``freedom`` is the number of observations minus
+    unknowns, and ``shared`` describes errors that points of a view share.
     """
 
     state: RigState
@@ -189,8 +189,8 @@ def adjust(
 ) -> Adjustment:
     """Adjust the rig and the board poses to sightings of points (n, 3) m of the board.
 
-    Each view is seen by at least one camera. ``free`` (9, k) is that of ``free_directions``. Raises
-    CalibrationError where the views do not determine the cameras.
+    Each view is seen by at least one camera. ``free`` (9, k) is the result of ``free_directions``.
+    Raises CalibrationError where the views do not determine the cameras.
     """
 
     def build(state: RigState) -> _Normal:

@@ -80,7 +80,7 @@ class Board(Section):
         """Orders (points,) in which the same board may be read.
 
         They are the order as it is, half a turn, and quarter turns of a square board. A picture
-        does not show which of them is the true one.
+        does not show which order is the true one.
         """
         order = np.arange(self.rows * self.columns)
         if self.kind == "asymmetric_dots":

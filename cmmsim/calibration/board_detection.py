@@ -1,10 +1,10 @@
 """A board in a picture: the points that are seen, and their pixels.
 
-OpenCV finds the corners of a chessboard. A board of dots is read at once if one threshold parts all
-dots from their ground, and the dots lie as a plane's grid does. The four sharpest corners of the
-dots' convex hull are then those of the board, and a homography names the rest. Any other picture of
-dots is left to OpenCV, which tries two dozen thresholds and knows asymmetric grids; it is thorough,
-and six times as slow.
+OpenCV finds the corners of a chessboard. A board of dots is read directly if one threshold
+separates all dots from the background, and the dots lie on the perspective image of a grid. The
+four sharpest corners of the dots' convex hull are then the corners of the board, and a homography
+identifies the other dots. OpenCV reads any other picture of dots. It tries two dozen thresholds and
+finds asymmetric grids, but is six times as slow.
 
 A fit of a bright ellipse to each dot makes its centre exact. The centre is that of the dot's
 ellipse in the image, not the image of the dot's centre, see cmmsim.geometry.disc_image. The fits

@@ -1,8 +1,8 @@
 """The instrument that a sensor file describes: its stereo rig, and the bodies that carry stickers.
 
 A rig is nominal and toed in, or calibrated. A body carries its stickers on three machined planes.
-The planes are exact, but the sticker places are nominal: a sticker sits up to about a millimetre
-beside its place.
+The planes are exact, but the sticker places are nominal: a sticker can be displaced by up to about
+a millimetre.
 """
 
 from dataclasses import dataclass, replace

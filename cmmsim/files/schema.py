@@ -1,8 +1,8 @@
 """Schema of a sensor file (TOML), with units and ranges.
 
-The ranges are those of stereo cameras, from microscopes to surveying. A number outside of its range
-is a slip of the keyboard or of a unit, and loses all its digits in what is computed with it.
-Schemas for editors show the ranges as well.
+The ranges cover stereo cameras from microscopes to surveying. A number outside its range is a
+typing error or has a wrong unit, and would make the computed results meaningless. Schemas for
+editors show the ranges as well.
 """
 
 from __future__ import annotations
@@ -103,9 +103,9 @@ def quantity(default: Any, unit: str, what: str) -> Any:
 
 
 class Timing(Section):
-    """Times at which the sensor looks, and at which its poses can be used.
+    """Times of the exposures, and of the use of their poses.
 
-    A measured pose is that in the middle of its exposure.
+    A measured pose is the pose in the middle of its exposure.
     """
 
     frame_rate: Frequency = quantity(..., "Hz", "stereo frames a second")
@@ -145,9 +145,9 @@ class Timing(Section):
         """Draw the latency of each frame (frames,), s, from the middle of its exposure to the
         pose's use.
 
-        It is normal about ``latency`` with standard deviation ``latency_jitter``. It is clipped on
-        both sides to 3 of those or to the latency itself, whichever is less: no latency is
-        negative, and the mean stays the stated one.
+        It is normal about ``latency`` with standard deviation ``latency_jitter``. Its deviation is
+        clipped to 3 standard deviations or to ``latency``, whichever is less. So no latency is
+        negative, and the mean remains ``latency``.
         """
         widest = self._widest_deviation
         return self.latency + np.clip(rng.normal(0.0, self.latency_jitter, frames), -widest, widest)
@@ -264,7 +264,7 @@ class Lens(Section):
 class Detection(Section):
     """Detector of stickers in windows when poses are measured, see :mod:`cmmsim.allowed_plugins`.
 
-    Teaching always takes the maximum-likelihood one, see :mod:`cmmsim.teaching`.
+    Teaching always uses the maximum-likelihood detector, see :mod:`cmmsim.teaching`.
     """
 
     detector: Annotated[str, AfterValidator(require_detector)] = quantity(
@@ -356,8 +356,8 @@ class Platform(Body):
 class SensorFile(Section):
     """Whole sensor file.
 
-    ``based_on`` is a built-in sensor, or a file beside this one, whose entries hold where this file
-    has none. ``note`` tells what a user must know of the figures, such as that they are assumed.
+    ``based_on`` names a built-in sensor, or a file in the same folder. It supplies the entries that
+    this file lacks. ``note`` is a warning about the figures, such as that they are assumed.
     ``renderer`` is one of :mod:`cmmsim.allowed_plugins`; "auto" takes pyrender where OpenGL works,
     and otherwise analytic.
     """

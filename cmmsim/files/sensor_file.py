@@ -1,7 +1,7 @@
 """Reading of sensor files (TOML), by name or path, with changes.
 
-Changes are entries other than a file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested
-as in the file.
+Changes are entries that replace the file's entries, by dotted key as
+``{"camera.dark_noise": 40.0}`` or nested as in the file.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from cmmsim.geometry.pose import Array
 
 
 def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Return changes by dotted key, whether given so or as tables in tables.
+    """Return changes by dotted key, from dotted keys or nested tables.
 
-    A later one replaces an earlier one.
+    A later change replaces an earlier change of the same key.
     """
     found: dict[str, Any] = {}
     for key, value in changes.items():
@@ -83,8 +83,8 @@ def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array
     (n, 2).
 
     Points evenly spaced in angle on an ellipse have the same mean and second moments whatever their
-    number is, from three on. So n stickers determine a plane or a pose sqrt(n) times better than
-    one would.
+    number is, from three on. So the accuracy of a plane or pose improves with sqrt(n) for n
+    stickers.
     """
     places = np.asarray(listed, dtype=float)
     reach = np.linalg.cholesky(np.cov(places.T, bias=True))
@@ -147,8 +147,8 @@ def sensor_text(name: str | Path) -> str:
 def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
     """Read the sensor file of a built-in name or a path.
 
-    Changes hold instead of the file's entries. Raises UnknownSensorError for a name that is
-    neither, and SensorFileError, with the valid names, for a bad content.
+    Changes replace the file's entries. Raises UnknownSensorError for a name that is neither, and
+    SensorFileError, with the valid names, for a bad content.
     """
     require_keys(name, changes)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")

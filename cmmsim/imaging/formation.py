@@ -1,7 +1,7 @@
 """Image formation from posed bodies to the light on each pixel, before noise.
 
 Windows are drawn through perfect lenses on a grid finer than the pixels, with a margin for the
-light that comes in from outside. Distortion takes each fine pixel from where the lens takes it. The
+light that comes in from outside. Distortion resamples each fine pixel from its ideal place. The
 point spread, the mean over each pixel, and the relative illumination follow. All of it is linear
 light. A perfect lens with no point spread is drawn on the pixels at once.
 
@@ -12,8 +12,8 @@ no edge is moved or widened. Source: R. G. Keys, Cubic convolution interpolation
 processing, IEEE Trans. ASSP 29 (1981).
 
 A whole image is drawn finely only around bright spots. Most of the scene stands still during an
-exposure: a window that nothing reaches shows the background and is not drawn, and one that no
-moving body reaches is drawn once.
+exposure: a window without any body shows the background and is not drawn, and a window without a
+moving body is drawn once.
 """
 
 from collections.abc import Sequence
@@ -88,7 +88,7 @@ class ImageFormation:
     optics: Optics
 
     def centre_error_px(self, cameras: Sequence[PinholeCamera], supersampling: int) -> float:
-        """Return the error of a sticker's centre that drawing leaves at a supersampling, px rms."""
+        """Return the error of a sticker's centre due to drawing at a supersampling, px rms."""
         fine = 1 if self.draws_pixels(cameras) else self.sub_pixels
         return self.renderer.centre_error_px(-(-supersampling // fine) * fine)
 
@@ -214,7 +214,7 @@ def _bent(
 ) -> NDArray[np.float32]:
     """Return fine windows (k, fine_size, fine_size) as the lens shows them.
 
-    Those of a perfect lens are only cut out.
+    For a perfect lens, the windows are only cut out.
     """
     if not side.camera.distortion.is_zero:
         return resample(drawn, nodes, fine_size)

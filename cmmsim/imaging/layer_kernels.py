@@ -15,8 +15,8 @@ class Solids(NamedTuple):
     """Solids from far to near.
 
     ``half_planes`` (m, 3) are a, b, c of a x + b y <= c, px; those of solid k stand from starts[k]
-    to starts[k + 1]. ``boxes`` (k, 4) are lowest x, y and highest x, y. ``slots`` (k,) say where
-    the cover of a solid is kept, or -1.
+    to starts[k + 1]. ``boxes`` (k, 4) are lowest x, y and highest x, y. ``slots`` (k,) are the
+    indices at which the covers of solids are stored, or -1.
     """
 
     half_planes: Array

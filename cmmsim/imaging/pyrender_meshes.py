@@ -7,9 +7,9 @@ fewer samples than that of a sharp rim.
 
 **Painter's order.** Windows need no depths if they show one solid and at most one stack of discs
 that lies on it. A camera before the plane of a disc sees the disc, for all of the solid lies behind
-that plane. A convex solid that fills a window shows only its level. A sticker's dark ring is then
-most of the window: it is taken for the ground, and the solid is drawn over it as a band around the
-ring, with the same edge, in far fewer drawn pixels.
+that plane. A convex solid that fills a window shows only its level. A sticker's dark ring then
+fills most of the window, so the window is cleared to the ring's level. The solid is drawn over it
+as a band around the ring. The edge is the same, and far fewer pixels are drawn.
 """
 
 from collections.abc import Sequence

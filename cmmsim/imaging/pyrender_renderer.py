@@ -3,8 +3,8 @@
 pyrender supplies the OpenGL context, the mesh buffers and the flat shader. The frame buffers hold
 one channel only, which draws faster than pyrender's four. Each window is drawn into its own cell of
 one large frame buffer, with its own projection. It is drawn larger by the supersampling factor and
-averaged in linear light. Every drawn pixel has one sample: several of pyrender's multisampling cost
-more than they gain on the stickers' soft rims.
+averaged in linear light. Every drawn pixel has one sample: multisampling costs more than it gains
+on the stickers' soft rims.
 
 A cell draws only the patches whose bounding box reaches into it. Projection and camera_from_body
 are multiplied in double precision, so that the shader sees one well-scaled matrix. Depths are asked
@@ -156,7 +156,7 @@ class _Atlas:
     ) -> NDArray[np.uint8]:
         """Draw the atlas (rows * cell_h, columns * cell_w) uint8, with cells in reading order.
 
-        It is valid until the next one.
+        The result is valid until the next call.
         """
         self._context._platform.make_current()
         # Drawn pixels a radian.
@@ -312,7 +312,7 @@ class _Atlas:
 def _called(name: str, *arguments: type) -> Any:
     """Return a function of OpenGL that takes plain numbers and addresses.
 
-    It is not asked for errors after each call, which would take most of the time.
+    OpenGL's errors are not checked after each call, because this would take most of the time.
     """
     from OpenGL.platform import PLATFORM
 
@@ -320,7 +320,7 @@ def _called(name: str, *arguments: type) -> Any:
 
 
 class _FrameBuffer:
-    """Frame buffer with a red channel and depth, one sample a pixel."""
+    """Frame buffer with a red channel and depth, one sample per pixel."""
 
     def __init__(self, gl: Any, width: int, height: int) -> None:
         from OpenGL.raw.GL.VERSION import GL_1_0  # reads into given memory

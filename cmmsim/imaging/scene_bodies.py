@@ -111,7 +111,7 @@ Patch = DiscStack | Mesh
 class SceneBody:
     """Rigid body as drawn: its solid and one stack of discs for each sticker.
 
-    ``sticker_places`` (n, 3) are the true ones, m.
+    ``sticker_places`` (n, 3) are the true places, m.
     """
 
     solid: Mesh
@@ -122,7 +122,7 @@ class SceneBody:
 def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
     """Return the true sticker places (n, 3).
 
-    They are the nominal ones, moved within their planes by a seeded distance and direction.
+    They are the nominal places, moved within their planes by a seeded distance and direction.
     """
     rng = np.random.default_rng([stickers.placement_seed, stream])
     distance = rng.uniform(*stickers.placement, len(body.nominal))
@@ -217,7 +217,7 @@ def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
 def rod_transforms(starts: Array, ends: Array) -> Array:
     """Return ``rod_transform`` (k, 4, 4) of k rods at once, from starts and ends (k, 3).
 
-    Raises CmmError for one that is too short.
+    Raises CmmError for a rod that is too short.
     """
     # Late, as numba takes time to import.
     from cmmsim.imaging.view_kernels import place_rods

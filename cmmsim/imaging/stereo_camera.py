@@ -66,10 +66,10 @@ class Quality:
 class VirtualStereoCamera:
     """Two cameras that look at the true scene and hand out noisy grey values.
 
-    ``rig`` and ``camera_from_base`` (4, 4) are the true ones. In the drawable of ``formation``,
-    body 0 is the platform and body 1 the base; the others are ``obstacle_names`` in order.
-    ``exposure`` is in s. ``pattern_seed`` is that of the differences from pixel to pixel. The right
-    camera exposes ``right_later`` s later.
+    ``rig`` and ``camera_from_base`` (4, 4) have their true values. In the drawable of
+    ``formation``, body 0 is the platform and body 1 the base; the others are ``obstacle_names`` in
+    order. ``exposure`` is in s. ``pattern_seed`` is the seed of the differences from pixel to
+    pixel. The right camera exposes ``right_later`` s later.
     """
 
     rig: StereoRig

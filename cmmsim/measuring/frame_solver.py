@@ -8,12 +8,13 @@ in two cases:
 - Its ellipse in one image differs from that of a whole sticker. A partly hidden sticker, or a
   bright spot that touches it, moves the centre and the rim alike.
 
-Undetected errors of both kinds are then of the size of the noise. At least four stickers must be
-left, since a wrong one among three cannot be told, and more than were left out.
+Undetected errors of both kinds are then of the size of the noise. At least four stickers must
+remain, because a wrong sticker among three cannot be identified. More stickers must remain than
+were left out.
 
-All residuals may be larger than noise: a camera has drifted since its calibration, or several
-stickers are a little wrong. Places are then judged by the residuals of the others, and the
-covariances grow by the same factor (Birge ratio), up to a limit.
+All residuals can be larger than noise, for example if a camera has drifted since its calibration,
+or several stickers are slightly misplaced. Places are then judged by the residuals of the others,
+and the covariances grow by the same factor (Birge ratio), up to a limit.
 
 The computation is compiled, in ``solver_kernels``.
 """

@@ -25,13 +25,12 @@ def _nothing_in_common(pose: Array) -> Array:
 
 @dataclass(frozen=True)
 class Measurement:
-    """Pose of the platform in the base frame, and what it was made from.
+    """Pose of the platform in the base frame, with the stickers that it rests on.
 
-    The error of a pose has two parts, which are never added in silence. The noise is new in every
-    frame. The common part comes from rig and taught frames that are not known exactly. It is one
-    draw, the same in every frame, so that no mean over frames makes it smaller. The mean of N
-    frames errs by covariance / N + common_covariance. ``Sensor.common_errors`` tells how the common
-    part of one pose goes with that of another.
+    The error of a pose has two parts, which are stated separately. The noise is new in every frame.
+    The common part comes from errors of the known rig and of the taught frames. It is the same in
+    every frame, so a mean over frames does not reduce it. The mean of N frames errs by covariance /
+    N + common_covariance. ``Sensor.common_errors`` relates the common parts of different poses.
 
     Attributes
     ----------

@@ -349,8 +349,8 @@ class StickerWindows:
     def _smears(self, swept: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
         """Return the stickers' movement (2, k, 2) px during the exposure, and where it counts (k,).
 
-        It does not count where it is too short to show beside the point spread, or so long that it
-        cannot be told.
+        It does not count if it is too short to show beside the point spread, or too long to be
+        measured.
         """
         moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in swept)
         first, last = (

@@ -93,18 +93,19 @@ FEWEST_NOMINAL = 6
 
 @dataclass(frozen=True)
 class PoseEstimator(Observer):
-    """Estimator that turns images into poses: an observer, the platform, and what was taught of it.
+    """Estimator that turns images into poses: an observer, the platform, and the result of
+    teaching.
 
     Parameters
     ----------
     rig, noise, settings
-        Those of the observer.
+        As in `Observer`.
     platform : MarkedBody
         Body that is measured.
     taught : Taught
         Its stickers and the place of the base.
     method : {"registration", "planes"}
-        Method by which a pose is made of the stickers.
+        Method that computes a pose from the stickers.
     common_covariance : callable, optional
         Covariance (6, 6) that all poses have in common, at a pose (6,), instead of that of
         teaching.
@@ -171,8 +172,7 @@ class PoseEstimator(Observer):
         return self.measured(self.observe(images, expected, *self._stickers, swept), expected)
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
-        """Measure as ``measure`` where nothing is known of the movement, which the streaks then
-        tell.
+        """Measure as ``measure``, with an unknown movement that is estimated from the streaks.
 
         Raises LostError, which states the length of the streaks where they show.
         """

@@ -1,8 +1,9 @@
 """Compiled: the pose of a body from the stickers that are seen in one frame.
 
 Images and drawn centres feed this solver alike, one frame or many. Taught places are laid onto the
-triangulated stickers. Then the worst sticker is left out, as long as one differs too much: from
-where the others put it, or from the ellipse of a whole sticker. ``frame_solver`` says why.
+triangulated stickers. While a sticker differs too much, the worst sticker is left out. It differs
+from the place that the other stickers predict, or from the ellipse of a whole sticker.
+``frame_solver`` gives the reasons.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Movement of a body during an exposure, told from the streaks of its stickers.
+"""Movement of a body during an exposure, estimated from the streaks of its stickers.
 
 A disc that moves by d px while the shutter is open is drawn out. The second moments of its light
 grow by d d' / 12, and those of an ellipse with matrix A are A A / 4. With the ellipse A_0 that the
@@ -9,8 +9,8 @@ sticker would show at rest, its apparent ellipse therefore fulfils
 All stickers of a rigid body share one small movement w (6,), d = P w, which is found by least
 squares over both images. An ellipse fits a streak only roughly. The fit is therefore repeated with
 the light of the ellipse moving by the d that was found, and the rest of A A is added to d d' / 3,
-until d settles. Streaks do not tell forth from back. The middle of the exposure, for which a pose
-stands, is the same for both.
+until d settles. Streaks do not show the sign of the movement. The pose refers to the middle of the
+exposure, which is the same for both signs.
 """
 
 from collections.abc import Callable
@@ -48,7 +48,7 @@ UNIT = 1e-4
 
 @dataclass(frozen=True)
 class Streaks:
-    """Movement told from streaks.
+    """Movement estimated from streaks.
 
     ``swept`` are camera_from_body (4, 4) at both ends of the exposure, in unknown order.
     ``longest_px`` is the longest movement of a sticker in the images.

@@ -45,9 +45,10 @@ class Taught:
     base_places : ndarray, shape (k, 3)
         Stickers in base axes, m.
     setup : str
-        Entries of the sensor file that it holds for, see ``setup_of``; empty if made by hand.
+        Entries of the sensor file for which the teaching is valid, see ``setup_of``; empty if made
+        by hand.
     known : KnownRig or None
-        Rig that it was taught with, where it is not the file's.
+        Rig that was used for teaching, if it differs from the file's rig.
 
     Raises
     ------
@@ -99,7 +100,8 @@ class Taught:
         base_places: Array,
         setup: str = "",
     ) -> Taught:
-        """Return exact knowledge, as by a certificate: all covariances are zero.
+        """Return a teaching result without error, such as from a certificate: all covariances are
+        zero.
 
         Parameters
         ----------

@@ -43,8 +43,8 @@ class FixedPattern:
     """Differences from pixel to pixel of one camera, the same in every image (EMVA 1288: PRNU and
     DSNU).
 
-    ``sensitivity`` is that of each pixel relative to the mean, and ``offset`` its signal in the
-    dark, e-. Both are arrays of one shape.
+    ``sensitivity`` is the sensitivity of each pixel relative to the mean, and ``offset`` its signal
+    in the dark, e-. Both are arrays of one shape.
     """
 
     sensitivity: NDArray[np.float32]
@@ -134,8 +134,8 @@ class CameraNoise:
     def rounding_excess(self, mean_grey: Array) -> Array:
         """Return the largest variance of grey values with about this mean, over their usual one.
 
-        It is 1 with noise of a grey value, and up to 3 with little noise. Noise then decides to
-        which of two numbers a mean half-way between is rounded.
+        It is 1 with noise of a grey value, and up to 3 with little noise. With little noise, the
+        noise decides whether a mean half-way between two numbers is rounded up or down.
 
         The variance of a rounded normal variable whose mean lies half-way between two numbers comes
         from the Fourier series of the rounding error: s² + 1/12 + sum over k of exp(-2 pi² k² s²)

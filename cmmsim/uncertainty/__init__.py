@@ -1,1 +1,1 @@
-"""Errors that all poses have in common: those of the known rig, of teaching, and of a drift."""
+"""Errors that all poses have in common: errors of the known rig, of teaching, and of a drift."""

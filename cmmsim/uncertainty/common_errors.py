@@ -1,13 +1,14 @@
-"""Errors that all poses of a run have in common: those of cameras, taught frames and exposure.
+"""Errors that all poses of a run have in common, from cameras, taught frames and exposure.
 
-A measured pose errs by noise, which is new in every frame. It also errs because the estimator takes
-things for exact that are not: the rig (24 numbers), the taught frames of base and platform (12),
-and the instant at which the right camera exposes. Each is one draw that stays the same along a run.
+A measured pose errs by noise, which is new in every frame. It also errs because the estimator
+assumes inexact values to be exact: the rig (24 numbers), the taught frames of base and platform
+(12), and the instant at which the right camera exposes. The error of each value is constant during
+a run.
 
-To first order they move a measured pose by J(pose) d, and J needs no images: centres are projected
-through a rig that is off, and measured with the known one. A rig that is off also teaches wrong
-frames and sticker places, and much of its error cancels there. Only what differs from home and base
-is left.
+To first order, these errors d move a measured pose by J(pose) d. J needs no images: centres are
+projected through a rig with errors, and measured with the known rig. Teaching with this rig also
+gives wrong frames and sticker places, which cancel much of the error. Only the difference between
+the errors at the pose and at teaching remains.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ STEPS = np.diag(
 
 @dataclass(frozen=True)
 class CommonErrors:
-    """Common errors by name, which ends with the unit.
+    """Common errors by name. Each name ends with the unit.
 
     ``changes`` (N, 6, k) of the poses are per unit of each error, m and rad, and ``covariance`` (k,
     k) belongs to the errors.
@@ -71,14 +72,14 @@ class CommonErrors:
 
     @property
     def pose_covariances(self) -> Array:
-        """Covariances (N, 6, 6) that the errors give each pose; the same draw in all of them."""
+        """Covariances (N, 6, 6) of each pose due to the errors, which are the same in all poses."""
         return np.asarray(self.changes @ self.covariance @ self.changes.swapaxes(1, 2))
 
 
 @dataclass(frozen=True)
 class MeasuringGeometry:
-    """Set-up as an estimator knows it: rig, both bodies, what was taught, and the pose (6,) at
-    teaching.
+    """Set-up as an estimator knows it: the rig, both bodies, the result of teaching, and the pose
+    (6,) at teaching.
     """
 
     rig: StereoRig

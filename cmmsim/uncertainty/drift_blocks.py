@@ -1,11 +1,11 @@
 """Residuals of the stickers' pixels in a few frames, and their changes by each error of the rig.
 
-A body's stickers are expected where their taught places and its measured pose put them. The pose
-itself is not known otherwise, so the part that six numbers explain is taken out. The misfit of the
-pattern and the gaps of the rays are left. With n stickers these are 4 n numbers, of unit variance
-in the 4 n - 6 directions that no pose explains, and zero in the others. The base stands still, and
-its pose was taught: nothing is taken out of its residuals, which also show how the whole rig stands
-against it.
+A body's stickers are expected where their taught places and its measured pose put them. The pose is
+estimated from the same pixels, so the part of the residuals that six numbers explain is removed.
+The misfit of the pattern and the gaps of the rays remain. With n stickers these are 4 n numbers, of
+unit variance in the 4 n - 6 directions that no pose explains, and zero in the others. The base
+stands still, and its pose was taught, so nothing is removed from its residuals. They also show
+movements of the whole rig relative to the base.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def base_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
 def stacked(rows: list[Rows], centres: tuple[int, ...]) -> Rows:
     """Join the rows of several bodies.
 
-    The stickers of all bodies, so many each, have offsets of their own.
+    Each body has its own offsets, for as many stickers as ``centres`` states.
     """
     sizes = [one.residuals.shape for one in rows]
     first = 0

@@ -1,15 +1,16 @@
 """Sequential likelihood ratio for a rig that moves, from rows of residuals, and its findings.
 
 One Gaussian model of all residuals says that the rig is as it was calibrated and taught: its errors
-are one draw of the calibration's covariance, the same in every frame. Other models let it walk at
-random, at one of several rates, or be more wrong from the start than its covariance says. Each is a
-Kalman filter, and predicts the next residuals before it sees them.
+are one draw of the calibration's covariance, the same in every frame. Other models let the rig walk
+at random, at one of several rates, or give it larger errors at the start than its covariance
+states. Each model is a Kalman filter that predicts the next residuals.
 
-The mean likelihood of the others over that of the first is, while the first is true, a martingale
-with the mean one. It exceeds 1 / chance at any time of a run, however long, with at most that
-probability (Ville's inequality), so that no correction for looking often is needed. Sources: J.
-Ville, Étude critique de la notion de collectif (1939); H. Robbins, Statistical methods related to
-the law of the iterated logarithm, Ann. Math. Statist. 41 (1970).
+The ratio is the mean likelihood of the other models over the likelihood of the first model. While
+the first model is true, this ratio is a martingale with mean 1. It exceeds 1 / chance at any time
+of a run, however long, with at most that probability (Ville's inequality), so no correction for
+repeated tests is needed. Sources: J. Ville, Étude critique de la notion de collectif (1939); H.
+Robbins, Statistical methods related to the law of the iterated logarithm, Ann. Math. Statist. 41
+(1970).
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ class Filter:
         self._constant = -float(np.log(prior_std).sum())
 
     def step(self, gram: Array, right: Array, squared: float, frames: int) -> None:
-        """See residuals r of unit variance with derivatives D (m, n), so many frames after those
-        before.
+        """Update with residuals r of unit variance and derivatives D (m, n), ``frames`` frames
+        after the last update.
 
         They are given as D'D (n, n), D'r (n,) and r'r.
         """
@@ -97,9 +98,7 @@ class Filter:
         return self._constant + 0.5 * float(part @ part) - float(np.log(np.diag(lower)).sum())
 
     def told_of(self, first: int) -> tuple[Array, Array]:
-        """Return the information (d, d) about the first d unknowns, and score (d,), whatever others
-        are.
-        """
+        """Return the marginal information (d, d) and score (d,) of the first d unknowns."""
         others = np.linalg.solve(self.precision[first:, first:], self.precision[first:, :first])
         return (
             self.precision[:first, :first] - self.precision[:first, first:] @ others,
@@ -120,7 +119,7 @@ def _factored(matrix: Array, right: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Told:
-    """Information on a drift in SIZES from residuals, apart from what was expected of it.
+    """Information on a drift, in units of SIZES, from residuals alone, without the prior.
 
     It is ``information`` (d, d), and ``score`` (d,), which is information times estimate.
     ``from_start`` says that the rig was so at teaching already.
@@ -155,7 +154,7 @@ class Evidence:
 
     @property
     def log_ratio(self) -> float:
-        """Logarithm of the likelihood of a rig that has moved, over that of one that has not.
+        """Logarithm of the likelihood ratio of a moved rig to an unmoved rig.
 
         The former is the mean over the models.
         """
@@ -175,7 +174,7 @@ class Evidence:
         return np.asarray(every.swapaxes(1, 2) @ every)
 
     def step(self, products: Array, frames: int) -> None:
-        """See a block by its products (n, n), so many frames after those before."""
+        """Update with a block's products (n, n), ``frames`` frames after the last update."""
         self._frames += frames
         size = self._size
         drifted = np.delete(np.arange(len(products) - 1), slice(self._size, self._size + RIG))
@@ -216,7 +215,7 @@ class Evidence:
 def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[Array, Array]:
     """Return the information (d, d) and score (d,) of residuals about the first d unknowns.
 
-    Those of the prior are taken off.
+    The prior's contributions are subtracted.
     """
     information, score = filtered.told_of(size)
     # Nothing has been seen, and nothing has walked.
@@ -227,8 +226,8 @@ def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[
 
 @dataclass(frozen=True)
 class Movement:
-    """Movement of one parameter of the rig and its standard deviation, in the unit that ends its
-    name.
+    """Movement of one parameter of the rig and its standard deviation, in the unit at the end of
+    the parameter's name.
     """
 
     name: str
@@ -256,8 +255,9 @@ class Finding:
     frames, judged_frames : int
         All frames, and those in which enough stickers were seen.
     movements : tuple of Movement
-        Fewest parameters that explain what is seen at the end of the run, the first one most. Other
-        parameters of nearly the same effect may be the true cause. Empty where nothing was noticed.
+        Smallest set of parameters that explains the residuals at the end of the run, in falling
+        order of effect. Other parameters of nearly the same effect might be the true cause. Empty
+        where nothing was noticed.
     explained : float
         Share that the movements explain.
     from_start : bool

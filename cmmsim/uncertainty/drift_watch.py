@@ -1,4 +1,4 @@
-"""Watch for a drift, which takes measurements frame after frame."""
+"""Detection of a drift from measurements, frame after frame."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TAUGHT_OFFSET_PX = 3e-4
 
 
 class DriftWatch:
-    """Watch that tells whether the rig still is as it was calibrated and taught.
+    """Watch for movements of the rig since it was calibrated and taught.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class DriftWatch:
             return None
 
     def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
-        """Take the next frame, in which ``base`` is what is seen of the base's stickers.
+        """Take the next frame; ``base`` holds the base's stickers observed in it.
 
         A lost frame only says that time passes.
         """

@@ -23,7 +23,8 @@ PHOTOGRAPHED = (
 )
 """Covariance (24, 24) of a rig that was calibrated by fifteen photographs of a board.
 
-Focal lengths to 1 px and principal points to 0.5 px were found with real ones; the rest matches."""
+Real photographs gave focal lengths to 1 px and principal points to 0.5 px. The other entries are
+consistent with these."""
 
 
 @dataclass(frozen=True)
