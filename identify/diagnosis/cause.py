@@ -7,16 +7,20 @@ their residuals is the column of the cause.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import lru_cache, reduce
 
 import numpy as np
 
+from dynamics import Robot
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
 Change = Callable[[OutputErrorProblem, float], OutputErrorProblem]
 """Function that returns the problem with a cause of a given size. It changes nothing else."""
+
+Columns = Callable[[OutputErrorProblem, Array], Array]
+"""Function (problem, parameters) that returns columns (m, g) of the residuals."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,11 @@ class Cause:
         Function (size) that returns a line to type, or one sentence of what to do.
     least : float
         Least size that there can be.
+    quick : callable and int, optional
+        Function (problem, parameters) that returns columns (m, g) of several causes at once, and
+        the place of this one among them. None: columns are differences of runs.
+    deviations : ndarray, shape (g,), optional
+        Change of the robot's geometric numbers by a size of one, for causes in the geometry.
     tried : tuple of float
         Sizes at which the cause is looked for, where a small one shows nothing. Empty: about zero.
     """
@@ -51,6 +60,8 @@ class Cause:
     step: float
     remedy: Callable[[float], str]
     least: float = -np.inf
+    quick: tuple[Columns, int] | None = None
+    deviations: Array | None = None
     tried: tuple[float, ...] = ()
 
 
@@ -69,4 +80,21 @@ def with_causes(
     """Return the problem with several causes, each of its size (k,)."""
     # one of size zero changes nothing
     present = [(one, float(size)) for one, size in zip(causes, sizes, strict=True) if size]
-    return reduce(lambda changed, pair: pair[0].change(changed, pair[1]), present, problem)
+    geometric = [size * one.deviations for one, size in present if one.deviations is not None]
+    if geometric:
+        # a robot is moved once for all numbers, which takes longer than a run of it
+        problem = with_geometry(problem, np.sum(geometric, axis=0))
+    others = [pair for pair in present if pair[0].deviations is None]
+    return reduce(lambda changed, pair: pair[0].change(changed, pair[1]), others, problem)
+
+
+def with_geometry(problem: OutputErrorProblem, deviations: Array) -> OutputErrorProblem:
+    """Return the problem of a robot whose geometric numbers are off by deviations (g,)."""
+    robot = _moved(problem.runs[0].robot, deviations.tobytes())
+    return replace(problem, runs=tuple(replace(run, robot=robot) for run in problem.runs))
+
+
+@lru_cache(maxsize=8)
+def _moved(robot: Robot, deviations: bytes) -> Robot:
+    """Return a moved robot, which a fit asks for several times. Bytes, as arrays are no keys."""
+    return robot.moved(np.frombuffer(deviations))

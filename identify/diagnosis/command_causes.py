@@ -1,6 +1,5 @@
-"""Causes between the log of the commands and the drives: joint zeros, scale, and clocks."""
+"""Causes between the log of the commands and the drives: their scale, and clocks."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,45 +16,10 @@ CLOCK_STEP_S = 1e-4
 SCALE_STEP = 1e-4
 """Change of the scale of commands for differences."""
 
-ZERO_STEP = {"rad": 1e-4, "m": 1e-5}
-"""Change of a joint's zero for differences, by the unit of joint coordinates."""
-
 
 def command_causes(problem: OutputErrorProblem) -> tuple[Cause, ...]:
     """Return the causes between log and drives that a problem can have."""
-    return (*zeros(problem), *scales(), *clocks(problem))
-
-
-def zeros(problem: OutputErrorProblem) -> tuple[Cause, ...]:
-    """Return the zeros of the joints. A joint of positive size reads less than it should."""
-    layout = problem.runs[0].robot.layout
-    unit = layout.joint_unit
-    step = ZERO_STEP[unit]
-
-    def shifted(joint: int) -> Callable[[LoopModel, float], LoopModel]:
-        # drives that read less by a value go further by it
-        return lambda run, size: replace(
-            run, logged=run.logged + size * np.eye(run.logged.shape[1])[joint]
-        )
-
-    def remedy(joint: int) -> Callable[[float], str]:
-        return lambda size: (
-            f"set the zero of joint {joint + 1} anew: it reads {abs(size):.3g} {unit} too "
-            f"{'little' if size > 0 else 'much'}; cmmsim geometry finds all zeros from poses at "
-            "rest"
-        )
-
-    return tuple(
-        Cause(
-            name=f"zero of joint {joint + 1}",
-            unit=unit,
-            group="zeros of the joints",
-            change=in_each_run(shifted(joint)),
-            step=step,
-            remedy=remedy(joint),
-        )
-        for joint in range(layout.joints)
-    )
+    return (*scales(), *clocks(problem))
 
 
 def scales() -> tuple[Cause, ...]:

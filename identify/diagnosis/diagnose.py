@@ -14,8 +14,9 @@ from identify.diagnosis.cause import Cause
 from identify.diagnosis.diagnosis import Diagnosis, diagnosis_of
 from identify.diagnosis.fit import Point, linearised
 from identify.diagnosis.own_cause import check_columns
+from identify.diagnosis.ranking import Rows
 from identify.diagnosis.score import cause_columns
-from identify.diagnosis.selection import Rows, select
+from identify.diagnosis.selection import select
 from identify.errors import EstimationError
 from identify.estimation.identification import asked_of, identify, output_error_problem
 from identify.estimation.output_error import OutputErrorProblem
@@ -23,6 +24,9 @@ from identify.estimation.output_error_search import search_with_common_errors
 from identify.estimation.result import IdentificationResult
 from identify.runtime import one_thread
 from identify.scenario import Scenario
+
+MOST_STEPS = 30
+"""Largest number of steps of the search for the optimum under the logged commands."""
 
 
 def diagnose(
@@ -103,6 +107,8 @@ def diagnosis_from(
 
 def _optimum(problem: OutputErrorProblem, start: Array) -> tuple[OutputErrorProblem, Point]:
     """Return a problem with the modes of its common errors at its optimum, and the optimum."""
+    # an estimate that is still under way would be accused of what it has not reached yet
+    problem = replace(problem, stop=replace(problem.stop, max_iterations=MOST_STEPS))
     found = search_with_common_errors(problem, [start], lambda n=1: None)
     there = found.linearised()
     solution = found.solution

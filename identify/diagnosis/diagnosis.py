@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from identify.diagnosis.cause import Cause
-from identify.diagnosis.selection import Ranked, Rows, Selected, Selection
+from identify.diagnosis.ranking import Ranked, Rows
+from identify.diagnosis.selection import Selected, Selection
 from identify.estimation.explanation import Misfit
 
 if TYPE_CHECKING:
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
 
 MOST_OF_IT = 0.5
 """Share of the misfit that the causes must explain for it to count as explained."""
+
+
+NAMED = 3
+"""Number of causes that one line names of those that cannot be told apart from another."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,9 @@ class Finding:
         sizes = "; ".join(
             str(one) if len(self.sizes) == 1 else f"{one.name}: {one}" for one in self.sizes
         )
-        alike = f" (or {', or '.join(self.alike)}: they cannot be told apart)" if self.alike else ""
+        others = ", or ".join(self.alike[:NAMED])
+        more = f", or {len(self.alike) - NAMED} more" if len(self.alike) > NAMED else ""
+        alike = f" (or {others}{more}: they cannot be told apart)" if self.alike else ""
         return f"{self.name}{alike}, {sizes}, explains {100 * self.share:.3g} % of the misfit"
 
 

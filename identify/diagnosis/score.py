@@ -83,26 +83,42 @@ def cause_columns(
 ) -> Array:
     """Return derivatives (m, k) of `residuals` with respect to the sizes of causes, at sizes (k,).
 
-    They are central differences, one-sided at the least size. A column is NaN where the model is
-    unstable.
+    A column is NaN where the model is unstable.
     """
-    spans = [
-        (max(size - one.step, one.least) - size, one.step)
-        for one, size in zip(causes, sizes, strict=True)
-    ]
-    moves = np.eye(len(causes))
+    columns = np.zeros((len(residuals(problem, parameters)), len(causes)))
+    slow = [place for place, one in enumerate(causes) if one.quick is None]
+    columns[:, slow] = _differences(problem, parameters, causes, sizes, slow)
+    there = with_causes(problem, causes, sizes)
+    for quick in {one.quick[0] for one in causes if one.quick is not None}:
+        found = quick(there, parameters)
+        for place, one in enumerate(causes):
+            if one.quick is not None and one.quick[0] is quick:
+                columns[:, place] = found[:, one.quick[1]]
+    return columns
+
+
+def _differences(
+    problem: OutputErrorProblem,
+    parameters: Array,
+    causes: Sequence[Cause],
+    sizes: Array,
+    places: Sequence[int],
+) -> Array:
+    """Return central differences (m, q) for the causes at some places, one-sided at least sizes."""
+    spans = [(max(-causes[k].step, causes[k].least - sizes[k]), causes[k].step) for k in places]
+    moves = np.eye(len(causes))[list(places)]
     ends = [
         with_causes(problem, causes, sizes + by * move)
         for span, move in zip(spans, moves, strict=True)
         for by in span
     ]
     found = each_residuals(ends, parameters)
-    columns = np.full((len(residuals(problem, parameters)), len(causes)), np.nan)
-    for place, (low, high) in enumerate(spans):
-        less, more = found[2 * place : 2 * place + 2]
-        if less is not None and more is not None:
-            columns[:, place] = (more - less) / (high - low)
-    return columns
+    columns = [
+        np.nan if less is None or more is None else (more - less) / (high - low)
+        for less, more, (low, high) in zip(found[::2], found[1::2], spans, strict=True)
+    ]
+    rows = len(residuals(problem, parameters))
+    return np.array([np.broadcast_to(one, rows) for one in columns]).reshape(-1, rows).T
 
 
 @dataclass(frozen=True)

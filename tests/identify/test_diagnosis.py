@@ -57,6 +57,22 @@ def with_zeros(*shifts):
     return changed
 
 
+def with_numbers(kind, *sizes):
+    """Function that returns a plant whose geometric numbers of a kind are off, one size a leg."""
+
+    def changed(plant):
+        names = plant.robot.geometry.number_names
+        off = np.zeros(len(names))
+        off[[names.index(f"leg{k}.{kind}") for k in range(1, 7)]] = sizes
+        return replace(plant, robot=plant.robot.moved(off))
+
+    return changed
+
+
+def crank_length(monkeypatch):
+    return record_of(10, monkeypatch, with_numbers("crank_length", 0, 0, 1.3e-4, 0, 0, 0))
+
+
 def zero(monkeypatch):
     return record_of(2, monkeypatch, with_zeros(0, 3e-4, 0, 0, 0, 0))
 
@@ -81,6 +97,7 @@ CASES = {
     "scale of the commands": (scale, 1.7e-3),
     "latency of the commands": (late, 6e-3),
     "drift of the commands' clock": (drift, 1e-3),
+    "crank length of leg 3": (crank_length, 1.3e-4),
 }
 """Records whose residual an injected cause doubles, and the true size of the cause."""
 
@@ -108,6 +125,18 @@ def test_several_zeros_are_named_as_a_group_with_the_size_of_each(monkeypatch):
     assert [one.name for one in sizes] == [f"zero of joint {k}" for k in range(1, 7)]
     off = [(one.value - size) / one.std for one, size in zip(sizes, true, strict=True)]
     assert np.abs(off).max() < 3
+
+
+def test_causes_that_move_the_platform_alike_are_named_together(monkeypatch):
+    """Over a small workspace a link that is longer acts as a zero that is off."""
+    record = record_of(11, monkeypatch, with_numbers("link_length", 0, 0, 0, 0, 2e-5, 0))
+    first = diagnosed(record).findings[0]
+    assert "link length of leg 5" in (first.name, *first.alike)
+    assert all(name.endswith(" 5") for name in (first.name, *first.alike))
+    several = 2e-5 * np.random.default_rng(5).standard_normal(6)
+    record = record_of(12, monkeypatch, with_numbers("link_length", *several))
+    first = diagnosed(record).findings[0]
+    assert "lengths of the links" in (first.name, *first.alike)
 
 
 def test_of_two_causes_both_are_named(monkeypatch):
@@ -225,7 +254,7 @@ def test_python_takes_causes_of_its_own():
     result = identify.identify(record, rss6(), synthetic.SHORT)
     found = identify.diagnose(record, result, rss6(), synthetic.SHORT, causes=[cause])
     assert "bump" in found.to_dataframe().index
-    assert "bump" in found._repr_html_()
+    assert found.candidates[0].name in found._repr_html_()
 
 
 @pytest.fixture

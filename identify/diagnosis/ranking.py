@@ -1,0 +1,216 @@
+"""Ranking of causes by how much of a misfit each, or each group, explains.
+
+Candidates are all causes alone, and all causes of a group together. They are ranked by their score
+statistic S less d ln n, with d the degrees of freedom and n the number of residuals (Schwarz's
+criterion). A group may explain what two causes of other kinds make together. So it is compared
+with a few causes alone, each the best beside those before it (orthogonal matching pursuit). Each of
+these costs 2 ln k more, as it is chosen among k (Chen and Chen, Biometrika 95(3), 2008).
+
+A candidate counts if chance does not make its statistic. What of the misfit it leaves is no noise:
+it lasts from frame to frame, and goes together with any slow column. So the spread of U^T r is that
+of noise and, by the share of the model's error, that of residuals as correlated as those left
+(`identify.estimation.explanation`). The probability is multiplied by the number of candidates
+(Bonferroni).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from identify.arrays import Array
+from identify.diagnosis.cause import Cause
+from identify.diagnosis.score import Beside, Score, score
+from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
+from identify.estimation.output_error import OutputErrorProblem
+
+ALIKE = 0.99
+"""Size of the cosine between two projected columns from which on they cannot be told apart."""
+
+EXACT = 0.999
+"""Size of that cosine up to which columns are as exact as to tell which cause is the better one."""
+
+NEAR = 9.0
+"""Difference of two statistics that chance may make, in units of the noise."""
+
+FEW = 3
+"""Largest number of causes alone that are compared with a group."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One cause, or all causes of a group. places: theirs in the catalogue."""
+
+    name: str
+    places: tuple[int, ...]
+
+    def shares(self, other: "Candidate") -> bool:
+        """Tell whether two candidates have a cause in common."""
+        return not set(self.places).isdisjoint(other.places)
+
+
+def candidates(causes: Sequence[Cause]) -> tuple[Candidate, ...]:
+    """Return all causes alone, then all groups that have several members."""
+    groups: dict[str, list[int]] = {}
+    for place, one in enumerate(causes):
+        groups.setdefault(one.group, []).append(place)
+    alone = (Candidate(one.name, (place,)) for place, one in enumerate(causes))
+    together = (
+        Candidate(name, tuple(places)) for name, places in groups.items() if len(places) > 1
+    )
+    return (*alone, *together)
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """Candidate with its score.
+
+    chance: probability that a right model has such a statistic for any candidate. worth: the
+    statistic less what as many free numbers gain by chance.
+    """
+
+    candidate: Candidate
+    score: Score
+    chance: float
+    worth: float
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Places of a problem's residuals in their vector (m,).
+
+    known: number of rows for what is known beside the poses. frames: which frames (N,) of each run
+    are good.
+    """
+
+    known: int
+    frames: tuple[NDArray[np.bool_], ...]
+
+    @classmethod
+    def of(cls, problem: OutputErrorProblem, residual: Array) -> "Rows":
+        """Return the places of residuals (m,) of a problem."""
+        frames = tuple(run.ok for run in problem.runs)
+        return cls(len(residual) - 6 * sum(int(one.sum()) for one in frames), frames)
+
+    def of_poses(self, rows: Array) -> Array:
+        """Return the part of residuals (m, ...) that is of poses."""
+        return rows[self.known :]
+
+    def spread(self, residual: Array, directions: Array) -> Array:
+        """Return the covariance (d, d) of U^T r for residuals as correlated as r (m,).
+
+        directions (m, d): the columns of U.
+        """
+        total = np.zeros((directions.shape[1],) * 2)
+        first = self.known
+        for ok in self.frames:
+            own = slice(first, first + 6 * int(ok.sum()))
+            first = own.stop
+            rows = directions[own].reshape(-1, 6, directions.shape[1])
+            total += coloured_score_covariance(residual[own].reshape(-1, 6), rows, ok)
+        return total
+
+
+def misfit_of(rows: Rows, residual: Array) -> Misfit:
+    """Return the misfit of the poses in residuals (m,)."""
+    return misfit_of_white(rows.of_poses(residual))
+
+
+def rank(
+    causes: Sequence[Cause], columns: Array, residual: Array, beside: Beside, rows: Rows
+) -> tuple[Ranked, ...]:
+    """Rank all candidates, the one of most worth first.
+
+    columns (m, k) of the causes and the residual (m,) are not projected yet.
+    """
+    left = beside.part(residual)
+    usable = np.isfinite(columns).all(axis=0)
+    projected = beside.part(np.where(usable, columns, 0.0))
+    lengths = np.where(usable, np.linalg.norm(columns, axis=0), np.inf)
+    every = candidates(causes)
+    price = np.log(len(rows.of_poses(residual)))
+    ranked = []
+    for one in every:
+        places = list(one.places)
+        found = score(projected[:, places], left, lengths[places])
+        chance = min(1.0, len(every) * chance_of(found, left, rows))
+        ranked.append(Ranked(one, found, chance, found.statistic - found.freedoms * price))
+    ranked.sort(key=lambda one: -one.worth)
+    if len(ranked[0].candidate.places) == 1:
+        return tuple(ranked)
+    chain, found = few_alone(projected, left, lengths)
+    worth = found.statistic - len(chain) * (price + 2 * np.log(len(causes)))
+    if worth <= ranked[0].worth:
+        return tuple(ranked)
+    chance = min(1.0, len(every) ** len(chain) * chance_of(found, left, rows))
+    first = next(one for one in ranked if one.candidate.places == chain[:1])
+    first = replace(first, chance=min(first.chance, chance))
+    return (first, *(one for one in ranked if one.candidate is not first.candidate))
+
+
+def few_alone(columns: Array, residual: Array, lengths: Array) -> tuple[tuple[int, ...], Score]:
+    """Return the places of a few causes alone, each the best beside those before, and their score.
+
+    The arguments are as for `score`.
+    """
+    chain: tuple[int, ...] = ()
+    found = score(columns[:, :0], residual, lengths[:0])
+    price = np.log(len(residual)) + 2 * np.log(columns.shape[1])
+    for _ in range(FEW):
+        beside = Beside.of(columns[:, list(chain)])
+        free = beside.part(columns)
+        long = np.linalg.norm(free, axis=0)
+        shown = long > 0.1 * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        falls = np.where(shown, (free.T @ residual) / np.where(shown, long, 1.0), 0.0) ** 2
+        chain = (*chain, int(np.argmax(falls)))
+        if falls.max() < price:
+            return chain[:-1], found
+        found = score(columns[:, list(chain)], residual, lengths[list(chain)])
+    return chain, found
+
+
+def chance_of(found: Score, residual: Array, rows: Rows) -> float:
+    """Return the probability that a model without the causes has such a statistic.
+
+    residual (m,): the one that was projected.
+    """
+    if not found.freedoms:
+        return 1.0
+    along = found.directions.T @ residual
+    left = residual - found.directions @ along
+    share = misfit_of(rows, left).share_of_model
+    spread = np.eye(found.freedoms)
+    if share:
+        spread = spread + share * rows.spread(left, found.directions)
+    return float(chdtrc(found.freedoms, along @ np.linalg.solve(spread, along)))
+
+
+def together(ranking: Sequence[Ranked], rows: Rows, residual: Array) -> tuple[Ranked, ...]:
+    """Return the first of a ranking and all that cannot be told apart from it, the lead first.
+
+    They have no cause in common with the first, and explain as much but for chance, or for a
+    cosine of `ALIKE`. One that stands alone is compared with such ones only. Of those that explain
+    as much as columns can be exact, the lead has the fewest numbers and stands first in the
+    catalogue, where causes that are easier to look for come first.
+    """
+    first = ranking[0]
+    most = first.score.statistic
+    left = residual - first.score.directions @ (first.score.directions.T @ residual)
+    chance = NEAR * max(misfit_of(rows, left).found, 1.0)
+    alone = len(first.candidate.places) == 1
+    others = [
+        one
+        for one in ranking
+        if not one.candidate.shares(first.candidate)
+        and (len(one.candidate.places) == 1) is alone
+        and one.score.freedoms
+        and one.score.statistic >= most - max(chance, (1 - ALIKE**2) * most)
+    ]
+    as_good = most - max(chance, (1 - EXACT**2) * most)
+    lead = min(
+        (one for one in (first, *others) if one.score.statistic >= as_good),
+        key=lambda one: (one.score.freedoms, one.candidate.places),
+    )
+    return (lead, *(one for one in (first, *others) if one is not lead))
