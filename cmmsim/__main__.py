@@ -47,7 +47,7 @@ def main() -> None:
     said = foreign_identify()
     if said:
         sys.exit(f"error: {said}")
-    # By name: nothing else in this package may depend on identify.
+    # The import is by name, because this package must not depend on identify elsewhere.
     import_module("identify.__main__").main()
 
 

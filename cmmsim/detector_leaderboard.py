@@ -1,8 +1,8 @@
 """Leaderboard of the detectors: their errors on images of tilted discs, and the Cramer-Rao bound.
 
 The discs are drawn exactly. Their centres are known and lie anywhere within a pixel, and the camera
-adds its noise. An error is the distance from the ellipse's centre; eccentricity is another matter.
-Two ways that OpenCV offers are compared as well.
+adds its noise. An error is the distance from the ellipse's centre; the eccentricity of the disc's
+centre is not included. Two ways that OpenCV offers are compared as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,13 +35,13 @@ TOGETHER = 100
 SMALLEST_RADIUS_PX = 1.0
 LARGEST_RADIUS_PX = 50.0
 LARGEST_TILT_DEG = 80.0
-# Pixels between a disc's rim and the side of the part that is looked at.
+# Pixels between a disc's rim and the edge of the fitted part.
 FREE_PX = 3
 RESAMPLES = 1000
 CONFIDENCE = 0.95
-# The leaderboard is about accuracy. Where the noise is below half a grey value, the rounding of
-# neighbours is not independent, and a misfit that is judged as if it were would turn good windows
-# away.
+# The leaderboard is about accuracy. If the noise is below half a grey value, the rounding errors of
+# neighbouring pixels are correlated. A limit on the misfit, which assumes independent errors, would
+# reject good windows.
 LIMITS = FitLimits(largest_misfit=np.inf)
 
 
@@ -147,7 +147,7 @@ class Scene:
 def scene_of(file: SensorFile) -> Scene:
     """Return the scene of a sensor file's stickers and left camera."""
     rig = rig_from_file(file.rig)[0]
-    # A fixed pattern stays from image to image: it is no noise.
+    # The fixed pattern is the same in all images, so it is not part of the noise.
     noise = replace(Sensor(file).noise, prnu=0.0, dsnu=0.0)
     return Scene(
         noise,

@@ -1,4 +1,4 @@
-"""Instrument: the part of a sensor that does not measure.
+"""Instrument: the part of a sensor that exists before it measures.
 
 It holds the true cameras and scene, the known parameters of the cameras, and the result of
 teaching.
@@ -111,7 +111,7 @@ class Instrument:
 
     @cached_property
     def _view(self) -> StickerView:
-        """Stickers as the known rig should see them."""
+        """Stickers as the known rig is expected to see them."""
         place = self.true_cameras.camera_from_base
         return StickerView(
             self._file, self.platform, self.base, self.rig, self._known, place, self.optics
@@ -148,7 +148,7 @@ class Instrument:
     def truth(self) -> Taught:
         """True places of rig and stickers, for studies of the observation noise alone.
 
-        No part of the measurement knows them.
+        The measurement does not use them.
         """
         return exactly_taught(self._file)
 
@@ -191,7 +191,7 @@ class Instrument:
         Returns
         -------
         Taught
-            Frames, which other sensors with the same cameras and bodies may take over.
+            Result, which can be passed to other sensors with the same cameras and bodies.
 
         Raises
         ------

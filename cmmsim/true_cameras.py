@@ -90,7 +90,7 @@ class TrueCameras:
 
     def placed(self, obstacles: Mapping[str, Array] | None) -> Mapping[str, Array]:
         """Return obstacles at base_from_body (4, 4) each, checked. Raises as `Sensor.look`."""
-        # The legs of a robot come in every frame, and are checked together.
+        # The legs of a robot are passed in every frame. They are checked together.
         if isinstance(obstacles, PlacedBodies) and self._are_placed(obstacles):
             return obstacles
         obstacles = {} if obstacles is None else obstacles
@@ -117,7 +117,7 @@ class TrueCameras:
         }
 
     def _are_placed(self, bodies: PlacedBodies) -> bool:
-        """Tell whether bodies are all obstacles, in their order, and stand where bodies can."""
+        """Tell whether bodies are all the obstacles in their order, at rigid transforms."""
         shape = len(self.obstacles), 4, 4
         if (
             bodies.names != tuple(self.obstacles)
@@ -161,12 +161,12 @@ class TrueCameras:
     def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
         """Both cameras before the scene, without drift.
 
-        Raises CmmError for a renderer that is not proved for them.
+        Raises CmmError if the statistical renderer is not validated for this sensor file.
         """
         return self._without_images() if self.renderer is STATISTICAL else self._drawing()
 
     def _without_images(self) -> StatisticalStereoCamera:
-        """Return cameras that say what would be found in their images."""
+        """Return cameras that give the detected stickers without images."""
         stickers = self._file.stickers
         light = Light(stickers.sticker_level / 255.0, stickers.ring_level / 255.0, self._optics)
         require_proved(self._file, self._noise, light)

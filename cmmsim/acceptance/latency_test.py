@@ -99,7 +99,7 @@ def estimate_latency(
                 f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed"
             )
         residuals = positions - motion(times) - offset
-        # One common delay and the offset first, then each delay for itself.
+        # One common delay and the offset are estimated first, then each delay separately.
         if iteration < ITERATIONS // 2:
             common, shift = _common_step(residuals, velocity)
             delays = delays + common

@@ -356,17 +356,17 @@ class Platform(Body):
 class SensorFile(Section):
     """Whole sensor file.
 
-    ``based_on`` names a built-in sensor, or a file in the same folder. It supplies the entries that
-    this file lacks. ``note`` is a warning about the figures, such as that they are assumed.
-    ``renderer`` is one of :mod:`cmmsim.allowed_plugins`; "auto" takes pyrender where OpenGL works,
-    and otherwise analytic.
+    ``based_on`` names a built-in sensor, or a file by its path from this file's folder. It supplies
+    the entries that this file lacks. ``note`` is a warning about the figures, such as that they are
+    assumed. ``renderer`` is one of :mod:`cmmsim.allowed_plugins`; "auto" takes pyrender where
+    OpenGL works, and otherwise analytic.
     """
 
     name: Annotated[str, AfterValidator(check_name)] = quantity(..., "", "name of the sensor")
     based_on: str | None = quantity(
         None,
         "",
-        "built-in sensor, or file beside this one, whose entries hold where this file has none",
+        "built-in sensor, or path of a file from this folder; supplies missing entries",
     )
     note: str = quantity("", "", "what a user must know of the figures")
     renderer: Annotated[str, AfterValidator(require_renderer)] = quantity(

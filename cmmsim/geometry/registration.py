@@ -18,7 +18,7 @@ class Registration:
     """Transform (4, 4) output-from-input, with the covariance (6, 6) of its small error [dt, dphi].
 
     ``misfit`` (n,) is the squared residual of each point in units of its noise. It has three
-    degrees of freedom, less the point's share of the fit.
+    degrees of freedom, minus the part that the fit of this point uses.
     """
 
     transform: Array
@@ -30,7 +30,7 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
     """Return rigid transforms (c, 4, 4) from ``source`` to ``targets`` (c, n, 3), by singular
     values.
 
-    The source is (n, 3), or one each (c, n, 3); weights are (c, n).
+    The source is (n, 3), or (c, n, 3) with one source per target; weights are (c, n).
     """
     shares = (weights / weights.sum(axis=1, keepdims=True))[..., None]
     source_means = (shares * source).sum(axis=1)
@@ -40,7 +40,8 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
     )
     u, _, vt = np.linalg.svd(products)
     turns = np.ones((len(targets), 3))
-    # The nearest orthogonal matrix may mirror; the least singular direction is then turned back.
+    # The nearest orthogonal matrix can be a reflection. The direction of the smallest singular
+    # value is then reversed.
     turns[:, 2] = np.sign(np.linalg.det(u @ vt))
     transforms = np.tile(np.eye(4), (len(targets), 1, 1))
     transforms[:, :3, :3] = (u * turns[:, None]) @ vt
@@ -78,8 +79,8 @@ def register(source: Array, target: Array, covariances: Array) -> Registration:
 def register_sets(source: Array, targets: Array, covariances: Array) -> Registration:
     """Registrations of a ``source`` onto each of several ``targets`` (c,n,3), as of ``register``.
 
-    The source is (n,3), or one each (c,n,3). The result has transforms (c,4,4), covariances
-    (c,6,6) and misfits (c n,).
+    The source is (n,3), or (c,n,3) with one source per target. The result has transforms (c,4,4),
+    covariances (c,6,6) and misfits (c n,).
     """
     # Late, as numba takes time to import.
     from cmmsim.geometry.rigid_kernels import rigid_fits

@@ -5,10 +5,10 @@ light that comes in from outside. Distortion resamples each fine pixel from its 
 point spread, the mean over each pixel, and the relative illumination follow. All of it is linear
 light. A perfect lens with no point spread is drawn on the pixels at once.
 
-The place from which the lens takes the light of a pixel is exact on three by three nodes of a
-window, and quadratic in both directions in between; over some tens of pixels the rest is below 1e-4
-px. Values between drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so that
-no edge is moved or widened. Source: R. G. Keys, Cubic convolution interpolation for digital image
+The ideal place of each pixel is exact on three by three nodes of a window, and interpolated by
+quadratics in between. In windows of some tens of pixels, the interpolation error is below 1e-4 px.
+Values between drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so that no
+edge is moved or widened. Source: R. G. Keys, Cubic convolution interpolation for digital image
 processing, IEEE Trans. ASSP 29 (1981).
 
 A whole image is drawn finely only around bright spots. Most of the scene stands still during an
@@ -30,8 +30,8 @@ from cmmsim.imaging.renderer import Drawable, Renderer, View, Views
 
 # Coefficients of a quadratic from its values at -1, 0 and 1.
 _QUADRATIC = frozen([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
-# Fine pixels along each side of a pixel: the point spread smooths what resampling leaves, without
-# it edges need more.
+# Fine pixels along each side of a pixel. The point spread smooths the errors of resampling; without
+# a point spread, sharp edges need more fine pixels.
 SUB_PIXELS = 6
 SHARP_SUB_PIXELS = 12
 # px: sides of drawn windows are multiples of this, so that few frame buffers serve all.
@@ -40,15 +40,15 @@ SIDE_STEP = 4
 REACH = 2
 # px: side of the finely drawn window around a bright spot.
 PASTED_SIZE = 24
-# px: a larger spot is left coarse.
+# px: a larger spot is drawn coarsely only.
 LARGEST_PASTED_SIZE = 96
-# px around a spot longer than a sticker that are drawn finely with it.
+# px: rim around a spot longer than a sticker, drawn finely together with the spot.
 DARK_RIM = 8
 # Radiance above which a spot is drawn finely.
 BRIGHT = 0.4
 # px: side of the pieces that are bent and blurred at a time.
 TILE = 64
-# Drawn samples a pixel and axis away from bright spots.
+# Drawn samples per pixel and axis away from bright spots.
 COARSE = 2
 
 
@@ -111,8 +111,9 @@ class ImageFormation:
     ) -> list[NDArray[np.float32]]:
         """Return the radiance (k, size, size) of each side's windows.
 
-        ``supersampling`` is the least number of drawn samples a pixel and axis. ``sub_pixels``
-        replace the usual ones. ``shade`` lays the relative illumination over the windows.
+        ``supersampling`` is the least number of drawn samples per pixel and axis. ``sub_pixels``
+        overrides the default numbers of sub-pixels. ``shade`` lays the relative illumination over
+        the windows.
         """
         if self.draws_pixels([side.camera for side in sides]):
             windows = self._drawn(
@@ -187,7 +188,7 @@ def _shown_places(
     """Return ideal pixels (k, 3, 3, 2) that show in the first, middle and last fine rows and
     columns.
 
-    They are those of windows with margin.
+    The windows include their margins.
     """
     half = 0.5 * (size + 2 * margin) * (1.0 - 1.0 / fine_size)
     ticks = 0.5 * (size - 1) + half * np.array([-1.0, 0.0, 1.0])
@@ -233,7 +234,7 @@ def _finer(camera: PinholeCamera, sub_pixels: int) -> PinholeCamera:
     return replace(
         camera,
         focal_px=camera.focal_px * sub_pixels,
-        # Pixels are counted from their middles, which move; their corners stay.
+        # Pixel coordinates refer to pixel centres, and only the image corners stay in place.
         centre_x_px=(camera.centre_x_px + 0.5) * sub_pixels - 0.5,
         centre_y_px=(camera.centre_y_px + 0.5) * sub_pixels - 0.5,
         width=camera.width * sub_pixels,
@@ -246,8 +247,9 @@ def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> ND
     """Return the weights (size, (size + 2 margin) sub_pixels) of drawn sub-pixels in each pixel of
     a row.
 
-    They are the mean over a pixel of a Gaussian of ``psf_px``. The drawn sub-pixels, means over
-    their own width, make up the exact mean over a pixel wherever the Gaussian puts it.
+    They are the mean over a pixel of a Gaussian of standard deviation ``psf_px``. Each drawn
+    sub-pixel is a mean over its own width, so the sum over sub-pixels is the exact mean over a
+    pixel.
     """
     total = (size + 2 * margin) * sub_pixels
     into_pixels = np.kron(
@@ -309,8 +311,8 @@ def whole_image(
 ) -> NDArray[np.float32]:
     """Return the mean radiance (height, width) of one camera's image over moments.
 
-    Bodies stand at (b, 4, 4) at each. The image is drawn coarsely, and as finely as windows around
-    each bright spot.
+    Bodies stand at (b, 4, 4) at each moment. The image is drawn coarsely, except for finely drawn
+    windows around bright spots.
     """
     image, bright = _coarse(formation, camera, moments)
     corners, size = _spots(
@@ -331,9 +333,9 @@ def whole_image(
 def _coarse(
     formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the mean radiance (height, width) with COARSE² drawn samples a pixel.
+    """Return the mean radiance (height, width) with COARSE² drawn samples per pixel.
 
-    The second result says where it is bright at any moment.
+    The second result is a mask of the pixels that are bright at any moment.
     """
     if len(moments) == 1 and formation.draws_pixels([camera]):
         view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))

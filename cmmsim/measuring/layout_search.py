@@ -3,8 +3,8 @@
 Bright spots that a window holds are fitted with ellipses. Spots of both images that lie on each
 other's epipolar lines are pairs, true and false ones together, and each pair is a point in space.
 The known layout of the stickers is looked for in this cloud of points. Three stickers far from each
-other are found by their three mutual distances, and each find proposes a pose. A pose is judged by
-the number of stickers of the layout that then have a point close by.
+other are found by their three mutual distances, and each matching triple of points proposes a pose.
+A pose is judged by the number of stickers of the layout that then have a point close by.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ from cmmsim.radiometry.noise import GreyImage, cut_windows
 from cmmsim.radiometry.stereo_images import StereoImages
 
 SMALLEST_AREA_PX = 8
-# Share of a square with the largest side.
+# Largest area of a bright spot, as a share of a square with the largest side.
 LARGEST_SHARE = 25 / 36
 # Share of the image's pixels that are taken as the brightest.
 BRIGHT_SHARE = 1e-4
@@ -36,10 +36,10 @@ SMALLEST_STEP = 40.0 / 255.0
 SMALLEST_WINDOW_PX = 24
 # Distance of a bright spot's rough centre from a prediction of it.
 ROOM_PX = 8
-# Stickers by whose taught places a platform is found.
+# Fewest stickers by which a platform with taught places is found.
 FEWEST_TAUGHT = 4
 LINE_TOLERANCE_PX = 0.5
-# Standard deviations of what is not known of the rig.
+# Limit of the rig's errors on the distance from an epipolar line, in standard deviations.
 LINE_STDS = 4.0
 # m from the camera.
 NEAREST = 0.3
@@ -80,8 +80,8 @@ def candidate_points(
 ) -> Array:
     """Return points (m, 3) in the camera frame that may be stickers.
 
-    They come from ellipses that keep within ``limits``, by true and false pairings together. Raises
-    LostError where there are too few bright spots.
+    They are triangulated from ellipses within ``limits``, and include false pairs. Raises LostError
+    where there are too few bright spots.
     """
     left, right = (fits.centres[fits.within(limits, observer.noise).good] for fits in ellipses)
     if not len(left) or not len(right):
@@ -100,7 +100,7 @@ def candidate_points(
 def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
     """Return rough centres (n, 2) px of compact bright spots of an image (height, width).
 
-    ``largest_side`` is that of a spot's bounding box, px.
+    ``largest_side`` is the largest side of a spot's bounding box, px.
     """
     counts = np.bincount(image.ravel())
     from_top = np.cumsum(counts[::-1])
@@ -137,8 +137,9 @@ def candidate_pairs(
     """Return all pairs (m, 2) of left and right spots that may be one point, and their points (m,
     3).
 
-    Spots (k, 2) and (l, 2) are in ideal px. A spot may be ``off_line`` px from the other's line,
-    and may appear in several pairs: the known layout decides later which is true.
+    Spots (k, 2) and (l, 2) are in ideal px. A spot can be up to ``off_line`` px from the epipolar
+    line of its partner. It can appear in several pairs: the known layout decides later which pair
+    is true.
     """
     pairs = np.argwhere(epipolar_distance(rig, left, right) < off_line)
     points = linear_triangulation(rig, left[pairs[:, 0]], right[pairs[:, 1]])
@@ -194,14 +195,14 @@ def _triangles(layout: Array) -> NDArray[np.int_]:
     triples = np.array(list(combinations(range(len(layout)), 3)), dtype=int).reshape(-1, 3)
     a, b, c = layout[triples.T]
     triples = triples[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 2.0 * SMALLEST_TRIANGLE]
-    # Mixed, so that the first triangles differ, and always alike, so that a frame has one result.
+    # The order is random, so that the first triangles differ, and fixed, so that results repeat.
     return np.random.default_rng(0).permutation(triples)
 
 
 def _blocks(triples: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
     """Yield the triples (t, 3) in parts that are judged together.
 
-    The first ones come alone, since they mostly end the search.
+    The first parts are small, because the first triples usually end the search.
     """
     first = 0
     while first < len(triples):
@@ -232,9 +233,10 @@ def _proposed(
 ) -> tuple[NDArray[np.int_], Array, NDArray[np.int_]]:
     """Find poses (c, 4, 4) that triples (t, 3) of stickers propose.
 
-    A triple proposes a pose where three points are as far from each other. Return the number of the
-    proposing triple (c,), the poses laid onto all stickers that then have a point close by, and the
-    number (c,) of stickers that have one in the end. Poses with fewer than three are left out.
+    A triple proposes a pose if three points have the same mutual distances. Return the index (c,)
+    of the proposing triple, the poses refitted to all stickers with a point close by, and the
+    number (c,) of stickers with a point close to the refitted pose. Poses with fewer than three are
+    left out.
     """
     # Both ends of a side may be off by the tolerance.
     corners = [_congruent(gaps, layout[triple], 2.0 * tolerance) for triple in triples]
