@@ -47,6 +47,8 @@ class Cause:
     quick : callable and int, optional
         Function (problem, parameters) that returns columns (m, g) of several causes at once, and
         the place of this one among them. None: columns are differences of runs.
+    alone : bool
+        True if the cause is asked alone, too. False: only together with its group.
     deviations : ndarray, shape (g,), optional
         Change of the robot's geometric numbers by a size of one, for causes in the geometry.
     tried : tuple of float
@@ -61,6 +63,7 @@ class Cause:
     remedy: Callable[[float], str]
     least: float = -np.inf
     quick: tuple[Columns, int] | None = None
+    alone: bool = True
     deviations: Array | None = None
     tried: tuple[float, ...] = ()
 

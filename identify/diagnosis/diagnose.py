@@ -97,7 +97,7 @@ def diagnosis_from(
             "the drives took torques: a record is diagnosed only where they took joint commands"
         )
     problem, point = _optimum(problem.driven_by_commands(), start)
-    causes = (*catalogue(problem), *own)
+    causes = (*catalogue(problem, point.parameters), *own)
     columns = cause_columns(problem, point.parameters, causes, np.zeros(len(causes)))
     check_columns(tuple(own), columns[:, len(causes) - len(own) :])
     found = select(problem, replace(point, columns=columns), causes)

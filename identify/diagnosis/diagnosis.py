@@ -8,11 +8,12 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.ranking import Ranked, Rows
 from identify.diagnosis.selection import Selected, Selection
-from identify.estimation.explanation import Misfit
+from identify.estimation.explanation import MISFIT_STDS, Misfit, whiteness
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -191,8 +192,47 @@ def diagnosis_of(
     whole = max(excess, gains)
     sizes = dict(zip(selection.places, _sizes(selection, causes, rows), strict=True))
     findings = tuple(_finding(one, causes, sizes, whole) for one in selection.selected)
+    noise = noise_finding(selection, rows, whole)
+    findings = findings if noise is None else (*findings, noise)
     candidates = tuple(_row(one, causes, whole) for one in selection.ranking)
     return Diagnosis(findings, candidates, selection.before, selection.after, seconds)
+
+
+def noise_finding(selection: Selection, rows: Rows, whole: float) -> Finding | None:
+    """Return the finding that the sensor states another noise than it has, or None.
+
+    It has no column, but what is left by all other causes then is white, and of another size than
+    stated. whole: misfit without any cause.
+    """
+    left = selection.after
+    off = (left.found - left.expected) / left.std
+    residuals, ok = rows.of_all_frames(selection.point.residual)
+    if abs(off) < MISFIT_STDS or whiteness(residuals, ok).suspicious:
+        return None
+    count = int(ok.sum())
+    ratios = [
+        float(np.sqrt(np.mean(residuals[ok][:, part] ** 2))) for part in (slice(3), slice(3, 6))
+    ]
+    names = ("noise of the positions", "noise of the orientations")
+    excess = 6 * count * (left.found - left.expected)
+    # a record that is nearer to the model than its noise allows has no misfit to share
+    share = excess / whole if excess > 0 else 1.0
+    return Finding(
+        name="noise of the sensor",
+        sizes=tuple(
+            Size(name, "1", ratio, ratio / np.sqrt(6 * count))
+            for name, ratio in zip(names, ratios, strict=True)
+        ),
+        share=share,
+        statistic=off**2,
+        freedoms=1,
+        chance=float(chdtrc(1, off**2)),
+        alike=(),
+        remedies=(
+            f"state {ratios[0]:.3g} times the standard deviation of the positions, and "
+            f"{ratios[1]:.3g} times that of the orientations, in measured_covariance",
+        ),
+    )
 
 
 def _sizes(selection: Selection, causes: Sequence[Cause], rows: Rows) -> list[Size]:

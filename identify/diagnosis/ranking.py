@@ -23,7 +23,12 @@ from scipy.special import chdtrc
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.score import Beside, Score, score
-from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
+from identify.estimation.explanation import (
+    LAGS,
+    Misfit,
+    coloured_score_covariance,
+    misfit_of_white,
+)
 from identify.estimation.output_error import OutputErrorProblem
 
 ALIKE = 0.99
@@ -52,11 +57,11 @@ class Candidate:
 
 
 def candidates(causes: Sequence[Cause]) -> tuple[Candidate, ...]:
-    """Return all causes alone, then all groups that have several members."""
+    """Return all causes that are asked alone, then all groups that have several members."""
     groups: dict[str, list[int]] = {}
     for place, one in enumerate(causes):
         groups.setdefault(one.group, []).append(place)
-    alone = (Candidate(one.name, (place,)) for place, one in enumerate(causes))
+    alone = (Candidate(one.name, (place,)) for place, one in enumerate(causes) if one.alone)
     together = (
         Candidate(name, tuple(places)) for name, places in groups.items() if len(places) > 1
     )
@@ -97,6 +102,23 @@ class Rows:
     def of_poses(self, rows: Array) -> Array:
         """Return the part of residuals (m, ...) that is of poses."""
         return rows[self.known :]
+
+    def of_all_frames(self, residual: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the residuals (N, 6) of all runs by frames, NaN where lost, and the good ones.
+
+        Between two runs there are as many lost frames as the test for whiteness has lags.
+        """
+        parts = []
+        good = []
+        first = self.known
+        for ok in self.frames:
+            own = np.full((len(ok) + LAGS, 6), np.nan)
+            last = first + 6 * int(ok.sum())
+            own[: len(ok)][ok] = residual[first:last].reshape(-1, 6)
+            parts.append(own)
+            good.append(np.concatenate([ok, np.zeros(LAGS, dtype=bool)]))
+            first = last
+        return np.concatenate(parts), np.concatenate(good)
 
     def spread(self, residual: Array, directions: Array) -> Array:
         """Return the covariance (d, d) of U^T r for residuals as correlated as r (m,).
@@ -140,8 +162,10 @@ def rank(
     ranked.sort(key=lambda one: -one.worth)
     if len(ranked[0].candidate.places) == 1:
         return tuple(ranked)
-    chain, found = few_alone(projected, left, lengths)
-    worth = found.statistic - len(chain) * (price + 2 * np.log(len(causes)))
+    alone = [place for place, one in enumerate(causes) if one.alone]
+    few, found = few_alone(projected[:, alone], left, lengths[alone])
+    chain = tuple(alone[place] for place in few)
+    worth = found.statistic - len(chain) * (price + 2 * np.log(len(alone)))
     if worth <= ranked[0].worth:
         return tuple(ranked)
     chance = min(1.0, len(every) ** len(chain) * chance_of(found, left, rows))

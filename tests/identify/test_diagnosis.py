@@ -18,9 +18,11 @@ from identify.diagnosis.score import Beside, score
 from identify.diagnosis.selection import CHANCE
 from identify.errors import EstimationError
 from identify.files.run_folder import load_result
+from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from tests.identify import synthetic
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import (
+    SIGMA,
     problem_of,
     quick,
     recorded_run_folder,
@@ -161,6 +163,58 @@ def test_a_cause_that_is_not_in_the_catalogue_is_called_none_of_these():
     assert found.misfit.significant
     assert found.none_of_these
     assert "none of these explains" in found.warnings()[0]
+
+
+STATED = np.broadcast_to(np.diag(SIGMA**2), (600, 6, 6)).copy()
+
+
+@pytest.mark.parametrize("times", [0.7, 1.4])
+def test_noise_that_is_stated_wrongly_is_named_with_its_ratio(times):
+    found = diagnosed(record_of(13, sigma=times * SIGMA, measured_covariance=STATED))
+    (only,) = found.findings
+    assert only.name == "noise of the sensor"
+    assert all(abs(one.value - times) < 3 * one.std for one in only.sizes)
+    assert f"state {only.sizes[0].value:.3g} times" in only.remedies[0]
+
+
+def test_gross_errors_are_named_by_their_frames():
+    frames = {50: 0, 231: 1, 400: 4}
+    size = 30 * SIGMA
+
+    def bias(frame, pose):
+        return size * np.eye(6)[frames[frame]] if frame in frames else 0.0
+
+    first = diagnosed(record_of(14, bias=bias)).findings[0]
+    assert first.name == "gross errors"
+    assert {one.name for one in first.sizes} == {
+        "x of frame 50",
+        "y of frame 231",
+        "beta of frame 400",
+    }
+    off = [(one.value - size[frames[int(one.name.split()[-1])]]) / one.std for one in first.sizes]
+    assert np.abs(off).max() < 3
+    assert "measured_ok = 0" in first.remedies[0]
+
+
+@pytest.mark.parametrize(("stated", "accused"), [(4e-5, False), (4e-6, True)])
+def test_a_camera_that_is_off_by_more_than_it_states_is_named(stated, accused):
+    """The error turns the measured platform about z in proportion to its x."""
+
+    def bias(frame, pose):
+        return 4e-5 * np.array([0, 0, 0, 0, 0, 1]) * (1 + 100 * pose[0])
+
+    record = record_of(15, bias=bias)
+    poses = record["measured_position"].values
+    changes = np.zeros((len(poses), 6, 1))
+    changes[:, 5, 0] = 1 + 100 * poses[:, 0]
+    store_common_errors(record, CommonErrors(("rig.turn_rad",), changes, np.diag([stated**2])))
+    found = diagnosed(record)
+    named = [one for one in found.findings if one.name == "error rig.turn_rad"]
+    assert bool(named) is accused
+    if accused:
+        assert found.findings[0] is named[0]
+        assert abs(named[0].sizes[0].value - 4e-5) < 3 * named[0].sizes[0].std
+        assert "calibrate anew" in named[0].remedies[0]
 
 
 def test_the_statistic_is_the_fall_of_the_cost_by_a_fit_of_the_same_columns():

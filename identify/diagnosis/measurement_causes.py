@@ -1,0 +1,158 @@
+"""Causes in the measured poses: gross errors of single frames, and errors that all frames share.
+
+A frame counts as suspicious if its residual is far from the median of its four neighbours, which
+shows what lasts. Its six components are then causes like all others (mean-shift model of outliers).
+The spread of such differences comes from their median, which outliers do not move.
+
+Errors of cameras and teaching are asked if the record states them. The residuals are whitened for
+them already, so that a cause is one that is larger than its stated standard deviation.
+
+References
+----------
+Cook and Weisberg, Residuals and influence in regression, Chapman and Hall, 1982.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from identify.arrays import Array
+from identify.diagnosis.cause import Cause, in_each_run
+from identify.estimation.output_error import OutputErrorProblem
+from identify.files.dataset import POSE
+from identify.model.loop_model import LoopModel
+from identify.record.stored_common_errors import kind_of
+
+STEPS = np.repeat([1e-6, 1e-5], 3)
+"""Change of each component of a pose for differences, m and rad."""
+
+BY_CHANCE = 1e-3
+"""Probability that noise alone makes any frame of a record suspicious."""
+
+MOST_FRAMES = 8
+"""Largest number of frames that are asked, those that are furthest off."""
+
+KINDS = {"rig": "errors of the cameras", "teaching": "errors of teaching"}
+"""Names of the groups of errors that all frames share, by their kind."""
+
+
+def measurement_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
+    """Return the causes in the measured poses of a problem at its optimum (p,)."""
+    return (*shared_errors(problem), *gross_errors(problem, parameters))
+
+
+def shared_errors(problem: OutputErrorProblem) -> tuple[Cause, ...]:
+    """Return the errors that all poses have in common, as the first record states them."""
+    common = problem.runs[0].common
+    stds = np.sqrt(np.diag(common.covariance))
+    return tuple(
+        _shared(name, place, float(std))
+        for place, (name, std) in enumerate(zip(common.names, stds, strict=True))
+        if std > 0 and all(run.common.names == common.names for run in problem.runs)
+    )
+
+
+def _shared(name: str, place: int, std: float) -> Cause:
+    def without(run: LoopModel, size: float) -> LoopModel:
+        return replace(run, measured=run.measured - size * run.common.changes[:, :, place])
+
+    kind = kind_of(name)
+    return Cause(
+        name=f"error {name}",
+        unit=name.rpartition("_")[2],
+        group=KINDS.get(kind, f"errors of {kind}"),
+        change=in_each_run(without),
+        step=std,
+        remedy=lambda size: (
+            f"calibrate anew: {name} is off by {size:.3g}, {abs(size) / std:.2g} times the "
+            f"standard deviation {std:.2g} that the record states"
+        ),
+        quick=(shared_columns, place),
+    )
+
+
+def shared_columns(problem: OutputErrorProblem, parameters: Array) -> Array:
+    """Return the columns (m, k) of the errors that all poses have in common."""
+    return _columns_of(problem, parameters, [run.common.changes for run in problem.runs])
+
+
+def gross_errors(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
+    """Return the components of the poses of suspicious frames."""
+    places = [
+        (number, int(frame))
+        for number, run in enumerate(problem.runs)
+        for frame in suspicious_frames(run.misses(parameters), run.ok)
+    ][:MOST_FRAMES]
+    if not places:
+        return ()
+    quick = partial(frame_columns, places=tuple(places))
+    return tuple(
+        _gross(number, frame, component, (quick, 6 * place + component))
+        for place, (number, frame) in enumerate(places)
+        for component in range(6)
+    )
+
+
+def _gross(
+    number: int,
+    frame: int,
+    component: int,
+    quick: tuple[Callable[[OutputErrorProblem, Array], Array], int],
+) -> Cause:
+    def without(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
+        runs = list(problem.runs)
+        measured = runs[number].measured.copy()
+        measured[frame, component] -= size
+        runs[number] = replace(runs[number], measured=measured)
+        return replace(problem, runs=tuple(runs))
+
+    which = f" of record {number + 1}" if number else ""
+    return Cause(
+        name=f"{POSE[component]} of frame {frame}{which}",
+        unit="m" if component < 3 else "rad",
+        group="gross errors",
+        change=without,
+        step=float(STEPS[component]),
+        remedy=lambda size: f"mark frame {frame}{which} as lost: measured_ok = 0",
+        quick=quick,
+        alone=False,
+    )
+
+
+def frame_columns(
+    problem: OutputErrorProblem, parameters: Array, places: tuple[tuple[int, int], ...]
+) -> Array:
+    """Return the columns (m, 6 f) of errors of f frames, given as number of the run and frame."""
+    changes = [np.zeros((*run.measured.shape, 6 * len(places))) for run in problem.runs]
+    for place, (number, frame) in enumerate(places):
+        changes[number][frame, :, 6 * place : 6 * place + 6] = np.eye(6)
+    return _columns_of(problem, parameters, changes)
+
+
+def _columns_of(problem: OutputErrorProblem, parameters: Array, changes: list[Array]) -> Array:
+    """Return columns (m, k) of errors that change the measured poses of each run (N, 6, k)."""
+    known, _ = problem.known(parameters)
+    parts = [np.zeros((len(known), changes[0].shape[2]))]
+    for run, change in zip(problem.runs, changes, strict=True):
+        white = run.without_common(np.asarray(run.whitener @ change[run.ok]))
+        parts.append(white.reshape(-1, change.shape[2]))
+    return np.vstack(parts)
+
+
+def suspicious_frames(residuals: Array, ok: NDArray[np.bool_]) -> NDArray[np.int_]:
+    """Return the frames whose residuals (n, 6) are far from their neighbours', the furthest first.
+
+    ok (N,): good frames, to which the residuals belong.
+    """
+    count = len(residuals)
+    around = [(np.arange(count) + by) % count for by in (-2, -1, 1, 2)]
+    apart = residuals - np.median(residuals[np.array(around)], axis=0)
+    far = np.sum(apart**2, axis=1)
+    # the median of chi-square with six degrees of freedom, as it would be without outliers
+    far = far * chdtri(6, 0.5) / np.median(far)
+    found = np.flatnonzero(far > chdtri(6, BY_CHANCE / count))
+    return np.flatnonzero(ok)[found[np.argsort(-far[found])]]
