@@ -72,10 +72,16 @@ def nearby_functions(nominal: RobotGeometry, geometry: RobotGeometry) -> dict[st
     }
 
 
+@lru_cache(maxsize=4)
+def _functions_by_name(geometry: RobotGeometry) -> dict[str, ca.Function]:
+    """CasADi functions of a geometry. They are built together, which takes a second or two."""
+    return {one.name(): one for one in robot_functions(geometry)}
+
+
 @lru_cache(maxsize=64)
 def casadi_function(geometry: RobotGeometry, name: str) -> ca.Function:
     """CasADi function of a geometry, with named inputs and outputs as in `CASADI`."""
-    found = next(one for one in robot_functions(geometry) if one.name() == name)
+    found = _functions_by_name(geometry)[name]
     inputs, outputs = (names.split() for names in CASADI[name])
     given = [ca.SX.sym(one, found.size1_in(k)) for k, one in enumerate(inputs)]
     return ca.Function(name, given, found.call(given), inputs, outputs)
