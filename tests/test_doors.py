@@ -38,6 +38,13 @@ reveal_type(robot)
 reveal_type(cmmsim.load_sensor("ctrack780"))
 identify.estimate
 """
+# Of what we import from others nothing is asked here, and reading it all takes most of the time.
+MYPY_CONFIG = """
+[mypy]
+follow_imports = skip
+[mypy-cmmsim.*,dynamics.*,identify.*]
+follow_imports = normal
+"""
 
 
 def python(*arguments, cwd, path=()):
@@ -96,6 +103,7 @@ def test_nothing_heavy_is_imported_before_it_is_wanted(start, heavy, tmp_path):
 def test_a_type_checker_follows_the_installed_packages(tmp_path):
     """In the environment of this test, from a folder that knows nothing of the checkout."""
     (tmp_path / "mine.py").write_text(SCRIPT)
+    (tmp_path / "mypy.ini").write_text(MYPY_CONFIG)
     said = python("-m", "mypy", "--cache-dir", tmp_path / "cache", "mine.py", cwd=tmp_path).stdout
     types = re.findall(r'Revealed type is "[\w.]*\b(\w+)"', said)
     assert types == ["IdentificationResult", "Robot", "Sensor"], (
