@@ -144,8 +144,8 @@ class AccuracySession:
                 self._saved = before.figures
                 if before.seed != self._seed:
                     self._remark(
-                        f"{self._compare} was saved with --accuracy-seed {before.seed}, this is "
-                        f"{self._seed}"
+                        f"{self._compare} was saved with --accuracy-seed {before.seed}, this "
+                        f"session has the seed {self._seed}"
                     )
         except AccuracyError as error:
             raise pytest.UsageError(str(error)) from error

@@ -98,7 +98,7 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
     print_table(header, rows, (), "rms error of poses that were not measured")
     told = [name for name, one in entry["parameters"].items() if one["observable"]]
     typer.echo(
-        f"{len(told)} of {len(entry['parameters'])} geometric numbers are told by {entry['poses']} "
-        f"poses; {len(entry['cannot_be_told'])} combinations cannot be told"
+        f"{entry['poses']} poses determine {len(told)} of {len(entry['parameters'])} geometric "
+        f"numbers; {len(entry['cannot_be_told'])} combinations remain undetermined"
     )
     typer.echo(f"files: {folder}")

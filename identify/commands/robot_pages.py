@@ -242,7 +242,7 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
     for body, change in inertias.changes.items():
         # An effect below 1e-9 is rounding.
         felt = f"accelerations differ by up to {100 * effects[body]:.2g} %"
-        said[body] = f"{change}; {felt if effects[body] > 1e-9 else 'the motion does not feel it'}"
+        said[body] = f"{change}; {felt if effects[body] > 1e-9 else 'no effect on the motion'}"
     return [f"changed {line}" for line in grouped(said)]
 
 

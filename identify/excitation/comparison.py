@@ -40,7 +40,7 @@ class Entry:
     observability : float
         Observability index (eq. 39).
     information : float or None
-        D of the simulated loop; None if the loop is unstable at the starting guess.
+        D of the simulated loop; None if the loop is unstable at the initial guess.
     seconds : float
         Duration of the search.
     evaluations, gradients, iterations : int

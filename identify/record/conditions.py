@@ -106,8 +106,8 @@ def check_command_times(record: xr.Dataset, source: str) -> None:
     written = np.flatnonzero(~np.isnan(acted))
     back = written[1:][np.diff(acted[written]) < -CLOCK_S]
     overtaken = (
-        "is before that of an earlier frame: if a later command arrives first, both must have the "
-        "time of its arrival"
+        "is before that of an earlier frame: if a later command arrives first, the earlier command "
+        "must have the same time"
     )
     for frames, what in (
         (unsaid, "is not finite, although the frame was measured"),

@@ -290,7 +290,8 @@ def _check_values(path: str, values: list[Any], kind: Kind) -> None:
         own = [key for key in known if path.startswith("options.") and key.startswith("options.")]
         valid = f"the kind has {', '.join(own)}" if own else _nearest(path, known)
         raise StudyError(f"unknown key {path!r}; {valid}")
-    # Strict validation as JSON accepts a list for a tuple, but no text or bool for a number.
+    # Values are validated as JSON, in which a list can be a tuple. In strict mode, a text or a bool
+    # is not accepted as a number.
     annotation: Any = Annotated[field.annotation, field]
     adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=ConfigDict(allow_inf_nan=False))
     for value in values:

@@ -1,1 +1,1 @@
-"""Validation against the truth on unseen motions, comparison of estimators, and their variation."""
+"""Validation against the truth, comparison of estimators, and variation of estimates."""

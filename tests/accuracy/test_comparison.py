@@ -26,7 +26,9 @@ def test_the_table_compares_with_saved_figures_and_tells_of_new_ones_and_of_anot
     assert cells["bias"] == ["0.002", "+25.0%"]
     assert cells["seen"] == ["0.98", "+0.0%"]
     assert cells["new"] == ["1", "new"]
-    again.stdout.fnmatch_lines(["before was saved with --accuracy-seed 0, this is 7"])
+    again.stdout.fnmatch_lines(
+        ["before was saved with --accuracy-seed 0, this session has the seed 7"]
+    )
 
 
 SAMPLE = f"np.array({list(np.random.default_rng(0).normal(10, 1, 50).round(3))})"

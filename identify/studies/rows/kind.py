@@ -110,7 +110,7 @@ LIMITS = (
     "scenario.excitation.least_leverage",
     "scenario.excitation.most_condition",
 )
-"""Keys that decide whether such a path is admissible."""
+"""Keys of the limits of a random path."""
 
 NOISE_OFF = Idle(
     tuple(f"sensor.camera.{name}" for name in ("dark_noise", "prnu", "dsnu", "pattern_seed")),
@@ -184,8 +184,8 @@ def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) 
     Raises
     ------
     StudyError
-        A key is never read (the message names the keys that are), or has no effect (the message
-        names the setting that is the reason).
+        A key is never read, or has no effect. The message names the keys that the kind reads, or
+        the setting that makes the key ineffective.
     """
     settings = {f"factors.{path}": path for path in study.factors}
     # Changes are allowed to hold some keys that rows do not read, see BESIDE.
