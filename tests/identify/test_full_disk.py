@@ -144,6 +144,9 @@ CASES = {
         "identify --record {made}/run/experiment.nc --out {place}/new/run", (), IDENTIFY, "run"
     ),
     "validate": Case("validate --out {place}/run", ("run",), VALIDATE, "run"),
+    "diagnose": Case(
+        "diagnose {place}/run", ("run",), ("identify.stages.diagnose.diagnosis_from",)
+    ),
     "report": Case("report --out {place}/run", ("run",), REPORT),
     "estimators": Case(
         "estimators --out {place}/run --only warm_start",
