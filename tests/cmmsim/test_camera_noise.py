@@ -180,11 +180,14 @@ def test_averaging_reduces_what_changes_but_not_the_pattern(exposures):
     ],
 )
 @pytest.mark.parametrize("differing", [False, True])
-def test_a_mean_drawn_at_once_has_the_mean_and_variance_of_averaged_exposures(changes, differing):
-    """Against 100,000 exposures of pixels of 25 levels, to 4.5 standard deviations, which chance
+@pytest.mark.parametrize("count", [25_000, pytest.param(100_000, marks=pytest.mark.thorough)])
+def test_a_mean_drawn_at_once_has_the_mean_and_variance_of_averaged_exposures(
+    changes, differing, count
+):
+    """Against many exposures of pixels of 25 levels, to 4.5 standard deviations, which chance
     alone passes in 5 of 1,000 runs of these 700 comparisons; what happens less than 5 times in all
     exposures is not seen."""
-    noise, count, frames = replace(NOISE, **changes), 100_000, 40
+    noise, frames = replace(NOISE, **changes), 40
     rng = np.random.default_rng(3)
     levels = np.concatenate([np.zeros(1), rng.uniform(0.0, 1.3, 24)]).astype(np.float32)
     pixels = draw_pattern(levels.shape, 0.03, 0.5 / noise.gain, rng)
