@@ -4,14 +4,20 @@ from identify.arrays import Array
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.command_causes import command_causes
 from identify.diagnosis.geometry_causes import geometry_causes
+from identify.diagnosis.loop_causes import loop_causes
 from identify.diagnosis.measurement_causes import measurement_causes
 from identify.estimation.output_error import OutputErrorProblem
 
 
 def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
-    """Return the causes that model and record can have, of a problem at its optimum (p,)."""
-    return (
+    """Return the causes that model and record can have, of a problem at its optimum (p,).
+
+    Companions of others stand behind them all.
+    """
+    causes = (
         *command_causes(problem),
         *geometry_causes(problem),
+        *loop_causes(problem, parameters),
         *measurement_causes(problem, parameters),
     )
+    return (*causes, *(one.companion for one in causes if one.companion is not None))

@@ -39,7 +39,7 @@ class Cause:
         Function (problem, size) that returns the problem with this cause.
     step : float
         Size by which the cause is moved for a difference, so small that residuals follow in
-        proportion, and so large that rounding does not count.
+        proportion, and so large that rounding does not count. Zero: the cause is there or not.
     remedy : callable
         Function (size) that returns a line to type, or one sentence of what to do.
     least : float
@@ -49,6 +49,10 @@ class Cause:
         the place of this one among them. None: columns are differences of runs.
     alone : bool
         True if the cause is asked alone, too. False: only together with its group.
+    exclusive : bool
+        True if at most one cause of the group can be there.
+    companion : Cause, optional
+        Cause that has a size only where this one is there, and is then fitted with it.
     deviations : ndarray, shape (g,), optional
         Change of the robot's geometric numbers by a size of one, for causes in the geometry.
     tried : tuple of float
@@ -62,10 +66,12 @@ class Cause:
     step: float
     remedy: Callable[[float], str]
     least: float = -np.inf
+    tried: tuple[float, ...] = ()
     quick: tuple[Columns, int] | None = None
     alone: bool = True
+    exclusive: bool = False
+    companion: "Cause | None" = None
     deviations: Array | None = None
-    tried: tuple[float, ...] = ()
 
 
 def in_each_run(change: Callable[[LoopModel, float], LoopModel]) -> Change:

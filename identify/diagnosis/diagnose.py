@@ -15,7 +15,7 @@ from identify.diagnosis.diagnosis import Diagnosis, diagnosis_of
 from identify.diagnosis.fit import Point, linearised
 from identify.diagnosis.own_cause import check_columns
 from identify.diagnosis.ranking import Rows
-from identify.diagnosis.score import cause_columns
+from identify.diagnosis.score import first_columns
 from identify.diagnosis.selection import select
 from identify.errors import EstimationError
 from identify.estimation.identification import asked_of, identify, output_error_problem
@@ -98,7 +98,7 @@ def diagnosis_from(
         )
     problem, point = _optimum(problem.driven_by_commands(), start)
     causes = (*catalogue(problem, point.parameters), *own)
-    columns = cause_columns(problem, point.parameters, causes, np.zeros(len(causes)))
+    causes, columns = first_columns(problem, point.parameters, causes, point.beside)
     check_columns(tuple(own), columns[:, len(causes) - len(own) :])
     found = select(problem, replace(point, columns=columns), causes)
     rows = Rows.of(problem, point.residual)

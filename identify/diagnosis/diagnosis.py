@@ -78,7 +78,8 @@ class Finding:
         others = ", or ".join(self.alike[:NAMED])
         more = f", or {len(self.alike) - NAMED} more" if len(self.alike) > NAMED else ""
         alike = f" (or {others}{more}: they cannot be told apart)" if self.alike else ""
-        return f"{self.name}{alike}, {sizes}, explains {100 * self.share:.3g} % of the misfit"
+        said = f", {sizes}" if sizes else ""
+        return f"{self.name}{alike}{said}, explains {100 * self.share:.3g} % of the misfit"
 
 
 @dataclass(frozen=True)
@@ -134,11 +135,22 @@ class Diagnosis:
     def __str__(self) -> str:
         asked = f"{len(self.candidates)} causes and groups were asked"
         if self.none_of_these:
-            best = f"; the most is {self.findings[0]}" if self.findings else ""
+            best = f"; the most is {self.findings[0]}" if self.findings else self._unfitted
             return f"none of these explains what the model leaves of the record: {asked}{best}"
         if not self.findings:
             return f"no cause is accused: {asked}"
         return "; then ".join(str(one) for one in self.findings)
+
+    @property
+    def _unfitted(self) -> str:
+        """Words on a cause that explains most of the misfit to first order, and not as fitted."""
+        first = self.candidates[0]
+        if first.share < MOST_OF_IT:
+            return ""
+        return (
+            f"; to first order {first.name} explains {100 * first.share:.3g} %, but no fit of it "
+            "does"
+        )
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self}>"
@@ -258,7 +270,10 @@ def _finding(
     name = own[0].name if len(own) == 1 else one.ranked.candidate.name
     return Finding(
         name=name,
-        sizes=tuple(own),
+        # one that is there or not has no size to tell
+        sizes=tuple(
+            size for place, size in zip(one.places, own, strict=True) if causes[place].step
+        ),
         share=one.gain / whole,
         statistic=one.ranked.score.statistic,
         freedoms=one.ranked.score.freedoms,
@@ -272,10 +287,11 @@ def _finding(
 
 def _row(one: Ranked, causes: Sequence[Cause], whole: float) -> CandidateRow:
     candidate = one.candidate
-    alone = len(candidate.places) == 1 and one.score.freedoms == 1
+    first = candidate.places[0]
+    alone = len(candidate.places) == 1 and one.score.freedoms == 1 and causes[first].step > 0
     return CandidateRow(
         name=candidate.name,
-        unit=causes[candidate.places[0]].unit,
+        unit=causes[first].unit,
         share=one.score.statistic / whole if whole > 0 else 0.0,
         statistic=one.score.statistic,
         freedoms=one.score.freedoms,

@@ -79,8 +79,8 @@ class WithCauses:
 
     @property
     def steps(self) -> Array:
-        """Steps (k,) of the causes."""
-        return np.array([one.step for one in self.causes])
+        """Steps (k,) of the causes, one for a cause that is there or not."""
+        return steps_of(self.causes)
 
     def parameters(self, coordinates: Array) -> Array:
         """Return the parameters (p,) of coordinates (p + k,)."""
@@ -106,6 +106,11 @@ class WithCauses:
         )
         count = len(coordinates)
         return float(residual @ residual), rows[:count, :count], rows[:count, count]
+
+
+def steps_of(causes: Sequence[Cause]) -> Array:
+    """Return the steps (k,) of causes, one for a cause that is there or not."""
+    return np.array([one.step or 1.0 for one in causes])
 
 
 def linearised(
@@ -140,9 +145,12 @@ def fit(
     Raises LoopFailure if the model is unstable at the start.
     """
     bounds = problem.bounds
-    steps = np.array([one.step for one in causes])
+    steps = steps_of(causes)
     least = np.array([one.least for one in causes])
     parameters = start
+    # A cause that is tried at a size stays there until the parameters have followed. The chord to
+    # it, by which it was ranked, leads the search astray.
+    columns = columns * [float(not one.tried) for one in causes]
     for _ in range(REFRESHES):
         whole = WithCauses(problem, causes, columns)
         coordinates = np.concatenate([bounds.coordinates(parameters), sizes / steps])

@@ -63,7 +63,9 @@ def candidates(causes: Sequence[Cause]) -> tuple[Candidate, ...]:
         groups.setdefault(one.group, []).append(place)
     alone = (Candidate(one.name, (place,)) for place, one in enumerate(causes) if one.alone)
     together = (
-        Candidate(name, tuple(places)) for name, places in groups.items() if len(places) > 1
+        Candidate(name, tuple(places))
+        for name, places in groups.items()
+        if len(places) > 1 and not causes[places[0]].exclusive
     )
     return (*alone, *together)
 
@@ -130,7 +132,7 @@ class Rows:
         for ok in self.frames:
             own = slice(first, first + 6 * int(ok.sum()))
             first = own.stop
-            rows = directions[own].reshape(-1, 6, directions.shape[1])
+            rows = directions[own].reshape(int(ok.sum()), 6, directions.shape[1])
             total += coloured_score_covariance(residual[own].reshape(-1, 6), rows, ok)
         return total
 
@@ -157,8 +159,12 @@ def rank(
     for one in every:
         places = list(one.places)
         found = score(projected[:, places], left, lengths[places])
+        if len(places) == 1 and found.sizes[0] < causes[places[0]].least:
+            # nothing can have such a size
+            found = score(projected[:, :0], left, lengths[:0])
         chance = min(1.0, len(every) * chance_of(found, left, rows))
-        ranked.append(Ranked(one, found, chance, found.statistic - found.freedoms * price))
+        worth = found.statistic - found.freedoms * price if found.freedoms else -np.inf
+        ranked.append(Ranked(one, found, chance, worth))
     ranked.sort(key=lambda one: -one.worth)
     if len(ranked[0].candidate.places) == 1:
         return tuple(ranked)

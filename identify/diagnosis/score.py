@@ -19,7 +19,7 @@ Philosophical Society 44(1), 1948. Sörbom, Model modification, Psychometrika 54
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -86,7 +86,12 @@ def cause_columns(
     A column is NaN where the model is unstable.
     """
     columns = np.zeros((len(residuals(problem, parameters)), len(causes)))
-    slow = [place for place, one in enumerate(causes) if one.quick is None]
+    slow = [
+        place
+        for place, one in enumerate(causes)
+        # one that is there or not has no derivative, and one that is only tried none at nothing
+        if one.quick is None and one.step and (sizes[place] or not one.tried)
+    ]
     columns[:, slow] = _differences(problem, parameters, causes, sizes, slow)
     there = with_causes(problem, causes, sizes)
     for quick in {one.quick[0] for one in causes if one.quick is not None}:
@@ -198,3 +203,31 @@ def score(columns: Array, residual: Array, lengths: Array) -> Score:
     inverse = np.zeros((count, int(kept.sum())))
     inverse[shown] = (turned[kept].T / lasting[kept]) / left[shown][:, None]
     return Score(float(along @ along), int(kept.sum()), -inverse @ along, directions, inverse)
+
+
+def first_columns(
+    problem: OutputErrorProblem, parameters: Array, causes: Sequence[Cause], beside: Beside
+) -> tuple[tuple[Cause, ...], Array]:
+    """Return causes, and their columns (m, k) where none has a size.
+
+    A cause that is tried at some sizes has the difference to the largest gain there as its column,
+    by its size. It is returned with that size alone.
+    """
+    columns = cause_columns(problem, parameters, causes, np.zeros(len(causes)))
+    residual = residuals(problem, parameters)
+    left = beside.part(residual)
+    tried = [(place, size) for place, one in enumerate(causes) for size in one.tried]
+    ends = [causes[place].change(problem, size) for place, size in tried]
+    found = each_residuals(ends, parameters)
+    chosen = list(causes)
+    gains = np.zeros(len(causes))
+    for (place, size), there in zip(tried, found, strict=True):
+        if there is None:
+            continue
+        column = ((there - residual) / size)[:, None]
+        judged = score(beside.part(column), left, np.linalg.norm(column, axis=0))
+        if judged.sizes[0] > 0 and judged.statistic > gains[place]:
+            gains[place] = judged.statistic
+            columns[:, place] = column[:, 0]
+            chosen[place] = replace(causes[place], tried=(size,))
+    return tuple(chosen), columns

@@ -14,14 +14,14 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.fit import Point, fit
-from identify.diagnosis.ranking import Ranked, Rows, misfit_of, rank, together
+from identify.diagnosis.ranking import ALIKE, Ranked, Rows, misfit_of, rank, together
 from identify.estimation.explanation import Misfit
 from identify.estimation.output_error import OutputErrorProblem
 
 CHANCE = 0.01
 """Probability that a right model is accused of any cause in the catalogue."""
 
-MOST = 4
+MOST = 3
 """Largest number of causes or groups that are selected."""
 
 
@@ -76,12 +76,21 @@ def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -
     now = nothing
     ranking = first
     while len(chosen) < MOST and ranking and ranking[0].chance <= CHANCE:
+        # columns are those without any cause, and follow what was fitted only so far
+        if ranking[0].score.statistic < (1 - ALIKE**2) * (point.cost - now.cost):
+            break
         alike = together(ranking, rows, now.beside_all.part(now.residual))
         best = alike[0]
         # a group may be asked after one of its members
         new = [k for k, place in enumerate(best.candidate.places) if place not in places]
         added = tuple(best.candidate.places[k] for k in new)
-        sizes = np.concatenate([now.sizes, best.score.sizes[new]])
+        beside = companions(causes, added)
+        # a column that was tried at a size is exact there
+        starts = [
+            causes[best.candidate.places[k]].tried[:1] or best.score.sizes[k : k + 1] for k in new
+        ]
+        added = (*added, *beside)
+        sizes = np.concatenate([now.sizes, *starts, np.zeros(len(beside))])
         columns = np.hstack([now.columns, point.columns[:, added]])
         try:
             kept, fitted = _fitted(
@@ -90,7 +99,8 @@ def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -
         except DynamicsError:
             # the model with the cause does not run: no more can be said
             break
-        if not set(added) & set(kept):
+        enough = now.cost - fitted.cost > np.log(len(now.residual))
+        if not (enough and set(added) & set(kept)):
             # to first order it explained something, and fitted it does not
             break
         names = tuple(one.candidate.name for one in alike[1:])
@@ -102,9 +112,24 @@ def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -
             one
             for one in rank(causes, point.columns, now.residual, now.beside_all, rows)
             if not set(one.candidate.places) <= set(places)
+            and not _excluded(causes, one.candidate.places, places)
         )
     before, after = (misfit_of(rows, one.residual) for one in (point, now))
     return Selection(chosen, places, now, first, before, after)
+
+
+def companions(causes: Sequence[Cause], places: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the places of the companions that causes at some places have."""
+    wanted = [causes[place].companion for place in places]
+    return tuple(
+        place for place, one in enumerate(causes) if any(one is companion for companion in wanted)
+    )
+
+
+def _excluded(causes: Sequence[Cause], asked: tuple[int, ...], places: tuple[int, ...]) -> bool:
+    """Tell whether causes at asked places cannot be there beside those at other places."""
+    taken = {causes[place].group for place in places if causes[place].exclusive}
+    return any(causes[place].group in taken for place in asked)
 
 
 def _fitted(
@@ -143,7 +168,9 @@ def shown_sizes(point: Point) -> NDArray[np.bool_]:
     sizes = point.sizes.copy()
     while kept.any():
         inside = np.flatnonzero(kept)
-        falls = sizes[inside] ** 2 / np.diag(covariance)[inside]
+        variances = np.diag(covariance)[inside]
+        # a cause that is there or not has no size that could be left out
+        falls = np.where(variances > 0, sizes[inside] ** 2 / np.maximum(variances, 1e-300), np.inf)
         least = inside[int(np.argmin(falls))]
         if falls.min() >= limit:
             break

@@ -94,12 +94,17 @@ def drift(monkeypatch):
     return record_of(5, latency_s=1e-3 * quick().timing.frame_times(10.0))
 
 
+def elastic(monkeypatch):
+    return record_of(16, scenario=quick(**{"plant.joint_stiffness_N_m_rad": 2e4}))
+
+
 CASES = {
     "zero of joint 2": (zero, 3e-4),
     "scale of the commands": (scale, 1.7e-3),
     "latency of the commands": (late, 6e-3),
     "drift of the commands' clock": (drift, 1e-3),
     "crank length of leg 3": (crank_length, 1.3e-4),
+    "elasticity of the joints": (elastic, 1 / 2e4),
 }
 """Records whose residual an injected cause doubles, and the true size of the cause."""
 
@@ -116,6 +121,33 @@ def test_the_cause_that_was_injected_is_named_first_with_its_size(name, monkeypa
     assert abs(size.value - true) < 3 * size.std
     assert first.share > 0.9
     # once it is fitted, noise explains the rest
+    assert not found.left.significant
+
+
+def test_static_friction_is_named_with_its_ratio_and_its_velocity_and_as_a_line_to_type():
+    true = {
+        "plant.friction": "stribeck",
+        "plant.static_ratio": 1.1,
+        "plant.stribeck_velocity_rad_s": 0.05,
+    }
+    found = diagnosed(record_of(17, scenario=quick(**true)))
+    (only,) = found.findings
+    assert only.name.startswith("static friction")
+    excess, wider = only.sizes
+    assert abs(excess.value - 0.1) < 3 * excess.std
+    beyond = float(wider.name.split()[-2])
+    assert abs(beyond + wider.value - 0.05) < 3 * wider.std
+    assert not found.left.significant
+    assert "--set model.friction=stribeck --set model.static_ratio=1." in only.remedies[0]
+    assert "--set model.stribeck_velocity_rad_s=0.0" in only.remedies[1]
+
+
+def test_another_law_of_the_drives_is_named_as_a_line_to_type():
+    found = diagnosed(record_of(18, scenario=quick(**{"plant.drive": "cascade"})))
+    first = found.findings[0]
+    assert first.name == "drives of the law cascade"
+    assert first.sizes == ()
+    assert first.remedies == ("--set model.drive=cascade, or --set model.drive=auto",)
     assert not found.left.significant
 
 

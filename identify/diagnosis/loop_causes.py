@@ -1,0 +1,246 @@
+"""Causes in the loop around the robot: friction, springs, limits and laws of the drives, and steps.
+
+Many of them show nothing at a small size, or are there or not. They are looked for at some sizes
+of their own. Sizes are taken from the run of the model itself: velocities from those of its joints,
+limits from its torques.
+
+A joint whose motor drives the body through a spring is behind its motor by the torque over the
+stiffness. To first order that is a shift of its command.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from dynamics.closed_loop import ClosedLoopRun, FrictionLaw, LoopSettings
+from dynamics.closed_loop.drives import DriveName
+from identify.arrays import Array
+from identify.diagnosis.cause import Cause, in_each_run
+from identify.estimation.output_error import OutputErrorProblem
+from identify.model.loop_model import LoopModel
+
+SLOW = {"slow": 0.1, "middling": 0.3, "fast": 0.9}
+"""Velocities over which static friction fades, as shares of the joints' RMS velocity."""
+
+FRICTION = "law of friction"
+"""Group of the laws of friction, of which a joint has one."""
+
+FINER = 4
+"""Factor of the steps a frame with which a finer model is tried."""
+
+DEFLECTION = {"rad": 1e-4, "m": 1e-5}
+"""Deflection at the largest torque for differences, by the unit of joint coordinates."""
+
+
+def loop_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
+    """Return the causes in the loop of a problem at its optimum (p,)."""
+    runs = [run.simulate(parameters) for run in problem.runs]
+    rates = [joint_rates(run, found) for run, found in zip(problem.runs, runs, strict=True)]
+    typical = float(np.sqrt(np.mean(np.concatenate(rates) ** 2)))
+    peak = max(float(np.abs(found.torque).max()) for found in runs)
+    return (
+        *friction_causes(problem.runs[0], typical),
+        elasticity(problem, parameters, runs, rates),
+        torque_limit(problem.runs[0], peak),
+        *laws(problem.runs[0].settings),
+        finer_steps(problem.runs[0].settings),
+    )
+
+
+def joint_rates(run: LoopModel, found: ClosedLoopRun) -> Array:
+    """Return the velocities (N, n) of the joints in a run of the model."""
+    return np.einsum("nij,nj->ni", run.robot.pose_jacobian(found.pose), found.pose_rate)
+
+
+def in_settings(change: Callable[[LoopSettings, float], LoopSettings]) -> Callable[..., LoopModel]:
+    """Return the change of a run that changes its loop's settings."""
+    return lambda run, size: replace(run, settings=change(run.settings, size))
+
+
+def friction_causes(run: LoopModel, typical: float) -> tuple[Cause, ...]:
+    """Return other laws of friction, where the model's is that of Coulomb.
+
+    typical: RMS velocity of the joints.
+    """
+    if run.settings.friction.name != "coulomb_viscous":
+        return ()
+    unit = f"{run.robot.layout.joint_unit}/s"
+    key = unit.replace("/", "_")
+
+    def smoothed(settings: LoopSettings, size: float) -> LoopSettings:
+        return replace(settings, friction=FrictionLaw("smoothed", smoothing_velocity=size))
+
+    smooth = Cause(
+        name="friction that is smooth about rest",
+        unit=unit,
+        group=FRICTION,
+        change=in_each_run(in_settings(smoothed)),
+        step=2e-3 * typical,
+        remedy=lambda size: (
+            f"--set model.friction=smoothed --set model.smoothing_velocity_{key}={size:.3g}"
+        ),
+        least=5e-4 * typical,
+        tried=(0.01 * typical, 0.05 * typical),
+        exclusive=True,
+    )
+    static = (_static(name, share * typical, unit, key) for name, share in SLOW.items())
+    return (*static, smooth)
+
+
+def _static(name: str, velocity: float, unit: str, key: str) -> Cause:
+    """Return static friction beyond that of Coulomb, which fades over a velocity."""
+
+    def stribeck(settings: LoopSettings, size: float) -> LoopSettings:
+        law = FrictionLaw("stribeck", static_ratio=1.0 + size, stribeck_velocity=velocity)
+        return replace(settings, friction=law)
+
+    def faded(settings: LoopSettings, size: float) -> LoopSettings:
+        if settings.friction.name != "stribeck":
+            return settings
+        law = replace(settings.friction, stribeck_velocity=velocity + size)
+        return replace(settings, friction=law)
+
+    width = Cause(
+        name=f"velocity over which it fades, beyond {velocity:.3g} {unit}",
+        unit=unit,
+        group=f"width of static friction, {name}",
+        change=in_each_run(in_settings(faded)),
+        step=0.05 * velocity,
+        remedy=lambda size: (
+            f"and --set model.stribeck_velocity_{key}={velocity + size:.3g} in place of that"
+        ),
+        least=-0.9 * velocity,
+        alone=False,
+    )
+    return Cause(
+        name=f"static friction, fading over {name} motion",
+        unit="1",
+        group=FRICTION,
+        change=in_each_run(in_settings(stribeck)),
+        step=0.02,
+        remedy=lambda size: (
+            f"--set model.friction=stribeck --set model.static_ratio={1 + size:.3g} "
+            f"--set model.stribeck_velocity_{key}={velocity:.3g}"
+        ),
+        least=0.0,
+        tried=(0.2,),
+        exclusive=True,
+        companion=width,
+    )
+
+
+def elasticity(
+    problem: OutputErrorProblem,
+    parameters: Array,
+    runs: list[ClosedLoopRun],
+    rates: list[Array],
+) -> Cause:
+    """Return the compliance of the joints, the same for all, at an optimum (p,).
+
+    runs and rates (N, n): each run of the model, and the velocities of its joints.
+    """
+    layout = problem.runs[0].robot.layout
+    torque_unit = layout.unit("joint1.coulomb")
+    carried = [
+        _carried(run, parameters, found, rate)
+        for run, found, rate in zip(problem.runs, runs, rates, strict=True)
+    ]
+
+    def deflected(changed: OutputErrorProblem, size: float) -> OutputErrorProblem:
+        pairs = zip(changed.runs, carried, strict=True)
+        return replace(
+            changed, runs=tuple(replace(run, logged=run.logged - size * by) for run, by in pairs)
+        )
+
+    peak = max(float(np.abs(one).max()) for one in carried)
+    return Cause(
+        name="elasticity of the joints",
+        unit=f"{layout.joint_unit}/({torque_unit})",
+        group="elasticity of the joints",
+        change=deflected,
+        step=DEFLECTION[layout.joint_unit] / peak,
+        remedy=lambda size: (
+            f"stiffen the joints, or measure angles behind their springs: the stiffness is "
+            f"{1 / size:.3g} {torque_unit}/{layout.joint_unit}, and the model has rigid joints"
+        ),
+        least=0.0,
+    )
+
+
+def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Array) -> Array:
+    """Return the torques (N, n) behind motors and their friction while each command acts."""
+    _, coulomb, viscous, _ = run.robot.layout.split(parameters + run.payload)
+    friction = run.settings.friction
+    carried = found.torque - coulomb * friction.level(rates) - viscous * rates
+    latencies = run.latencies
+    late = run.settings.timing.latency_s if latencies is None else latencies
+    period = 1.0 / run.settings.timing.frame_rate_hz
+    acting = found.time + late + period / 2
+    return np.stack([np.interp(acting, found.time, one) for one in carried.T], axis=1)
+
+
+def torque_limit(run: LoopModel, peak: float) -> Cause:
+    """Return a limit of the torques below that of the model. peak: its largest torque."""
+    layout = run.robot.layout
+    unit = layout.unit("joint1.coulomb")
+    key = unit.replace(" ", "_")
+
+    def limited(settings: LoopSettings, size: float) -> LoopSettings:
+        drives = replace(settings.drives, torque_limit=peak * (1.0 - min(size, 0.99)))
+        return replace(settings, drives=drives)
+
+    return Cause(
+        name="torque limit of the drives",
+        unit="1",
+        group="torque limit of the drives",
+        change=in_each_run(in_settings(limited)),
+        step=0.01,
+        remedy=lambda size: (
+            f"state control.torque_limit_{key} = {peak * (1 - size):.4g} with the record: the "
+            f"drives cut {100 * size:.3g} % of the largest torque"
+        ),
+        least=0.0,
+        tried=(0.05, 0.15, 0.35),
+    )
+
+
+def laws(settings: LoopSettings) -> tuple[Cause, ...]:
+    """Return the other law of the drives that reads the same gains: cascade, or PID."""
+    others: dict[str, DriveName] = {"pid": "cascade", "cascade": "pid"}
+    other = others.get(settings.drives.law)
+    if other is None:
+        return ()
+
+    def under_it(settings: LoopSettings, size: float) -> LoopSettings:
+        return replace(settings, drives=replace(settings.drives, law=other))
+
+    return (
+        Cause(
+            name=f"drives of the law {other}",
+            unit="",
+            group="law of the drives",
+            change=in_each_run(in_settings(under_it)),
+            step=0.0,
+            remedy=lambda size: f"--set model.drive={other}, or --set model.drive=auto",
+            tried=(1.0,),
+        ),
+    )
+
+
+def finer_steps(settings: LoopSettings) -> Cause:
+    """Return steps of the model that are too coarse."""
+    steps = FINER * settings.steps_per_frame
+
+    def finer(settings: LoopSettings, size: float) -> LoopSettings:
+        return replace(settings, steps_per_frame=steps)
+
+    return Cause(
+        name="steps of the model that are too coarse",
+        unit="",
+        group="steps of the model",
+        change=in_each_run(in_settings(finer)),
+        step=0.0,
+        remedy=lambda size: f"--set model.steps_per_frame={steps}",
+        tried=(1.0,),
+    )
