@@ -4,6 +4,7 @@ robot of a kind.
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -32,6 +33,12 @@ def with_bodies(robot):
     return values
 
 
+@cache
+def functions_of(geometry):
+    """Functions by name as CasADi evaluates them: compiling takes longer than so few questions."""
+    return {one.name(): one for one in robot_functions(geometry)}
+
+
 def assert_same_dynamics(robot, values, description, folder):
     """The same accelerations and joint coordinates all over the travel, of the robot and of what
     its file holds.
@@ -44,8 +51,7 @@ def assert_same_dynamics(robot, values, description, folder):
     pose, twist, torque = (values.T for values in travel_states(robot, values))
     joints, accelerations = [], []
     for one, parameters in ((robot, values), (other, other.nominal_parameters)):
-        # As CasADi evaluates them: compiling takes longer, and these robots are asked once.
-        functions = {one.name(): one for one in robot_functions(one.geometry)}
+        functions = functions_of(one.geometry)
         joints.append(np.array(functions["inverse_kinematics"](pose)[0]))
         accelerations.append(
             np.array(functions["forward_dynamics"](pose, twist, torque, parameters))
