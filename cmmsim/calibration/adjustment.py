@@ -1,14 +1,14 @@
 """One least-squares adjustment of both cameras, their relative pose and all board poses.
 
-The observations are all measured pixels. Nine intrinsics describe a camera: focal lengths fx, fy
-and principal point cx, cy in px, then k1, k2, p1, p2, k3 of Brown and Conrady as OpenCV orders
-them. Intrinsics that are not free keep their start values.
+The observations are all measured pixels. Nine intrinsics describe a camera: the focal lengths fx
+and fy and the principal point cx, cy in px, then the distortion coefficients k1, k2, p1, p2, k3 of
+Brown and Conrady in OpenCV's order. Intrinsics that are not free stay at their start values.
 
-Levenberg and Marquardt's method solves the normal equations. A board pose is seen by its own view
-only, so the poses are eliminated view by view (Schur complement), which leaves the reduced normal
-matrix N of the free intrinsics and of right_from_left. All pixels have equal weight, and their
-variance sigma² is estimated from the residuals. The covariance of independent errors is sigma²
-N^-1; it is enlarged where the points of a view share their errors.
+Levenberg and Marquardt's method solves the normal equations. A board pose affects only the
+residuals of its own view. The poses are therefore eliminated view by view (Schur complement), and
+the reduced normal matrix N of the free intrinsics and of right_from_left remains. All pixels have
+equal weight, and their variance sigma² is estimated from the residuals. The covariance for
+independent errors is sigma² N^-1. It is enlarged if the points of a view have common errors.
 """
 
 from collections.abc import Callable
@@ -30,19 +30,20 @@ DEFAULT_DISTORTION = "brown5"
 MOST_STEPS = 60
 # Relative decrease of the sum of squares that ends the iteration.
 SMALLEST_GAIN = 1e-11
-# smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
+# N, scaled to a unit diagonal, counts as singular if its smallest eigenvalue is below this.
 SINGULAR = 1e-14
-# Unknowns of a pose, then the places of the unknowns of all views and of one view's board.
+# Number of unknowns of a pose, then the slices of the unknowns that all views have in common and of
+# the unknowns of one view's board.
 POSE = 6
 COMMON = slice(None, -POSE)
 BOARD = slice(-POSE, None)
 
 
 def free_directions(distortion: str, fix_aspect: bool) -> Array:
-    """Return the matrix (9, k) from the k free numbers of a camera to all nine.
+    """Return the matrix (9, k) that maps the k free intrinsics of a camera to all nine.
 
-    ``distortion`` names the free terms, a key of DISTORTIONS. ``fix_aspect`` sets fx = fy. Raises
-    UnknownOptionError.
+    ``distortion`` is the key of DISTORTIONS that names the free distortion terms. ``fix_aspect``
+    sets fx = fy. Raises UnknownOptionError for any other key.
     """
     if distortion not in DISTORTIONS:
         raise UnknownOptionError("distortion", distortion, DISTORTIONS)
@@ -56,29 +57,30 @@ def free_directions(distortion: str, fix_aspect: bool) -> Array:
 
 
 def camera_matrix(values: Array) -> Array:
-    """Return OpenCV's matrix (3, 3) of a camera's intrinsics (9,)."""
+    """Return OpenCV's camera matrix (3, 3) for the intrinsics (9,) of a camera."""
     return np.array([[values[0], 0.0, values[2]], [0.0, values[1], values[3]], [0.0, 0.0, 1.0]])
 
 
 def project(values: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Return the pixels (n, 2) of points (n, 3) in camera axes, and their derivatives.
+    """Return the pixels (n, 2) of points (n, 3) in camera axes, and the pixels' derivatives.
 
-    The derivatives are by the intrinsics (n, 2, 9) and by the points (n, 2, 3), px/m. The points
-    must lie before the camera.
+    The derivatives are with respect to the intrinsics (n, 2, 9) and to the points (n, 2, 3), px/m.
+    The points must lie in front of the camera.
     """
     pixels, jacobian = cv2.projectPoints(
         points, np.zeros(3), np.zeros(3), camera_matrix(values), values[4:]
     )
-    # OpenCV's columns are 3 of the turn, 3 of the shift, 2 of f, 2 of c, and 5 of the distortion.
+    # OpenCV's columns are 3 for the rotation, 3 for the translation, 2 for the focal lengths, 2 for
+    # the principal point, and 5 for the distortion.
     by_all = np.asarray(jacobian, dtype=float).reshape(len(points), 2, -1)
     return np.asarray(pixels, dtype=float).reshape(-1, 2), by_all[:, :, 6:15], by_all[:, :, 3:6]
 
 
 @dataclass(frozen=True)
 class RigState:
-    """State of the rig and of the boards of v views.
+    """State of the rig and of the board poses in v views.
 
-    It has intrinsics (2, 9), right_from_left (4, 4), and left_from_boards (v, 4, 4).
+    ``intrinsics`` is (2, 9), ``right_from_left`` (4, 4), and ``left_from_boards`` (v, 4, 4).
     """
 
     intrinsics: Array
@@ -92,10 +94,10 @@ class RigState:
         return float(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
 
     def moved(self, intrinsics: Array, right: Array, boards: Array) -> "RigState":
-        """Return the state after changes of all its parts.
+        """Return the state after changes of the intrinsics, the relative pose and the boards.
 
-        They are changes of the intrinsics (2, 9), and small errors [dt, dphi] of right_from_left
-        (6,) and of the boards (v, 6).
+        ``intrinsics`` (2, 9) is added. ``right`` (6,) and ``boards`` (v, 6) are small changes
+        [dt, dphi] of right_from_left and of the board poses.
         """
         return RigState(
             self.intrinsics + intrinsics,
@@ -118,11 +120,12 @@ class Adjustment:
     """Result of an adjustment.
 
     ``residuals`` (m, 2) of each camera are measured minus computed pixels, and ``sigma_px`` is the
-    estimated standard deviation of a pixel coordinate. ``covariance`` (24, 24) belongs to the left
-    and right intrinsics (9 each) and to the small error [dt, dphi] of right_from_left;
-    ``independent_covariance`` assumes independent errors of all points. ``condition`` is the
-    condition number of N scaled to a unit diagonal. ``freedom`` is the number of observations minus
-    unknowns, and ``shared`` describes errors that points of a view share.
+    estimated standard deviation of a pixel coordinate. ``covariance`` (24, 24) belongs to the 9
+    left intrinsics, the 9 right intrinsics and the small error [dt, dphi] of right_from_left.
+    ``independent_covariance`` is the same matrix under the assumption that all points have
+    independent errors. ``condition`` is the condition number of N scaled to a unit diagonal.
+    ``steps`` is the number of iterations. ``freedom`` is the number of observations minus the
+    number of unknowns, and ``shared`` describes the common errors of the points of a view.
     """
 
     state: RigState
@@ -138,11 +141,11 @@ class Adjustment:
 
 @dataclass(frozen=True)
 class _Normal:
-    """Normal equations by view.
+    """Normal equations of each view.
 
-    ``matrix`` (v, s, s) and ``side`` (v, s) belong to the c common unknowns and, last, to the pose
-    of the view's board; s = c + 6. ``cost`` is the sum of the squared residuals of both cameras,
-    px².
+    ``matrix`` (v, s, s) and right-hand ``side`` (v, s) have s = c + 6 unknowns: first the c common
+    ones, then the pose of the view's board. ``residuals`` (m, 2) belong to each camera, px.
+    ``cost`` is the sum of the squared residuals of both cameras, px².
     """
 
     matrix: Array
@@ -151,17 +154,18 @@ class _Normal:
     cost: float
 
     def blocks(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
-        """Return the blocks of the common unknowns (v, c, c), mixed (v, c, 6) and of the boards (v,
-        6, 6).
+        """Return the blocks of the matrix with its diagonal enlarged by the damping.
 
-        The damping enlarges their diagonals.
+        They are those of the common unknowns (v, c, c), the mixed blocks (v, c, 6), and those of
+        the boards (v, 6, 6).
         """
         damped = self.matrix + damping * self.matrix * np.eye(self.matrix.shape[1])
         return damped[:, COMMON, COMMON], damped[:, COMMON, BOARD], damped[:, BOARD, BOARD]
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array]:
-        """Return each view's share of the reduced normal matrix (v, c, c) and of its right-hand
-        side (v, c).
+        """Return each view's contribution to the reduced normal equations.
+
+        These are the matrices (v, c, c) and the right-hand sides (v, c).
         """
         common, mixed, boards = self.blocks(damping)
         eliminated = np.linalg.solve(boards, mixed.swapaxes(1, 2)).swapaxes(1, 2)
@@ -173,8 +177,8 @@ class _Normal:
     def step(self, damping: float) -> tuple[Array, Array]:
         """Return the damped changes of the common unknowns (c,) and of the boards (v, 6)."""
         matrix, side = (part.sum(axis=0) for part in self.reduced(damping))
-        # Focal lengths and distortion terms differ by ten orders of magnitude: a unit diagonal
-        # keeps digits.
+        # Focal lengths and distortion terms differ by ten orders of magnitude. Scaling to a unit
+        # diagonal avoids a loss of digits.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         common = (
             scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
@@ -187,10 +191,10 @@ class _Normal:
 def adjust(
     points: Array, sightings: tuple[Sightings, Sightings], start: RigState, free: Array
 ) -> Adjustment:
-    """Adjust the rig and the board poses to sightings of points (n, 3) m of the board.
+    """Adjust the rig and the board poses to sightings of the board's points (n, 3), m.
 
-    Each view is seen by at least one camera. ``free`` (9, k) is the result of ``free_directions``.
-    Raises CalibrationError where the views do not determine the cameras.
+    At least one camera must have sightings in each view. ``free`` (9, k) is the result of
+    ``free_directions``. Raises CalibrationError if the views do not determine the cameras.
     """
 
     def build(state: RigState) -> _Normal:
@@ -217,7 +221,7 @@ def adjust(
         )
     sigma2 = normal.cost / freedom
     shared = shared_errors(scores, information, sigma2)
-    spread = block_diag(free, free, np.eye(POSE))  # (24,c), from the free unknowns to all
+    spread = block_diag(free, free, np.eye(POSE))  # (24, c) maps the free parameters to all
     return Adjustment(
         state,
         normal.residuals,
@@ -252,7 +256,7 @@ def _minimise(
         elif (
             damping > 1e6 or abs(common @ normal.side[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost
         ):
-            # A step that does not help is rounding: it would lower the cost by next to nothing.
+            # The linear model predicts almost no decrease, so the increase is a rounding error.
             return state, step
         else:
             damping *= 10.0
@@ -296,9 +300,10 @@ def _normal_equations(
 def _predict(
     points: Array, seen: Sightings, state: RigState, side: int, free: Array
 ) -> tuple[Array, Array, Array]:
-    """Predict the pixels (m, 2) of one camera, and their derivatives.
+    """Return the predicted pixels (m, 2) of one camera, and their derivatives.
 
-    They are by the common unknowns (m, 2, c) and by the view's board (m, 2, 6).
+    The derivatives are with respect to the common unknowns (m, 2, c) and to the pose of the view's
+    board (m, 2, 6).
     """
     k = free.shape[1]
     moves = state.left_from_boards[seen.view]

@@ -1,8 +1,8 @@
-"""Calibration boards: the content of a board file (TOML), and the places of its points.
+"""Calibration boards: the content of a board file (TOML), and the positions of its points.
 
-The board frame has its origin at the first point, x along the columns, y along the rows, and z away
-from an observer who looks at the front; the points lie in z = 0. Points run along x first, then row
-by row, as OpenCV orders them.
+The board frame has its origin at the first point. Its x axis points from column to column, its y
+axis from row to row, and its z axis away from an observer who looks at the front. All points lie in
+z = 0. They are ordered row by row, and along x within a row, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class Board(Section):
              other row shifted)
     columns  points along x: inner corners of a chessboard, or dots in one row
     rows     points along y
-    spacing  m between neighbouring points; for asymmetric_dots between rows, whose own dots are
-             twice as far apart
-    radius   m, of dots only
+    spacing  distance between neighbouring points, m; for asymmetric_dots the distance between
+             rows, while dots of the same row are twice as far apart
+    radius   radius of the dots, m; not allowed for a chessboard
     dark     True if dots are darker than the board
     """
 
@@ -77,10 +77,11 @@ class Board(Section):
 
     @property
     def symmetries(self) -> list[NDArray[np.int_]]:
-        """Orders (points,) in which the same board may be read.
+        """Orders (points,) of the points that look the same in a picture.
 
-        They are the order as it is, half a turn, and quarter turns of a square board. A picture
-        does not show which order is the true one.
+        They belong to the unturned board, to half a turn, and to quarter turns if the board has as
+        many rows as columns. An asymmetric grid with an odd number of rows has one order only. A
+        picture does not show which order is the true one.
         """
         order = np.arange(self.rows * self.columns)
         if self.kind == "asymmetric_dots":
@@ -106,8 +107,8 @@ class Board(Section):
 def read_board(path: str | Path) -> Board:
     """Read the board of a TOML file.
 
-    Raises CalibrationError with the valid names for an unknown key, and with the value for a wrong
-    one.
+    Raises CalibrationError, which lists the valid names for an unknown key, and shows the value for
+    an invalid value.
     """
     source = f"board file {path}"
     content = parsed(read_text(path, source, CalibrationError), source, CalibrationError)

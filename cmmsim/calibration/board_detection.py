@@ -1,14 +1,15 @@
-"""A board in a picture: the points that are seen, and their pixels.
+"""Detection of a board in a picture: the visible points and their pixels.
 
-OpenCV finds the corners of a chessboard. A board of dots is read directly if one threshold
-separates all dots from the background, and the dots lie on the perspective image of a grid. The
-four sharpest corners of the dots' convex hull are then the corners of the board, and a homography
-identifies the other dots. OpenCV reads any other picture of dots. It tries two dozen thresholds and
-finds asymmetric grids, but is six times as slow.
+OpenCV finds the corners of a chessboard. Dots are found directly if one threshold separates all
+dots from the background, and the dots lie on the perspective image of a grid. The four sharpest
+corners of the dots' convex hull are then the corners of the board, and a homography identifies the
+other dots. OpenCV finds the dots in any other picture. It tries two dozen thresholds and supports
+asymmetric grids, but is six times as slow.
 
-A fit of a bright ellipse to each dot makes its centre exact. The centre is that of the dot's
-ellipse in the image, not the image of the dot's centre, see cmmsim.geometry.disc_image. The fits
-also measure the dots' radius, whatever the board file says.
+A fit of a bright ellipse to each dot refines its centre. The result is the centre of the dot's
+ellipse in the image, which differs from the image of the dot's centre (see
+cmmsim.geometry.disc_image). The fits also measure the radius of the dots, independently of the
+board file.
 """
 
 from __future__ import annotations
@@ -28,30 +29,35 @@ from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
 # Share of the board's points that must be measured.
 FEWEST_SHARE = 0.7
-# Distance by which a point may leave the plane's perspective, as a share of that of neighbours.
+# Largest distance of a point from its place in the plane's perspective image, as a share of the
+# distance between neighbouring points.
 LARGEST_POINT_GAP = 0.25
-# Share of a dot's radius by which the measured one may differ: more costs its correction 20 %.
+# Largest relative difference between the measured and the given radius of the dots. A larger one
+# would make the correction of the dots' centres wrong by more than 20 %.
 LARGEST_RADIUS_GAP = 0.1
-# Half the window of cornerSubPix over the distance of neighbouring corners.
+# Half the width of cornerSubPix's window, as a share of the distance between neighbouring corners.
 FINE_WINDOW_SHARE = 0.3
 
 FIT_ITERATIONS = 5
-# Dot radii around a centre that are looked at, and those from which the ground is taken.
+# Radius of the fitted surroundings of a dot, and the radius beyond which they belong to the ground,
+# both in dot radii.
 WINDOW_REACH = 2.2
 GROUND_FROM = 1.2
-# Sigmas of blur that are tried, and the number of dots on which they are tried.
+# Standard deviations of blur that are tried, and the number of dots on which they are tried.
 SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)
 PROBED = 12
-# A fit that ends farther from OpenCV's centre, in dot radii, has caught something else.
+# A fit is rejected if its centre is farther than this from the rough centre, in dot radii.
 LARGEST_MOVE = 0.3
-# Share of dots whose fits must succeed to tell their radius; otherwise the covered area tells it.
+# The radius comes from the fits if more than this share of them succeed, otherwise from the covered
+# area.
 FITTED_SHARE = 0.5
 # Samples along each side of the square around a dot in which its area is measured.
 CELL_SIDE = 41
-# Percentiles of a cell's grey values whose mean parts ground from dot.
+# The mean of these percentiles of a cell's grey values separates ground from dot.
 EXTREMES = (2.0, 98.0)
-# A photograph's noise is not known and its edges are blurred: all grey values count alike, and the
-# limit only refuses what is no ellipse at all (residuals of 25 grey values rms).
+# The noise of a photograph is unknown and its edges are blurred. All grey values therefore have
+# equal weight, and the limit rejects only shapes that are no ellipse (residuals of 25 grey values
+# rms).
 PLAIN_NOISE = CameraNoise(
     electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0
 )
@@ -59,9 +65,10 @@ LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
 SMALLEST_AREA_PX = 20.0
 # Area of a dot as a share of the image.
 LARGEST_AREA = 0.01
-# OpenCV first looks in an image of at most this size, which is faster and has less noise.
+# OpenCV first searches an image reduced to at most this size, which is faster and has less noise.
 FIND_SIDE_PX = 1600
-# Share of the distance of neighbours by which a dot may lie off the grid of the four corners.
+# Largest distance of a dot from the grid that the four corners define, as a share of the distance
+# between neighbours.
 LARGEST_GRID_GAP = 0.3
 
 
@@ -69,7 +76,8 @@ LARGEST_GRID_GAP = 0.3
 class BoardView:
     """View of a board by one camera.
 
-    It has the index (n,) of the points, their pixels (n, 2), and the radius of the dots, m.
+    ``index`` (n,) identifies the points of the board, ``pixels`` (n, 2) are their places in the
+    image, and ``radius`` is the measured radius of the dots, m.
     """
 
     index: NDArray[np.int_]
@@ -84,7 +92,7 @@ class BoardView:
 
 
 def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
-    """Find the board in one grey image, or say in words why it is not there."""
+    """Return the view of the board in a grey image, or the reason why none was found."""
     radius: float | None = None
     if board.kind == "chessboard":
         found = find_chessboard(grey, board.columns, board.rows)
@@ -103,9 +111,9 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
 
 
 def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
-    """Return the view with its rows turned round if it was read mirrored.
+    """Return the view, with reversed rows if its order is mirrored, or the reason for rejecting it.
 
-    A board is seen from its front only.
+    A camera sees only the front of a board, so a mirrored order is wrong.
     """
     grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
     plane = board.points[view.index, :2]
@@ -129,7 +137,7 @@ def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
 
 
 def radius_differs(measured: float | None, given: float | None) -> bool:
-    """Tell whether a measured radius contradicts a given one; False where either is missing."""
+    """Tell whether a measured radius contradicts a given one; False if either is missing."""
     return (
         measured is not None
         and given is not None
@@ -140,7 +148,7 @@ def radius_differs(measured: float | None, given: float | None) -> bool:
 def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     """Return the corners (rows * columns, 2) px, or None.
 
-    The sector-based search comes first, then the older one with refined corners.
+    The sector-based search is tried first, then the older search with refined corners.
     """
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     found, corners = cv2.findChessboardCornersSB(grey, (columns, rows), flags=flags)
@@ -160,9 +168,10 @@ def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array |
 
 
 def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | None:
-    """Return dot centres (rows * columns, 2) px in the board's order, and their measured radius, m.
+    """Return the dot centres (rows * columns, 2) px in the board's order, and the radius, m.
 
-    A dot that is no clean ellipse is NaN. The result is None where there is no board.
+    The radius is measured. The centre of a dot whose fit failed is NaN. The result is None if no
+    board is found.
     """
     bright = 255 - grey if board.dark else grey
     rough = search_dots(bright, board)
@@ -179,12 +188,12 @@ def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | No
 def _refine(
     bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
 ) -> tuple[Array, Array]:
-    """Return fitted centres (n, 2), and fitted over expected radii (n,).
+    """Return fitted centres (n, 2), and ratios (n,) of the fitted to the expected radii.
 
-    Dots that need windows of one size are fitted together.
+    Dots with windows of the same size are fitted together.
     """
     largest = np.linalg.norm(shapes, axis=2).max(axis=1)
-    # Neighbouring dots must stay outside.
+    # The window must not contain neighbouring dots.
     reach = min(WINDOW_REACH, board.nearest / board.dot_radius - 1.15)
     sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
     fine = np.full_like(rough, np.nan)
@@ -206,13 +215,13 @@ def _refine(
 
 
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
-    """Return the sigma in px of the Gaussian blur with which ellipses fit windows best.
+    """Return the standard deviation in px of the Gaussian blur with the smallest misfit.
 
-    It is the blur of lens and focus together.
+    It describes the blur of lens and focus together.
     """
     best = SPREADS_PX[0]
     least = np.inf
-    # The misfit has one minimum: it falls towards the true blur, and rises from there on.
+    # The misfit has one minimum: it falls up to the true blur and rises beyond it.
     for spread in SPREADS_PX:
         fits = fit_ellipses(
             windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS, spread
@@ -226,8 +235,9 @@ def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
 
 
 def _dot_shapes(rough: Array, board: Board) -> Array:
-    """Return matrices (n, 2, 2) px that carry the unit disc to each dot, by the board's
-    perspective.
+    """Return matrices (n, 2, 2) px that map the unit disc to the image of each dot.
+
+    They follow from the homography of the board.
     """
     plane = board.points[:, :2]
     flat, _ = cv2.findHomography(plane, rough)
@@ -242,10 +252,8 @@ def _dot_shapes(rough: Array, board: Board) -> Array:
 def _without_neighbours(
     windows: NDArray[np.uint8], centres: Array, shapes: Array, reach: float
 ) -> Array:
-    """Return windows (n, h, h) whose pixels beyond ``reach`` dot radii are set to the dot's
-    ground.
-    """
-    # Late, as numba takes time to import.
+    """Return windows (n, h, h) with the dot's ground at all pixels beyond ``reach`` dot radii."""
+    # Imported late, because importing numba takes time.
     from cmmsim.detection.start_kernels import isolate_dots
 
     alone = np.array(windows, dtype=float)
@@ -254,12 +262,12 @@ def _without_neighbours(
 
 
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
-    """Return the median radius of bright dots over half the distance to their nearest neighbour.
+    """Return the median radius of bright dots, as a share of half the distance to a neighbour.
 
-    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px carry the unit disc to each dot's cell. In
-    each cell the grey values' share of the step from ground to dot adds up to the dot's area. Dots
-    without a level top, because of blur, seem larger: by a quarter at 2.5 px radius and 1 px of
-    blur.
+    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. A dot's
+    share of the area of its cell is the mean grey value of the cell above the ground, divided by
+    the contrast of dot and ground. The radius comes out too large if blur leaves no level top: by a
+    quarter at 2.5 px radius and 1 px of blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0
@@ -274,7 +282,10 @@ def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> f
 
 
 def search_dots(bright: NDArray[np.uint8], board: Board) -> Array | None:
-    """Return rough centres (rows * columns, 2) px of bright dots in the board's order, or None."""
+    """Return rough centres (rows * columns, 2) px of bright dots in the board's order, or None.
+
+    The single threshold is tried first, then OpenCV in a reduced image and in the whole one.
+    """
     rough = read_at_once(bright, board) if board.kind == "dots" else None
     for side in (FIND_SIDE_PX, max(bright.shape)):
         if rough is None:
@@ -283,8 +294,9 @@ def search_dots(bright: NDArray[np.uint8], board: Board) -> Array | None:
 
 
 def read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
-    """Return the centres by one threshold, Otsu's; None where it does not show exactly the board's
-    grid.
+    """Return the dot centres found with Otsu's threshold, in the board's order.
+
+    The result is None unless the bright spots form exactly the board's grid.
     """
     points = _bright_spots(bright)
     if len(points) != len(board.points):
@@ -308,7 +320,7 @@ def read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
 
 
 def _bright_spots(bright: NDArray[np.uint8]) -> Array:
-    """Return the centroids (n, 2) px of bright spots whose area may be a dot's."""
+    """Return the centroids (n, 2) px of bright spots that have a plausible area of a dot."""
     _, shown = cv2.threshold(bright, 0.0, 1.0, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     found = []
     for contour in cv2.findContours(shown, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
@@ -322,9 +334,9 @@ def _bright_spots(bright: NDArray[np.uint8]) -> Array:
 
 
 def _sharpest_corners(points: Array) -> Array:
-    """Return the four corners (4, 2) of the convex hull of points (n, 2) with the smallest angles.
+    """Return the four corners (4, 2) of the points' convex hull that have the smallest angles.
 
-    They are clockwise as an observer sees them, as the board's are from its front.
+    They are in clockwise order in the image, like the corners of a board seen from its front.
     """
     hull = cv2.convexHull(points.astype(np.float32), clockwise=False)[:, 0].astype(float)
     before, after = (hull - np.roll(hull, step, axis=0) for step in (1, -1))
@@ -335,9 +347,9 @@ def _sharpest_corners(points: Array) -> Array:
 
 
 def found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
-    """Return OpenCV's centres (n, 2) px, or None.
+    """Return the dot centres (n, 2) px that OpenCV finds in a scaled image, or None.
 
-    OpenCV returns (n, 1, 2) up to version 4, and (n, 2) from version 5 on.
+    OpenCV itself returns (n, 1, 2) up to version 4, and (n, 2) from version 5 on.
     """
     small = (
         bright
@@ -356,13 +368,13 @@ def found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Ar
         )
         if found:
             rough = np.asarray(centres, dtype=float).reshape(-1, 2)
-            # Scaling keeps the first pixel's corner in place, not its middle.
+            # Scaling fixes the outer corner of the first pixel, which is at (-0.5, -0.5).
             return (rough + 0.5) / scale - 0.5
     return None
 
 
 def _blob_detector(pixels: int) -> Any:
-    opencv: Any = cv2  # its type stubs leave the blob detector out
+    opencv: Any = cv2  # the type stubs of OpenCV lack the blob detector
     options = opencv.SimpleBlobDetector_Params()
     options.filterByColor = True
     options.blobColor = 255

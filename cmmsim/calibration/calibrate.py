@@ -1,7 +1,7 @@
-"""Calibration of both cameras from the views of a board, and warnings about it.
+"""Calibration of both cameras from the views of a board, with warnings about doubtful results.
 
-The steps are start values, the adjustment, giving up images that do not fit, and the correction of
-the dots' centres.
+The steps are the start values, the adjustment, the rejection of images that do not fit, and the
+correction of the dots' centres.
 """
 
 from collections.abc import Sequence
@@ -30,26 +30,26 @@ from cmmsim.geometry.pose import Array, apply, invert
 from cmmsim.geometry.stereo_rig import StereoRig
 
 FEWEST_PAIRS = 3
-# An image is given up if its residuals exceed this many medians of all images.
+# An image is rejected if its rms residual exceeds this multiple of the median over all images.
 LARGEST_RMS_RATIO = 4.0
-# Residuals below this are rounding, however they compare.
+# Rms residuals below this limit are rounding errors and never lead to a rejection.
 ROUNDING_PX = 1e-3
-# Rounds of giving up images, and of correcting dot centres.
+# Largest number of rounds of rejecting images, and of correcting dot centres.
 ROUNDS = 5
-# Change of the dots' correction that ends it.
+# The correction of the dot centres ends when it changes by less than this.
 SETTLED_PX = 1e-4
-# m: a board whose longer side lies outside is taken for one in a wrong unit.
+# Plausible range of a board's longer side, m. Other values suggest a wrong unit.
 BOARD_SIDES = (0.01, 5.0)
-# Share of the pairs.
+# Largest share of unused pairs without a warning.
 LARGEST_UNUSED = 1.0 / 3.0
-# Share of the baseline by which the right camera may stand on the left of the left one.
+# Share of the baseline beyond which a right camera on the left of the left camera is reported.
 LEFTWARD = 0.5
-# Shares of the focal length and of the image width.
+# Largest standard deviations without a warning, as shares of the focal length and image width.
 LARGEST_FOCAL_STD = 0.003
 LARGEST_CENTRE_STD = 0.005
-# rad between the board normals that differ most: 15 degrees.
+# Smallest angle without a warning between the two board normals that differ most, rad (15 degrees).
 SMALLEST_TILT = 0.26
-# Share of the image's area within the hull of all points.
+# Smallest share of the image area within the convex hull of all points without a warning.
 SMALLEST_COVER = 0.4
 FEW_VIEWS = 8
 
@@ -58,9 +58,9 @@ FEW_VIEWS = 8
 class CalibrationOptions:
     """Options of a calibration.
 
-    ``distortion`` names the free terms, a key of DISTORTIONS. ``fix_aspect`` sets fx = fy.
-    ``min_images`` is the fewest pairs that show the board to both cameras. ``correct_dots`` takes
-    the eccentricity of dots off.
+    ``distortion`` is the key of DISTORTIONS that names the free distortion terms. ``fix_aspect``
+    sets fx = fy. ``min_images`` is the required number of pairs in which both cameras see the
+    board. ``correct_dots`` enables the correction for the eccentricity of the dots' images.
     """
 
     distortion: str = DEFAULT_DISTORTION
@@ -84,9 +84,9 @@ def calibrate(
 ) -> Calibration:
     """Calibrate both cameras from pairs of images of size (width, height) px.
 
-    An image pair with the board in one camera only helps that camera. Raises CalibrationError with
-    the reasons of all pairs when too few show the board to both, or when the views do not determine
-    the cameras.
+    A pair in which one camera sees the board contributes to that camera only. Raises
+    CalibrationError if both cameras see the board in too few pairs, with the reasons, or if the
+    views do not determine the cameras.
     """
     options = options or CalibrationOptions()
     _require_pairs(pairs, options)
@@ -117,8 +117,8 @@ def _require_pairs(pairs: Sequence[PairView], options: CalibrationOptions) -> No
     if good < options.min_images:
         reasons = some([f"{pair.name} ({pair.reasons})" for pair in pairs if not pair.both])
         raise CalibrationError(
-            f"{good} of {len(pairs)} pairs show the board to both cameras, {options.min_images} "
-            "needed" + (f"; without it: {reasons}" if good < len(pairs) else "")
+            f"both cameras see the board in {good} of {len(pairs)} pairs, {options.min_images} are "
+            "needed" + (f"; pairs without it: {reasons}" if good < len(pairs) else "")
         )
 
 
@@ -129,9 +129,9 @@ def _without_misfits(
     free: Array,
     options: CalibrationOptions,
 ) -> tuple[list[PairView], list[PairView], Adjustment, tuple[Sightings, Sightings]]:
-    """Adjust the rig, giving up images that fit far worse than the others.
+    """Adjust the rig, and reject images that fit far worse than the others.
 
-    Return all pairs, those that are used, the adjustment and its sightings.
+    Return all pairs, the used pairs, the adjustment, and the sightings that it used.
     """
     judged = list(pairs)
     boards = start.left_from_boards.copy()
@@ -163,7 +163,7 @@ def _without_misfits(
 
 
 def _image_rms(solved: Adjustment, sightings: tuple[Sightings, Sightings]) -> Array:
-    """Return the root mean square residual (2, v) of each image, px; NaN where it is not used."""
+    """Return the root mean square residual (2, v) of each image, px; NaN for unused images."""
     views = len(solved.state.left_from_boards)
     rms = np.full((2, views), np.nan)
     for side, (seen, residuals) in enumerate(zip(sightings, solved.residuals, strict=True)):
@@ -179,9 +179,9 @@ def _with_true_centres(
     free: Array,
     size: tuple[int, int],
 ) -> tuple[Adjustment, tuple[Sightings, Sightings]]:
-    """Adjust the rig with the eccentricity of the dots' images taken off.
+    """Adjust the rig to dot centres that are corrected for the eccentricity of their images.
 
-    The correction needs the rig, so both are found in turns.
+    The correction depends on the rig, so correction and adjustment alternate.
     """
     last = [np.zeros_like(seen.pixels) for seen in measured]
     for _ in range(ROUNDS):
@@ -200,7 +200,7 @@ def _with_true_centres(
 def _offsets(
     board: Board, seen: Sightings, state: RigState, side: int, size: tuple[int, int]
 ) -> Array:
-    """Return the centre of each dot's image minus the image of its centre (m, 2), px."""
+    """Return the eccentricities (m, 2) px: centre of a dot's image minus image of its centre."""
     moves = state.left_from_boards if side == 0 else state.right_from_left @ state.left_from_boards
     places = (
         np.einsum("mij,mj->mi", moves[seen.view, :3, :3], board.points[seen.point])
@@ -229,8 +229,9 @@ def _used(
 def contradictions(board: Board, state: RigState, pairs: Sequence[PairView]) -> list[str]:
     """Return one line for each contradiction between the pictures and their board file.
 
-    They are dots of another size, folders that seem swapped, lengths that seem no metres, and many
-    unused pairs. ``state`` is adjusted; ``pairs`` are all, with the reasons of those not used.
+    The checks are the size of the dots, the order of the two folders, the unit of lengths, and the
+    number of unused pairs. ``state`` is the adjusted state. ``pairs`` are all pairs, and state the
+    reasons of missing sides.
     """
     return [
         *_dot_radius(board, pairs),
@@ -251,9 +252,9 @@ def _dot_radius(board: Board, pairs: Sequence[PairView]) -> list[str]:
     if not radius_differs(measured, board.radius):
         return []
     return [
-        f"the board file gives dots of radius {board.radius:g} m, in the pictures they measure "
-        f"{measured:.4g} m where their spacing is {board.spacing:g} m: correct the one that is "
-        "wrong, the dots' centres rest on it"
+        f"the board file gives dots of radius {board.radius:g} m, but in the pictures the radius "
+        f"is {measured:.4g} m for a spacing of {board.spacing:g} m: correct the wrong value, "
+        "because the dots' centres depend on it"
     ]
 
 
@@ -263,8 +264,8 @@ def _swapped(state: RigState) -> list[str]:
         return []
     place = ", ".join(f"{value:.3g}" for value in eye)
     return [
-        f"the right camera stands on the left of the left one, at ({place}) m in its axes: if that "
-        "is not so, swap the folders LEFT and RIGHT"
+        "the right camera stands on the left of the left camera, at "
+        f"({place}) m in the left camera's axes: if this is wrong, swap the folders LEFT and RIGHT"
     ]
 
 
@@ -276,8 +277,8 @@ def _units(board: Board, state: RigState) -> list[str]:
     distance = np.median([np.linalg.norm(apply(pose, middle)) for pose in state.left_from_boards])
     baseline = np.linalg.norm(state.right_from_left[:3, 3])
     return [
-        f"a board of {width:.3g} x {height:.3g} m, seen from {distance:.3g} m by cameras "
-        f"{baseline:.3g} m apart: the board file gives lengths in m, are these other units?"
+        f"the board measures {width:.3g} x {height:.3g} m, at {distance:.3g} m from cameras "
+        f"{baseline:.3g} m apart: are the lengths in the board file in m?"
     ]
 
 
@@ -287,8 +288,8 @@ def _unused(board: Board, pairs: Sequence[PairView]) -> list[str]:
         return []
     return [
         f"{len(unused)} of {len(pairs)} pairs are not used, the first is {unused[0].name} "
-        f"({unused[0].reasons}): has the board {board.columns} columns and {board.rows} rows as "
-        "its file says?"
+        f"({unused[0].reasons}): does the board have {board.columns} columns and {board.rows} rows "
+        "as its file states?"
     ]
 
 
@@ -297,15 +298,15 @@ def weaknesses(
 ) -> list[str]:
     """Return one line for each weakness of a calibration.
 
-    They are errors shared within a view, uncertain cameras, boards alike, images not covered, and
-    few views.
+    The checks are common errors of the points of a view, the uncertainty of the cameras, the part
+    of the image that the points cover, the tilt of the boards, and the number of views.
     """
     lines = []
     if (factor := solved.shared.factor) > 1.0:
         lines.append(
-            f"points of one view err alike: the covariance is on average {factor:.1f} times that "
-            f"of independent errors (chance allows {solved.shared.limit:.1f}); is the board flat, "
-            "evenly lit and sharp?"
+            f"points of one view have common errors: the covariance is on average {factor:.1f} "
+            f"times that of independent errors (limit by chance: {solved.shared.limit:.1f}); is "
+            "the board flat, evenly lit and sharp?"
         )
     spread = np.sqrt(np.diag(solved.covariance))
     for side, (camera, name) in enumerate(zip(rig.cameras, SIDES, strict=True)):
@@ -324,17 +325,17 @@ def weaknesses(
         cover = cv2.contourArea(hull) / (camera.width * camera.height)
         if cover < SMALLEST_COVER:
             lines.append(
-                f"board points cover {cover:.0%} of the {name} image, distortion beyond them is "
-                "extrapolated; show the board in the corners too"
+                f"board points cover {cover:.0%} of the {name} image, and the distortion outside "
+                "is extrapolated; show the board in the corners, too"
             )
     if (tilt := solved.state.largest_tilt) < SMALLEST_TILT:
         lines.append(
             "the boards are nearly parallel: their normals differ by at most "
-            f"{np.degrees(tilt):.1f} degrees, so that focal length and distance can hardly be told "
-            "apart; tilt the board by 30 degrees and more"
+            f"{np.degrees(tilt):.1f} degrees, so that focal length and distance are hardly "
+            "separable; tilt the board by 30 degrees and more"
         )
     if (count := len(solved.state.left_from_boards)) < FEW_VIEWS:
         lines.append(
-            f"{count} views only; {FEW_VIEWS} and more make an estimate of the uncertainty reliable"
+            f"only {count} views: the stated uncertainty is reliable from {FEW_VIEWS} views on"
         )
     return lines

@@ -1,6 +1,4 @@
-"""Result of a calibration: its figures, its text (TOML, JSON), and the sensor file that it
-completes.
-"""
+"""Result of a calibration: its figures, their TOML and JSON text, and the completed sensor file."""
 
 import json
 import os
@@ -27,14 +25,16 @@ from cmmsim.uncertainty.known_rig import KnownRig
 TABLES = ("rig.left", "rig.right", "rig.right_from_left")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
-# Ratio of the baselines of calibration and sensor file, the larger over the smaller.
+# Largest ratio of the two baselines of the calibration and the sensor file without a warning.
 LARGEST_RATIO = 1.5
 
 
 @dataclass(frozen=True)
 class UsedView:
-    """Name of a used pair, its place in left_from_boards, and the rms residual in px of each used
-    image.
+    """A used pair of images.
+
+    ``name`` is the name of the pair, ``view`` its index in left_from_boards, and ``rms_px`` the rms
+    residual of each used image by side, px.
     """
 
     name: str
@@ -44,10 +44,11 @@ class UsedView:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Both cameras with their covariance, and all that they rest on.
+    """Both cameras with their covariance, and the data from which they were calibrated.
 
-    ``sightings`` are those adjusted, where dots have no eccentricity. ``rejected`` has the reason
-    by the pair's name, also for pairs of which one image is used. ``warnings`` are one line each.
+    ``sightings`` are the adjusted pixels, corrected for the eccentricity of dots. ``rejected`` maps
+    the name of each pair with an unused image to the reason; the other image can be in use. Each of
+    the ``warnings`` is one line.
     """
 
     rig: StereoRig
@@ -73,8 +74,9 @@ class Calibration:
 
     @property
     def covariance(self) -> Array:
-        """Covariance (24, 24) in the order of PARAMETER_NAMES; rows of fixed parameters are
-        zero.
+        """Covariance (24, 24) in the order of PARAMETER_NAMES.
+
+        Rows and columns of fixed parameters are zero.
         """
         spread = np.eye(len(PARAMETER_NAMES))
         spread[-3:, -3:] = _inverse_left_jacobian(self.rotation_vector)
@@ -82,23 +84,24 @@ class Calibration:
 
     @property
     def known(self) -> KnownRig:
-        """Both cameras as the calibration knows them, with their covariance."""
+        """The estimated rig with its covariance."""
         return KnownRig(self.rig, self.covariance)
 
     @property
     def std(self) -> Array:
-        """Standard deviations (24,)."""
+        """Standard deviations (24,) in the order of PARAMETER_NAMES."""
         return np.sqrt(np.diag(self.covariance))
 
 
 def _inverse_left_jacobian(vector: Array) -> Array:
-    """Return the change (3, 3) of a rotation vector (3,) by a small turn applied on the left.
+    """Return the derivative (3, 3) of a rotation vector (3,) with respect to a small left rotation.
 
     See Sola et al. 2018, eq. 146.
     """
     angle = float(np.linalg.norm(vector))
     k = skew(vector)
-    # The general formula divides rounding by the square of a small angle; this is its series.
+    # At small angles the general formula divides rounding errors by the angle squared. The series
+    # does not.
     if angle < 1e-4:
         return np.eye(3) - 0.5 * k + k @ k / 12.0
     return (
@@ -129,7 +132,7 @@ def rig_tables(found: Calibration) -> str:
 
 
 def as_dict(found: Calibration) -> dict[str, Any]:
-    """Return everything of a calibration, ready for JSON."""
+    """Return all results of a calibration as a dictionary for JSON."""
     solved = found.adjustment
     return {
         "opencv": cv2.__version__,
@@ -170,11 +173,11 @@ def as_dict(found: Calibration) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class SensorTemplate:
-    """Sensor file without its calibrated cameras.
+    """Text of a sensor file without the tables of its cameras.
 
-    ``text`` may stand in the folder that it was made for. ``size`` is (width, height) of the
-    images, px, and ``baseline`` the distance of the cameras, m. ``name`` is that of the file, or
-    its path.
+    Relative paths in ``text`` refer to the folder for which it was made. ``size`` is (width,
+    height) of the images, px, and ``baseline`` the distance between the cameras, m, both from the
+    original file. ``name`` is the built-in name or the path of that file.
     """
 
     text: str
@@ -186,8 +189,8 @@ class SensorTemplate:
         """Raise CalibrationError for images of another size (width, height) px."""
         if size != self.size:
             raise CalibrationError(
-                f"the images are {size[0]} x {size[1]} px, those of the sensor file {self.name} "
-                f"{self.size[0]} x {self.size[1]}: take a sensor file of the same cameras"
+                f"the images are {size[0]} x {size[1]} px, but the sensor file {self.name} states "
+                f"{self.size[0]} x {self.size[1]} px: use a sensor file of the same cameras"
             )
 
     def filled(self, found: Calibration) -> str:
@@ -199,22 +202,23 @@ class SensorTemplate:
         return self.text + rig_tables(found)
 
     def disagreements(self, found: Calibration) -> list[str]:
-        """Return one line where the calibrated baseline is far from the sensor file's."""
+        """Return a warning if the calibrated baseline differs much from that of the sensor file."""
         baseline = float(np.linalg.norm(found.rig.right_from_left[:3, 3]))
         if max(baseline / self.baseline, self.baseline / baseline) <= LARGEST_RATIO:
             return []
         return [
-            f"the cameras stand {baseline:.4g} m apart, those of the sensor file {self.name} "
-            f"{self.baseline:.4g} m: are the lengths of the board file in m, and is it the file of "
-            "these cameras?"
+            f"the calibrated cameras stand {baseline:.4g} m apart, but {self.baseline:.4g} m in "
+            f"the sensor file {self.name}: are the lengths of the board file in m, and does the "
+            "sensor file describe these cameras?"
         ]
 
 
 def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:
-    """Return a sensor file of a built-in name or a path, to be filled and written into ``folder``.
+    """Return the template of a sensor file, given by a built-in name or a path.
 
-    A file that the sensor file is based on is named as seen from the folder. Raises as
-    read_sensor_file, and CalibrationError where the cameras stand in inline tables.
+    The completed file is meant for ``folder``, so a path in ``based_on`` becomes relative to it.
+    Raises the errors of read_sensor_file, and CalibrationError if the cameras are given as inline
+    tables.
     """
     section = read_sensor_file(name).rig
     text = (
@@ -225,19 +229,19 @@ def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:
         tomllib.loads(text + "".join(f"[{table}]\n" for table in TABLES))
     except tomllib.TOMLDecodeError as error:
         raise CalibrationError(
-            f"sensor file {name} must hold {', '.join(TABLES)} as tables of their own: {error}"
+            f"sensor file {name} must have [{'], ['.join(TABLES)}] as separate tables: {error}"
         ) from error
     baseline = float(np.linalg.norm(rig_from_file(section)[0].right_from_left[:3, 3]))
     return SensorTemplate(text, (section.width, section.height), baseline, str(name))
 
 
 def require_sensor(path: str | Path) -> None:
-    """Raise SensorFileError where a file describes no sensor."""
+    """Raise SensorFileError if a file does not describe a sensor."""
     rig_from_file(read_sensor_file(path).rig)
 
 
 def _based_from(text: str, name: str | Path, folder: Path) -> str:
-    """Return the text whose based_on, where it is a file, names that file from ``folder``."""
+    """Return the text with a relative path in ``based_on`` rewritten relative to ``folder``."""
     basis = tomllib.loads(text).get("based_on")
     if basis is None or basis in built_in_names() or Path(basis).is_absolute():
         return text
@@ -252,9 +256,9 @@ def _based_from(text: str, name: str | Path, folder: Path) -> str:
 
 
 def _without_tables(text: str, names: Sequence[str]) -> str:
-    """Return a TOML text without some tables.
+    """Return a TOML text without the tables of the given names.
 
-    Comments before the next header go with the table that they follow.
+    Comments between such a table and the next header are removed, too.
     """
     kept = []
     skipping = False

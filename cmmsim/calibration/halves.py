@@ -1,6 +1,6 @@
-"""Comparison of two halves of the pictures, each calibrated for itself.
+"""Comparison of two calibrations, each from one half of the pictures.
 
-It is the only proof of a stated covariance that needs no truth.
+It is the only check of a stated covariance that works without the true cameras.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,37 +18,37 @@ from cmmsim.uncertainty.known_rig import KnownRig
 
 @dataclass(frozen=True)
 class Halves:
-    """Squared differences of the halves' calibrations, for n splits.
+    """Squared differences between the calibrations of both halves, for n splits.
 
     ``squares`` (n, p) belong to p independent directions of the free parameters. Each is divided by
-    the variance that both halves state, so that 1 is expected.
+    the sum of the variances that both calibrations state, so its expected value is 1.
     """
 
     squares: np.ndarray
 
     @property
     def mean_square(self) -> float:
-        """Mean over splits and directions; well above 1 where the stated covariance is too
-        small.
-        """
+        """Mean over splits and directions; well above 1 if the stated covariance is too small."""
         return float(self.squares.mean())
 
     @property
     def chance(self) -> float:
-        """Standard deviation of the mean of one split if the covariance is right.
+        """Standard deviation of the mean square of one split if the covariance is right.
 
-        Splits of the same pictures are not independent, so that many of them help less than their
-        number says.
+        It is not divided by the number of splits, because splits of the same pictures are not
+        independent.
         """
         return float(np.sqrt(2.0 / self.squares.shape[1]))
 
     @property
     def verdict(self) -> str:
-        """Statement on the covariance, which holds beyond two standard deviations of a single
-        split.
+        """Statement on the covariance.
+
+        It calls the covariance wrong if the mean square differs from 1 by more than two standard
+        deviations of a single split.
         """
         if abs(self.mean_square - 1.0) <= 2.0 * self.chance:
-            return "they agree as they state"
+            return "the differences agree with the stated covariance"
         return f"the stated covariance is too {'small' if self.mean_square > 1.0 else 'large'}"
 
     def to_dict(self) -> dict[str, float | int | str]:
@@ -70,15 +70,16 @@ def compare_halves(
     rng: np.random.Generator,
     advance: Callable[[], None] = lambda: None,
 ) -> Halves:
-    """Split pairs of pictures at random into two halves, repeatedly, and compare the calibrations.
+    """Split pairs of pictures repeatedly at random into two halves, and compare the calibrations.
 
-    Raises CalibrationError where halves are too few pictures, or do not determine the cameras.
+    ``advance`` is called after each calibration. Raises CalibrationError if a half has too few
+    pairs or does not determine the cameras.
     """
     half = len(pairs) // 2
     least = max(options.min_images, FEWEST_PAIRS)
     if half < least:
         raise CalibrationError(
-            f"halves of {len(pairs)} pairs of pictures are fewer than {least} each"
+            f"each half of {len(pairs)} pairs of pictures has {half} pairs, fewer than {least}"
         )
     squares = []
     for _ in range(splits):
@@ -93,15 +94,15 @@ def compare_halves(
 
 
 def squared_differences(one: KnownRig, other: KnownRig) -> np.ndarray:
-    """Return squared differences (p,) of two rigs along independent directions.
+    """Return the squared differences (p,) of two rigs along independent directions.
 
-    They are divided by the sum of both variances.
+    Each is divided by the sum of both variances.
     """
     covariance = one.covariance + other.covariance
     free = np.flatnonzero(np.diag(covariance) > 0.0)
     std = np.sqrt(np.diag(covariance)[free])
     apart = (one.rig.parameters - other.rig.parameters)[free] / std
     values, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(std, std))
-    # fx = fy, where asked for, leaves directions without variance; both halves agree in them
+    # The constraint fx = fy leaves directions without variance, in which both halves agree.
     kept = values > len(PARAMETER_NAMES) * np.finfo(float).eps * values[-1]
     return np.asarray((vectors.T @ apart)[kept] ** 2 / values[kept])

@@ -1,4 +1,4 @@
-"""Rendered calibration images: seeded poses of a board, and the views of a sensor's cameras."""
+"""Rendered calibration images: random poses of a board, and its images in a sensor's cameras."""
 
 from __future__ import annotations
 
@@ -20,37 +20,41 @@ from cmmsim.imaging.scene_bodies import SUNK, Disc, DiscStack, Mesh, Patch, soli
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame
 
-# The drawn board
-# Rim of the plate beyond its outermost points, in spacings. The outer squares of a chessboard reach
-# there, and a bright rim surrounds them.
+# Constants of the drawn board.
+# Width of the plate beyond its outermost points, in spacings. A chessboard's outer squares fill it,
+# and a bright rim of width RIM surrounds them.
 MARGIN = 1.0
 RIM = 0.35
 THICKNESS = 0.008  # m
+# Reflectances.
 BRIGHT = 0.86
-DARK = 0.06  # shares of white light sent back
-# The front looks against the board's z axis.
+DARK = 0.06
+# The normal of the front points against the board's z axis.
 FRONT = frozen([0.0, 0.0, -1.0])
-# Its poses
-# rad between the board's normal and the view from the middle of the baseline.
+# Constants of its poses.
+# Largest angle between the board's normal and the direction to the middle of the baseline, rad.
 LARGEST_TILT = 0.75
-# Shares of the depth at which the optical axes come nearest.
+# Range of the board's depth, in units of the depth at which the optical axes come nearest.
 DEPTH_RANGE = (0.8, 1.2)
 # Each image is divided into 3 x 3 cells that the board visits in turn.
 CELLS = 3
-# Least cosine between the board's normal and the view of either camera.
+# Smallest cosine between the board's normal and the viewing direction of either camera.
 GRAZING = 0.35
-# Poses drawn for one image before giving up, and poses that are examined together.
+# Largest number of poses tried for one image, and number of poses that are examined together.
 TRIES = 4000
 AT_ONCE = 200
-# Its images
+# Constants of its images.
 TILE_PX = 64
 SUPERSAMPLING = 12
-# Points along each side of the plate, which show where a bent image of it reaches.
+# Points along each side of the plate, from which the extent of its distorted image is found.
 OUTLINE_POINTS = 15
 
 
 def board_drawable(board: Board, distance: float) -> Drawable:
-    """Return everything of a board as one body in the board frame, seen from ``distance`` m."""
+    """Return plate and marks of a board as one body in the board frame.
+
+    ``distance`` is the distance from the cameras to the board, m.
+    """
     ground, mark = (BRIGHT, DARK) if board.dark else (DARK, BRIGHT)
     dots = [DiscStack((Disc(point, FRONT, board.dot_radius, mark),)) for point in board.points]
     patches: list[Patch] = [
@@ -78,7 +82,7 @@ def _plate(board: Board, level: float) -> Mesh:
 
 
 def _squares(board: Board, level: float) -> list[Mesh]:
-    """Return the dark squares of a chessboard, with its outermost ones."""
+    """Return the dark squares of a chessboard, including those outside its outermost corners."""
     corners = board.spacing * np.array(
         [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
     )
@@ -95,21 +99,22 @@ def _squares(board: Board, level: float) -> list[Mesh]:
 
 
 def default_board(rig: StereoRig) -> Board:
-    """Return a board of 13 x 9 dots, a third as wide as the left camera's view where the axes
-    meet.
+    """Return a board of 13 x 9 dots that fills a third of the width of the left image.
+
+    This holds at the depth at which the optical axes meet.
     """
     spacing = round(meeting_depth(rig) * rig.left.width / rig.left.focal_px / 3.0 / 13.0, 3)
     return Board(kind="dots", columns=13, rows=9, spacing=spacing, radius=round(0.25 * spacing, 5))
 
 
 def meeting_depth(rig: StereoRig) -> float:
-    """Return the depth along the left axis at which the right one comes nearest, m.
+    """Return the depth along the left optical axis at which the right axis comes nearest, m.
 
     It is 1.5 baselines for parallel axes.
     """
     right_axis = invert(rig.right_from_left)[:3, 2]
     eye = _right_eye(rig)
-    # The closest approach of two lines, of which parallel axes have none.
+    # The closest approach of two lines, which parallel axes do not have.
     across = 1.0 - right_axis[2] ** 2
     depth = (eye[2] - (eye @ right_axis) * right_axis[2]) / across if across > 1e-6 else 0.0
     return float(depth) if depth > 0.0 else 1.5 * float(np.linalg.norm(eye))
@@ -118,15 +123,17 @@ def meeting_depth(rig: StereoRig) -> float:
 def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generator) -> list[Array]:
     """Return ``count`` poses left_from_board (4, 4).
 
-    Raises CalibrationError when no such pose is found, because the board is too large or too small.
+    Both cameras see the whole board in each of them. Raises CalibrationError if no such pose is
+    found.
     """
     return [_draw_pose(rig, board, k, rng) for k in range(count)]
 
 
 def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generator) -> Array:
-    """Draw one pose in the cell whose turn it is.
+    """Draw one pose that shows the whole board to both cameras.
 
-    Where that cell shows no whole board to both cameras, the pose may be in any cell.
+    The board lies in the next cell of the image. If the first half of the tries fails, any cell is
+    allowed.
     """
     corners = plate_corners(board)
     depth = meeting_depth(rig)
@@ -139,14 +146,14 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
         )
         if good.any():
             chosen = int(np.argmax(good))
-            # The stream goes on as if no pose had been drawn beyond the chosen one.
+            # Reset the random stream to its state directly after the chosen pose.
             rng.bit_generator.state = before
             _drawn_numbers(number, first, chosen + 1, rng)
             return np.asarray(poses[chosen])
     width, height = np.ptp(corners[:, :2], axis=0)
     raise CalibrationError(
         f"none of {TRIES} poses shows the whole board of {width:.3g} x {height:.3g} m to both "
-        f"cameras at about {depth:.3g} m: take a smaller one"
+        f"cameras at about {depth:.3g} m: use a smaller board"
     )
 
 
@@ -164,11 +171,12 @@ def _drawn_numbers(
 def _poses_of(
     rig: StereoRig, middle: Array, depth: float, side: int, cells: NDArray[np.int_], numbers: Array
 ) -> Array:
-    """Return poses left_from_board (n, 4, 4) of a board with a middle (3,).
+    """Return poses left_from_board (n, 4, 4) of a board with its middle (3,) in given cells.
 
-    The middle shows in cells (n,) of one camera's image, at about this depth. Numbers (n, 6) from 0
-    to 1 say where exactly, and how tilted. The front looks at the middle of the baseline; then the
-    board is turned within its plane, and tilted about a random axis in it.
+    ``cells`` (n,) are cells of the image of camera ``side``, and ``depth`` is the mean depth, m.
+    Numbers (n, 6) from 0 to 1 determine the exact depth, the pixel and the tilt. The front first
+    faces the middle of the baseline. Then the board is turned within its plane, and tilted about a
+    random axis in that plane.
     """
     camera = rig.cameras[side]
     from_left = rig.from_camera[side]
@@ -195,7 +203,7 @@ def _right_eye(rig: StereoRig) -> Array:
 
 
 def _facing(towards: Array) -> Array:
-    """Return rotations (n, 3, 3) of boards whose fronts look along ``towards`` (n, 3).
+    """Return rotations (n, 3, 3) of boards whose fronts face along ``towards`` (n, 3).
 
     Their x axes are horizontal in the left image.
     """
@@ -206,8 +214,9 @@ def _facing(towards: Array) -> Array:
 
 
 def _front_to_both(rig: StereoRig, poses: Array, corners: Array) -> NDArray[np.bool_]:
-    """Tell whether both cameras see the fronts of boards at poses (n, 4, 4), not at a grazing
-    angle.
+    """Tell whether both cameras see the front of a board at poses (n, 4, 4).
+
+    A view at a grazing angle does not count.
     """
     places = poses[:, :3, :3] @ corners.mean(axis=0) + poses[:, :3, 3]
     views = np.stack([places, places - _right_eye(rig)])
@@ -235,7 +244,8 @@ def render_pairs(
     """
     if board.kind == "chessboard" and renderer.name == "analytic":
         raise CalibrationError(
-            "the analytic renderer draws no chessboard: take the renderer pyrender, or a dot board"
+            "the analytic renderer cannot draw a chessboard: use the renderer pyrender, or a board "
+            "of dots"
         )
     distance = float(np.mean([np.linalg.norm(pose[:3, 3]) for pose in poses]))
     formation = ImageFormation(renderer, board_drawable(board, distance), 0.0, optics)
@@ -250,8 +260,9 @@ def render_pairs(
 def _radiance(
     formation: ImageFormation, camera: PinholeCamera, camera_from_board: Array, board: Board
 ) -> NDArray[np.float32]:
-    """Return the radiance (height, width) of one image; only tiles that the board reaches are
-    drawn.
+    """Return the radiance (height, width) of one image.
+
+    Only tiles that can contain a part of the board are rendered; the others are black.
     """
     image = np.zeros(
         (-(-camera.height // TILE_PX) * TILE_PX, -(-camera.width // TILE_PX) * TILE_PX),
@@ -269,7 +280,7 @@ def _radiance(
 def _reached_tiles(
     camera: PinholeCamera, camera_from_board: Array, board: Board, margin: int
 ) -> NDArray[np.int_]:
-    """Return the first pixels (k, 2) of the tiles within the bounds of the board's plate."""
+    """Return the first pixels (k, 2) of the tiles within the bounding box of the board's plate."""
     plate = plate_corners(board)
     share = np.linspace(0.0, 1.0, OUTLINE_POINTS)[:, None, None]
     outline = ((1.0 - share) * plate + share * np.roll(plate, -1, axis=0)).reshape(-1, 3)

@@ -1,24 +1,26 @@
-"""Errors that the points of one view share, found from the views' scores, and their covariance.
+"""Common errors of the points of one view, found from the views' scores, and their covariance.
 
-Independent errors of pixels are an assumption. In photographs a bent board, uneven light or the
-bias of the corner search moves neighbouring points alike, so that a view tells less than its number
-of points promises. The scores show it, not the size of the residuals. A score is the pull that the
-residuals of view v still exert on the common unknowns, s_v = J_v' r_v with the view's own pose
-eliminated; the sum over all views is zero at the solution. With the views' reduced normal matrices
-I_v, which add up to N, independent errors of variance sigma² leave
+The adjustment assumes that errors of pixels are independent. In photographs a bent board, uneven
+light or the bias of the corner search displaces neighbouring points in common. A view then carries
+less information than its number of points suggests. The scores of the views show this, while the
+size of the residuals does not. The score of view v is s_v = J_v' r_v, with the residuals r_v and
+their derivatives J_v by the common unknowns after the view's own pose is eliminated. The sum over
+all views is zero at the solution. Let I_v be the views' reduced normal matrices, which add up to N.
+For independent errors of variance sigma² the covariance of the scores is
 
     cov(s_u, s_v) = sigma² (delta_uv I_v - I_u N^-1 I_v),
 
-so that Q = sum s_v' N^-1 s_v / sigma² has the mean c - sum tr(W_v²), W_v = N^-1/2 I_v N^-1/2. Q
-over its mean estimates the mean eigenvalue of the true covariance relative to sigma² N^-1. This is
-the mean generalised design effect of Rao and Scott (1981, J. Am. Stat. Assoc. 76, 221-230), with
-the correction for leverage in the mean.
+so Q = sum s_v' N^-1 s_v / sigma² has the mean c - sum tr(W_v²), W_v = N^-1/2 I_v N^-1/2. The ratio
+of Q to this mean estimates the mean eigenvalue of the true covariance relative to sigma² N^-1. This
+is the mean generalised design effect of Rao and Scott (1981, J. Am. Stat. Assoc. 76, 221-230), with
+a mean that is corrected for leverage.
 
-The sandwich of Liang and Zeger (1986, Biometrika 73, 13-22) shows the directions that suffer most;
-whitened, it is N^-1/2 (sum s_v s_v') N^-1/2. For 10 to 25 views and 24 unknowns it is singular: its
-rank is the number of views less one. It is therefore shrunk towards the unit matrix as by Ledoit
-and Wolf (2004, J. Multivar. Anal. 88, 365-411), and scaled to the mean above. An error that all
-views share, such as one bend of the board, stays hidden from any comparison of views.
+The sandwich estimator of Liang and Zeger (1986, Biometrika 73, 13-22) shows which directions are
+affected most. Its whitened form is N^-1/2 (sum s_v s_v') N^-1/2. Its rank is the number of views
+minus one, so it is singular for 10 to 25 views and 24 unknowns. It is therefore shrunk towards the
+unit matrix as in Ledoit and Wolf (2004, J. Multivar. Anal. 88, 365-411), and scaled to the mean
+eigenvalue above. An error that is common to all views, such as a constant bend of the board, cannot
+be found by comparing views.
 """
 
 from dataclasses import dataclass
@@ -28,18 +30,19 @@ from scipy.special import chdtri
 
 from cmmsim.geometry.pose import Array
 
-# Probability of a ratio beyond the limit where the errors of points are independent.
+# Probability that the ratio exceeds its limit if the errors of points are independent.
 CHANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """Errors that points of a view share.
+    """Common errors of the points of a view.
 
-    ``ratio`` is the mean eigenvalue of the covariance over that of independent errors, as the views
-    show it. Independent errors exceed ``limit`` with probability CHANCE. ``independent`` (c, c) is
-    the covariance of the common unknowns for independent errors, sigma² N^-1, and ``covariance``
-    that for the errors found. Both are equal where the ratio may be chance.
+    ``ratio`` is the estimated mean eigenvalue of the covariance relative to the covariance for
+    independent errors. With independent errors it exceeds ``limit`` with probability CHANCE.
+    ``independent`` (c, c) is the covariance of the common unknowns for independent errors, sigma²
+    N^-1. ``covariance`` (c, c) takes the common errors into account. Both are equal if the ratio
+    does not exceed its limit.
     """
 
     ratio: float
@@ -49,18 +52,16 @@ class SharedErrors:
 
     @property
     def factor(self) -> float:
-        """Mean enlargement of the covariance over all directions, against that of independent
-        errors.
-        """
+        """Mean factor by which the common errors enlarge the covariance; 1 below the limit."""
         return self.ratio if self.ratio > self.limit else 1.0
 
 
 def shared_errors(scores: Array, information: Array, sigma2: float) -> SharedErrors:
-    """Find the errors that views share within, from scores (v, c) and reduced normal matrices (v,
-    c, c).
+    """Estimate the common errors of the points of each view.
 
-    ``sigma2`` is the variance of a pixel coordinate, px². The limit is that of the chi-square
-    distribution with the mean and variance of Q for independent normal errors.
+    ``scores`` (v, c) and ``information`` (v, c, c) are the views' scores and reduced normal
+    matrices, and ``sigma2`` is the variance of a pixel coordinate, px². The limit is a quantile of
+    a scaled chi-square distribution with the mean and variance of Q for independent normal errors.
     """
     whiten = _whitening(information.sum(axis=0))
     independent = sigma2 * whiten @ whiten.T
@@ -78,7 +79,7 @@ def shared_errors(scores: Array, information: Array, sigma2: float) -> SharedErr
 
 
 def _whitening(total: Array) -> Array:
-    """Return a matrix R (c, c) with R' N R = 1, of the normal matrix N."""
+    """Return a matrix R (c, c) with R' N R = I for the normal matrix N."""
     scale = 1.0 / np.sqrt(np.diag(total))
     eigenvalues, vectors = np.linalg.eigh(total * scale[:, None] * scale)
     return np.asarray(scale[:, None] * vectors / np.sqrt(eigenvalues))
@@ -87,7 +88,7 @@ def _whitening(total: Array) -> Array:
 def _moments(shares: Array) -> tuple[float, float]:
     """Return mean and variance of Q for independent normal errors.
 
-    The views' shares W_v (v, c, c) add up to one.
+    The views' shares W_v (v, c, c) add up to the unit matrix.
     """
     squares = shares @ shares
     traced = float(np.einsum("vii->", squares))
@@ -101,10 +102,10 @@ def _moments(shares: Array) -> tuple[float, float]:
 
 
 def _enlargement(pulls: Array, ratio: float) -> Array:
-    """Return the covariance (c, c) relative to that of independent errors.
+    """Return the whitened covariance (c, c), which is the unit matrix for independent errors.
 
-    It is the shrunk sandwich of whitened scores (v, c), with the mean eigenvalue ``ratio``, and in
-    no direction below one.
+    It is the shrunk sandwich of whitened scores (v, c), scaled to the mean eigenvalue ``ratio``.
+    Eigenvalues below one are raised to one.
     """
     views, size = pulls.shape
     sandwich = pulls.T @ pulls

@@ -1,4 +1,4 @@
-"""Pairs of image files, and the points of the board that both cameras saw in them."""
+"""Pairs of image files, and the points of the board that the cameras saw in them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,8 @@ from cmmsim.geometry.pose import Array
 
 SIDES = ("left", "right")
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
-# Percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit.
+# Percentile of an image with more than 8 bits that becomes 255. A fixed scale would not do: images
+# of 12-bit cameras use 1/16 of the range of 16 bits.
 WHITE_SHARE = 99.9
 HOW_PAIRED = "pairs are made in the order of the sorted file names"
 
@@ -29,8 +30,9 @@ class ImagePair:
 
     @property
     def name(self) -> str:
-        """Name of the pair in results and messages: the left file's, with the right one's if they
-        differ.
+        """Name of the pair in results and messages.
+
+        It is the name of the left file, followed by the name of the right file if that differs.
         """
         return (
             self.left.name
@@ -40,23 +42,23 @@ class ImagePair:
 
 
 def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
-    """Return pairs of the images in two folders.
+    """Return pairs of the images in two folders, in the order of the sorted file names.
 
-    The order of the sorted names makes the pairs. All names may differ (left_01.png, right_01.png),
-    but if some are the same, all must be. Raises CalibrationError if a folder is missing or empty,
-    if both are one, and if numbers or names differ; it then lists names that stand in one folder
-    only.
+    The names in both folders are either all different (left_01.png, right_01.png) or all equal.
+    Raises CalibrationError if a folder is missing or empty, or if both folders are the same. It is
+    also raised, with the names that exist in one folder only, if the numbers of images differ or
+    if only some names are equal.
     """
     if Path(left).resolve() == Path(right).resolve():
         raise CalibrationError(
-            f"{left} is named for both cameras; name a folder of left and a folder of right images"
+            f"{left} is given for both cameras; give one folder of left and one of right images"
         )
     found = [_image_files(Path(folder)) for folder in (left, right)]
     names = [{path.stem for path in side} for side in found]
     if len(found[0]) != len(found[1]) or (names[0] & names[1] and names[0] != names[1]):
         alone = [sorted(names[0] - names[1]), sorted(names[1] - names[0])]
         raise CalibrationError(
-            f"{left} holds {len(found[0])} images and {right} {len(found[1])}; {HOW_PAIRED}, so "
+            f"{left} has {len(found[0])} images and {right} has {len(found[1])}; {HOW_PAIRED}, so "
             f"each image needs its partner. Only on the left: {some(alone[0])}; only on the right: "
             f"{some(alone[1])}"
         )
@@ -64,10 +66,11 @@ def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """Read the grey values (height, width) of an image file as the camera took it.
+    """Read the grey values (height, width) of an image file.
 
-    A turn that is noted in the file is not applied. Colours become grey. More than 8 bit are scaled
-    so that the brightest 0.1 % are white. Raises CalibrationError.
+    A rotation noted in the file's metadata is not applied. Colours are converted to grey. Values of
+    more than 8 bits are scaled so that the brightest 0.1 % are white. Raises CalibrationError for
+    an unreadable file.
     """
     try:
         data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
@@ -104,7 +107,7 @@ def _eight_bit(image: NDArray) -> NDArray[np.uint8]:
 def _image_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise CalibrationError(
-            f"no folder {folder}; name a folder of left and a folder of right images"
+            f"no folder {folder}; give one folder of left and one of right images"
         )
     files = sorted(
         path
@@ -113,7 +116,7 @@ def _image_files(folder: Path) -> list[Path]:
     )
     if not files:
         raise CalibrationError(
-            f"folder {folder} holds no images, which end in {', '.join(SUFFIXES)}"
+            f"folder {folder} contains no images, which end in {', '.join(SUFFIXES)}"
         )
     return files
 
@@ -122,7 +125,7 @@ def _image_files(folder: Path) -> list[Path]:
 class PairView:
     """View of the board in one pair of images.
 
-    A side is the board, or the reason why there is none.
+    Each side is the view of one camera, or the reason why that camera has none.
     """
 
     name: str
@@ -131,7 +134,7 @@ class PairView:
 
     @property
     def sides(self) -> tuple[BoardView | str, BoardView | str]:
-        """Left and right side."""
+        """Views of the left and the right camera, or the reasons why they are missing."""
         return self.left, self.right
 
     @property
@@ -141,7 +144,7 @@ class PairView:
 
     @property
     def reasons(self) -> str:
-        """Reasons why sides are missing; empty when none is."""
+        """Reasons why views are missing; empty if both cameras have one."""
         if isinstance(self.left, str) and self.left == self.right:
             return f"both: {self.left}"
         return "; ".join(
@@ -151,14 +154,14 @@ class PairView:
         )
 
     def without(self, side: int, reason: str) -> "PairView":
-        """Return the pair with one side (0 left, 1 right) given up."""
+        """Return the pair with the view of one side (0 left, 1 right) replaced by a reason."""
         return replace(self, left=reason) if side == 0 else replace(self, right=reason)
 
 
 def view_pairs(
     pairs: Sequence[ImagePair], board: Board, advance: Callable[[], None] = lambda: None
 ) -> tuple[list[PairView], tuple[int, int]]:
-    """Find the board in each pair, and the size (width, height) px that all images have.
+    """Return the views of the board in each pair, and the common size (width, height) px.
 
     ``advance`` is called after each pair. Raises CalibrationError for images that cannot be read or
     differ in size.
@@ -175,8 +178,8 @@ def view_pairs(
             size = (width, height) if path is pairs[0].left else size
             if (width, height) != size:
                 raise CalibrationError(
-                    f"{path} is {width} x {height} px, {pairs[0].left} {size[0]} x {size[1]}: all "
-                    "images must have one size, unturned and uncropped"
+                    f"{path} is {width} x {height} px, but {pairs[0].left} is {size[0]} x "
+                    f"{size[1]} px: all images must have the same size, neither rotated nor cropped"
                 )
             sides.append(find_board(grey, board))
         seen.append(PairView(pair.name, *sides))
@@ -186,9 +189,10 @@ def view_pairs(
 
 @dataclass(frozen=True)
 class Sightings:
-    """Points that one camera saw in all pairs.
+    """All m sightings of board points by one camera.
 
-    They have the view (m,), ascending, the point (m,) of the board, and pixels (m, 2).
+    ``view`` (m,) is the ascending index of the view, ``point`` (m,) the index of the point of the
+    board, and ``pixels`` (m, 2) its place in the image.
     """
 
     view: NDArray[np.int_]
@@ -196,21 +200,21 @@ class Sightings:
     pixels: Array
 
     def shifted(self, by: Array) -> "Sightings":
-        """Return the sightings with their pixels moved by (m, 2)."""
+        """Return the sightings with their pixels moved by ``by`` (m, 2)."""
         return replace(self, pixels=self.pixels + by)
 
 
 def sightings_of(pairs: Sequence[PairView]) -> tuple[Sightings, Sightings]:
     """Return the sightings of the left and of the right camera.
 
-    A pair's place in the list is the number of its view.
+    The index of a pair in the list is the index of its view.
     """
     left, right = (views_of(pairs, side) for side in range(2))
     return _joined(left), _joined(right)
 
 
 def views_of(pairs: Sequence[PairView], side: int) -> dict[int, BoardView]:
-    """Return the views of one camera by the place of their pair in the list."""
+    """Return the views of one camera; the keys are the indices of their pairs in the list."""
     return {
         k: view
         for k, view in enumerate(pair.sides[side] for pair in pairs)
@@ -227,6 +231,6 @@ def _joined(views: dict[int, BoardView]) -> Sightings:
 
 
 def some(names: Sequence[str]) -> str:
-    """Name the first three and count the others; "none" where there is none."""
+    """Return the first three names and the number of the others, or "none" for no names."""
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more if names else "none"

@@ -1,8 +1,8 @@
-"""Start of the adjustment: OpenCV's calibration of each camera and of the pair.
+"""Start values of the adjustment: OpenCV's calibration of each camera and of the pair.
 
-A symmetric board can be read in several orders (half a turn, quarter turns), and each picture is
-read by itself. Both pictures of a pair must be read alike. They are if, and only if, the right
-camera stands in the same place for all pairs.
+The points of a symmetric board can be numbered in several orders (half a turn, quarter turns), and
+the order is found for each picture separately. Both pictures of a pair must have the same order.
+This is the case if, and only if, the right camera stands in the same place for all pairs.
 """
 
 from collections.abc import Sequence
@@ -19,23 +19,25 @@ from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array, invert, rigid
 
 FEWEST_VIEWS = 3
-# px rms between the points of two pictures that show the board in one place.
+# Two pictures show the board in the same place if their points differ by less than this, px rms.
 ALIKE_PX = 2.0
-# Places of the right camera count as the same within this angle, rad, and share of the baseline.
+# Poses of the right camera count as the same within this angle, rad, and this share of the
+# baseline.
 ALIKE_ANGLE = 0.06
 ALIKE_SHARE = 0.12
 MISFIT = (
-    "the two places of the board fit no other pair: wrong partner, or moved between the exposures"
+    "the two poses of the board fit no other pair: the images do not belong together, or the board "
+    "moved between the exposures"
 )
 
 
 def start_values(
     board: Board, pairs: Sequence[PairView], size: tuple[int, int], bend: bool, fix_aspect: bool
 ) -> tuple[RigState, list[PairView]]:
-    """Return the first state, and the pairs with right images read like the left ones.
+    """Return the first state, and the pairs with the same order of points in both images.
 
-    Pairs that do not fit lose both sides. ``bend`` frees two radial terms of distortion, and
-    ``size`` is (width, height) px. Raises CalibrationError.
+    Pairs that do not fit the others lose both views. ``bend`` frees two radial terms of distortion,
+    and ``size`` is (width, height) px. Raises CalibrationError.
     """
     left, from_left = _one_camera(board, pairs, 0, size, bend, fix_aspect)
     right, from_right = _one_camera(board, pairs, 1, size, bend, fix_aspect)
@@ -56,16 +58,18 @@ def _one_camera(
     bend: bool,
     fix_aspect: bool,
 ) -> tuple[Array, dict[int, Array]]:
-    """Return the intrinsics (9,) of one camera, and camera_from_board (4, 4) by the pair's
-    place.
+    """Return the intrinsics (9,) of one camera, and camera_from_board (4, 4) for each of its views.
+
+    The keys are the indices of the pairs.
     """
     views = views_of(pairs, side)
     if len(views) < FEWEST_VIEWS:
         raise CalibrationError(
-            f"the {SIDES[side]} camera sees the board in {len(views)} images, {FEWEST_VIEWS} needed"
+            f"the {SIDES[side]} camera sees the board in {len(views)} images, "
+            f"{FEWEST_VIEWS} are needed"
         )
     _require_variety(list(views.values()), board.symmetries, SIDES[side])
-    # Two radial terms are enough for a start; the adjustment frees the others.
+    # Two radial terms are enough for start values. The adjustment frees the other terms.
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= 0 if bend else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     flags |= cv2.CALIB_FIX_ASPECT_RATIO if fix_aspect else 0
@@ -98,9 +102,10 @@ def _one_camera(
 def _require_variety(
     views: Sequence[BoardView], orders: Sequence[NDArray[np.int_]], camera: str
 ) -> None:
-    """Raise CalibrationError where the views of a camera show the board in too few places.
+    """Raise CalibrationError if the views of a camera show the board in too few places.
 
-    ``orders`` are the board's symmetries, in any of which a view may be read.
+    ``orders`` are the board's symmetries. Two views that agree in any of these orders count as one
+    place.
     """
     different: list[BoardView] = []
     for view in views:
@@ -112,8 +117,8 @@ def _require_variety(
     if len(different) < FEWEST_VIEWS:
         places = "one place" if len(different) == 1 else f"{len(different)} places"
         raise CalibrationError(
-            f"the {len(views)} pictures of the {camera} camera are alike, they show the board in "
-            f"{places} only (within {ALIKE_PX:g} px), {FEWEST_VIEWS} at the least are needed: move "
+            f"the {len(views)} pictures of the {camera} camera are alike: they show the board in "
+            f"{places} only (within {ALIKE_PX:g} px), at least {FEWEST_VIEWS} are needed; move "
             "and tilt the board from picture to picture"
         )
 
@@ -131,9 +136,9 @@ def _read_alike(
     from_left: dict[int, Array],
     from_right: dict[int, Array],
 ) -> tuple[list[PairView], dict[int, Array], Array]:
-    """Return pairs whose right images are read in the order that most pairs agree on.
+    """Choose the order of each right image such that most pairs agree on right_from_left.
 
-    The other results are the places of the board that the right camera then sees, and
+    Return the pairs in this order, the poses right_from_board by the pair's index, and
     right_from_left (4, 4).
     """
     orders = board.symmetries
@@ -144,12 +149,13 @@ def _read_alike(
     pair_of = np.array([k for k, _ in names])
     support = np.array([len(set(pair_of[row])) for row in alike])
     angle = _angles(places, np.eye(3)[None])[:, 0]
-    # Among orders with equal support, the cameras are most likely turned least against each other.
+    # Among orders with equal support, the one with the smallest angle between the cameras is most
+    # likely.
     best = int(np.lexsort((angle, -support))[0])
     count = sum(pair.both for pair in pairs)
     if support[best] < max(FEWEST_VIEWS, 0.5 * count):
         raise CalibrationError(
-            f"only {support[best]} of {count} pairs agree on where the right camera stands: the "
+            f"only {support[best]} of {count} pairs agree on the place of the right camera: the "
             "images of a pair were not taken together, or the folders are paired wrongly"
         )
     chosen = {names[i][0]: i for i in np.flatnonzero(alike[best])}
@@ -165,10 +171,7 @@ def _read_alike(
 
 
 def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
-    """Return the rigid move (4, 4) in the board's plane that carries points[order] to points.
-
-    It undoes the renaming.
-    """
+    """Return the rigid motion (4, 4) in the board's plane that moves points[order] onto points."""
     points = board.points
     renamed = board.points[order]
     a = renamed[1] - renamed[0]
@@ -181,7 +184,7 @@ def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
 
 
 def _alike(places: Array) -> Array:
-    """Return the mask (n, n) of transforms (n, 4, 4) that are about the same."""
+    """Return the mask (n, n) of pairs of transforms (n, 4, 4) that are nearly equal."""
     shifts = places[:, :3, 3]
     gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
     near = gap < ALIKE_SHARE * np.linalg.norm(shifts, axis=1)[:, None]
@@ -189,8 +192,9 @@ def _alike(places: Array) -> Array:
 
 
 def _angles(places: Array, rotations: Array) -> Array:
-    """Return the angles (n, m) rad between the rotations of transforms (n, 4, 4) and others (m, 3,
-    3).
+    """Return the angles (n, m) between rotations of transforms (n, 4, 4) and rotations (m, 3, 3).
+
+    They are in rad.
     """
     trace = np.einsum("nij,mij->nm", places[:, :3, :3], rotations)
     return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
@@ -205,7 +209,7 @@ def _stereo(
 ) -> Array:
     """Return right_from_left (4, 4) by OpenCV, from the points that both cameras see.
 
-    The cameras stay as they are.
+    The intrinsics are fixed. If OpenCV fails, the result is ``guess``.
     """
     points = []
     left = []

@@ -1,3 +1,1 @@
-"""Centres of stickers in images: search, fits, other detectors, and the bound that none can
-beat.
-"""
+"""Detectors of sticker centres in images, and the Cramer-Rao bound of their errors."""

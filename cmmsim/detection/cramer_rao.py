@@ -1,15 +1,15 @@
-"""The Cramer-Rao bound: the smallest error with which a disc's centre can be known from its image.
+"""The Cramer-Rao bound: the smallest covariance of an unbiased estimate of a disc's centre.
 
-The mean grey value of a pixel is ground + contrast * its share of light, which is the exact
-coverage by the ellipse blurred by a Gaussian point spread. Unknown are the centre, the shape,
-contrast and ground. The grey value is the mean plus normal noise, whose variance depends on the
-mean, rounded and clipped. The Fisher information of such a number is summed over all numbers that
-may come out.
+The mean grey value of a pixel is ground + contrast * share. The share of light is the exact
+coverage by the ellipse, blurred by a Gaussian point spread. The unknowns are the centre and shape
+of the ellipse, the contrast and the ground. The grey value is the mean plus normal noise, rounded
+and clipped. The variance of the noise depends on the mean. The Fisher information of a grey value
+is a sum over all its possible numbers.
 
-Where the noise is below half a grey value, the information depends on the mean's place between two
-numbers, and no estimator is unbiased at each single place of a centre. The information is therefore
-averaged over one grey value: the bound holds on average over places that are not known beforehand.
-With more noise the average changes nothing.
+If the noise is below half a grey value, the information depends on where the mean lies between two
+whole grey values, and no estimator is unbiased at each single position of a centre. The information
+is therefore averaged over one grey value, so the bound holds on average over unknown positions. For
+stronger noise the average changes nothing.
 """
 
 import numpy as np
@@ -20,17 +20,17 @@ from cmmsim.geometry.disc_image import coverage
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 
-# Standard deviations within which noise is followed.
+# Standard deviations at which the noise distribution is cut off.
 REACH = 6.0
-# Tabulated informations in one grey value; fewer where the noise hides the rounding.
+# Largest number of table entries per grey value. Stronger noise needs fewer.
 TABLE_STEPS = 64
 
 
 def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
-    """Return the Fisher information that one rounded and clipped grey value holds about its mean.
+    """Return the Fisher information that a rounded and clipped grey value has about its mean.
 
-    It is per grey value squared. Raises CmmError for a camera without noise, whose values are
-    certain, so that there is no bound.
+    Its unit is 1 / (grey value)². Raises CmmError for a camera without noise, for which there is no
+    bound.
     """
     mean_grey = np.asarray(mean_grey, dtype=float)
     variance, slope = _analog_variance(mean_grey, noise)
@@ -46,8 +46,8 @@ def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
         (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None],
     )
     possible = (numbers >= 0) & (numbers <= noise.white_level)
-    # The upper tail is taken from above: differences of numbers close to one would lose all
-    # digits
+    # In the upper half the probability is the difference of upper tails, because a difference of
+    # numbers close to one would lose all digits.
     probability = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
     change = -(_rise(high, slope, variance) - _rise(low, slope, variance)) / deviation[..., None]
     usable = possible & (probability > 1e-30)
@@ -65,8 +65,8 @@ def cramer_rao_bound(
 ) -> Array:
     """Return the smallest covariance (n, 2, 2) px² of an unbiased centre in windows of ``size`` px.
 
-    Contrast and ground are grey values; the other parameters are those of ``disc_image.coverage``.
-    Raises CmmError.
+    Contrast and ground are grey values. ``centres``, ``shapes``, ``size`` and ``psf_px`` are the
+    parameters of ``disc_image.coverage``. Raises CmmError for a camera without noise.
     """
     shares, derivatives = coverage(centres, shapes, size, psf_px)
     information = np.interp(
@@ -80,13 +80,14 @@ def cramer_rao_bound(
 
 
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
-    """Return means from ``lowest`` to ``highest``, and the information averaged over one grey
-    value.
+    """Return mean grey values from ``lowest`` to ``highest``, and the information at each.
+
+    The information is averaged over one grey value.
     """
     least_noise = float(
         np.sqrt(_analog_variance(np.array([lowest - 1.5, highest + 1.5]), noise)[0].min())
     )
-    # An even number, so that the middle of the averaging window is an entry of the table.
+    # The number is even, so that the middle of the averaging window is an entry of the table.
     steps = 2 * int(np.ceil(0.5 * min(TABLE_STEPS, 16.0 / least_noise)))
     count = int(np.ceil((highest - lowest + 2.0) * steps)) + 1
     means = lowest - 1.5 + np.arange(count + steps) / steps
@@ -98,7 +99,7 @@ def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tup
 
 
 def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array]:
-    """Return the variance before rounding, and its derivative by the mean."""
+    """Return the noise variance before rounding, and its derivative by the mean."""
     variance = noise.variance(mean_grey) - 1.0 / (12.0 * noise.frames)
     if not noise.enabled or variance.min() <= 0.0:
         raise CmmError(f"without noise there is no Cramer-Rao bound, got {noise}")
@@ -109,9 +110,9 @@ def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array
 
 
 def _rise(limit: Array, slope: Array, variance: Array) -> Array:
-    """Return deviation times the derivative of -ndtr(limit) by the mean.
+    """Return the standard deviation times the derivative of -ndtr(limit) by the mean.
 
-    The mean shifts and widens the noise.
+    The mean changes both the position and the width of the noise distribution.
     """
     finite = np.where(np.isfinite(limit), limit, 0.0)
     density = np.where(np.isfinite(limit), np.exp(-0.5 * finite**2) / np.sqrt(2.0 * np.pi), 0.0)

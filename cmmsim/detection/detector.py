@@ -1,6 +1,4 @@
-"""Contract of all detectors of sticker centres: their input, their result, and the choice of
-one.
-"""
+"""Interface of all detectors of sticker centres: input, result, and selection by name."""
 
 from __future__ import annotations
 
@@ -21,10 +19,10 @@ from cmmsim.radiometry.noise import CameraNoise
 
 @dataclass(frozen=True)
 class FitLimits:
-    """Limits within which a window counts as one whole sticker.
+    """Limits for accepting the content of a window as one whole sticker.
 
-    ``smallest_contrast`` is in grey values. ``largest_misfit`` limits the reduced chi-square, for
-    noise of a grey value and more.
+    ``smallest_contrast`` is in grey values. ``largest_misfit`` is the limit of the reduced
+    chi-square if the noise is at least one grey value.
     """
 
     smallest_contrast: float = 40.0
@@ -36,8 +34,8 @@ class DetectedCentres:
     """Ellipse centres in n windows, in px of the whole image.
 
     ``centres`` (n, 2) have ``covariances`` (n, 2, 2) px², which are the effect of pixel noise to
-    first order. ``good`` (n,) says whether a window holds one whole bright spot. Values of other
-    windows are finite but mean nothing. A detector may also state ``shapes`` (n, 2, 2) px,
+    first order. ``good`` (n,) is True if a window contains one whole bright spot. The values of
+    other windows are finite but meaningless. A detector can also state ``shapes`` (n, 2, 2) px,
     ``shape_covariances`` (n, 3, 3) px² of A_xx, A_xy, A_yy, and ``misfits`` (n,), the reduced
     chi-square of the grey values.
     """
@@ -52,10 +50,10 @@ class DetectedCentres:
     def with_others(
         self, at: NDArray[np.int_], others: DetectedCentres, which: NDArray[np.bool_]
     ) -> Self:
-        """Return the result with windows ``at`` (m,) replaced by those of ``which`` (k,) of other
-        windows.
+        """Return the result with windows ``at`` (m,) replaced by the windows ``which`` of another.
 
-        It states what both results state.
+        ``which`` (k,) is a mask of the other result's k windows. Optional arrays that one of the
+        results lacks are None.
         """
         changed: dict[str, Any] = {}
         for name, own in vars(self).items():
@@ -67,18 +65,19 @@ class DetectedCentres:
 
 
 def no_centres() -> DetectedCentres:
-    """Return the result for no windows."""
+    """Return the result for an empty set of windows."""
     return DetectedCentres(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
 
 
 @dataclass(frozen=True)
 class SpotWindows:
-    """Windows with one bright spot each, and what is known of them.
+    """Windows that contain one bright spot each, and the known properties of their images.
 
-    ``windows`` (n, h, h) are grey values, and ``corners`` (n, 2) the pixel (x, y) of the whole
-    image that each begins at. ``fit_size`` is the side in px of the part around the bright spot
-    that is looked at. ``psf_px`` is the sigma of the Gaussian point spread. ``smears`` (n, 2) px
-    are the movements of the spots during the exposure; centres are for its middle.
+    ``windows`` (n, h, h) are grey values, and ``corners`` (n, 2) are the pixels (x, y) of the whole
+    image at which they begin. ``fit_size`` is the side in px of the part around the bright spot
+    that is used. ``psf_px`` is the standard deviation of the Gaussian point spread. ``smears`` (n,
+    2) px are the movements of the spots during the exposure. The centres to be found are those at
+    the middle of the exposure.
     """
 
     windows: NDArray
@@ -91,17 +90,18 @@ class SpotWindows:
 
 
 Detect = Callable[[SpotWindows], DetectedCentres]
-"""Ellipse centres in windows with one bright spot each."""
+"""Function that finds the ellipse centres in windows with one bright spot each."""
 
 
 @dataclass(frozen=True)
 class Detector:
     """Detector of sticker centres.
 
-    ``bias_px`` is the rms error of a centre without noise at the built-in sensors' radius (3.8 px,
-    45 degrees, sharp images). It differs from place to place within a pixel, so it acts like noise
-    that ``detect`` does not state. ``margin_px`` is the additional width of a window on each side,
-    against that of the maximum-likelihood fit.
+    ``bias_px`` is the rms error of a centre without noise, for sharp images of stickers of 3.8 px
+    radius that are tilted by 45 degrees, as in the built-in sensors. The error varies with the
+    position within a pixel, so it acts like additional noise. The covariances of ``detect`` do not
+    include it. ``margin_px`` is the width on each side by which windows must be larger than those
+    of the maximum-likelihood fit.
     """
 
     name: str
@@ -112,17 +112,17 @@ class Detector:
 
 @lru_cache
 def find_detector(name: str) -> Detector:
-    """Return the detector of a built-in name, or of ``module:name``.
+    """Return the detector with a built-in name, or the detector ``module:name``.
 
-    The latter is a Detector, or a ``Detect`` function that may carry ``bias_px`` and ``margin_px``.
-    Raises UnknownOptionError with the valid names, and CmmError for what cannot be imported or
-    called.
+    The latter is a Detector, or a ``Detect`` function with optional attributes ``bias_px`` and
+    ``margin_px``. Raises UnknownOptionError with the valid names, and CmmError if ``module:name``
+    cannot be imported or called.
     """
     return find("detector", name, DETECTORS, Detector, _check_centres)
 
 
 def _check_centres(part: str, found: object, spots: SpotWindows) -> None:
-    """Raise CmmError unless a detector of a user's own has returned what it should."""
+    """Raise CmmError if the result of a user's detector has a wrong type, shape or value."""
     require_kind(found, DetectedCentres, f"{part} must return DetectedCentres")
     count = len(spots.windows)
     for name, shape in (("centres", (count, 2)), ("covariances", (count, 2, 2))):

@@ -1,23 +1,23 @@
 """Centre of an ellipse from the gradients at all pixels of its edge: the dual conic operator.
 
-Each pixel of the edge gives a line l = (a, b, c), c = -(a x + b y), through the pixel and across
-the gradient (a, b). Lines that touch the ellipse fulfil l' C* l = 0 with its dual conic C* = [[A,
-B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]. This is linear in the five unknowns, and (D/2, E/2) is the
-centre. The residual of each line of unit length is weighted by |gradient|², which is the same as
-leaving (a, b) unnormalised, so that pixels away from the edge need not be sorted out. Source: J.-N.
-Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction, Machine Vision and
-Applications 21 (2009).
+Each pixel (x, y) of the edge defines the line l = (a, b, c), c = -(a x + b y), which passes through
+the pixel perpendicular to the gradient (a, b). Lines that touch the ellipse satisfy l' C* l = 0
+with its dual conic C* = [[A, B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]. This is linear in the five
+unknowns, and (D/2, E/2) is the centre. The gradient (a, b) is not normalised. This weights the
+residual of each line by |gradient|², so pixels away from the edge need not be removed. Source:
+J.-N. Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction, Machine
+Vision and Applications 21 (2009).
 
-The noise of a pixel enters the gradients around it. Its effect on the centre follows from the
-normal equations sum of k (k' u + c²) = 0, k = (a², a b, b², a c, b c), by the implicit function
-theorem.
+The noise of a pixel enters the gradients around it. Its effect on the centre follows by the
+implicit function theorem from the normal equations sum of k (k' u + c²) = 0 for the unknowns u =
+(A, B, C, D, E), with k = (a², a b, b², a c, b c).
 
-A line that is missing where the rim comes near the window's edge pulls the centre by up to a tenth
-of a pixel, so such a window is not good; EDGE_PX is the room that the lines need around the
-ellipse.
+If the rim comes near the edge of the window, lines are missing, and the centre is wrong by up to a
+tenth of a pixel. Such a window is not good. EDGE_PX is the distance from the edge that the lines
+need.
 
-Gradients of a sharp edge are not exact. Without noise, and tilted by 45 degrees, the centre is off
-by about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. The covariance does not
+Gradients of a sharp edge are not exact. Without noise, and tilted by 45 degrees, the error of the
+centre is about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. The covariance does not
 include this bias.
 """
 
@@ -29,18 +29,20 @@ from cmmsim.detection.grey_centroid import BrightSpots, bright_spots, whole_insi
 from cmmsim.geometry.pose import Array
 
 SLOPE = (-0.5, 0.0, 0.5)
-# Smoothing across the slope (Scharr): the most nearly isotropic of this size.
+# Smoothing perpendicular to the slope (Scharr): the most isotropic kernel of this size.
 SMOOTHING = (0.1875, 0.625, 0.1875)
-# px from the rim to the window's side: a gradient reaches 1.5 px from a sharp rim, and the last
-# pixel has none.
+# Smallest distance from the rim to the side of the window, px. Gradients extend 1.5 px from a sharp
+# rim, and the outermost pixels have no gradient.
 EDGE_PX = 2
 # Reciprocal condition below which the lines do not determine an ellipse.
 SMALLEST_CONDITION = 1e-9
 
 
 def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
-    """Return centres by the dual conic; the point spread only widens the rim, and smears play no
-    part.
+    """Return centres by the dual conic operator.
+
+    The point spread only increases the required distance from the window's edge. Smears are
+    ignored.
     """
     if len(given.windows) == 0:
         return no_centres()
@@ -51,7 +53,7 @@ def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
     )
     normal = np.einsum("inyx,jnyx->nij", basis, basis)
     determined = np.linalg.cond(normal) < 1.0 / SMALLEST_CONDITION
-    # Any regular matrix will do, as these windows are not good.
+    # These windows are not good, so any regular matrix can take the place of a singular one.
     normal[~determined] = np.eye(5)
     dual = np.linalg.solve(normal, -np.einsum("inyx,nyx->ni", basis, lines.c**2)[..., None])[..., 0]
     centres = 0.5 * dual[:, 3:] * lines.unit_px[:, None] + spots.centroids
@@ -72,10 +74,11 @@ DUAL_CONIC = Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX)
 
 
 class _EdgeLines:
-    """Lines (a, b, c), each (n, h, h), from the centroids and in units of ``unit_px`` (n,).
+    """Lines (a, b, c), each (n, h, h), relative to the centroids and in units of ``unit_px`` (n,).
 
-    ``x`` and ``y`` are those of the pixels. ``scale`` (n, h, h) is one over the contrast where a
-    line counts: within the dark ring, with all neighbours in the window.
+    ``x`` and ``y`` are the coordinates of the pixels. ``scale`` (n, h, h) is the inverse contrast
+    for lines that count, and 0 for others. A line counts if its pixel lies within the dark ring and
+    has all its neighbours in the window.
     """
 
     def __init__(
@@ -110,7 +113,7 @@ def _filtered(
 ) -> Array:
     """Return the correlation of (n, h, h) with a separable kernel, or its adjoint.
 
-    Values outside of the window are zero.
+    Values outside the window are zero.
     """
     turn = -1 if adjoint else 1
     across = ndimage.correlate1d(values, along_x[::turn], axis=2, mode="constant")
@@ -125,7 +128,7 @@ def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Arra
     x = lines.x
     y = lines.y
     zero = np.zeros_like(lines.a)
-    rows = np.linalg.inv(normal)[:, 3:]  # of D and E
+    rows = np.linalg.inv(normal)[:, 3:]  # the rows of D and E
     residual = np.einsum("ni,inyx->nyx", dual, basis) + c * c
     total = np.zeros((len(a), 2, *a.shape[1:]))
     for by_line, c_by, kernels in (
@@ -140,7 +143,7 @@ def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Arra
 
 
 def _squared_shape(dual: Array) -> Array:
-    """Return A A' (n, 2, 2) of the ellipse: centre centre' minus the upper left of C*."""
+    """Return A A' (n, 2, 2) of the ellipse: centre centre' minus the upper left part of C*."""
     centre = 0.5 * dual[:, 3:]
     upper_left = np.stack(
         [dual[:, 0], 0.5 * dual[:, 1], 0.5 * dual[:, 1], dual[:, 2]], axis=1

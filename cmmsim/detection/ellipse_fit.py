@@ -1,10 +1,10 @@
 """Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows.
 
-A pixel is modelled as ground + contrast * share, where share is the exact part of the pixel that
-the ellipse covers, blurred by the point spread and, where it is known, by the movement during the
+The model of a grey value is ground + contrast * share. The share is the exact part of the pixel
+that the ellipse covers, blurred by the point spread and, if it is known, by the movement during the
 exposure. Gauss-Newton solves for the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast,
-ground]. Grey values are weighted by the camera's noise variance at the fitted value. The inverse of
-the normal matrix is the covariance of the parameters.
+ground]. The weight of a grey value is the inverse of the camera's noise variance at the fitted
+value. The inverse of the normal matrix is the covariance of the parameters.
 """
 
 import threading
@@ -24,34 +24,36 @@ from cmmsim.radiometry.noise import CameraNoise
 if TYPE_CHECKING:
     from cmmsim.detection.fit_kernels import FitSettings
 
-# Pixels beyond this many sticker radii may lie outside the dark ring and are left out.
+# Pixels beyond this many sticker radii can lie outside the dark ring and are not fitted.
 RING_REACH = 2.4
 SMALLEST_RADIUS_PX = 0.8
-# The first parameters: c_x, c_y, A_xx, A_xy, A_yy.
+# Number of the parameters c_x, c_y, A_xx, A_xy, A_yy, which come first.
 ELLIPSE_UNKNOWNS = 5
-# Step between two places of a moving ellipse whose light is added, or half a point spread.
+# The light of a moving ellipse is a sum over positions this far apart, or half a point spread if
+# that is more.
 SMEAR_STEP_PX = 0.2
-# A step shorter than this ends a fit.
+# A fit ends with a step shorter than this.
 CONVERGED_PX = 1e-4
-# Difference without noise between images and the model of a pixel, rms, as a share of the contrast.
+# Rms difference between noise-free images and the model of a pixel, as a share of the contrast.
 MODEL_ERROR = 0.0025
 FEWEST_FOR_A_THREAD = 16  # windows
 
 
 @dataclass(frozen=True)
 class EllipseFits(DetectedCentres):
-    """Result for n windows: all that a detector may state, and contrast and ground (n,) in grey
-    values.
+    """Result of the fits in n windows.
+
+    It has all optional arrays of ``DetectedCentres``, and contrast and ground (n,) in grey values.
     """
 
-    shapes: Array = field()  # which takes away the default
+    shapes: Array = field()  # without a default, unlike in the base class
     shape_covariances: Array = field()
     misfits: Array = field()
     contrast: Array
     ground: Array
 
     def within(self, limits: FitLimits, noise: CameraNoise) -> "EllipseFits":
-        """Return the fits, of which only those are still good that keep within limits."""
+        """Return the fits, with those that violate the limits marked as not good."""
         good = self.good & (self.contrast >= limits.smallest_contrast)
         return replace(
             self,
@@ -81,9 +83,10 @@ def fit_ellipses(
     """Fit one ellipse in each of n windows (n, h, h) of grey values.
 
     The windows begin at pixels ``corners`` (n, 2) (x, y) of the whole image. The part of
-    ``fit_size`` px around the bright spot is fitted. ``psf_px`` is the sigma of the Gaussian point
-    spread. The spots move by ``smears`` (n, 2) px during the exposure, and the centres are for its
-    middle. Raises CmmError for a point spread too narrow to be followed.
+    ``fit_size`` px around the bright spot is fitted. ``psf_px`` is the standard deviation of the
+    Gaussian point spread. The spots move by ``smears`` (n, 2) px during the exposure, and the
+    centres are those at its middle. Raises CmmError for a point spread that is too narrow to be
+    modelled.
     """
     require_psf(psf_px)
     from cmmsim.detection.fit_kernels import UNKNOWNS, fit_windows
@@ -138,12 +141,12 @@ def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "Fit
 
 
 def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
-    """Fit windows 0 to count, half of them in a second thread where that pays.
+    """Fit windows 0 to count, and use a second thread for half of them if there are many.
 
-    The thread is a new one each time: it costs 50 us, and a lasting one would be missing in forked
-    processes. There is no second thread where NUMBA_NUM_THREADS or the machine allows one only.
+    Each call starts a new thread. This costs 50 us, but a permanent thread would be missing in
+    forked processes. There is no second thread if NUMBA_NUM_THREADS or the machine allows only one.
     """
-    from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
+    from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set at run time
 
     if count < FEWEST_FOR_A_THREAD or NUMBA_NUM_THREADS == 1:
         fit(slice(0, count))
@@ -154,24 +157,25 @@ def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
     other.join()
 
 
-# Largest steps of a fit: px of centre and shape, grey values of 255 of contrast and ground.
+# Largest steps of a fit: centre and shape in px, contrast and ground in grey values of 0 to 255.
 _LARGEST_STEP = frozen([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
-_GREYS = frozen(np.arange(-64.0, 512.0, 0.25))  # at these of 255 the noise variance is tabulated
+# Grey values, on a scale of 0 to 255, at which the noise variance is tabulated.
+_GREYS = frozen(np.arange(-64.0, 512.0, 0.25))
 
 
 def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, ground: Array) -> Array:
-    """Return the largest reduced chi-square (n,) of good fits with this contrast and ground, grey
-    values.
+    """Return the largest accepted reduced chi-square (n,) for a contrast and ground in grey values.
 
-    The fit takes each grey value's variance as the mean over all means. With noise below half a
-    grey value, that of an even ground differs, and what is left of the model's own error shows.
+    The fit uses a rounding variance that is averaged over all mean grey values. If the noise is
+    below half a grey value, the rounding variance of a uniform ground differs from this average,
+    and the error of the model becomes visible. The limit is raised to allow for both.
     """
     model = (MODEL_ERROR * contrast) ** 2 / noise.variance(ground)
     return limits.largest_misfit * (noise.rounding_excess(ground) + model)
 
 
 def lies_inside(centres: Array, shapes: Array, size: int) -> NDArray[np.bool_]:
-    """Tell whether the whole ellipse lies inside the window and is larger than the smallest one."""
+    """Tell whether an ellipse lies wholly inside the window and exceeds the smallest radius."""
     reach = np.linalg.norm(shapes, axis=2)  # half extent along x and y
     inside = np.all((centres - reach > -0.5) & (centres + reach < size - 0.5), axis=1)
     mean = 0.5 * (shapes[:, 0, 0] + shapes[:, 1, 1])

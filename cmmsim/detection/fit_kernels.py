@@ -1,6 +1,6 @@
-"""Compiled: the maximum-likelihood fit of an ellipse to the grey values of a window.
+"""Compiled kernels of the maximum-likelihood fit of an ellipse to the grey values of a window.
 
-See ``ellipse_fit``.
+``ellipse_fit`` describes the model.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ class FitSettings(NamedTuple):
     """Settings of a fit.
 
     Pixels within ``ring_reach`` radii of the ellipse are fitted, and no radius is below
-    ``smallest`` px. A step is cut to ``largest_step`` (7,). There are at most so many
-    ``iterations``, which end at a step below ``converged`` px. ``psf_px`` is the point spread, or
-    0. Two places of a moving ellipse whose light is added are ``smear_step`` px apart.
-    ``variances`` belong to grey values from ``first_grey`` on, ``entries_a_grey`` for each.
+    ``smallest`` px. Steps are limited to ``largest_step`` (7,). ``iterations`` is the largest
+    number of steps; a step below ``converged`` px ends the fit. ``psf_px`` is the standard
+    deviation of the point spread, or 0. The light of a moving ellipse is a sum over positions that
+    are ``smear_step`` px apart. ``variances`` is a table of noise variances that begins at the grey
+    value ``first_grey`` and has ``entries_a_grey`` entries per grey value.
     """
 
     ring_reach: float
@@ -43,7 +44,7 @@ class FitSettings(NamedTuple):
 
 @compiled
 def variance_at(mean: float, settings: FitSettings) -> float:
-    """Return the noise variance of a grey value, linear between the table's entries."""
+    """Return the noise variance of a mean grey value, interpolated linearly in the table."""
     place = (mean - settings.first_grey) * settings.entries_a_grey
     k = min(max(int(place), 0), len(settings.variances) - 2)
     return settings.variances[k] + (place - k) * (settings.variances[k + 1] - settings.variances[k])
@@ -61,12 +62,12 @@ def accumulate(
     normal: Array,
     right: Array,
 ) -> float:
-    """Add up the normal matrix (7, 7), lower triangle, and the right-hand side (7,).
+    """Fill the lower triangle of the normal matrix (7, 7), and the right-hand side (7,).
 
-    Return the weighted squared misfit. Pixels wholly outside or inside of the ellipse share a mean,
-    so that only the sums of their residuals are needed.
+    Return the weighted sum of squared residuals. All pixels wholly outside the ellipse have the
+    same mean, and so have all pixels wholly inside. Only the sums of their residuals are needed.
     """
-    # Slopes by the parameters, then the residual and the weight, of each pixel on the rim.
+    # For each pixel on the rim: derivatives by the parameters, the residual, and the weight.
     rows = np.empty((window.size, UNKNOWNS + 2))
     count = 0
     misfit = 0.0
@@ -116,10 +117,10 @@ def accumulate(
 
 @compiled
 def add_products(rows: Array, normal: Array, right: Array) -> None:
-    """Fill the normal matrix (7, 7) and the right-hand side (7,) of rows (n, 9).
+    """Fill the normal matrix (7, 7) and the right-hand side (7,) from rows (n, 9).
 
-    A row has the slopes by seven parameters, the residual, and the weight. Sums that are variables
-    of their own are added in vector lanes.
+    A row has the derivatives by seven parameters, the residual, and the weight. Each sum is a
+    separate scalar variable, so that the compiler can use vector instructions.
     """
     for i in range(UNKNOWNS):
         s_0 = 0.0
@@ -170,9 +171,10 @@ def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int
 
 @compiled
 def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, size: int) -> float:
-    """Add a step (7,), cut to its largest values, and return how far the ellipse was to move, px.
+    """Add a step (7,) within its limits to the parameters, and return the largest change, px.
 
-    The centre stays in the window, and the radii between limits.
+    The returned change is that of the centre or shape, before the centre is limited to the window
+    and the radii are limited to their range.
     """
     moved = 0.0
     for k in range(UNKNOWNS):
@@ -190,7 +192,7 @@ def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, si
 
 @compiled
 def set_shape(parameters: Array, shape: Array) -> None:
-    """Fill the matrix A (2, 2) of an ellipse's parameters."""
+    """Fill the matrix A (2, 2) from the parameters of an ellipse."""
     shape[0, 0] = parameters[2]
     shape[0, 1] = parameters[3]
     shape[1, 0] = parameters[3]
@@ -201,7 +203,7 @@ def set_shape(parameters: Array, shape: Array) -> None:
 def light_of_still(
     centre_x: float, centre_y: float, shape: Array, psf_px: float, shares: Array, derivatives: Array
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that stands still."""
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) for an ellipse at rest."""
     if psf_px > 0.0:
         blur_window(centre_x, centre_y, shape, psf_px, shares, derivatives)
     else:
@@ -212,9 +214,9 @@ def light_of_still(
 def add_light(
     shares: Array, derivatives: Array, weight: float, to_shares: Array, to_derivatives: Array
 ) -> None:
-    """Add shares (h, w) and derivatives (h, w, 5), weighted, to others.
+    """Add weighted shares (h, w) and derivatives (h, w, 5) to ``to_shares`` and ``to_derivatives``.
 
-    Sums of whole arrays would compile for seconds.
+    The loops are explicit because sums of whole arrays take seconds to compile.
     """
     for row in range(shares.shape[0]):
         for column in range(shares.shape[1]):
@@ -232,10 +234,10 @@ def light_of_moving(
     shares: Array,
     derivatives: Array,
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly.
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) for an ellipse at constant velocity.
 
-    It moves by ``smear`` (2,) px during the exposure, by the midpoint rule; its parameters are
-    those in the middle.
+    It moves by ``smear`` (2,) px during the exposure, and its parameters belong to the middle of
+    the exposure. The light is integrated by the midpoint rule.
     """
     count = math.ceil(math.hypot(smear[0], smear[1]) / settings.smear_step)
     if count <= 1:
@@ -268,11 +270,12 @@ def fit_window(
     shape: Array,
     covariance: Array,
 ) -> float:
-    """Gauss-Newton from ``parameters`` (7,), which it moves; returns the reduced chi-square.
+    """Fit one ellipse by Gauss-Newton steps; return the reduced chi-square.
 
-    It ends when the ellipse moves by less than ``converged`` px: the normal matrix and the misfit
-    of that last step are those of the result. Fills the ellipse's ``shape`` (2,2) and the
-    ``covariance`` (m,m) of its first m parameters.
+    ``parameters`` (7,) contain the start values and are replaced by the result. The fit ends when
+    the ellipse moves by less than ``converged`` px. The normal matrix and the misfit are those from
+    before this last step. Fills the ellipse's ``shape`` (2, 2) and the ``covariance`` (m, m) of its
+    first m parameters.
     """
     size = len(window)
     mask = np.empty((size, size), np.bool_)
@@ -281,7 +284,7 @@ def fit_window(
     normal = np.empty((UNKNOWNS, UNKNOWNS))
     right = np.empty(UNKNOWNS)
     set_shape(parameters, shape)
-    # The mask stays that of the start, so that all steps minimise the same sum.
+    # The mask of the start is used throughout, so that all steps minimise the same sum.
     freedom = max(mask_ring(parameters, shape, settings.ring_reach, mask) - UNKNOWNS, 1)
     misfit = 0.0
     for iteration in range(settings.iterations + 1):
@@ -290,7 +293,7 @@ def fit_window(
             window, mask, shares, derivatives, parameters[5], parameters[6], settings, normal, right
         )
         for k in range(UNKNOWNS):
-            # Keeps the factor finite where the window leaves a parameter undetermined.
+            # Keep the factor finite if the window does not determine a parameter.
             normal[k, k] += 1e-9
         factor(normal)
         if iteration == settings.iterations:
@@ -319,8 +322,8 @@ def fit_windows(
     """Fit the part of ``size`` px around the bright spot of each window (n, h, h) of floats.
 
     The spots move by ``smears`` (n, 2) px during the exposure. Fills the corners (n, 2) of these
-    parts, and in their px the parameters (n, 7), shapes (n, 2, 2), covariances (n, m, m) of the
-    first m parameters and misfits (n,).
+    parts within their windows, and the misfits (n,). Also fills the parameters (n, 7), the shapes
+    (n, 2, 2) and the covariances (n, m, m) of the first m parameters, relative to these corners.
     """
     for k in range(len(windows)):
         spot = moments(windows[k])

@@ -1,14 +1,14 @@
 """Centre of a bright spot as the centroid of its grey values above a threshold.
 
-A pixel weighs what it has above ground + THRESHOLD * contrast, and nothing below. The weight is
-continuous, so that noise at the threshold moves the centroid smoothly. Pixels that may lie beyond
-the dark ring do not count.
+The weight of a pixel is its grey value minus the threshold, ground + THRESHOLD * contrast, or zero
+below the threshold. The weight is continuous, so that noise near the threshold moves the centroid
+smoothly. Pixels that can lie beyond the dark ring do not count.
 
-The centroid is biased. A pixel's light acts as if it all fell on the pixel's middle, and the
-threshold takes away more on one side of the spot than on the other. The bias depends on the
-centre's place within its pixel. Without noise, sharp and tilted by 45 degrees, it is about 0.01 px
-rms at radius 3.8 px, 0.013 at 2.5 and 0.005 at 10; a point spread of 0.6 px halves it. The
-covariance does not include it.
+The centroid is biased for two reasons. All light of a pixel is assigned to the middle of the pixel,
+and the threshold removes more light on one side of the spot than on the other. The bias depends on
+the position of the centre within its pixel. For sharp images without noise of stickers tilted by 45
+degrees, it is about 0.01 px rms at radius 3.8 px, 0.013 at 2.5 and 0.005 at 10. A point spread of
+0.6 px halves it. The covariance does not include the bias.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no
 from cmmsim.detection.ellipse_fit import RING_REACH
 from cmmsim.geometry.pose import Array
 
-# Share of the contrast.
+# Threshold for the centroid, as a share of the contrast.
 THRESHOLD = 0.1
-# Share of the contrast where only the spot itself is wanted, whatever surrounds it.
+# Threshold that separates the spot from its surroundings, as a share of the contrast.
 CORE_THRESHOLD = 0.4
 
 
@@ -30,9 +30,10 @@ CORE_THRESHOLD = 0.4
 class BrightSpots:
     """Windows cut down to the surroundings of their bright spots.
 
-    ``windows`` (n, h, h) begin at pixels ``corners`` (n, 2) of the whole image. ``weights`` (n, h,
-    h) are those of the centroid, and ``within`` says whether a pixel counts. ``centroids`` (n, 2)
-    are px of the window, and ``spreads`` (n, 2, 2) second moments of the spot's core, px².
+    ``windows`` (n, h, h) begin at pixels ``corners`` (n, 2) of the whole image. ``contrast`` (n,)
+    is in grey values. ``weights`` (n, h, h) are the weights of the pixels in the centroid, and
+    ``within`` (n, h, h) is True for pixels that count. ``centroids`` (n, 2) are relative to the
+    window, px, and ``spreads`` (n, 2, 2) are the second moments of the spot's core, px².
     """
 
     windows: Array
@@ -45,7 +46,7 @@ class BrightSpots:
 
 
 def detect_by_centroid(given: SpotWindows) -> DetectedCentres:
-    """Return grey centroids; neither the point spread nor smears play a part."""
+    """Return grey centroids; the point spread and smears are ignored."""
     if len(given.windows) == 0:
         return no_centres()
     spots = bright_spots(given)
@@ -65,7 +66,7 @@ GREY_CENTROID = Detector("grey_centroid", detect_by_centroid, 0.009)
 
 
 def bright_spots(given: SpotWindows) -> BrightSpots:
-    """Find the bright spot of each window and keep the part around it that is to be looked at."""
+    """Find the bright spot of each window, and cut out the part of ``fit_size`` px around it."""
     values = given.windows.astype(float)
     size = given.fit_size
     rough = _centroids(_weights(values, CORE_THRESHOLD)[0])
@@ -87,9 +88,9 @@ def bright_spots(given: SpotWindows) -> BrightSpots:
 def whole_inside(
     centres: Array, spreads: Array, size: int, margin: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Tell whether whole ellipses lie inside their windows, ``margin`` px away from the sides.
+    """Tell whether ellipses lie wholly inside their windows, ``margin`` px away from the sides.
 
-    They have centres (n, 2) and second moments (n, 2, 2).
+    The ellipses have centres (n, 2) and second moments ``spreads`` (n, 2, 2).
     """
     reach = 2.0 * np.sqrt(np.maximum(np.diagonal(spreads, axis1=1, axis2=2), 0.0))
     return np.all(
@@ -99,10 +100,11 @@ def whole_inside(
 
 
 def _weights(windows: Array, threshold: float) -> tuple[Array, Array]:
-    """Return the grey values above the threshold (n, h, h), and the contrast (n,).
+    """Return the excess (n, h, h) of grey values over the threshold, and the contrast (n,).
 
-    Ground and contrast are medians below and above the middle between the darkest and the brightest
-    pixel.
+    Pixels are divided at the mean of the darkest and the brightest grey value. The ground is the
+    median of the darker pixels, and the contrast the median of the brighter pixels minus the
+    ground.
     """
     flat = np.sort(windows.reshape(len(windows), -1), axis=1)
     count = flat.shape[1]
@@ -136,9 +138,9 @@ def _spreads(weights: Array, centroids: Array) -> Array:
 
 
 def _within_ring(centroids: Array, spreads: Array, size: int) -> NDArray[np.bool_]:
-    """Tell which pixels (n, size, size) are nearer than the dark ring's rim.
+    """Return the mask (n, size, size) of pixels within RING_REACH radii of the spot.
 
-    An ellipse with radius r has the second moment r² / 4.
+    A disc of radius r has the second moment r² / 4.
     """
     x, y = _offsets(centroids, size)
     # A flat window has no spread, but must have an inverse.
@@ -148,7 +150,7 @@ def _within_ring(centroids: Array, spreads: Array, size: int) -> NDArray[np.bool
 
 
 def _offsets(centroids: Array, size: int) -> tuple[Array, Array]:
-    """Return x (n, 1, size) and y (n, size, 1) of all pixels from the centroids, px."""
+    """Return x (n, 1, size) and y (n, size, 1) of all pixels relative to the centroids, px."""
     ticks = np.arange(size, dtype=float)
     return ticks[None, None, :] - centroids[:, 0, None, None], ticks[None, :, None] - centroids[
         :, 1, None, None

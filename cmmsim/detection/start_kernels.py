@@ -1,4 +1,4 @@
-"""Compiled: the start of an ellipse's fit, from ranks and moments of a window's grey values."""
+"""Compiled kernels for the start values of a fit, from ranks and moments of the grey values."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# A pixel with this share of the contrast belongs to the bright spot when the fit starts.
+# A pixel above this share of the contrast belongs to the bright spot.
 CORE_SHARE = 0.4
 SMALLEST_START_PX = 1.2
-# One step a grey value at 8 bit.
+# Number of histogram bins: one per grey value of 8-bit images.
 RANK_STEPS = 256
 
 
 @compiled
 def nth_smallest(values: Array, n: int) -> float:
-    """Return the value with ``n`` smaller ones, by Hoare's selection; ``values`` are reordered."""
+    """Return the value of rank ``n`` (from 0) by Hoare's selection, which reorders ``values``."""
     first = 0
     last = len(values) - 1
-    # Even windows are common, and need no selection.
+    # Windows of equal values are common, and need no selection.
     if last > 0 and all_alike(values):
         return values[0]
     while first < last:
@@ -54,10 +54,10 @@ def all_alike(values: Array) -> bool:
 
 @compiled
 def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
-    """Return the values of a window (h, w) with ``low_rank`` and with ``high_rank`` smaller ones.
+    """Return the values of a window (h, w) with the ranks ``low_rank`` and ``high_rank`` (from 0).
 
-    All are finite. They are counted in even steps from the smallest to the largest, and sorted only
-    within the steps that hold these.
+    All values must be finite. A histogram with equal bins finds the two bins that contain the
+    results, and only the values in these bins are sorted.
     """
     width = window.shape[1]
     smallest = window[0, 0]
@@ -81,7 +81,7 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
     found = np.empty((2, window.size + 1))
     count = np.zeros(2, np.int64)
     for row in range(window.shape[0]):
-        # The next value takes the place of one that was not to be kept, without a branch.
+        # Each value is stored without a branch. The next value overwrites it unless it counts.
         for column in range(width):
             found[0, count[0]] = found[1, count[1]] = window[row, column]
             count[0] += steps[row, column] == low
@@ -94,9 +94,7 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
 
 @compiled
 def step_of_rank(counts: Array, rank: int) -> tuple:
-    """Return the step in which the value with ``rank`` smaller ones falls, and how many fall
-    before.
-    """
+    """Return the bin that contains the value of a rank, and the number of values in lower bins."""
     step = 0
     before = 0
     while before + counts[step] <= rank:
@@ -107,10 +105,8 @@ def step_of_rank(counts: Array, rank: int) -> tuple:
 
 @compiled
 def moments(window: Array) -> tuple:
-    """Return ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a
-    window.
-    """
-    # Ranks instead of extremes: single noisy pixels decide neither the ground nor the top.
+    """Return ground, contrast, centroid x, y and second moments xx, xy, yy of a bright spot."""
+    # Ranks are less sensitive to single noisy pixels than the smallest and largest value.
     ground, bright = two_of_rank(window, window.size // 3, window.size - 6)
     contrast = max(bright - ground, 1.0)
     area = 1e-300
@@ -121,7 +117,7 @@ def moments(window: Array) -> tuple:
     yy = 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
-            # The division comes after a comparison that most pixels fail.
+            # Most pixels fail this comparison, which avoids a division.
             if window[row, column] - ground < 0.9 * CORE_SHARE * contrast:
                 continue
             share = (window[row, column] - ground) / contrast
@@ -140,7 +136,7 @@ def moments(window: Array) -> tuple:
 
 @compiled
 def bound_radii(xx: float, xy: float, yy: float, lowest: float, highest: float) -> tuple:
-    """Return a symmetric (2, 2) matrix with eigenvalues between two limits, as xx, xy, yy."""
+    """Return a symmetric (2, 2) matrix with its eigenvalues limited to a range, as xx, xy, yy."""
     mean = 0.5 * (xx + yy)
     half = math.hypot(0.5 * (xx - yy), xy)
     large = mean + half
@@ -158,14 +154,14 @@ def bound_radii(xx: float, xy: float, yy: float, lowest: float, highest: float) 
 
 @compiled
 def start_ellipse(spot: tuple, size: int, parameters: Array) -> None:
-    """Fill the first parameters (7,) from the moments of a window of ``size`` px.
+    """Fill the start parameters (7,) from the ``moments`` of a window of ``size`` px.
 
-    A uniform ellipse has the spread A A / 4.
+    A uniform ellipse with the matrix A has the second moments A A / 4.
     """
     ground, contrast, x, y, xx, xy, yy = spot
     xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * SMALLEST_START_PX) ** 2, (0.25 * size) ** 2)
     root = math.sqrt(xx * yy - xy * xy)
-    # The root of a matrix M is (M + sqrt(det) 1) / sqrt(trace + 2 sqrt(det)).
+    # The square root of a (2, 2) matrix M is (M + sqrt(det) I) / sqrt(trace + 2 sqrt(det)).
     scale = 2.0 / math.sqrt(xx + yy + 2.0 * root)
     parameters[0] = x
     parameters[1] = y
@@ -182,8 +178,9 @@ def isolate_dots(
 ) -> None:
     """Set the pixels of windows (n, h, w) beyond ``reach`` dot radii to the ground.
 
-    The ground is the median of those from ``ground_from`` radii to there, or 0 where there are
-    none. Centres (n, 2) are px of the window, and ``inverses`` (n, 2, 2) carry px to dot radii.
+    The ground is the median of the pixels from ``ground_from`` to ``reach`` dot radii, or 0 if
+    there are none. Centres (n, 2) are relative to the window, px. ``inverses`` (n, 2, 2) map
+    offsets from the centre in px to dot radii.
     """
     _, height, width = windows.shape
     distances = np.empty((height, width))

@@ -1,4 +1,4 @@
 """Poses, cameras, the stereo rig, frames from planes, and the image of a disc.
 
-Nothing here knows files or images.
+The modules of this package use neither files nor images.
 """

@@ -1,18 +1,18 @@
 """A pinhole camera with its lens: the distortion of Brown and Conrady, point spread and vignetting.
 
-Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward. Ideal
-pixels are those of the same camera with a perfect lens: lines are straight there, and epipolar
-geometry and triangulation hold.
+Pixel coordinates (0, 0) are the centre of the top-left pixel. Camera axes are x right, y down, z
+forward. Ideal pixels are the pixels of the same camera with a perfect lens. In them lines are
+straight, and the linear formulas of epipolar geometry and triangulation hold.
 
-Distortion has OpenCV's order and meaning of the five coefficients. It acts on normalised image
-coordinates (x, y) = (X/Z, Y/Z); with s = x² + y²:
+The five distortion coefficients have OpenCV's order and meaning. Distortion acts on normalised
+image coordinates (x, y) = (X/Z, Y/Z). With s = x² + y²:
 
     x_d = x (1 + k1 s + k2 s² + k3 s³) + 2 p1 x y + p2 (s + 2 x²)
     y_d = y (1 + k1 s + k2 s² + k3 s³) + p1 (s + 2 y²) + 2 p2 x y
 
-The model holds up to the radius where the radial part stops growing; beyond it the image folds back
-onto itself. Source: D. C. Brown, Close-range camera calibration, Photogrammetric Engineering 37
-(1971).
+The model is valid up to the radius at which the radial part stops growing. Beyond this radius the
+image folds back onto itself. Source: D. C. Brown, Close-range camera calibration, Photogrammetric
+Engineering 37 (1971).
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array, frozen
 
 NDArrayBool = NDArray[np.bool_]
-# Focal lengths: a fold farther out is taken for none.
+# A fold at a normalised radius beyond this is ignored.
 FARTHEST_FOLD = 1e3
 INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-# Standard deviations after which the point spread is cut off.
+# Standard deviations at which the point spread is cut off.
 PSF_REACH = 5.0
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """Radial k1, k2, k3 and tangential p1, p2; all zero is a perfect lens."""
+    """Radial coefficients k1, k2, k3 and tangential p1, p2; all are zero for a perfect lens."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -55,15 +55,13 @@ class Distortion:
 
     @property
     def is_zero(self) -> bool:
-        """True if this lens moves nothing."""
+        """True if all coefficients are zero."""
         return not (self.k1 or self.k2 or self.p1 or self.p2 or self.k3)
 
     @cached_property
     def fold_radius(self) -> float:
-        """Undistorted radius at which the radial part stops growing; infinite where it never
-        does.
-        """
-        # Roots of the slope of the radial part, in 1/s.
+        """Undistorted radius at which the radial part stops growing; infinite if it never stops."""
+        # Roots of the derivative of the radial part, in 1/s.
         roots = np.roots([1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3])
         turning = roots[
             (np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / FARTHEST_FOLD**2)
@@ -71,15 +69,15 @@ class Distortion:
         return float(1.0 / np.sqrt(turning.max())) if len(turning) else np.inf
 
     def distort(self, points: Array) -> Array:
-        """Return distorted points (..., 2) of undistorted ones (..., 2)."""
+        """Return the distorted points (..., 2) of undistorted points (..., 2)."""
         return self._bent(points)[0]
 
     def jacobian(self, points: Array) -> Array:
-        """Return the derivative (..., 2, 2) of the distorted by the undistorted points (..., 2)."""
+        """Return the derivatives (..., 2, 2) of distorted points by undistorted points (..., 2)."""
         return self._bent(points)[1]
 
     def _bent(self, points: Array) -> tuple[Array, Array]:
-        # Late, as numba takes time to import.
+        # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import bend_all
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
@@ -89,21 +87,20 @@ class Distortion:
         return bent.reshape(points.shape), slopes.reshape(*points.shape, 2)
 
     def holds(self, points: Array) -> NDArrayBool:
-        """Tell whether the model is one-to-one at undistorted points (..., 2).
+        """Tell whether the model is valid at undistorted points (..., 2).
 
-        It is within the fold, where the image is not turned over.
+        It is valid inside the fold radius if the determinant of the derivative is positive.
         """
         within = np.sum(points * points, axis=-1) < self.fold_radius**2
         return within & (np.linalg.det(self.jacobian(points)) > 0.0)
 
     def undistort(self, points: Array) -> tuple[Array, NDArrayBool]:
-        """Return undistorted points (..., 2) of distorted ones (..., 2), and whether each was
-        found.
+        """Return the undistorted points (..., 2) of distorted points, and whether each was found.
 
-        Newton's method ends at 1e-12. A point that no undistorted one within the fold reaches is
-        not found; its value is finite and means nothing.
+        Newton's method ends at a distance of 1e-12. A point is not found if it is not the image of
+        an undistorted point inside the fold. Its value is then finite but meaningless.
         """
-        # Late, as numba takes time to import.
+        # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import straighten_all
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
@@ -127,16 +124,16 @@ class PinholeCamera:
     width, height : int
         Size of the image, px.
     aspect : float
-        Focal length along y over that along x.
+        Ratio of the focal lengths along y and along x.
     distortion : Distortion
         Distortion of the lens.
 
     Raises
     ------
     ShapeError
-        If a figure is not a finite number.
+        If a parameter is not a finite number.
     CmmError
-        If focal length, aspect or size are not above zero.
+        If focal length, aspect or size is not positive.
 
     Examples
     --------
@@ -195,13 +192,13 @@ class PinholeCamera:
 
     @cached_property
     def ideal(self) -> PinholeCamera:
-        """The same camera with a perfect lens."""
+        """Camera with the same parameters and a perfect lens."""
         return self if self.distortion.is_zero else replace(self, distortion=Distortion())
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
         """Return pixels (..., 2) of points (..., 3) in camera axes, and whether each is seen.
 
-        A point is seen if it lies before the camera and inside its image.
+        A point is seen if it lies in front of the camera and inside its image.
         """
         depth = points[..., 2]
         ahead = depth > 1e-6
@@ -215,7 +212,8 @@ class PinholeCamera:
     def shows(self, pixels: Array, margin: float = -0.5) -> NDArrayBool:
         """Tell whether pixels (..., 2) lie inside the image.
 
-        They are more than ``margin`` px from the middles of its outermost pixels.
+        ``margin`` px is the smallest distance to the centres of the outermost pixels; -0.5 allows
+        the whole image.
         """
         return np.all(
             (pixels > margin) & (pixels < (self.width - 1 - margin, self.height - 1 - margin)),
@@ -223,9 +221,7 @@ class PinholeCamera:
         )
 
     def distort(self, ideal: Array) -> tuple[Array, NDArrayBool]:
-        """Return pixels (..., 2) of the image for ideal pixels (..., 2), and where the model
-        holds.
-        """
+        """Return pixels (..., 2) for ideal pixels (..., 2), and where the model is valid."""
         if self.distortion.is_zero:
             return ideal, np.ones(ideal.shape[:-1], dtype=bool)
         normalised = (ideal - self.centre) / self.focal_lengths
@@ -234,9 +230,9 @@ class PinholeCamera:
         ) * self.focal_lengths + self.centre, self.distortion.holds(normalised)
 
     def undistort(self, pixels: Array) -> tuple[Array, NDArrayBool]:
-        """Return ideal pixels (..., 2) for pixels (..., 2) of the image, and whether each has one.
+        """Return ideal pixels (..., 2) for pixels (..., 2) of the image, and whether each exists.
 
-        The values of those without one are finite and mean nothing.
+        Values that do not exist are finite but meaningless.
         """
         if self.distortion.is_zero:
             return pixels, np.ones(pixels.shape[:-1], dtype=bool)
@@ -244,25 +240,25 @@ class PinholeCamera:
         return normalised * self.focal_lengths + self.centre, found
 
     def distortion_jacobian(self, ideal: Array) -> Array:
-        """Return the derivative (..., 2, 2) of the image's pixels by the ideal ones (..., 2)."""
+        """Return the derivative (..., 2, 2) of the image's pixels by ideal pixels (..., 2)."""
         focal = self.focal_lengths
         return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal
 
 
 def camera_from(intrinsics: Array, width: int, height: int) -> PinholeCamera:
-    """Return the camera of nine intrinsics (9,), see INTRINSIC_NAMES."""
+    """Return the camera with intrinsics (9,) in the order of INTRINSIC_NAMES."""
     fx, fy, cx, cy, *terms = (float(value) for value in intrinsics)
     return PinholeCamera(fx, cx, cy, width, height, aspect=fy / fx, distortion=Distortion(*terms))
 
 
 @dataclass(frozen=True)
 class Optics:
-    """Point spread and darkening towards the corners of a lens.
+    """Point spread and vignetting of a lens.
 
     ``psf_px`` is the standard deviation of the Gaussian point spread, px. ``vignetting`` is the
-    share of the light that is missing in the corner farthest from the principal point; the loss
-    grows with the square of the distance from there. If both are zero, the image is that of a
-    pinhole.
+    share of the light that is missing in the corner farthest from the principal point. The loss
+    grows with the square of the distance from the principal point. If both are zero, the image is
+    that of a pinhole camera.
     """
 
     psf_px: float = 0.0
@@ -274,12 +270,13 @@ class Optics:
 
     @property
     def margin_px(self) -> int:
-        """Distance, in whole px, from which light outside of a window reaches into it."""
+        """Largest distance in whole px from which light outside a window reaches into it."""
         return ceil(PSF_REACH * self.psf_px)
 
     def illumination(self, camera: PinholeCamera, pixels: Array) -> Array:
-        """Return the relative illumination (...) of pixels (..., 2), 1 at the principal point and
-        at least 0.
+        """Return the relative illumination (...) of pixels (..., 2).
+
+        It is 1 at the principal point, and never below 0.
         """
         corners = np.array(
             [[x, y] for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)]
@@ -292,8 +289,9 @@ class Optics:
     def window_illumination(
         self, camera: PinholeCamera, corners: NDArray[np.int_], size: int
     ) -> Array:
-        """Return the relative illumination (k, size, size) of windows with first pixels ``corners``
-        (k, 2).
+        """Return the relative illumination (k, size, size) of windows.
+
+        ``corners`` (k, 2) are the first pixels (x, y) of the windows.
         """
         ticks = np.arange(size)
         x = corners[:, 0, None, None] + ticks

@@ -1,8 +1,8 @@
-"""Compiled: the image of a point in a camera with a lens, and points that two cameras see.
+"""Compiled kernels for the image of a point in a distorting camera, and for triangulation.
 
-A camera is given by its nine intrinsics in the order of ``camera.INTRINSIC_NAMES``. The lens bends
-normalised image coordinates; ``camera`` has the formulas. Points are found by least squares in the
-pixels of both images.
+A camera is given by its nine intrinsics in the order of ``camera.INTRINSIC_NAMES``. Module
+``camera`` states the formulas of the distortion, which acts on normalised image coordinates.
+Triangulation is a least-squares fit to the pixels of both images.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy as np
 from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.matrix_kernels import from_entries, inverse_entries
 
-# Largest distance, in normalised coordinates, between a point and the image of its inverse.
+# Largest error of an undistorted point, in normalised coordinates of its distorted image.
 CONVERGED = 1e-12
 MOST_STEPS = 60
-# Steps of Gauss-Newton of a triangulation.
+# Largest number of Gauss-Newton steps of a triangulation.
 TRIANGULATION_STEPS = 6
 
 
 class Cameras(NamedTuple):
-    """Two cameras: ``figures`` (2,9) are their intrinsics and ``size`` (2,2) their images, px.
+    """Two cameras with intrinsics ``figures`` (2, 9) and image sizes ``size`` (2, 2), px.
 
-    ``moves`` (2,4,4) lead into their axes, from those in which points are given.
+    ``moves`` (2, 4, 4) transform points from their given axes into the axes of each camera.
     """
 
     figures: Array
@@ -35,9 +35,9 @@ class Cameras(NamedTuple):
 
 @compiled
 def bend(x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: float) -> tuple:
-    """Return a distorted point x, y and its slopes xx, xy, yy by the undistorted one (x, y).
+    """Return a distorted point x, y and its derivatives xx, xy, yy by the undistorted point.
 
-    The slope of x by y equals that of y by x.
+    The derivative of x by y equals that of y by x.
     """
     s = x * x + y * y
     radial = 1.0 + s * (k1 + s * (k2 + s * k3))
@@ -54,9 +54,9 @@ def bend(x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: flo
 
 @compiled
 def bend_all(lens: Array, points: Array, bent: Array, slopes: Array) -> None:
-    """Fill distorted points (n,2) and their slopes (n,2,2) by the undistorted points (n,2).
+    """Fill distorted points (n, 2) and their derivatives (n, 2, 2) by the undistorted points.
 
-    The lens (5,) is k1, k2, p1, p2, k3.
+    ``lens`` (5,) is k1, k2, p1, p2, k3, and ``points`` (n, 2) are undistorted.
     """
     for n in range(len(points)):
         x, y, xx, xy, yy = bend(
@@ -71,10 +71,10 @@ def bend_all(lens: Array, points: Array, bent: Array, slopes: Array) -> None:
 
 @compiled
 def straighten_all(lens: Array, points: Array, reach: float, straight: Array, found: Array) -> None:
-    """Fill the undistorted points (n,2) of distorted ones (n,2) by Newton's method.
+    """Fill the undistorted points (n, 2) of distorted points (n, 2) by Newton's method.
 
-    ``found`` (n,) says which have one within the radius ``reach`` at which the image is not turned
-    over. The values of the others are finite and mean nothing.
+    ``found`` (n,) is True if an undistorted point exists within the radius ``reach`` and the image
+    is not mirrored there. Other values are finite but meaningless.
     """
     for n in range(len(points)):
         x = points[n, 0]
@@ -93,7 +93,7 @@ def straighten_all(lens: Array, points: Array, reach: float, straight: Array, fo
             determinant = xx * yy - xy * xy
             if gap <= 0.1 * CONVERGED:
                 break
-            # Steps near the fold are kept finite: beyond it there is no undistorted point.
+            # Near the fold the determinant vanishes; this limit avoids infinite steps.
             steady = determinant if abs(determinant) > 1e-6 else 1e-6
             x += min(max((yy * gap_x - xy * gap_y) / steady, -1.0), 1.0)
             y += min(max((xx * gap_y - xy * gap_x) / steady, -1.0), 1.0)
@@ -104,9 +104,9 @@ def straighten_all(lens: Array, points: Array, reach: float, straight: Array, fo
 
 @compiled
 def project(camera: Array, x_m: float, y_m: float, depth: float) -> tuple:
-    """Return the pixel u, v of a point in camera axes, and the slopes of the image there.
+    """Return the pixel u, v of a point in camera axes, and the derivatives of the distortion.
 
-    The slopes xx, xy, yx, yy are those by the ideal pixel of a perfect lens.
+    The derivatives xx, xy, yx, yy of the pixel are with respect to the ideal pixel.
     """
     u, v, xx, xy, yy = bend(
         x_m / depth, y_m / depth, camera[4], camera[5], camera[6], camera[7], camera[8]
@@ -117,9 +117,9 @@ def project(camera: Array, x_m: float, y_m: float, depth: float) -> tuple:
 
 @compiled
 def faces(point: Array, normal: Array, grazing: float) -> bool:
-    """Tell whether a sticker at a point (3,) in camera axes is turned towards the camera.
+    """Tell whether a sticker at a point (3,) in camera axes faces the camera.
 
-    The cosine between its normal and the view must exceed ``grazing``.
+    The cosine between its normal and the direction to the camera must exceed ``grazing``.
     """
     dot = 0.0
     squared = 0.0
@@ -131,13 +131,13 @@ def faces(point: Array, normal: Array, grazing: float) -> bool:
 
 @compiled
 def length_of(x: float, y: float) -> float:
-    """Return the length of a vector; ``math.hypot`` minds overflow and takes much longer."""
+    """Return the length of a vector, faster than ``math.hypot``, which guards against overflow."""
     return math.sqrt(x * x + y * y)
 
 
 @compiled
 def light_at(camera: Array, size: Array, u: float, v: float, vignetting: float) -> float:
-    """Return the relative illumination of a pixel of a camera with an image size (2,)."""
+    """Return the relative illumination of pixel (u, v) in an image of size (width, height)."""
     if vignetting == 0.0:
         return 1.0
     x = camera[2]
@@ -153,10 +153,11 @@ def light_at(camera: Array, size: Array, u: float, v: float, vignetting: float) 
 def slope_by(
     move: Array, by_u: float, by_v: float, f_x: float, f_y: float, t_x: float, t_y: float
 ) -> tuple:
-    """Return the slope of one coordinate of a pixel by a point, along three axes.
+    """Return the derivatives of one pixel coordinate by the three coordinates of a point.
 
-    by_u and by_v are its slopes by the ideal pixel; f_x and f_y focal lengths over depth; t_x and
-    t_y the tangents of the line of sight.
+    ``by_u`` and ``by_v`` are the derivatives of the pixel coordinate by the ideal pixel. ``f_x``
+    and ``f_y`` are the focal lengths divided by the depth, and ``t_x`` and ``t_y`` are the
+    normalised image coordinates of the point.
     """
     in_x = by_u * f_x
     in_y = by_v * f_y
@@ -173,10 +174,11 @@ def pull(
     camera: Array, move: Array, point: Array, pixel: Array, spread: Array, parted: float,
     normal: Array, right: Array,
 ) -> float:  # fmt: skip
-    """Add what one image says of a point (3,) to its normal equations; return r' W r.
+    """Add one image's contribution to the normal equations of a point (3,); return r' W r.
 
-    r is the ``pixel`` (2,) less its expected place, J its slope, and W the inverse of ``spread``
-    (2,2) + ``parted``. ``normal`` (6,) has the entries of J' W J, ``right`` (3,) is J' W r.
+    r is the measured ``pixel`` (2,) minus the predicted pixel, J the derivative of the latter by
+    the point, and W the inverse of ``spread`` (2, 2) + ``parted`` I. J' W J is added to the six
+    entries ``normal`` (6,), and J' W r to ``right`` (3,).
     """
     x = move[0, 0] * point[0] + move[0, 1] * point[1] + move[0, 2] * point[2] + move[0, 3]
     y = move[1, 0] * point[0] + move[1, 1] * point[1] + move[1, 2] * point[2] + move[1, 3]
@@ -223,12 +225,13 @@ def triangulate(
     cameras: Cameras, pixels: Array, spreads: Array, parted: float, settled: float,
     point: Array, scratch: Array,
 ) -> float:  # fmt: skip
-    """Move a point (3,) from near to where two pixels (2,2) put it; return the gap of their rays.
+    """Triangulate a point (3,) from two pixels (2, 2); return the gap of their rays.
 
-    The gap is the squared distance in units of the noise. ``spreads`` (2,2,2) are covariances of
-    the pixels; ``parted`` px² is added to them, but the covariance of the point is that of
-    ``spreads`` alone. Steps of Gauss-Newton end below ``settled`` m. ``scratch`` (3,6) is filled
-    with the entries of the point's information and of its covariance.
+    ``point`` contains a start value and is replaced by the result. The gap is the squared distance
+    of the rays in units of the noise. ``spreads`` (2, 2, 2) are the covariances of the pixels.
+    ``parted`` px² is added to them for the weights and the gap, but not for the covariance of the
+    point. Gauss-Newton ends with a step below ``settled`` m. The first two rows of ``scratch``
+    (3, 6) are filled with the entries of the point's information matrix and of its covariance.
     """
     normal = scratch[0]
     inverse = scratch[1]
@@ -254,7 +257,7 @@ def triangulate(
         point[2] += z
         if x * x + y * y + z * z < settled * settled:
             break
-    # The rays are weighted with errors of the rig, but the stated covariance is that of the noise.
+    # The weights include errors of the rig, but the stated covariance is that of the noise alone.
     trace = spreads[0, 0, 0] + spreads[0, 1, 1] + spreads[1, 0, 0] + spreads[1, 1, 1]
     share = 0.25 * trace / (0.25 * trace + parted)
     for k in range(6):
@@ -268,9 +271,10 @@ def triangulate_all(
     cameras: Cameras, pixels: Array, spreads: Array, parted: float, settled: float,
     points: Array, covariances: Array, gaps: Array,
 ) -> None:  # fmt: skip
-    """Triangulate n points: pixels (n,2,2), their covariances (n,2,2,2), points (n,3) from start.
+    """Triangulate n points from pixels (n, 2, 2) with covariances ``spreads`` (n, 2, 2, 2).
 
-    Fills covariances (n,3,3) and gaps (n,); see ``triangulate``.
+    ``points`` (n, 3) contain start values and are replaced. Fills covariances (n, 3, 3) and gaps
+    (n,). See ``triangulate`` for the other parameters.
     """
     scratch = np.empty((3, 6))
     for n in range(len(points)):

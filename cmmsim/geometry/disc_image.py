@@ -1,42 +1,43 @@
 """The image of a disc: its ellipse, the centre of the ellipse, and its share of each pixel.
 
-**Ellipse.** It is exact in perspective. With C the centre, n the unit normal and R the radius in
-camera axes, D = C C' - R² (I - n n') is the dual conic of the rim. Carried to pixels by the camera
-matrix it gives the ellipse's centre and, in its upper left, its shape: a symmetric matrix A (2, 2)
-that carries the unit disc onto the ellipse.
+**Ellipse.** Through a perfect lens the image of a disc is exactly an ellipse. Let C be the centre,
+n the unit normal and R the radius of the disc, in camera axes. Then D = C C' - R² (I - n n') is the
+dual conic of the rim. Transformed to pixels by the camera matrix, its last column gives the centre
+of the ellipse, and its upper left part gives the shape: a symmetric matrix A (2, 2) that maps the
+unit disc onto the ellipse.
 
 **Eccentricity.** The centre of a circle's image is not the image of the circle's centre. Through a
 perfect lens the ellipse's centre is f (D13/D33, D23/D33), while the circle's centre projects to f
-(X/Z, Y/Z). Distortion bends the ellipse c + A u, |u| = 1, into a curve, to which an ellipse is
-fitted again. With J the Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with
-small w(u). A fit to grey values minimises the squared distance between curve and ellipse along its
-length, which is the integral over the angle of u of (u'w - u'a)² / |J A t|, where t is the tangent
-of the unit circle and a the shift of the ellipse's centre. So
+(X/Z, Y/Z). Distortion maps the ellipse c + A u, |u| = 1, to a curve, to which an ellipse is fitted.
+With J the Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with small w(u). Let t
+be the tangent of the unit circle, and J A a the shift of the centre of the fitted ellipse. A fit to
+grey values minimises the squared distance between curve and ellipse along the curve. This is the
+integral of (u'w - u'a)² / |J A t| over the angle of u, so
 
     a = (∫ u u' / |J A t|)^-1 ∫ u (u'w) / |J A t|,    and the fitted centre is d(c) + J A a.
 
 For a round J A and a quadratic w_i = ½ H_ijk u_j u_k this is a_i = (H_ijj + 2 H_jij) / 8.
 
-**Coverage.** By Green's theorem the area of the ellipse in a pixel is the integral of (x - left) dy
-over the arcs of the rim in it, plus the whole rise dy of those arcs of its row that lie right of
-it. On an arc x = c + A u, u = (cos t, sin t) goes from one crossing of the lines between pixels to
-the next, and the integrals of u_i du_j follow from its ends and its angle. A change of c or A moves
-the rim with a velocity v = dc + dA u. It changes the share by the flux of v through the pixel's own
-arcs, whose outward normal is (dy, -dx): integrals of the same kind.
+**Coverage.** By Green's theorem the area of the ellipse within a pixel is a sum of two parts. The
+first is the integral of (x - left) dy over the arcs of the rim inside the pixel, where left is the
+pixel's left side. The second is the integral of dy over the arcs that lie in the same row to the
+right of the pixel. An arc x = c + A u, u = (cos t, sin t), extends from one crossing of a line
+between pixels to the next. The integrals of u_i du_j along it follow from its ends and its angle. A
+change of c or A moves the rim by v = dc + dA u. It changes the share by the flux of v through the
+arcs inside the pixel, whose outward normal is (dy, -dx). This flux consists of the same integrals.
 
-**Blurred coverage.** With a Gaussian point spread the share of light in a pixel is the integral
-over the ellipse of g_i(x) g_j(y), where g_i(x) is the light that the point spread carries from a
-point x into pixel i. By the divergence theorem it is an integral along the rim x(t) = c + A (cos t,
-sin t),
+**Blurred coverage.** Let g_i(x) be the share of light that a Gaussian point spread moves from a
+point x into pixel i. The share of light in a pixel is then the integral of g_i(x) g_j(y) over the
+ellipse. By the divergence theorem it is an integral along the rim x(t) = c + A (cos t, sin t),
 
-    share = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i,
+    share = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i.
 
-and a change of the ellipse, which moves the rim by v = dc + dA (cos t, sin t), changes it by
+A change of the ellipse moves the rim by v = dc + dA (cos t, sin t), and changes the share by
 
     d share = integral of g_i(x) g_j(y) v . n ds.
 
-Both are smooth and periodic in t, so the trapezoidal rule converges exponentially once its points
-lie closer than the point spread is wide.
+Both integrands are smooth and periodic in t. The trapezoidal rule therefore converges exponentially
+once its points lie closer than the width of the point spread.
 """
 
 from collections.abc import Iterator
@@ -48,9 +49,9 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, frozen
 from cmmsim.geometry.stereo_rig import StereoRig
 
-# Points of a bent ellipse over which its fit is integrated.
+# Number of points on a distorted ellipse at which the integrals of the fit are evaluated.
 RIM_POINTS = 24
-# Standard deviation of the narrowest point spread that can be followed.
+# Standard deviation of the narrowest point spread that can be modelled.
 NARROWEST_PX = 0.05
 SHAPE_BASIS = frozen([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
 
@@ -58,13 +59,13 @@ SHAPE_BASIS = frozen([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0,
 def project_discs(
     camera: PinholeCamera, centres: Array, normals: Array, radii: Array
 ) -> tuple[Array, Array]:
-    """Return the ellipses of n discs wholly before the camera, through a perfect lens.
+    """Return the ellipses of n discs through a perfect lens.
 
-    Discs have centres (n, 3) m and unit normals (n, 3) in camera axes, and radii (n,) m. Ellipses
-    have centres (n, 2) px and symmetric shapes A (n, 2, 2) px: they are the images of the unit disc
-    under x -> centre + A x.
+    Discs have centres (n, 3) m and unit normals (n, 3) in camera axes, and radii (n,) m. They must
+    lie wholly in front of the camera. Ellipses have centres (n, 2) px and symmetric shapes A (n, 2,
+    2) px: they are the images of the unit disc under x -> centre + A x.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.disc_kernels import project_all
 
     pixels = np.empty((len(centres), 2))
@@ -77,11 +78,11 @@ def project_discs(
 def sticker_outlines(
     rig: StereoRig, camera_from_body: Array, places: Array, normals: Array, radius: float
 ) -> tuple[Array, Array]:
-    """Return centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of stickers in both
-    images.
+    """Return the ellipses of n stickers in both images: centres (2, n, 2) and shapes, px.
 
-    ``camera_from_body`` is (4, 4), or (n, 4, 4) for one each. Stickers have places (n, 3) m and
-    normals (n, 3) in body axes, and a radius in m. Distortion is taken as linear across a sticker.
+    The shapes A are (2, n, 2, 2). ``camera_from_body`` is (4, 4) for all stickers, or (n, 4, 4)
+    with one transform per sticker. Stickers have places (n, 3) m and normals (n, 3) in body axes,
+    and a radius in m. The distortion is linearised within each sticker.
     """
     centres = []
     shapes = []
@@ -99,10 +100,10 @@ def sticker_outlines(
 def bend_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> None:
     """Replace ellipses of a perfect lens by those in the camera's image.
 
-    They have ``middles`` (n, 2) and ``shapes`` (n, 2, 2), across which distortion is taken as
-    linear.
+    They have ``middles`` (n, 2) and ``shapes`` (n, 2, 2), px. The distortion is linearised within
+    each ellipse.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.disc_kernels import bend_ellipses
 
     if not camera.distortion.is_zero:
@@ -110,10 +111,10 @@ def bend_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> None:
 
 
 def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius: float) -> Array:
-    """Return the centre of the ellipse fitted to a circle's image minus the projected centre (n,
-    2), px.
+    """Return the eccentricities (n, 2) px of the images of n circles.
 
-    Circles have centres (n, 3) m and unit normals (n, 3) in camera axes, and a radius in m.
+    They are the centre of the ellipse fitted to the circle's image, minus the image of the circle's
+    centre. Circles have centres (n, 3) m and unit normals (n, 3) in camera axes, and a radius in m.
     """
     middles, shapes = project_discs(camera.ideal, centres, normals, np.full(len(centres), radius))
     projected = camera.project(centres)[0]
@@ -123,10 +124,10 @@ def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius:
 
 
 def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
-    """Return the centre fitted to a distorted ellipse minus the ellipse's distorted centre (n, 2),
-    px.
+    """Return the shifts (n, 2) px of the centres of n ellipses due to the curvature of distortion.
 
-    Ellipses have middles (n, 2) and shapes A (n, 2, 2) in ideal px.
+    They are the centre of the ellipse fitted to the distorted ellipse, minus the distorted centre
+    of the original ellipse. Ellipses have middles (n, 2) and shapes A (n, 2, 2) in ideal px.
     """
     angle = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
     u = np.stack([np.cos(angle), np.sin(angle)])
@@ -146,12 +147,13 @@ def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
 def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
     """Return the share of light (n, size, size), 0 to 1, in each pixel, and its derivatives.
 
-    The derivatives (n, size, size, 5) are by [c_x, c_y, A_xx, A_xy, A_yy]. Centres (n, 2) px count
-    from the middle of the window's first pixel; shapes (n, 2, 2) px are symmetric and positive
-    definite. ``psf_px`` is the sigma of the point spread; 0 gives the covered share. Raises
-    CmmError for a point spread narrower than NARROWEST_PX.
+    The derivatives (n, size, size, 5) are with respect to [c_x, c_y, A_xx, A_xy, A_yy]. Centres (n,
+    2) px are relative to the middle of the window's first pixel. Shapes (n, 2, 2) px are symmetric
+    and positive definite. ``psf_px`` is the standard deviation of the point spread; 0 gives the
+    covered share. Raises CmmError for a point spread that is not 0 but narrower than NARROWEST_PX.
     """
-    from cmmsim.geometry.disc_kernels import blur_windows  # compile, so they are loaded only here
+    # Imported late, because importing numba takes time.
+    from cmmsim.geometry.disc_kernels import blur_windows
     from cmmsim.geometry.rim_kernels import cover_windows
 
     require_psf(psf_px)
@@ -166,14 +168,14 @@ def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> t
 
 
 def _contiguous(*arrays: Array) -> Iterator[Array]:
-    """Yield arrays of floats in the layout for which kernels are compiled."""
+    """Yield the arrays as contiguous arrays of floats, for which the kernels are compiled."""
     return (np.ascontiguousarray(values, dtype=float) for values in arrays)
 
 
 def require_psf(psf_px: float) -> None:
-    """Raise CmmError for a point spread that is neither 0 nor wide enough to be followed."""
+    """Raise CmmError for a point spread that is neither 0 nor wide enough to be modelled."""
     if not (psf_px == 0.0 or NARROWEST_PX <= psf_px < np.inf):
         raise CmmError(
-            f"a point spread of {psf_px:g} px cannot be fitted, only 0 or at least "
+            f"a point spread of {psf_px:g} px cannot be fitted: it must be 0 or at least "
             f"{NARROWEST_PX:g} px"
         )

@@ -1,6 +1,6 @@
-"""Compiled: discs as a camera sees them, and their blurred light in pixels.
+"""Compiled kernels for the ellipses of discs in an image, and their blurred share of pixels.
 
-The formulas stand in ``disc_image``.
+``disc_image`` states the formulas.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from cmmsim.geometry.camera_kernels import project
 
 @compiled
 def disc_ellipse(centre: Array, normal: Array, radius: float, focal: Array) -> tuple:
-    """Return the ellipse of a disc in camera axes, as a perfect lens shows it.
+    """Return the ellipse x, y, xx, xy, yy of a disc in camera axes through a perfect lens.
 
-    Its middle x, y is in normalised coordinates. Its matrix xx, xy, yy is A A', px², where A
-    carries the unit disc onto the ellipse.
+    The middle x, y is in normalised coordinates. xx, xy, yy are the entries of A A', px², where A
+    maps the unit disc onto the ellipse.
     """
     squared = radius * radius
-    # The dual conic D of ``disc_image``, over its last entry D33.
+    # The dual conic D of ``disc_image``, divided by its last entry D33.
     depth = centre[2] * centre[2] - squared * (1.0 - normal[2] * normal[2])
     x = (centre[0] * centre[2] + squared * normal[0] * normal[2]) / depth
     y = (centre[1] * centre[2] + squared * normal[1] * normal[2]) / depth
@@ -39,7 +39,7 @@ def disc_ellipse(centre: Array, normal: Array, radius: float, focal: Array) -> t
 
 @compiled
 def symmetric_root(xx: float, xy: float, yy: float) -> tuple:
-    """Return the entries xx, xy, yy of the root of a positive definite matrix M.
+    """Return the entries xx, xy, yy of the square root of a positive definite matrix M.
 
     It is (M + d I) / sqrt(trace M + 2 d) with d² = det M.
     """
@@ -50,7 +50,7 @@ def symmetric_root(xx: float, xy: float, yy: float) -> tuple:
 
 @compiled
 def bent_root(xx: float, xy: float, yy: float, a: float, b: float, c: float, d: float) -> tuple:
-    """Return ``symmetric_root`` of J M J' with the slopes J = [[a, b], [c, d]] of a lens."""
+    """Return ``symmetric_root`` of J M J' for the Jacobian J = [[a, b], [c, d]] of a lens."""
     return symmetric_root(
         a * a * xx + 2.0 * a * b * xy + b * b * yy,
         a * c * xx + (a * d + b * c) * xy + b * d * yy,
@@ -63,9 +63,10 @@ def project_all(
     centres: Array, normals: Array, radii: Array, focal: Array, principal: Array,
     middles: Array, shapes: Array,
 ) -> None:  # fmt: skip
-    """Fill the ellipses of n discs through a perfect lens: middles (n,2) and shapes (n,2,2), px.
+    """Fill the ellipses of n discs through a perfect lens: middles (n, 2) and shapes, px.
 
-    The discs have centres and normals (n,3) in camera axes, and radii (n,).
+    The shapes are (n, 2, 2). The discs have centres and normals (n, 3) in camera axes, and radii
+    (n,). ``focal`` (2,) are the focal lengths and ``principal`` (2,) the principal point, px.
     """
     for n in range(len(centres)):
         x, y, xx, xy, yy = disc_ellipse(centres[n], normals[n], radii[n], focal)
@@ -79,9 +80,9 @@ def project_all(
 
 @compiled
 def bend_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
-    """Replace ellipses of a perfect lens by those in the image of a camera with a lens.
+    """Replace ellipses of a perfect lens by those of a distorting camera with intrinsics (9,).
 
-    The lens is taken as linear across each ellipse.
+    The distortion is linearised within each ellipse.
     """
     for n in range(len(middles)):
         x = (middles[n, 0] - camera[2]) / camera[0]
@@ -103,10 +104,10 @@ def bend_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
 def place_discs(
     moves: Array, owners: Array, places: Array, directions: Array, centres: Array, normals: Array
 ) -> None:
-    """Fill centres and normals (n, 3) in camera axes of discs.
+    """Fill the centres and normals (n, 3) of discs in camera axes.
 
-    ``places`` and ``directions`` (n, 3) are in the axes of their ``owners`` (n,), and ``moves`` (b,
-    4, 4) lead from the bodies to the camera.
+    ``places`` and ``directions`` (n, 3) are in the axes of the bodies ``owners`` (n,), and
+    ``moves`` (b, 4, 4) are the transforms camera_from_body.
     """
     for n in range(len(places)):
         move = moves[owners[n]]
@@ -120,7 +121,7 @@ def place_discs(
 
 @compiled
 def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> None:
-    """Fill probes (n,k,3): the middle of each disc, then k - 1 points on its rim."""
+    """Fill ``probes`` (n, k, 3) with the middle of each disc and k - 1 points on its rim."""
     count = probes.shape[1] - 1
     u = np.empty(3)
     for n in range(len(centres)):
@@ -160,9 +161,9 @@ def inverse_shape(shape: Array) -> Array:
     return m
 
 
-# Standard deviations from the rim beyond which no light is followed: 4e-8 of it.
+# Standard deviations from the rim at which the point spread is cut off; 4e-8 of the light is lost.
 REACH = 5.5
-# Rim points to one standard deviation of the point spread.
+# Rim points per standard deviation of the point spread.
 POINTS_PER_SIGMA = 1.1
 FEWEST_POINTS = 24
 SQRT_HALF = math.sqrt(0.5)
@@ -173,11 +174,10 @@ SQRT_TWO_PI = math.sqrt(2.0 * math.pi)
 def carried(
     start: float, first: int, last: int, psf_px: float, across: Array, passed: Array
 ) -> None:
-    """Fill the light that the point spread carries from ``start`` into pixels first to last of one
-    axis.
+    """Fill g and P of ``disc_image`` at the coordinate ``start`` for pixels ``first`` to ``last``.
 
-    ``across`` g is the share of a point's light, and ``passed`` P its integral from -infinity to
-    ``start``, px.
+    ``across`` is g, the share of a point's light that reaches a pixel along one axis. ``passed`` is
+    P, the integral of g from -infinity to ``start``, px.
     """
     u = (first - 0.5 - start) / psf_px
     below = 0.5 * (1.0 + math.erf(u * SQRT_HALF))
@@ -194,7 +194,7 @@ def carried(
 
 @compiled
 def rim_points(shape: Array, psf_px: float) -> int:
-    """Return a number of points on the rim at which the trapezoidal rule has converged."""
+    """Return the number of points on the rim with which the trapezoidal rule has converged."""
     extent = math.sqrt(
         max(shape[0, 0] ** 2 + shape[0, 1] ** 2, shape[1, 0] ** 2 + shape[1, 1] ** 2)
     )
@@ -213,7 +213,7 @@ def blur_window(
     passed_x = np.empty(width)
     across_y = np.empty(height)
     passed_y = np.empty(height)
-    # Light that passes all pixels left of a column.
+    # Contributions to all pixels left of a column.
     whole = np.zeros((height, width + 1))
     m = inverse_shape(shape)
     count = rim_points(shape, psf_px)
@@ -236,7 +236,7 @@ def blur_window(
         carried(y, low, high, psf_px, across_y, passed_y)
         for row in range(low, high + 1):
             through = across_y[row] * n_x
-            # Pixels left of the reach get all of it; the last loop adds that up from the right.
+            # For pixels farther left P is 1. The last loop adds these contributions from the right.
             whole[row, min(left, width)] += through
             for column in range(left, right + 1):
                 shares[row, column] += through * passed_x[column]

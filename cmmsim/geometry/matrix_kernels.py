@@ -1,4 +1,4 @@
-"""Compiled: small symmetric systems of equations, by Cholesky's factor and by minors."""
+"""Compiled kernels for small symmetric systems of equations, by Cholesky's factor or by minors."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def factor(matrix: Array) -> None:
             rest = matrix[i, j]
             for k in range(j):
                 rest -= matrix[i, k] * matrix[j, k]
-            # A matrix that rounding has made indefinite keeps a tiny pivot.
+            # If rounding errors make the matrix indefinite, the pivot becomes a tiny number.
             matrix[i, j] = math.sqrt(max(rest, SMALLEST_PIVOT)) if i == j else rest / matrix[j, j]
 
 
 @compiled
 def solve_factored(lower: Array, right: Array) -> None:
-    """Solve L L' x = right (n,) in place."""
+    """Solve L L' x = ``right`` (n,) in place."""
     n = len(right)
     for i in range(n):
         for k in range(i):
@@ -39,9 +39,9 @@ def solve_factored(lower: Array, right: Array) -> None:
 
 @compiled
 def invert_factored(lower: Array, inverse: Array) -> None:
-    """Fill ``inverse`` with the leading (m,m) part of the inverse of L L'.
+    """Fill ``inverse`` with the leading (m, m) part of the inverse of L L'.
 
-    It is K' K with the inverse K of L.
+    The inverse is K' K with K = L^-1.
     """
     n = len(lower)
     m = len(inverse)
@@ -61,7 +61,7 @@ def invert_factored(lower: Array, inverse: Array) -> None:
 
 @compiled
 def inverse_entries(n: Array, into: Array) -> None:
-    """Fill the inverse of a symmetric matrix (3,3), both given by their six entries.
+    """Fill the inverse of a symmetric matrix (3, 3); both are given by their six entries.
 
     The entries are 00, 01, 02, 11, 12 and 22.
     """
@@ -90,6 +90,6 @@ def from_entries(entries: Array, matrix: Array) -> None:
 
 @compiled
 def square_by(n: Array, x: float, y: float, z: float) -> float:
-    """Return v' N v of a vector v = (x, y, z) and a symmetric matrix N with entries ``n`` (6,)."""
+    """Return v' N v for v = (x, y, z) and the symmetric matrix N with entries ``n`` (6,)."""
     squared = n[0] * x * x + n[3] * y * y + n[5] * z * z
     return squared + 2.0 * (n[1] * x * y + n[2] * x * z + n[4] * y * z)

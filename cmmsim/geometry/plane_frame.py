@@ -1,7 +1,8 @@
 """The frame that three planes define (paper section 4.2).
 
-Its origin is the intersection of planes A, B and C, its z axis A's normal, its x axis the line that
-A and B share, and y = z x x. A plane is n . p = d with unit normal n.
+Its origin is the intersection of the planes A, B and C. Its z axis is the normal of A, its x axis
+the intersection line of A and B, and y is the cross product of z and x. A plane is n . p = d with
+the unit normal n.
 """
 
 from dataclasses import dataclass
@@ -20,11 +21,11 @@ FEWEST_STICKERS = 3
 
 @dataclass(frozen=True)
 class FittedPlane:
-    """A plane, or several (...).
+    """One plane, or an array (...) of planes.
 
-    They have unit normals (..., 3), offsets d (...), m, and tangents (..., 3, 2). The covariance
-    (..., 3, 3) belongs to [turn about each tangent..., d]: the normal moves by tangents @
-    parameters[:2].
+    Planes have unit normals (..., 3), offsets d (...), m, and two tangents (..., 3, 2). The
+    covariance (..., 3, 3) belongs to three parameters: two tilts, rad, and d, m. The tilts change
+    the normal by tangents @ tilts.
     """
 
     normal: Array
@@ -34,10 +35,11 @@ class FittedPlane:
 
 
 def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "") -> FittedPlane:
-    """Fit a weighted least-squares plane through points (n, 3) with covariances (n, 3, 3).
+    """Fit a weighted least-squares plane to points (n, 3) with covariances (n, 3, 3).
 
-    Several sets of points (..., n, 3) give as many planes. ``towards`` (..., 3) is a rough normal
-    that fixes the sign. Raises LostError with fewer than three points off one line.
+    For sets of points (..., n, 3) the result is one plane per set. ``towards`` (..., 3) is a rough
+    normal that fixes the sign. Raises LostError for fewer than three points, or if all points lie
+    on one line.
     """
     count = points.shape[-2]
     if count < FEWEST_STICKERS:
@@ -56,7 +58,7 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
     normal = normal * np.where(_dot(normal, towards) > 0.0, 1.0, -1.0)[..., None]
     # Shift of the plane from the middle, along the normal.
     shift = np.zeros(normal.shape[:-1])
-    # The start is the unweighted plane, so two weighted steps reach rounding.
+    # The start is the unweighted plane, so two weighted steps converge to rounding errors.
     for _ in range(2):
         tangents = _tangents(normal)
         jacobian = np.concatenate([arms @ tangents, np.full((*arms.shape[:-1], 1), -1.0)], axis=-1)
@@ -70,7 +72,7 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
         normal = normal + (tangents @ change[..., :2, None])[..., 0]
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     tangents = _tangents(normal)
-    # The parameters were [turn, shift about the middle]; the offset is shift + n . middle.
+    # The fit has the parameters [tilts, shift]. The offset is shift + n . middle.
     to_offset = np.zeros((*shift.shape, 3, 3)) + np.eye(3)
     to_offset[..., 2, :2] = (middle[..., None, :] @ tangents)[..., 0, :]
     spread = to_offset @ covariance @ to_offset.swapaxes(-1, -2)
@@ -78,9 +80,9 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
 
 
 def frame_from_planes(normals: Array, offsets: Array) -> Array:
-    """Return camera_from_planes (..., 4, 4): the frame of planes A, B, C.
+    """Return camera_from_planes (..., 4, 4) for the frame of planes A, B, C.
 
-    They are given as unit normals (..., 3, 3) by row and offsets (..., 3).
+    The rows of ``normals`` (..., 3, 3) are the unit normals, and ``offsets`` are (..., 3).
     """
     first = normals[..., 0, :]
     z = first / np.linalg.norm(first, axis=-1, keepdims=True)
@@ -96,8 +98,9 @@ def frame_of_points(
     """Return the frame (4, 4) of planes through measured stickers, and its covariance (6, 6).
 
     The covariance is that of the small error [dt, dphi]. Stickers are points (n, 3) with
-    covariances (n, 3, 3), on planes ``plane_index`` (n,) 0, 1, 2 for A, B, C; ``towards`` (3, 3)
-    are rough normals by row. Raises LostError that names the plane, the count and the limit.
+    covariances (n, 3, 3). ``plane_index`` (n,) is 0, 1 or 2 for a sticker on plane A, B or C. The
+    rows of ``towards`` (3, 3) are rough normals. Raises LostError, which names the plane, if a
+    plane has too few stickers or all of them lie on one line.
     """
     frame, planes = frames_of_points(points, covariances, plane_index, towards)
     sensitivity = _frame_sensitivity(
@@ -109,9 +112,9 @@ def frame_of_points(
 def frames_of_points(
     points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
 ) -> tuple[Array, list[FittedPlane]]:
-    """Return the frames (..., 4, 4) of sets of points (..., n, 3), and planes A, B and C.
+    """Return the frames (..., 4, 4) of sets of points (..., n, 3), and the planes A, B and C.
 
-    The arguments are those of ``frame_of_points``.
+    The parameters are the same as in ``frame_of_points``.
     """
     planes = []
     for k, name in enumerate(PLANE_NAMES):
@@ -136,13 +139,13 @@ def _tangents(normal: Array) -> Array:
 
 
 def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:
-    """Return the change (6, 9) of [t, phi] of a frame by two turns and the offset of planes A, B
-    and C.
+    """Return the derivative (6, 9) of a frame by two tilts and the offset of each plane.
 
-    It is the derivative of `frame_from_planes`; the planes' tangents are (3, 3, 2).
+    It is the derivative of the small change [t, phi] of ``frame_from_planes``. The planes have
+    normals (3, 3) and tangents (3, 3, 2).
     """
     x, y, z, origin = frame[:3].T
-    # Changes of all normals and offsets by each parameter.
+    # Derivatives of all normals and offsets by each of the nine parameters.
     turned = np.zeros((9, 3, 3))
     shifted = np.zeros((9, 3))
     for plane in range(3):

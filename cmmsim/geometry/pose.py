@@ -1,9 +1,10 @@
 """Poses and transforms.
 
 A pose is ``[x y z alpha beta gamma]`` in m and rad with R = Rx(alpha) Ry(beta) Rz(gamma) (paper eq.
-1). A transform is a 4x4 matrix named output-from-input, ``camera_from_base``, so that adjacent
-names cancel in a product. A small error of a transform is ``[dt, dphi]``: the shift of its origin
-and the rotation vector that is applied on the left, both in the axes of the output frame.
+1). A transform is a 4x4 matrix with a name of the form output_from_input, such as
+``camera_from_base``. Adjacent names then cancel in a product. A small error of a transform is
+``[dt, dphi]``: the shift of its origin, and the rotation vector that is applied on the left. Both
+are in the axes of the output frame.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from cmmsim.errors import ShapeError
 
 Array = NDArray[np.float64]
 
-# Deviation of the entries of a rigid transform that is accepted: single precision passes.
+# Largest accepted deviation of a transform from a rigid one. Single precision is sufficient.
 RIGID = 1e-6
 
 
 def frozen(values: ArrayLike) -> Array:
-    """Return values as an array of its own that cannot be changed."""
+    """Return a copy of the values as a read-only array."""
     array = np.array(values, dtype=float)
     array.setflags(write=False)
     return array
@@ -31,9 +32,7 @@ IDENTITY = frozen(np.eye(4))
 
 
 def checked_pose(pose: ArrayLike) -> Array:
-    """Return a pose (6,) as an array of its own. Raises ShapeError unless it is six finite
-    numbers.
-    """
+    """Return a copy of a pose (6,). Raises ShapeError unless it is six finite numbers."""
     return finite_array(pose, (6,), "a pose is six finite numbers [x y z alpha beta gamma]")
 
 
@@ -64,7 +63,7 @@ def pose_to_transform(pose: ArrayLike) -> Array:
 
 def transforms_of(poses: Array) -> Array:
     """Return the transforms (..., 4, 4) of poses (..., 6)."""
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import pose_transforms
 
     transforms = np.empty((*poses.shape[:-1], 4, 4))
@@ -74,10 +73,10 @@ def transforms_of(poses: Array) -> Array:
 
 
 def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
-    """Return a transform (4, 4) as an array of its own.
+    """Return a copy of a transform (4, 4).
 
-    Raises ShapeError, with the ``name``, unless it is 4x4 finite numbers and a rigid motion: not
-    transposed, scaled or mirrored.
+    Raises ShapeError, whose message begins with ``name``, unless it is a rigid motion of 4x4 finite
+    numbers. A transposed, scaled or mirrored transform is not rigid.
     """
     values = finite_array(transform, (4, 4), f"{name} must be (4,4) and finite")
     rotation = values[:3, :3]
@@ -96,11 +95,8 @@ def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
 
 
 def all_rigid(transforms: Array) -> bool:
-    """Tell whether ``checked_transform`` accepts all transforms (k, 4, 4).
-
-    They are checked at once, so that a wrong one is not named.
-    """
-    # Late, as numba takes time to import.
+    """Tell whether ``checked_transform`` would accept all transforms (k, 4, 4)."""
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import farthest_from_rigid
 
     return bool(farthest_from_rigid(np.ascontiguousarray(transforms)) <= RIGID)
@@ -134,8 +130,8 @@ def transform_to_pose(transform: ArrayLike) -> Array:
 
 
 def poses_of(transforms: Array) -> Array:
-    """Poses (..., 6) of rigid transforms (..., 4, 4)."""
-    # Late, as numba takes time to import.
+    """Return the poses (..., 6) of rigid transforms (..., 4, 4)."""
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import transform_poses
 
     poses = np.empty((*transforms.shape[:-2], 6))
@@ -145,7 +141,7 @@ def poses_of(transforms: Array) -> Array:
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """Transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    """Return the transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
     transform = np.zeros((*np.shape(rotation)[:-2], 4, 4))
     transform[..., :3, :3] = rotation
     transform[..., :3, 3] = translation
@@ -154,20 +150,20 @@ def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def invert(transform: Array) -> Array:
-    """Inverses (..., 4, 4) of rigid transforms."""
+    """Return the inverses (..., 4, 4) of rigid transforms (..., 4, 4)."""
     back = transform[..., :3, :3].swapaxes(-1, -2)
     return rigid(back, -(back @ transform[..., :3, 3:])[..., 0])
 
 
 def apply(transform: Array, points: Array) -> Array:
-    """Return points (..., 3) carried by a transform (4, 4)."""
+    """Return points (..., 3) after a transform (4, 4)."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def apply_each(transforms: Array, points: Array) -> Array:
-    """Return points (..., n, 3) carried by each of the transforms (..., 4, 4).
+    """Return points (..., n, 3) after each of the transforms (..., 4, 4).
 
-    The points are (n, 3), or a set of them for each transform.
+    ``points`` is one set (n, 3) for all transforms, or one set per transform (..., n, 3).
     """
     return np.asarray(
         points @ transforms[..., :3, :3].swapaxes(-1, -2) + transforms[..., None, :3, 3]
@@ -175,7 +171,7 @@ def apply_each(transforms: Array, points: Array) -> Array:
 
 
 def skew(vectors: Array) -> Array:
-    """Cross product matrices (..., 3, 3) of vectors (..., 3)."""
+    """Return the cross product matrices (..., 3, 3) of vectors (..., 3)."""
     result = np.zeros((*vectors.shape, 3))
     x = vectors[..., 0]
     y = vectors[..., 1]
@@ -194,13 +190,13 @@ def rotation_exp(vector: Array) -> Array:
     angle = float(np.linalg.norm(vector))
     k = skew(vector)
     return (
-        # Rodrigues' formula in sinc, which keeps all digits at small angles.
+        # Written with sinc, Rodrigues' formula loses no digits at small angles.
         np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * k @ k
     )
 
 
 def rotation_log(rotation: Array) -> Array:
-    """Rotation vector (3,) of a rotation (3,3) whose angle is well below pi."""
+    """Return the rotation vector (3,) of a rotation (3, 3) with an angle well below pi."""
     axis = 0.5 * np.array(
         [
             rotation[2, 1] - rotation[1, 2],
@@ -210,15 +206,14 @@ def rotation_log(rotation: Array) -> Array:
     )
     sine = float(np.linalg.norm(axis))
     cosine = 0.5 * (np.trace(rotation) - 1.0)
-    # For a tiny turn, the axis is the rotation vector to first order.
+    # For a tiny angle the rotation vector equals ``axis`` to first order.
     return axis if sine < 1e-12 else axis * (np.arctan2(sine, cosine) / sine)
 
 
 def euler_rates_matrix(pose: Array) -> Array:
-    """Return the matrix (..., 3, 3) from rates of the angles of poses (..., 6) to the rotation
-    vector.
+    """Return the matrices (..., 3, 3) that map rates of pose angles to angular velocities.
 
-    It is in the axes of the output frame.
+    Poses are (..., 6), and angular velocities are in the axes of the output frame.
     """
     ca = np.cos(pose[..., 3])
     sa = np.sin(pose[..., 3])
@@ -235,8 +230,11 @@ def euler_rates_matrix(pose: Array) -> Array:
 
 
 def pose_jacobian(poses: Array) -> Array:
-    """Change (..., 6, 6) of poses (..., 6) by the small errors [dt, dphi] of their transforms."""
-    # Late, as numba takes time to import.
+    """Return the derivatives (..., 6, 6) of poses by the small errors of their transforms.
+
+    Poses are (..., 6), and small errors are [dt, dphi].
+    """
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import all_angle_rates
 
     flat = np.ascontiguousarray(poses, dtype=float).reshape(-1, 6)
@@ -249,11 +247,11 @@ def pose_jacobian(poses: Array) -> Array:
 
 
 def pose_covariance(transforms: Array, covariances: Array) -> Array:
-    """Covariances (..., 6, 6) of the poses of transforms (..., 4, 4), to first order.
+    """Return the covariances (..., 6, 6) of the poses of transforms (..., 4, 4), to first order.
 
     ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi].
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import pose_covariances
 
     spreads = np.empty(covariances.shape)
@@ -264,9 +262,9 @@ def pose_covariance(transforms: Array, covariances: Array) -> Array:
 
 
 def compose_covariance(outer: Array, covariance: Array) -> Array:
-    """Return the covariance (..., 6, 6) of the error of ``outer @ inner`` from that of ``inner``.
+    """Return the covariance (..., 6, 6) of the small error of a product ``outer @ inner``.
 
-    ``outer`` (4, 4) is exact.
+    ``covariance`` (..., 6, 6) belongs to ``inner``, and ``outer`` (4, 4) is exact.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = outer[:3, :3]

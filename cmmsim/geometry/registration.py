@@ -1,4 +1,4 @@
-"""Weighted rigid registration (paper eq. 27): the transform from known points to measured ones."""
+"""Weighted rigid registration (paper eq. 27): the transform from known to measured points."""
 
 from dataclasses import dataclass
 
@@ -7,18 +7,18 @@ import numpy as np
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array
 
-# Steps of Gauss-Newton after the unweighted start.
+# Gauss-Newton steps after the unweighted start.
 STEPS = 2
-# m: points closer than this to one line do not determine a rotation.
+# Points do not determine a rotation if their spread about one line is smaller than this, m.
 SMALLEST_SPREAD = 0.005
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Transform (4, 4) output-from-input, with the covariance (6, 6) of its small error [dt, dphi].
+    """Transform (4, 4) with the covariance (6, 6) of its small error [dt, dphi].
 
-    ``misfit`` (n,) is the squared residual of each point in units of its noise. It has three
-    degrees of freedom, minus the part that the fit of this point uses.
+    ``misfit`` (n,) is the squared residual of each point in units of its noise. Its expected value
+    is 3, reduced by the share of the fit's six degrees of freedom that this point determines.
     """
 
     transform: Array
@@ -27,10 +27,10 @@ class Registration:
 
 
 def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
-    """Return rigid transforms (c, 4, 4) from ``source`` to ``targets`` (c, n, 3), by singular
-    values.
+    """Return rigid transforms (c, 4, 4) from ``source`` to ``targets`` (c, n, 3).
 
-    The source is (n, 3), or (c, n, 3) with one source per target; weights are (c, n).
+    The method is a singular value decomposition. The source is (n, 3), or (c, n, 3) with one source
+    per target. Weights are (c, n).
     """
     shares = (weights / weights.sum(axis=1, keepdims=True))[..., None]
     source_means = (shares * source).sum(axis=1)
@@ -40,8 +40,8 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
     )
     u, _, vt = np.linalg.svd(products)
     turns = np.ones((len(targets), 3))
-    # The nearest orthogonal matrix can be a reflection. The direction of the smallest singular
-    # value is then reversed.
+    # The nearest orthogonal matrix can be a reflection. In this case the direction of the smallest
+    # singular value is reversed.
     turns[:, 2] = np.sign(np.linalg.det(u @ vt))
     transforms = np.tile(np.eye(4), (len(targets), 1, 1))
     transforms[:, :3, :3] = (u * turns[:, None]) @ vt
@@ -52,7 +52,7 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
 
 
 def require_spread(points: Array) -> None:
-    """Raise LostError unless points (n, 3) hold three that are clearly not on one line."""
+    """Raise LostError for fewer than three points (n, 3), or if all points lie on one line."""
     if len(points) < 3:
         raise LostError(
             f"{len(points)} visible stickers, at least 3 that are not on one line are needed"
@@ -66,10 +66,11 @@ def require_spread(points: Array) -> None:
 
 
 def register(source: Array, target: Array, covariances: Array) -> Registration:
-    """Maximum-likelihood transform with target = transform(source) + noise.
+    """Return the maximum-likelihood transform for target = transform(source) + noise.
 
-    ``source`` (n,3) are known points, and ``target`` (n,3) measured ones, m, with ``covariances``
-    (n,3,3). Raises LostError when fewer than three points off one line are given.
+    ``source`` (n, 3) are known points, and ``target`` (n, 3) are measured points, m, with
+    ``covariances`` (n, 3, 3). Raises LostError for fewer than three points, or if all points lie on
+    one line.
     """
     require_spread(source)
     fit = register_sets(source, target[None], covariances[None])
@@ -77,12 +78,12 @@ def register(source: Array, target: Array, covariances: Array) -> Registration:
 
 
 def register_sets(source: Array, targets: Array, covariances: Array) -> Registration:
-    """Registrations of a ``source`` onto each of several ``targets`` (c,n,3), as of ``register``.
+    """Return the registrations of a ``source`` onto c ``targets`` (c, n, 3), see ``register``.
 
-    The source is (n,3), or (c,n,3) with one source per target. The result has transforms (c,4,4),
-    covariances (c,6,6) and misfits (c n,).
+    The source is (n, 3), or (c, n, 3) with one source per target. The result has transforms (c, 4,
+    4), covariances (c, 6, 6) and misfits (c n,). The spread of the points is not checked.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.rigid_kernels import rigid_fits
 
     sets, count = targets.shape[:2]

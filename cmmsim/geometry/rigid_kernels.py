@@ -1,9 +1,9 @@
-"""Compiled: rigid fits of points by steps of Gauss-Newton, and what their residuals say.
+"""Compiled kernels for rigid fits of points by Gauss-Newton, and tests of their residuals.
 
-A point is known in a body's axes, and measured with a covariance. ``arm`` is the known point
-turned by the transform, ``gap`` the measured point less where the transform puts it. The residual
-of a fitted point has the covariance S - J C J': its noise S less what it pulls the pose by, with
-the covariance C of the pose and the slope J of the point.
+A point is known in the axes of a body, and measured with a covariance. ``arm`` is the known point
+rotated by the transform. ``gap`` is the measured point minus the transformed known point. The
+residual of a fitted point has the covariance S - J C J'. S is the covariance of the point's noise,
+C the covariance of the pose, and J the derivative of the point by the pose.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from cmmsim.geometry.transform_kernels import carry, move_by
 def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array) -> float:
     """Add a point to the normal equations of a pose; return its squared gap in units of its noise.
 
-    ``info`` (3,3) is the inverse covariance W of the point. ``normal`` (6,6), lower triangle, has
-    J' W J, and ``change`` (6,) J' W gap.
+    ``info`` (3, 3) is the inverse covariance W of the point. J' W J is added to the lower triangle
+    of ``normal`` (6, 6), and J' W gap to ``change`` (6,).
     """
     x = arm[0]
     y = arm[1]
@@ -37,7 +37,7 @@ def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array)
         push = info[i, 0] * gap[0] + info[i, 1] * gap[1] + info[i, 2] * gap[2]
         squared += gap[i] * push
         change[i] += push
-        # The row i of W J: the slope of the point by the pose is [1, -arm x].
+        # Row i of W J. The derivative J of the point by the pose is [I, -skew(arm)].
         by_x = info[i, 2] * y - info[i, 1] * z
         by_y = info[i, 0] * z - info[i, 2] * x
         by_z = info[i, 1] * x - info[i, 0] * y
@@ -46,7 +46,7 @@ def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array)
         normal[5, i] += by_z
         for j in range(i + 1):
             normal[i, j] += info[i, j]
-        # The column i of J' times that row.
+        # Column i of J' multiplied by that row.
         if i == 0:
             normal[4, 3] += z * by_x
             normal[5, 3] -= y * by_x
@@ -73,10 +73,10 @@ def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array)
 
 @compiled
 def solve_step(normal: Array, change: Array, covariance: Array) -> float:
-    """Solve the normal equations of a pose in place; return by how much the squares fall.
+    """Solve the normal equations of a pose in place; return the decrease of the sum of squares.
 
-    ``change`` (6,) becomes the step [dt, dphi], and ``covariance`` (6,6) is filled. ``normal`` is
-    overwritten.
+    ``change`` (6,) is replaced by the step [dt, dphi], and ``covariance`` (6, 6) is filled.
+    ``normal`` is overwritten.
     """
     before = (change[0], change[1], change[2], change[3], change[4], change[5])
     factor(normal)
@@ -90,7 +90,7 @@ def solve_step(normal: Array, change: Array, covariance: Array) -> float:
 
 @compiled
 def turn_arm(transform: Array, place: Array, point: Array, arm: Array, gap: Array) -> None:
-    """Fill the arm (3,) and the gap (3,) of a point (3,) known at ``place`` (3,)."""
+    """Fill the arm (3,) and the gap (3,) of a measured point (3,) with known ``place`` (3,)."""
     carry(transform, place, 0.0, arm)
     for i in range(3):
         gap[i] = point[i] - transform[i, 3] - arm[i]
@@ -101,11 +101,11 @@ def rigid_fits(
     places: Array, points: Array, informations: Array, starts: Array, steps: int,
     transforms: Array, covariances: Array, misfits: Array,
 ) -> None:  # fmt: skip
-    """Fit transforms (f,4,4), from start to result, that carry ``places`` (k,3) to ``points``.
+    """Fit transforms (f, 4, 4) that move known ``places`` (k, 3) to measured ``points`` (k, 3).
 
-    Points ``starts[f]`` to ``starts[f + 1]`` belong to fit f; their inverse covariances are
-    ``informations`` (k,3,3). Fills covariances (f,6,6) and misfits (k,), squared residuals in
-    units of the noise.
+    ``transforms`` contain start values and are replaced. Points ``starts[f]`` to ``starts[f + 1]``
+    belong to fit f, and their inverse covariances are ``informations`` (k, 3, 3). Fills covariances
+    (f, 6, 6), and misfits (k,), which are squared residuals in units of the noise.
     """
     arm = np.empty(3)
     gap = np.empty(3)
@@ -134,8 +134,8 @@ def rigid_fits(
 def left_noise(arm: Array, noise: Array, covariance: Array, half: Array, entries: Array) -> None:
     """Fill the entries (6,) of the covariance of a fitted point's residual.
 
-    ``noise`` (3,3) is the point's covariance, ``covariance`` (6,6) the pose's; ``half`` (3,6) is
-    overwritten.
+    ``noise`` (3, 3) is the covariance of the point, and ``covariance`` (6, 6) that of the pose.
+    ``half`` (3, 6) is overwritten.
     """
     x = arm[0]
     y = arm[1]
@@ -158,9 +158,10 @@ def residual_misfit(
 ) -> float:
     """Return the squared residual ``gap`` (3,) in units of its own covariance.
 
-    ``left`` (6,) has the entries of that covariance, see ``left_noise``. Directions in which less
-    than the share ``smallest`` of the point's noise (3,3) is left are not counted: there the point
-    alone determines the pose. ``inverse`` (6,) is overwritten.
+    ``left`` (6,) has the entries of that covariance, see ``left_noise``. A direction does not count
+    if the variance of the residual is below the share ``smallest`` of the variance of the point's
+    ``noise`` (3, 3). In such a direction the point alone determines the pose. ``inverse`` (6,) is
+    overwritten.
     """
     xx = left[0] - smallest * noise[0, 0]
     xy = left[1] - smallest * noise[0, 1]
@@ -178,10 +179,10 @@ def residual_misfit(
 
 @compiled
 def checkable_misfit(gap: Array, noise: Array, left: Array, smallest: float) -> float:
-    """Return ``residual_misfit`` of the directions alone in which enough noise is left."""
+    """Return ``residual_misfit`` from only the directions with enough variance."""
     lower = noise.copy()
     factor(lower)
-    root = np.zeros((3, 3))  # the inverse of the factor, which makes the noise the unit matrix
+    root = np.zeros((3, 3))  # the inverse of the factor whitens the noise
     for k in range(3):
         for i in range(k, 3):
             rest = 1.0 if i == k else 0.0
@@ -204,9 +205,10 @@ def residual_misfits(
     transforms: Array, spreads: Array, of: Array, places: Array, points: Array,
     covariances: Array, smallest: float, misfits: Array,
 ) -> None:  # fmt: skip
-    """Fill ``residual_misfit`` (n,) of points (n,3) with covariances (n,3,3), known at places.
+    """Fill ``misfits`` (n,) with the ``residual_misfit`` of each measured point (n, 3).
 
-    Each belongs to the fit ``of`` (n,) among transforms (f,4,4) with covariances ``spreads``.
+    The points have covariances (n, 3, 3) and known ``places`` (n, 3). ``of`` (n,) is the index of
+    each point's fit among transforms (f, 4, 4) with covariances ``spreads`` (f, 6, 6).
     """
     arm = np.empty(3)
     gap = np.empty(3)

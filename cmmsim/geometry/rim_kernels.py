@@ -1,8 +1,8 @@
-"""Compiled: the share of each pixel that an ellipse covers, arc by arc of its rim.
+"""Compiled kernels for the share of each pixel that an ellipse covers, arc by arc of its rim.
 
-The formulas stand in ``disc_image``. The rim is followed once around, from one line between pixels
-to the next. An ellipse is given as its centre and the matrix A (2, 2) that carries the unit circle
-onto it. Pixel (row, column) reaches half a pixel to all sides of its middle.
+``disc_image`` states the formulas. The rim is followed once around, from one line between pixels to
+the next. An ellipse is given by its centre and the matrix A (2, 2) that maps the unit circle onto
+it. Pixel (row, column) extends half a pixel from its middle to each side.
 """
 
 from __future__ import annotations
@@ -14,16 +14,18 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# Tangent of half an arc's angle, up to which eleven terms of its series give all digits.
+# Up to this tangent of half an arc's angle, eleven terms of the series give all digits.
 SHORT_ARC = 0.2
 
 
 class Cover(NamedTuple):
-    """Areas that arcs leave in a window.
+    """Contributions of arcs to the covered areas of a window.
 
-    shares (h, w) are areas from the left side of their own pixels. past (h, w + 1) is how far they
-    rise, which covers all pixels left of them. touched (h, w) says whether there are any.
-    derivatives (h, w, 5) of the shares are by [c_x, c_y, A_xx, A_xy, A_yy], or none (0, 0, 5).
+    ``shares`` (h, w) are the areas between the left side of a pixel and the arcs inside it.
+    ``past`` (h, w + 1) is the total rise dy of the arcs in a pixel, which contributes to all pixels
+    to the left. ``touched`` (h, w) is True for pixels with arcs. ``derivatives`` (h, w, 5) of the
+    shares are with respect to [c_x, c_y, A_xx, A_xy, A_yy]; with the shape (0, 0, 5) they are not
+    computed.
     """
 
     shares: Array
@@ -35,7 +37,8 @@ class Cover(NamedTuple):
 class Arcs(NamedTuple):
     """Arcs in the order of the rim.
 
-    They have rows and columns (n,) of their pixels, and starts and ends (n, 4) as u, v, u, v.
+    ``rows`` and ``columns`` (n,) are those of their pixels. ``ends`` (n, 4) are the start and the
+    end of each arc as points u, v, u, v of the unit circle.
     """
 
     rows: Array
@@ -45,13 +48,13 @@ class Arcs(NamedTuple):
 
 @compiled
 def angle_between(cross: float, dot: float) -> float:
-    """Return the angle from one unit vector to another, by their cross and dot products."""
-    half = cross / (1.0 + dot)  # the tangent of half of it
+    """Return the angle between two unit vectors from their cross and dot products."""
+    half = cross / (1.0 + dot)  # tangent of half the angle
     if not abs(half) < SHORT_ARC:
         return math.atan2(cross, dot)
     z = half * half
     w = z * z
-    # The series of the arctangent as two short chains of products, which run side by side.
+    # Splitting the series of the arctangent in two allows the processor to compute both at once.
     even = 1.0 + w * (1.0 / 5.0 + w * (1.0 / 9.0 + w * (1.0 / 13.0 + w * (1.0 / 17.0 + w / 21.0))))
     odd = 1.0 / 3.0 + w * (1.0 / 7.0 + w * (1.0 / 11.0 + w * (1.0 / 15.0 + w / 19.0)))
     return 2.0 * half * (even - z * odd)
@@ -59,7 +62,7 @@ def angle_between(cross: float, dot: float) -> float:
 
 @compiled
 def add_arcs(count: int, arcs: Arcs, centre_x: float, shape: Array, cover: Cover) -> None:
-    """Add the areas that ``count`` arcs leave in a window."""
+    """Add the contributions of the first ``count`` arcs to ``cover``."""
     width = cover.shares.shape[1]
     sloping = len(cover.derivatives) > 0
     a = shape[0, 0]
@@ -96,10 +99,10 @@ def add_arcs(count: int, arcs: Arcs, centre_x: float, shape: Array, cover: Cover
 
 @compiled
 def crossings(centre: float, reach: float, crossed: Array) -> None:
-    """Fill ``crossed`` (n, 2) for the lines before, between and behind n - 1 pixels.
+    """Fill ``crossed`` (n, 2) for the n lines that bound n - 1 pixels along one axis.
 
-    They are the distances of the lines from the centre, in units of the ``reach`` of the rim, and
-    half their lengths in the unit circle.
+    The first column is the distance of a line from the centre, in units of the half extent
+    ``reach`` of the ellipse. The second is half the length of the line inside the unit circle.
     """
     share = 1.0 / reach
     for k in range(len(crossed)):
@@ -119,12 +122,13 @@ def follow_quarter(
     count: int,
     arcs: Arcs,
 ) -> int:
-    """Follow a part of the rim on which x and y only rise or only fall.
+    """Follow a quarter of the rim, on which x and y are both monotonic; return the number of arcs.
 
-    Return the number of arcs, with those found before. Quarter 0 leads from the largest x to the
-    largest y, and so on; ``ends`` are (u, v) of these four. ``columns`` (w + 1, 2) and ``rows`` (h
-    + 1, 2) are ``crossings`` of the lines between pixels. Arcs above, below and left of the window
-    are left out. Arcs right of it stand in the column behind the last.
+    Quarter 0 leads from the largest x to the largest y, quarter 1 from there to the smallest x, and
+    so on. ``ends`` are (u, v) of these four points. ``columns`` (w + 1, 2) and ``rows`` (h + 1, 2)
+    are the ``crossings`` of the lines between pixels. ``count`` is the number of arcs found before,
+    which is included in the result. Arcs above, below and to the left of the window are omitted.
+    Arcs to its right are assigned to column w.
     """
     x_u, x_v = ends[0]
     y_u, y_v = ends[1]
@@ -156,7 +160,7 @@ def follow_quarter(
             not (above or (column == width and way_x > 0)) and (end_x - line_x) * way_x > 0.0
         )
         crosses_y = (end_y - row - 0.5 * way_y) * way_y > 0.0
-        # The crossing with the next line between rows is computed once a row.
+        # The crossing with the next line between rows is computed once per row.
         if new_row and crosses_y:
             t = rows[row + side[1], 0]
             s = -way_y * rows[row + side[1], 1]
@@ -168,7 +172,7 @@ def follow_quarter(
         to_v = last_v
         to_column = column
         to_row = row
-        # Of both lines, the one that the rim meets first ends the arc.
+        # The arc ends at whichever of the two lines the rim crosses first.
         if crosses_x and (not crosses_y or (down_x - line_x) * way_x >= 0.0):
             t = columns[column + side[0], 0]
             s = -way_x * columns[column + side[0], 1]
@@ -202,13 +206,16 @@ def follow_quarter(
 
 @compiled
 def within(place: float, size: int) -> int:
-    """Return the row or column of a place in a window; -1 before it, and ``size`` behind."""
+    """Return the row or column of a coordinate; -1 before the window, and ``size`` beyond it."""
     return math.floor(min(max(place + 0.5, -1.0), float(size)))
 
 
 @compiled
 def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> None:
-    """Fill ``cover``, except for the light that pixels get from arcs right of them."""
+    """Fill ``cover`` with the arcs of the rim.
+
+    The shares do not yet include the arcs to the right of each pixel.
+    """
     cover.shares[:] = 0.0
     cover.past[:] = 0.0
     cover.touched[:] = False
@@ -240,9 +247,9 @@ def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> 
 def cover_window(
     centre_x: float, centre_y: float, shape: Array, shares: Array, derivatives: Array
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5).
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse.
 
-    Shares are exactly 0 or 1 where the rim does not pass.
+    The share of a pixel that the rim does not cross is exactly 0 or 1.
     """
     height, width = shares.shape
     cover = Cover(
@@ -253,7 +260,7 @@ def cover_window(
     first = max(within(centre_y - reach, height), 0)
     last = min(within(centre_y + reach, height), height - 1)
     for row in range(first, last + 1):
-        # From the right, add the rise of all arcs that were passed: whole pixels have 0 or 1.
+        # Add the rise of all arcs farther right. For pixels without arcs the sum is 0 or 1.
         risen = cover.past[row, width]
         whole = np.rint(risen)
         for column in range(width - 1, -1, -1):

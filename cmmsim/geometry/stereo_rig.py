@@ -1,7 +1,7 @@
-"""Two cameras held by one rigid bar, and points triangulated from both of their images.
+"""Two cameras on one rigid bar, and points triangulated from their images.
 
-The camera frame C of the sensor is the frame of the left camera. Points come from OpenCV's linear
-triangulation, followed by weighted Gauss-Newton steps.
+The camera frame C of the sensor is the frame of the left camera. Triangulation consists of OpenCV's
+linear method and weighted Gauss-Newton steps.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ PARAMETER_NAMES = (
     *(f"{side}.{name}" for side in ("left", "right") for name in INTRINSIC_NAMES),
     *(f"right_from_left.{name}" for name in PLACE_NAMES),
 )
-"""Names of a rig's parameters: the intrinsics of both cameras, and translation and rotation vector
-of ``right_from_left``.
+"""Names of a rig's parameters: the intrinsics of the left and the right camera, then the
+translation and the rotation vector of ``right_from_left``.
 """
 
-# m: length of the last step of a triangulation.
+# A triangulation ends with a step shorter than this, m.
 SETTLED = 1e-8
 
 
@@ -42,7 +42,7 @@ class StereoRig:
     left, right : PinholeCamera
         The cameras.
     right_from_left : ndarray, shape (4, 4)
-        Transform from the left camera's axes into the right one's.
+        Transform from the axes of the left camera into those of the right camera.
 
     Raises
     ------
@@ -76,21 +76,19 @@ class StereoRig:
 
     @property
     def from_camera(self) -> tuple[Array, Array]:
-        """Transforms (4, 4) from the camera frame C into the axes of the left and of the right
-        camera.
-        """
+        """Transforms (4, 4) from the camera frame C into the axes of each camera, left first."""
         return np.eye(4), self.right_from_left
 
     @cached_property
     def ideal(self) -> StereoRig:
-        """The same rig with perfect lenses."""
+        """Rig with the same parameters and perfect lenses."""
         perfect = all(camera.distortion.is_zero for camera in self.cameras)
         return self if perfect else replace(self, left=self.left.ideal, right=self.right.ideal)
 
     @cached_property
     def figures(self) -> Cameras:
-        """Both cameras as compiled functions take them, for points in the camera frame C."""
-        # Late, as numba takes time to import.
+        """Both cameras in the form of the compiled functions, for points in the camera frame C."""
+        # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import Cameras
 
         return Cameras(
@@ -106,8 +104,9 @@ class StereoRig:
 
     @property
     def fundamental(self) -> Array:
-        """Fundamental matrix F (3, 3) of ideal pixels: right' F left = 0 for homogeneous pixels of
-        one point.
+        """Fundamental matrix F (3, 3) with right' F left = 0.
+
+        ``left`` and ``right`` are homogeneous ideal pixels of the same point.
         """
         rotation = self.right_from_left[:3, :3]
         shift = self.right_from_left[:3, 3]
@@ -116,8 +115,9 @@ class StereoRig:
         return np.linalg.inv(self.right.matrix).T @ essential @ np.linalg.inv(self.left.matrix)
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
-        """Return pixels (2, n, 2) of points (n, 3) in C in both images, and whether they are seen
-        (2, n).
+        """Return pixels (2, n, 2) of points (n, 3) in both images, and whether each is seen (2, n).
+
+        The points are in the camera frame C.
         """
         seen = [
             camera.project(apply(move, points))
@@ -126,10 +126,10 @@ class StereoRig:
         return np.stack([s[0] for s in seen]), np.stack([s[1] for s in seen])
 
     def derivatives(self, points: Array) -> tuple[Array, Array]:
-        """Return the derivatives of both pixels of points (n, 3) in C.
+        """Return the derivatives of the pixels of points (n, 3) in both images.
 
-        They are by the points (2, n, 2, 3), and by the rig's parameters (2, n, 2, 24) in the order
-        of PARAMETER_NAMES.
+        They are with respect to the points (2, n, 2, 3), and to the rig's parameters (2, n, 2, 24)
+        in the order of PARAMETER_NAMES. The points are in the camera frame C.
         """
         by_points = np.empty((2, len(points), 2, 3))
         by_rig = np.zeros((2, len(points), 2, len(PARAMETER_NAMES)))
@@ -156,9 +156,9 @@ class StereoRig:
         )
 
     def moved(self, changes: Array) -> StereoRig:
-        """Return the rig with changes (24,) of its parameters.
+        """Return the rig after adding ``changes`` (24,) to its parameters.
 
-        Its camera frame C stays that of the left camera.
+        The camera frame C remains that of the left camera.
         """
         if not changes.any():
             return self
@@ -173,10 +173,11 @@ class StereoRig:
 def toed_in_rig(
     camera: PinholeCamera, baseline: float, position: Array, target: Array
 ) -> tuple[StereoRig, Array]:
-    """Return a rig whose cameras look at one point, and the true ``camera_from_base`` (4, 4).
+    """Return a rig with both cameras aimed at one point, and the true ``camera_from_base`` (4, 4).
 
-    ``position`` (3,) is the middle of the baseline and ``target`` (3,) the point looked at, m in
-    the base frame. The baseline is horizontal and perpendicular to the viewing direction.
+    ``position`` (3,) is the middle of the baseline, and both optical axes pass through ``target``
+    (3,), m in the base frame. The baseline is horizontal and perpendicular to the viewing
+    direction.
     """
     forward = target - position
     right_axis = np.cross(forward, [0.0, 0.0, 1.0])
@@ -188,13 +189,13 @@ def toed_in_rig(
 def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
     """Return camera_from_base (4, 4) of a rig with the middle of its baseline at ``position`` (3,).
 
-    The rig looks at ``target``. The direction of view is the mean of both optical axes, made
-    perpendicular to the baseline. A toed-in rig is put where ``toed_in_rig`` puts it, as long as
-    its baseline is horizontal there.
+    The rig looks at ``target`` (3,). The viewing direction is the mean of both optical axes,
+    projected perpendicular to the baseline. For a rig of ``toed_in_rig`` with the same position and
+    target, the result is the same as there.
     """
     right_centre = invert(rig.right_from_left)[:3, 3]
     x = right_centre / np.linalg.norm(right_centre)
-    # The sum of both optical axes, in the axes of the left camera, is the direction of view.
+    # The sum of both optical axes, in the axes of the left camera, is the viewing direction.
     y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
     y /= np.linalg.norm(y)
     return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * right_centre) @ _look_at(
@@ -203,7 +204,7 @@ def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
 
 
 def _look_at(eye: Array, target: Array) -> Array:
-    """Return camera_from_base (4, 4) of a camera at ``eye`` (3,) that looks at ``target`` (3,).
+    """Return camera_from_base (4, 4) of a camera at ``eye`` (3,) aimed at ``target`` (3,).
 
     Its x axis is horizontal.
     """
@@ -217,7 +218,7 @@ def _look_at(eye: Array, target: Array) -> Array:
 class StereoPoints:
     """Points (n, 3) with covariances (n, 3, 3) in the camera frame, m.
 
-    ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise, with one
+    ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise. It has one
     degree of freedom.
     """
 
@@ -235,18 +236,17 @@ def triangulate(
     near: Array | None = None,
     parted: float = 0.0,
 ) -> StereoPoints:
-    """Return the points seen at pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2),
-    px².
+    """Return the points at pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2) px².
 
-    The search starts at ``near`` points (n, 3), or where the linear method finds them. ``parted``
-    px² is added to the covariances while the rays are laid onto each other, but not to the
-    result's.
+    The start values are ``near`` (n, 3), or the results of the linear method. ``parted`` px² is
+    added to the covariances for the weights and the ray gap, but not for the covariances of the
+    points.
     """
     if left.shape != right.shape or left.ndim != 2 or left.shape[1] != 2:
         raise ShapeError(
             f"left and right pixels must both be (n,2), got {left.shape} and {right.shape}"
         )
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.geometry.camera_kernels import triangulate_all
 
     if near is None:
@@ -261,7 +261,7 @@ def triangulate(
 
 
 def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:
-    """Return points (n, 3) in the camera frame by OpenCV's linear method (float64)."""
+    """Return points (n, 3) in the camera frame from ideal pixels, by OpenCV's linear method."""
     if len(left) == 0:
         return np.zeros((0, 3))
     first, second = rig.projection_matrices

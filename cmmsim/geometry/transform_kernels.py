@@ -1,4 +1,4 @@
-"""Compiled: transforms of rigid bodies, their poses, and covariances of both."""
+"""Compiled kernels for rigid transforms, their poses, and the covariances of both."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def transform_pose(transform: Array, pose: Array) -> None:
     """Fill the pose (6,) of a rigid transform (4,4)."""
     for i in range(3):
         pose[i] = transform[i, 3]
-    # R = Rx Ry Rz: its first row and its last column tell the angles.
+    # The angles follow from the first row and the last column of R = Rx Ry Rz.
     pose[3] = math.atan2(-transform[1, 2], transform[2, 2])
     pose[4] = math.atan2(transform[0, 2], math.hypot(transform[1, 2], transform[2, 2]))
     pose[5] = math.atan2(-transform[0, 1], transform[0, 0])
@@ -74,7 +74,10 @@ def multiply(first: Array, second: Array, product: Array) -> None:
 
 @compiled
 def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
-    """Fill a point (3,), or with ``shift`` 0 a direction, carried by a transform (4,4)."""
+    """Fill ``carried`` (3,) with a point (3,) after a transform (4, 4).
+
+    ``shift`` is 1 for a point, and 0 for a direction, which is only rotated.
+    """
     x = point[0]
     y = point[1]
     z = point[2]
@@ -84,7 +87,7 @@ def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
 
 @compiled
 def move_by(transform: Array, change: Array) -> None:
-    """Move a transform (4,4) by ``change`` (6,) [dt, dphi], in the axes of its output."""
+    """Change a transform (4, 4) by ``change`` (6,) [dt, dphi], in the axes of its output frame."""
     turn = change[3:]
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     # Rodrigues' formula, with its limits for small angles.
@@ -105,8 +108,8 @@ def move_by(transform: Array, change: Array) -> None:
 def make_rigid(transform: Array) -> None:
     """Replace the rotation of a transform (4,4) by the nearest orthogonal matrix.
 
-    Newton's steps R (3 - R'R) / 2 converge quadratically. Products of transforms need this, where
-    each is made of the one before: their rounding errors double from one to the next.
+    Newton's steps R (3 I - R'R) / 2 converge quadratically. This is needed if each transform is
+    computed as a product from the one before, because the rounding errors double with each product.
     """
     square = np.empty((3, 3))
     row = np.empty(3)
@@ -127,10 +130,10 @@ def make_rigid(transform: Array) -> None:
 
 @compiled
 def farthest_from_rigid(transforms: Array) -> float:
-    """Return the largest deviation of transforms (k,4,4) from rigid ones.
+    """Return the largest deviation of transforms (k, 4, 4) from rigid transforms.
 
-    Compared are the entries of R'R of the rotations R, and the last rows. Infinite where an entry
-    is not finite, or a rotation mirrors.
+    It is the largest deviation of the entries of R'R from the unit matrix, and of the last rows
+    from [0 0 0 1]. It is infinite if an entry is not finite or a transform is mirrored.
     """
     farthest = 0.0
     for k in range(len(transforms)):
@@ -155,7 +158,7 @@ def farthest_from_rigid(transforms: Array) -> float:
 
 @compiled
 def angle_rates(pose: Array, rates: Array) -> None:
-    """Fill the slopes (3,3) of a pose's angles by a rotation vector, in the output's axes."""
+    """Fill the derivatives (3, 3) of a pose's angles by a small rotation vector in output axes."""
     ca = math.cos(pose[3])
     sa = math.sin(pose[3])
     cb = math.cos(pose[4])
@@ -181,12 +184,13 @@ def all_angle_rates(poses: Array, rates: Array) -> None:
 
 @compiled
 def pose_covariance(pose: Array, turn: Array, covariance: Array, spread: Array) -> None:
-    """Fill the covariance (6,6) of a pose (6,) from that of its transform's small error.
+    """Fill the covariance (6, 6) of a pose (6,) from that of its transform's small error.
 
-    The error [dt, dphi] is given in other axes, which ``turn`` (3,3) carries to those of the pose.
+    ``covariance`` (6, 6) belongs to the error [dt, dphi] in other axes. ``turn`` (3, 3) rotates
+    these axes to those of the pose.
     """
     rates = np.empty((3, 3))
-    slopes = np.empty((6, 3))  # of the place by dt, then of the angles by dphi
+    slopes = np.empty((6, 3))  # derivatives of the place by dt, then of the angles by dphi
     half = np.empty((6, 6))
     angle_rates(pose, rates)
     for i in range(3):
@@ -215,7 +219,7 @@ def pose_covariance(pose: Array, turn: Array, covariance: Array, spread: Array) 
 
 @compiled
 def pose_covariances(poses: Array, covariances: Array, spreads: Array) -> None:
-    """Fill covariances (n,6,6) of poses (n,6) from those of their transforms' small errors."""
+    """Fill the covariances (n, 6, 6) of poses (n, 6) from those of their transforms' errors."""
     turn = np.eye(3)
     for k in range(len(poses)):
         pose_covariance(poses[k], turn, covariances[k], spreads[k])

@@ -1,1 +1,1 @@
-"""Exposures without images: drawn centres of stickers, as a detector would find them."""
+"""Exposures without images: random sticker centres that simulate the results of a detector."""

@@ -1,6 +1,7 @@
-"""Compiled: results that the fit of ellipses would have for stickers that nobody draws.
+"""Compiled kernels that simulate the results of the ellipse fit without rendering images.
 
-They are the covariance of an ellipse's centre, and the finds in windows of both images.
+They compute the covariance of an ellipse's centre, and random fit results in windows of both
+images.
 """
 
 from __future__ import annotations
@@ -25,10 +26,12 @@ from cmmsim.geometry.matrix_kernels import factor, invert_factored
 class CentreNoise(NamedTuple):
     """Table of the inverse covariance of a centre.
 
-    ``table`` (a, b, c, 3) holds xx, xy, yy of the inverse covariance over the ellipse's mean half
-    axis m, by m and its ovalness p and q, from ``first`` (3,) on in ``steps`` (3,). ``by_light``
-    (3,) are factors of 1 / light², 1 / light and 1, whose sum is the growth of the covariance at a
-    share of light. ``contrast``, ``ring`` and ``black`` are grey values of full light.
+    ``table`` (a, b, c, 3) contains the entries xx, xy, yy of the inverse covariance, divided by the
+    ellipse's mean half axis m. Its axes are m and the ovalness p and q. They begin at ``first``
+    (3,) and have ``steps`` (3,). At a share of light, the covariance is larger by the factor
+    by_light[0] / light² + by_light[1] / light + by_light[2]. ``contrast``, ``ring`` and ``black``
+    are grey values at full light; ``ring`` is relative to ``black``. ``fit_size`` px and
+    ``settings`` are those of the fit.
     """
 
     table: Array
@@ -53,10 +56,11 @@ def fit_covariances(
     settings: FitSettings,
     covariances: Array,
 ) -> None:
-    """Fill covariances (n, m, m) of the first m parameters that ``fit_window`` would state.
+    """Fill the covariances (n, m, m) that ``fit_window`` states for the first m parameters.
 
-    The n ellipses are as its model says. They have centres (n, 2) in px of parts of ``size`` px,
-    shapes (n, 2, 2), smears (n, 2) px, contrasts and grounds (n,).
+    The grey values are those of the model without noise. The n ellipses have centres (n, 2) px
+    relative to windows of ``size`` px, shapes (n, 2, 2) px, smears (n, 2) px, contrasts and grounds
+    (n,).
     """
     mask = np.empty((size, size), np.bool_)
     window = np.empty((size, size))
@@ -93,10 +97,11 @@ def tabulated(
     yy: float,
     light: float,
 ) -> tuple:
-    """Return the covariance xx, xy, yy px² of the centre of an ellipse with a given shape.
+    """Return the covariance xx, xy, yy px² of the centre of an ellipse, from the table.
 
-    It is linear between the table's entries; the first four parameters are those of
-    ``CentreNoise``.
+    xx, xy, yy are the entries of the ellipse's shape, px, and ``light`` is its share of light. The
+    first four parameters are those of ``CentreNoise``. Between entries of the table the
+    interpolation is linear.
     """
     mean = 0.5 * (xx + yy)
     a = (mean - first[0]) / steps[0]
@@ -129,7 +134,7 @@ def tabulated(
 def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear: tuple) -> tuple:
     """Return the covariance xx, xy, yy px² of the centre of an ellipse that moves by ``smear`` px.
 
-    It is computed at the ellipse's own place.
+    It is computed without the table, for the actual position of the centre within its pixel.
     """
     local = np.empty((1, 2))
     found = np.empty((1, 5, 5))
@@ -150,10 +155,9 @@ def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear
 
 @compiled
 def holds(centre: float, reach: float, size: int) -> bool:
-    """Tell whether the part of ``size`` px fitted about ``centre`` holds what reaches so far about
-    it.
+    """Tell whether an ellipse lies inside the fitted part of ``size`` px around its centre.
 
-    All are px along one axis.
+    ``centre`` and the half extent ``reach`` are px along one axis.
     """
     local = centre - np.rint(centre - 0.5 * (size - 1))
     return local - reach > -0.5 and local + reach < size - 0.5
@@ -162,9 +166,10 @@ def holds(centre: float, reach: float, size: int) -> bool:
 class Ellipses(NamedTuple):
     """Ellipses of m stickers in both images.
 
-    They have centres (2, m, 2), shapes (2, m, 2, 2) and smears (2, m, 2), px, and a mask ``seen``
-    (2, m) of those seen whole. ``noise`` (2, m, 6) is unit normal, for centres, shapes, and the
-    limit of thin ellipses. Contrasts and grounds (2, m) are grey values.
+    Their centres are (2, m, 2), shapes (2, m, 2, 2) and smears (2, m, 2), px. ``seen`` (2, m) is
+    True for ellipses of which nothing is hidden. ``noise`` (2, m, 6) are unit normal numbers: two
+    for the centre, three for the shape, and one for the limit of thin ellipses. Contrasts and
+    grounds (2, m) are grey values.
     """
 
     centres: Array
@@ -177,10 +182,11 @@ class Ellipses(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Parts of ``size`` px that are fitted.
+    """Fitted parts of the images, of ``size`` px.
 
-    They have sides (k,), the numbers of their stickers (k,), first pixels ``corners`` (k, 2), and
-    ``found`` (k,), which says whether there is a sticker.
+    ``sides`` (k,) is 0 for the left and 1 for the right image. ``stickers`` (k,) are the indices of
+    their stickers, and ``corners`` (k, 2) their first pixels. ``found`` (k,) is False for a part
+    without a sticker.
     """
 
     sides: Array
@@ -193,8 +199,8 @@ class Windows(NamedTuple):
 class Fits(NamedTuple):
     """Results of k fits.
 
-    They are ``good`` (k,), with centres (k, 2) and shapes (k, 2, 2), px, and the covariances (k, 5,
-    5) of both; contrasts and grounds (k,) are grey values.
+    ``good`` (k,) is True for successful fits. Centres (k, 2) and shapes (k, 2, 2), px, have common
+    covariances (k, 5, 5). Contrasts and grounds (k,) are grey values.
     """
 
     good: Array
@@ -206,10 +212,11 @@ class Fits(NamedTuple):
 
 
 class Smallest(NamedTuple):
-    """Limits for an ellipse.
+    """Limits for an ellipse that can be fitted.
 
-    They are half of its width in px, the half width at which half of the fits end for being too
-    thin, the softness of that limit, and the contrast in grey values.
+    ``radius`` is the smallest half width, px. Of the ellipses with the half width ``thin_px``, half
+    fail because they are too thin; ``thin_std_px`` is the standard deviation of this limit between
+    fits. ``contrast`` is the smallest contrast in grey values.
     """
 
     radius: float
@@ -222,9 +229,9 @@ class Smallest(NamedTuple):
 def nearest_stickers(
     seen: Array, centres: Array, corners: Array, side_px: int, windows: Windows
 ) -> None:
-    """Fill the parts that are fitted in windows of ``side_px`` px with first pixels (2, k, 2).
+    """Fill the fitted parts of windows of ``side_px`` px with first pixels ``corners`` (2, k, 2).
 
-    They lie about the sticker nearest to the middle of each, as far as the window goes.
+    A part is centred at the sticker nearest to the middle of its window, and limited to the window.
     """
     at = 0
     slack = side_px - windows.size
@@ -238,7 +245,7 @@ def nearest_stickers(
             for n in range(seen.shape[1]):
                 x = centres[side, n, 0] - corner[0] - middle
                 y = centres[side, n, 1] - corner[1] - middle
-                # Windows are square, so the farther axis decides.
+                # Windows are square, so the larger of both distances counts.
                 gap = max(abs(x), abs(y))
                 if seen[side, n] and gap < least:
                     least = gap
@@ -255,8 +262,9 @@ def nearest_stickers(
 def fit_stickers(
     ellipses: Ellipses, windows: Windows, smallest: Smallest, settings: FitSettings, fits: Fits
 ) -> None:
-    """Fill what is found in windows; results that are not good have unit covariances and mean
-    nothing.
+    """Fill the random results of the fits in windows.
+
+    Results that are not good have unit covariances and meaningless values.
     """
     count = len(windows.stickers)
     size = windows.size
@@ -317,7 +325,7 @@ def fit_stickers(
                 )
                 root[i, j] = fits.covariances[k, i, j]
         chosen += fits.good[k]
-        # The root of the covariance turns unit noise into that of the fit.
+        # Cholesky's factor of the covariance transforms unit noise to the noise of the fit.
         factor(root)
         for i in range(5):
             off[i] = 0.0

@@ -1,7 +1,7 @@
-"""Compiled: a pose from the stickers that two cameras find, frame after frame.
+"""Compiled kernels that simulate measured poses frame by frame, without images.
 
-The stickers found are compared with those expected at the true pose. They differ by noise, by the
-errors of teaching, and by those of the rig.
+Sticker positions found by two cameras are compared with the positions expected at the true pose.
+The differences are due to noise, and to the errors of teaching and of the rig.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ from cmmsim.measuring.solver_kernels import MEASURED, STATE, Belief, Outlines, S
 from cmmsim.without_images.drawn_fit_kernels import CentreNoise, holds, smeared, tabulated
 from cmmsim.without_images.hiding_kernels import Solids, hidden_stickers
 
-# m: last step of a triangulation, which begins at the expected place.
+# A triangulation, which starts at the expected place, ends with a step shorter than this, m.
 SETTLED = 2e-4
 
 
 class Frame(NamedTuple):
-    """Stickers as two cameras find them in one frame.
+    """Stickers found by two cameras in one frame.
 
-    ``stickers`` are those used, with their triangulated places. ``pixels`` (n, 2, 2) have
-    covariances ``spreads`` (n, 2, 2, 2), px², and ``variances`` (n,) of a coordinate in the mean of
-    both images. ``longest`` (1,) is the longest way of a sticker during the exposure, px.
+    ``stickers`` states which stickers are used, with their triangulated places. ``pixels`` (n, 2,
+    2) have covariances ``spreads`` (n, 2, 2, 2), px². ``variances`` (n,) are the variances of a
+    pixel coordinate, averaged over both images. ``longest`` (1,) is the longest path of a sticker
+    during the exposure, px.
     """
 
     stickers: Seen
@@ -46,8 +47,9 @@ class Frame(NamedTuple):
 
 
 class Stickers(NamedTuple):
-    """True and taught places (n, 3) of the platform's stickers, normals (n, 3) in its axes, and
-    radius, m.
+    """True and taught places (n, 3) of the platform's stickers, normals (n, 3), and radius, m.
+
+    Places and normals are in the axes of the platform.
     """
 
     true: Array
@@ -57,12 +59,13 @@ class Stickers(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits for a sticker to be found.
+    """Limits for finding a sticker, and properties of the images.
 
-    It is turned to both cameras by more than the cosine ``grazing``. ``thin_px`` and
-    ``thin_std_px`` say how thin an ellipse may be, and how softly. ``largest_gap`` is the squared
-    gap of its two rays. Nothing stands within ``clear`` m of it. ``vignetting`` is that of the
-    lens. ``parted``, px², is the variance by which errors of the rig part its rays.
+    The cosine between the normal of a sticker and the direction to each camera exceeds ``grazing``.
+    ``thin_px`` and ``thin_std_px`` are mean and standard deviation of the smallest half width of an
+    ellipse. ``largest_gap`` is the largest squared distance of the two rays. No body covers any
+    part of the image within ``clear`` m of the sticker. ``vignetting`` is that of the lens.
+    ``parted`` px² is the variance of the rays' distance that is due to errors of the rig.
     """
 
     grazing: float
@@ -75,10 +78,11 @@ class Limits(NamedTuple):
 
 
 class Eyes(NamedTuple):
-    """Cameras at their true and at their known places, and all that they look at.
+    """Cameras, and the scene in front of them.
 
-    The platform's stickers have owners (n,), body 0. The taught base_from_camera and
-    camera_from_base are (4, 4).
+    ``looking`` are the true cameras, and ``measuring`` the cameras as the sensor knows them.
+    ``owners`` (n,) are the bodies of the stickers, here all 0 for the platform. The taught
+    base_from_camera and camera_from_base are (4, 4).
     """
 
     looking: Cameras
@@ -97,11 +101,12 @@ class Eyes(NamedTuple):
 def see(
     side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: Array, frame: Frame
 ) -> None:
-    """Fill one image's pixels and covariances of the used stickers, and take out those not seen.
+    """Fill the pixels and covariances of stickers in one image, and mark unseen ones as not used.
 
-    ``moves`` (b, 4, 4) are camera_from_body of all solids, the platform first. ``ends`` (2, 4, 4)
-    are those of the platform at the beginning and the end of the exposure, where it is ``moving``.
-    ``noise`` (n, 3) is unit normal, for the centres and for the limit of thin ellipses.
+    ``moves`` (b, 4, 4) are camera_from_body of all solids, the platform first. If the platform is
+    ``moving``, ``ends`` (2, 4, 4) are its camera_from_body at the beginning and the end of the
+    exposure. ``noise`` (n, 3) are unit normal numbers: two for the centre, and one for the limit of
+    thin ellipses.
     """
     count = len(frame.variances)
     used = frame.stickers.used
@@ -164,10 +169,10 @@ def see(
         else:
             wide, tilt, high = tabulated(table, first_node, steps, by_light, xx, xy, yy, light)
         first = math.sqrt(wide)
-        # Cholesky's factor of the covariance shapes the unit noise.
+        # Cholesky's factor of the covariance transforms the unit noise.
         across = tilt / first
-        # The estimator takes the eccentricity off, so the noise is added to the sticker's own
-        # pixel.
+        # The estimator corrects for the eccentricity, so the noise is added to the image of the
+        # sticker's centre.
         pixels[n, 0] = u + first * noise[n, 0]
         pixels[n, 1] = v + across * noise[n, 0] + math.sqrt(high - across * across) * noise[n, 1]
         spread = spreads[n]
@@ -180,12 +185,12 @@ def see(
 
 @compiled
 def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame) -> None:
-    """Fill the finds of both cameras: pixels and covariances, and the stickers that are used.
+    """Fill the pixels and covariances in both images, and the mask of used stickers.
 
-    ``poses`` (6, 6) are in the middle, at the beginning and at the end of the left camera's
-    exposure, then of the right one's. ``bodies`` (b, 4, 4) are base_from_body of all solids but the
-    platform. ``noise`` (2, n, 3) is unit normal, and ``kept`` (n,) says that a sticker is not left
-    out by chance.
+    ``poses`` (6, 6) of the platform are those in the middle, at the beginning and at the end of the
+    left camera's exposure, then of the right camera's. ``bodies`` (b, 4, 4) are base_from_body of
+    all solids except the platform. ``noise`` (2, n, 3) are unit normal numbers. ``kept`` (n,) is
+    False for stickers that are omitted at random.
     """
     moving = False
     apart = False
@@ -202,7 +207,7 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
         for end in range(2 if moving else 0):
             pose_transform(poses[3 * side + 1 + end], platform)
             multiply(eyes.looking.moves[side], platform, ends[end])
-        # Both cameras see the same pose unless the right one exposes later.
+        # Both cameras see the same pose unless the right camera exposes later.
         if side == 0 or moving or apart:
             pose_transform(poses[3 * side], platform)
         multiply(eyes.looking.moves[side], platform, moves[0])
@@ -213,9 +218,9 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
 
 @compiled
 def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
-    """Take out stickers that nobody looks for with the platform at ``place`` (4, 4).
+    """Triangulate the used stickers, with the platform at camera_from_platform ``place`` (4, 4).
 
-    The others are triangulated.
+    Stickers that the estimator would not search for, or would reject, are marked as not used.
     """
     seen = frame.stickers
     expected = np.empty(3)
@@ -259,9 +264,9 @@ def measure_frame(
     eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
     pose: Array, spread: Array, verdict: Array,
 ) -> None:  # fmt: skip
-    """Fill the measured pose (6,) and its covariance (6,6), NaN where the frame is lost.
+    """Fill the measured pose (6,) and its covariance (6, 6), or NaN if the frame is lost.
 
-    The parameters are those of ``look``. The ``verdict`` says what became of it.
+    The first parameters are those of ``look``. ``verdict`` is filled with the state of the frame.
     """
     look(eyes, poses, bodies, noise, kept, frame)
     platform = np.empty((4, 4))
@@ -288,10 +293,11 @@ def measure_frames(
     eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
     found: Array, spreads: Array, verdicts: Array,
 ) -> float:  # fmt: skip
-    """``measure_frame`` N times; return the longest way of a sticker, px.
+    """Apply ``measure_frame`` to N frames; return the longest path of a sticker, px.
 
-    The frames have poses (N,6,6), noise (N,2,n,3) and kept (N,n), with the same bodies (b,4,4).
-    Fills found (N,6), spreads (N,6,6) and the verdict.
+    The frames have poses (N, 6, 6), noise (N, 2, n, 3) and kept (N, n). The bodies (b, 4, 4) are
+    the same in all frames. Fills the measured poses ``found`` (N, 6), their covariances ``spreads``
+    (N, 6, 6), and the verdicts.
     """
     longest = 0.0
     for k in range(len(poses)):

@@ -1,12 +1,12 @@
-"""One exposure of two cameras without images: the results that fits of ellipses would have.
+"""Exposures of two cameras without images: random results with the distribution of ellipse fits.
 
-A sticker that is seen whole in an image is found where the centre of its ellipse is, and with its
-shape, both with noise. The covariance of the noise is the one that the fit states there: the
-inverse of its normal matrix at the true ellipse. Effects of noise on the fit beyond the first order
-are left out, and so is a sticker of which anything is hidden.
+The result for a sticker that is wholly visible in an image is its true ellipse plus noise in centre
+and shape. The covariance of the noise is the one that the fit states: the inverse of its normal
+matrix at the true ellipse. Effects of noise beyond the first order are neglected. A partly hidden
+sticker is not found.
 
-Exposures without images are proved to be like those with images under some conditions; others are
-refused.
+Exposures without images are verified against exposures with images under certain conditions. Other
+conditions are refused.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,22 +39,22 @@ if TYPE_CHECKING:
 NAME = "statistical"
 WIDEST_PSF_PX = 1.0
 LONGEST_STREAK_PX = 4.0
-# Standard deviations of noise that must stay between black and white.
+# Grey values must be this many standard deviations of noise away from black and white.
 CLIPPED = 3.0
 THIN_PX = 0.885
-"""Half width of an ellipse at which half of the fits end at the smallest ellipse.
+"""Half width of an ellipse at which half of the fits end at the smallest allowed ellipse.
 
-It is measured in images. The errors of such fits are not of first order.
+It was determined from images. The errors of such fits are not of first order.
 """
 THIN_STD_PX = 0.055
-"""Standard deviation of the half width at which fits begin to end there, also measured."""
-# base_from_body (4, 4) of a body without a place: far below.
+"""Standard deviation of this limit between fits, also determined from images."""
+# base_from_body (4, 4) of a body without a place, which lies far below the scene.
 ABSENT = frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
 
 
 @dataclass(frozen=True)
 class Light:
-    """Radiance, 0 to 1, of stickers and of their rings, and the lens."""
+    """Radiances, 0 to 1, of stickers and of their rings, and the properties of the lens."""
 
     sticker: float
     ring: float
@@ -62,7 +62,7 @@ class Light:
 
 
 def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
-    """Raise CmmError, naming the key and its limit, for a sensor that the proof does not cover."""
+    """Raise CmmError, with the key and its limit, for a sensor outside the verified conditions."""
     ring, bright = (
         float(noise.mean_grey(np.array(level))) for level in (light.ring, light.sticker)
     )
@@ -73,7 +73,7 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
         (detector != DEFAULT_DETECTOR, f"detection.detector {detector!r}", DEFAULT_DETECTOR),
         (not noise.enabled, "camera.noise false", "true: without noise, rounding alone decides"),
         (noise.prnu > 0.0 or noise.dsnu > 0.0, f"camera.prnu {noise.prnu:g}, dsnu {noise.dsnu:g}",
-         "0: a pattern is the same in each frame"),
+         "0: a fixed pattern is the same in each frame"),
         (low**2 < NO_SWING, f"noise of {low:.2g} grey values in the dark", "at least "
                                                                            f"{NO_SWING**0.5:.2g}"),
         (ring < CLIPPED * low or bright > noise.white_level - CLIPPED * high,
@@ -91,11 +91,11 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
 
 
 def require_short(longest_px: float) -> None:
-    """Raise CmmError where an exposure draws stickers out farther than it was proved for."""
+    """Raise CmmError if the motion blur of a sticker exceeds the verified length."""
     if longest_px > LONGEST_STREAK_PX:
         raise CmmError(
             _not_proved(
-                f"stickers drawn out over {longest_px:.1f} px by the exposure",
+                f"stickers that move by {longest_px:.1f} px during the exposure",
                 f"at most {LONGEST_STREAK_PX:g} px",
             )
         )
@@ -103,17 +103,17 @@ def require_short(longest_px: float) -> None:
 
 def _not_proved(what: str, needed: str) -> str:
     return (
-        f"renderer {NAME!r} is not proved for {what}, only for {needed}; take the renderer "
+        f"renderer {NAME!r} is not verified for {what}, only for {needed}; use the renderer "
         "analytic or pyrender"
     )
 
 
 def refuse_images(*_: object, **__: object) -> NoReturn:
-    """Raise CmmError that names the renderers that draw."""
+    """Raise CmmError, with the names of the renderers that draw images."""
     drawing = ", ".join(name for name in RENDERERS if name != NAME)
     raise CmmError(
-        f"renderer {NAME!r} draws no images, it only says what would be found in them; {drawing} "
-        "draw them"
+        f"renderer {NAME!r} draws no images, it only simulates the results of detection; {drawing} "
+        "draw images"
     )
 
 
@@ -122,11 +122,12 @@ STATISTICAL = Renderer(NAME, refuse_images)
 
 @dataclass(frozen=True)
 class StatisticalStereoCamera:
-    """Two cameras that look at the true scene and say what a fit would find.
+    """Two virtual cameras that simulate the results of the fit in the true scene.
 
-    They are like `VirtualStereoCamera`, without images. ``rig`` and ``camera_from_base`` (4, 4) are
-    the true ones; ``exposure`` and ``right_later`` are in s. ``obstacle_names`` are those of the
-    scene's solids after platform and base.
+    They correspond to `VirtualStereoCamera`, but draw no images. ``rig`` and ``camera_from_base``
+    (4, 4) are the true values. ``exposure`` is the exposure time and ``right_later`` the delay of
+    the right camera, s. ``obstacle_names`` are the names of the scene's solids after platform and
+    base.
     """
 
     rig: StereoRig
@@ -145,9 +146,9 @@ class StatisticalStereoCamera:
         quality: Quality | None = None,
         pose_rate: Array | None = None,
     ) -> "DrawnStickers":
-        """Take one exposure; parameters are those of ``VirtualStereoCamera.look``.
+        """Take one exposure; the parameters are those of ``VirtualStereoCamera.look``.
 
-        The observer's noise knows how many exposures are averaged.
+        The number of averaged exposures is a property of the observer's noise.
         """
         rates = None if pose_rate is None else pose_rate[None]
         return DrawnStickers(
@@ -155,14 +156,15 @@ class StatisticalStereoCamera:
         )
 
     def moved(self, changes: Array) -> "StatisticalStereoCamera":
-        """Return the cameras with changes (24,) of their rig's parameters."""
+        """Return the cameras after adding ``changes`` (24,) to the parameters of their rig."""
         return replace(self, rig=self.rig.moved(changes))
 
     def exposed(self, poses: Array, rates: Array | None) -> Array:
-        """Return poses (N, 6, 6) of the platform at poses (N, 6) in motion at rates (N, 6).
+        """Return the poses (N, 6, 6) of the platform at six instants of each of N exposures.
 
-        They are in the middle, at the beginning and at the end of the left camera's exposure, then
-        of the right one's.
+        ``poses`` (N, 6) are the poses in the middle of the left camera's exposure, and ``rates``
+        (N, 6) their rates, or None at rest. The instants are the middle, the beginning and the end
+        of the left camera's exposure, then of the right camera's.
         """
         if rates is None:
             return np.repeat(poses[:, None], 6, axis=1)
@@ -181,12 +183,13 @@ class StatisticalStereoCamera:
         return np.array([IDENTITY, *(obstacles.get(name, ABSENT) for name in self.obstacle_names)])
 
     def centre_error_px(self, quality: Quality) -> float:
-        """Return the error of a sticker's centre that drawing leaves: 0, as nothing is drawn."""
+        """Return the error of a sticker's centre due to rendering: 0, as nothing is rendered."""
         return 0.0
 
     def greys(self, noise: CameraNoise, side: int, centres: Array) -> tuple[Array, Array]:
-        """Return contrasts (k,) of stickers at centres (k, 2) px of one image, and their grounds
-        (k,).
+        """Return contrasts (k,) and grounds (k,), in grey values, of stickers in one image.
+
+        The stickers have centres (k, 2), px.
         """
         lit = self.light.optics.illumination(self.rig.cameras[side], centres)
         grounds = np.asarray(noise.mean_grey(self.light.ring * lit))
@@ -194,13 +197,13 @@ class StatisticalStereoCamera:
 
     @cached_property
     def from_base(self) -> list[Array]:
-        """Places (4,4) of the base in the axes of both cameras."""
+        """Transforms camera_from_base (4, 4) of the left and the right camera."""
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     def side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return centres (m, 2) and shapes (m, 2, 2) of ellipses in one image, px.
+        """Return centres (m, 2) and shapes (m, 2, 2) of the ellipses in one image, px.
 
-        The third result says which are seen whole.
+        The third result is the mask (m,) of stickers of which nothing is hidden.
         """
         places, normals = self.scene.placed(moves)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
@@ -221,10 +224,10 @@ class StatisticalStereoCamera:
 
 
 class DrawnStickers:
-    """Stickers as a fit would find them in one exposure, worked out as far as they are asked for.
+    """Simulated fit results of one exposure, which are computed only when they are needed.
 
-    ``exposed`` (6, 6) are poses as of ``StatisticalStereoCamera.exposed``, ``bodies`` (b, 4, 4)
-    those of its ``placed``, and ``rng`` is that of the noise.
+    ``exposed`` (6, 6) are poses from ``StatisticalStereoCamera.exposed``, ``bodies`` (b, 4, 4) are
+    transforms from ``StatisticalStereoCamera.placed``, and ``rng`` generates the noise.
     """
 
     full = windows = refuse_images
@@ -243,9 +246,9 @@ class DrawnStickers:
 
     @cached_property
     def _found(self) -> "Ellipses":
-        """Ellipses of all stickers.
+        """Ellipses of all stickers, without contrasts and grounds.
 
-        Their grey values, which the observer's noise decides, are not known yet.
+        The grey values depend on the observer's noise, which is not known here.
         """
         from cmmsim.without_images.drawn_fit_kernels import Ellipses
 
@@ -266,7 +269,7 @@ class DrawnStickers:
             centres.append(at)
             shapes.append(shape)
             seen.append(whole)
-            # A body at rest smears nothing.
+            # A body at rest has no motion blur.
             if np.array_equal(first, last):
                 smears.append(np.zeros(at.shape))
                 continue
@@ -307,7 +310,7 @@ class DrawnStickers:
         return found[0], found[1]
 
     def _fitted(self, windows: "Windows", observer: Observer) -> EllipseFits:
-        """Return the ellipses that are found in windows."""
+        """Return the simulated fits in windows."""
         from cmmsim.without_images.drawn_fit_kernels import Fits, Smallest, fit_stickers
 
         settings = observer.settings
@@ -347,8 +350,8 @@ class DrawnStickers:
 
 
 def _empty_windows(count: int, observer: Observer) -> "Windows":
-    """Make room for windows."""
-    # Late, as numba takes time to import.
+    """Return uninitialised windows."""
+    # Imported late, because importing numba takes time.
     from cmmsim.without_images.drawn_fit_kernels import Windows
 
     whole = np.empty((2, count), dtype=int)

@@ -1,4 +1,4 @@
-"""Compiled: the stickers that convex solids hide."""
+"""Compiled kernels that find the stickers that convex solids hide."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from cmmsim.geometry.disc_kernels import probe_discs
 from cmmsim.geometry.transform_kernels import carry
 from cmmsim.imaging.layer_kernels import enters
 
-# Points about a sticker that are probed, with its middle, for solids that hide them.
+# Number of points around a sticker that are tested in addition to its middle.
 PROBES = 12
-# Share of the way to a point in which meeting a solid counts as lying on it.
+# A solid that a line of sight meets within the last share TOUCHING of its length does not hide the
+# point, because the point lies on the solid's surface.
 TOUCHING = 1e-6
 
 
 class Solids(NamedTuple):
     """Convex solids in their own axes.
 
-    The faces of solid b are ``starts[b]`` to ``starts[b + 1]`` of outward normals (f, 3) and
-    offsets (f,). The ball of ``radii[b]`` about ``middles[b]`` (3,) holds all of it.
+    The faces of solid b are the entries ``starts[b]`` to ``starts[b + 1]`` of the outward normals
+    (f, 3) and offsets (f,). The ball with ``radii[b]`` around ``middles[b]`` (3,) contains the
+    solid.
     """
 
     starts: Array
@@ -33,8 +35,9 @@ class Solids(NamedTuple):
 
 @compiled
 def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
-    """Tell whether the line from ``eye`` to ``point`` (3,) comes within ``radius`` of ``middle``
-    (3,).
+    """Tell whether the segment from ``eye`` to ``point`` meets the ball around ``middle``.
+
+    All three are (3,), and ``radius`` is that of the ball.
     """
     along = 0.0
     total = 0.0
@@ -42,7 +45,7 @@ def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
     for i in range(3):
         along += (point[i] - eye[i]) * (middle[i] - eye[i])
         total += (point[i] - eye[i]) ** 2
-    # The point of the line of sight, between its ends, that is nearest to the middle.
+    # Position along the segment of the point that is nearest to the middle.
     share = min(max(along / total, 0.0), 1.0)
     for i in range(3):
         gap += (eye[i] + share * (point[i] - eye[i]) - middle[i]) ** 2
@@ -51,8 +54,9 @@ def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
 
 @compiled
 def to_body(move: Array, point: Array, into: Array) -> None:
-    """Carry a point (3,) in camera axes into axes of the body at camera_from_body ``move`` (4,
-    4).
+    """Transform a point (3,) from camera axes to the axes of a body.
+
+    ``move`` (4, 4) is camera_from_body, and ``into`` (3,) is filled.
     """
     for i in range(3):
         into[i] = 0.0
@@ -71,12 +75,12 @@ def hidden_stickers(
     asked: Array,
     hidden: Array,
 ) -> None:
-    """Fill ``hidden`` (n,): whether a solid stands before any point within ``clear`` m of a
-    sticker.
+    """Fill ``hidden`` (n,), which is True if a solid hides a sticker or its surroundings.
 
-    The points lie in the sticker's plane. ``moves`` (b, 4, 4) are camera_from_body of the solids;
-    places and normals (n, 3) of stickers are in camera axes. The solids ``owners`` (n,) carry them
-    and do not hide them. Only stickers that are ``asked`` (n,) are looked at.
+    The surroundings are a disc of radius ``clear`` m around the sticker, in its plane. Its middle
+    and PROBES points on its rim are tested. ``moves`` (b, 4, 4) are camera_from_body of the solids,
+    and places and normals (n, 3) of stickers are in camera axes. A sticker is not hidden by its own
+    solid ``owners`` (n,). Stickers that are not ``asked`` (n,) count as not hidden.
     """
     camera = np.zeros(3)
     eyes = np.empty((len(moves), 3))

@@ -1,12 +1,13 @@
-"""Poses measured without images, one by one or many together.
+"""Measurement of poses without images, frame by frame or many frames at once.
 
-The stickers found are those of ``DrawnStickers``, except for a covariance from a table. Nothing is
-searched: each sticker is looked for where it is.
+The results have the same distribution as those of ``DrawnStickers``, but the covariance of a centre
+comes from a table. There is no search: each sticker is found at its true position.
 
-The table holds the noise of a sticker's centre over its ellipse. The fit states a covariance at a
-centre, see `fit_covariances`. Its mean over all places of the centre within a pixel is inverted.
-The inverse grows with the rim: over the mean half axis m it changes little with m, and smoothly
-with the ovalness p = (A_xx - A_yy) / 2 m and q = A_xy / m of the ellipse's shape A.
+The table describes the noise of a sticker's centre as a function of its ellipse. The covariance
+from ``fit_covariances`` belongs to one position of the centre. It is averaged over all positions
+within a pixel and inverted. The inverse grows with the length of the rim. Divided by the mean half
+axis m, it depends only weakly on m. It depends smoothly on the ovalness p = (A_xx - A_yy) / 2 m and
+q = A_xy / m of the ellipse's shape A.
 """
 
 import os
@@ -47,23 +48,23 @@ from cmmsim.without_images.drawn_stickers import (
 )
 from cmmsim.without_images.sticker_scene import CLEAR
 
-# Values of p and of q.
+# Tabulated values of p and of q.
 OVAL = np.linspace(-0.78, 0.78, 14)
-# Mean half axes, up to half of the fitted part.
+# Number of tabulated mean half axes, up to half the fitted part.
 RADII = 8
 MOST_OVAL = 0.85
-# Places within a pixel, along each axis.
+# Number of positions within a pixel along each axis, without and with a point spread.
 SHARP_PHASES = 5
 BLURRED_PHASES = 2
-# px by which a tabulated ellipse stays within the fitted part.
+# Smallest distance of a tabulated ellipse from the edge of the fitted part, px.
 EDGE_PX = 0.2
-# Shares of light at which its effect is followed.
+# Shares of light at which the covariance is computed.
 LIGHTS = np.array([0.4, 0.7, 1.0])
-# Probability that a good sticker is left out for an outline in either image.
+# Probability that a good sticker is rejected because of its outline in either image.
 OUTLINE_CHANCE = 2 * CHANCE
-# rad: turn of the last step of a fit, which begins at the true pose.
+# A fit of the pose, which starts at the true pose, ends with a rotation smaller than this, rad.
 SETTLED = 1e-4
-# Frames that share a stream of noise and a thread's turn.
+# Number of frames that are measured by one thread with one random stream.
 BLOCK = 512
 
 
@@ -71,8 +72,9 @@ BLOCK = 512
 def centre_noise(
     noise: CameraNoise, psf_px: float, fit_size: int, sticker: float, ring: float
 ) -> CentreNoise:
-    """Return the table for stickers and rings of these radiances, 0 to 1, in parts of ``fit_size``
-    px.
+    """Return the table of the centre's covariance in fitted parts of ``fit_size`` px.
+
+    ``sticker`` and ``ring`` are the radiances of stickers and rings, 0 to 1.
     """
     dark, bright, black = (
         float(noise.mean_grey(np.array(level))) for level in (ring, sticker, 0.0)
@@ -99,7 +101,8 @@ def centre_noise(
     found = covariances(_shapes(m.ravel(), p.ravel(), q.ravel(), 0.5 * fit_size - EDGE_PX), 1.0)
     known = np.linalg.inv(found)[:, [0, 0, 1], [0, 1, 1]] / m.reshape(-1, 1)
     table = known.reshape(*m.shape, 3)
-    # The growth with less light hardly depends on the shape: one usual ellipse tells it.
+    # The growth of the covariance with less light hardly depends on the shape, so it is computed
+    # for one typical ellipse.
     usual = _shapes(np.array([0.3 * fit_size]), np.array([0.25]), np.array([0.0]), 0.5 * fit_size)
     growth = [float(np.trace(covariances(usual, light)[0])) for light in LIGHTS]
     by_light = (
@@ -115,9 +118,9 @@ def centre_noise(
 
 
 def _shapes(m: Array, p: Array, q: Array, largest: float) -> Array:
-    """Return shapes (n, 2, 2) of mean half axes m (n,) px and ovalness p, q (n,).
+    """Return the shapes (n, 2, 2) for mean half axes m (n,) px and ovalness p, q (n,).
 
-    Their half axes are limited to those that can be fitted.
+    Their half axes are limited to the range from SMALLEST_RADIUS_PX to ``largest``.
     """
     oval = np.minimum(np.hypot(p, q), MOST_OVAL)
     angle = 0.5 * np.arctan2(q, p)
@@ -133,9 +136,9 @@ def _shapes(m: Array, p: Array, q: Array, largest: float) -> Array:
 
 
 class StatisticalTracker:
-    """Tracker that measures frame after frame as a `Tracker` does.
+    """Tracker with the methods of `Tracker` that measures poses without images.
 
-    Nothing is predicted: a lost platform is found again at once.
+    It makes no predictions, so a lost platform is found again in the next frame.
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
@@ -145,21 +148,21 @@ class StatisticalTracker:
             )
         self._estimator = estimator
         self._camera: StatisticalStereoCamera | None = None
-        # Finds of a frame, which the next one overwrites.
+        # Buffer for the stickers of one frame, which the next frame overwrites.
         self._one = self._frame()
 
     def forget(self) -> None:
-        """Do nothing: there is nothing to be forgotten."""
+        """Do nothing, because this tracker has no memory."""
 
     def miss(self) -> None:
-        """Pass a frame that nobody saw."""
+        """Do nothing for a missed frame, because this tracker has no memory."""
 
     def measure(self, exposure: StereoImages) -> Measurement:
-        """Measure one frame, such as ``sensor.look`` returns; raises CmmError for images."""
+        """Measure the pose in one frame from ``sensor.look``; raises CmmError for images."""
         if not isinstance(exposure, DrawnStickers):
             raise CmmError(
-                "a sensor without images measures what its own look() returns; images go to "
-                "measure_frame"
+                "a sensor without images measures only results of its own look(); use "
+                "measure_frame for images"
             )
         frame = self._one
         found = np.empty(6)
@@ -198,10 +201,10 @@ class StatisticalTracker:
         bodies: Array,
         rng: np.random.Generator,
     ) -> MeasuredPoses:
-        """Measure frames (N, 6, 6), as of ``StatisticalStereoCamera.exposed``, among bodies (b, 4,
-        4).
+        """Measure the poses in N frames with platform poses ``exposed`` (N, 6, 6).
 
-        The bodies stand still.
+        ``exposed`` comes from ``StatisticalStereoCamera.exposed``. ``bodies`` (b, 4, 4) are
+        base_from_body of the base and the obstacles, which stand still.
         """
         count = len(exposed)
         eyes = self._eyes_of(camera)
@@ -219,16 +222,16 @@ class StatisticalTracker:
             require_short(measure_frames(eyes, poses, bodies, noise, kept, self._frame(), *filled))
             stickers[part] = np.where(verdicts[:, STATE] == MEASURED, verdicts[:, LEFT], 0)
 
-        # Kernels release the interpreter's lock. Each block has a stream of its own, so that
-        # threads change no numbers.
+        # Kernels release the interpreter's lock. Each block has its own random stream, so the
+        # results do not depend on the number of threads.
         with ThreadPoolExecutor(min(len(starts) or 1, os.cpu_count() or 1)) as pool:
             list(pool.map(block, starts, rng.spawn(len(starts))))
         return MeasuredPoses(found, spreads, stickers)
 
     def _eyes_of(self, camera: StatisticalStereoCamera) -> Eyes:
-        """Return the cameras and all that they look at.
+        """Return the cameras and their scene in the form of the kernels.
 
-        Where a camera has only moved since the last frame, the rest stays.
+        If only the cameras have changed since the last frame, the scene is reused.
         """
         if camera is not self._camera:
             if self._camera is None or camera.scene is not self._camera.scene:
@@ -246,18 +249,17 @@ class StatisticalTracker:
         return Frame(stickers, pixels, np.empty((n, 2, 2, 2)), np.empty(n), np.empty(1))
 
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Draw unit normal noise (N, 2, n, 3), and the stickers (N, n) that are not left out by
-        chance.
+        """Draw unit normal noise (N, 2, n, 3), and the mask (N, n) of stickers that stay in use.
 
-        The noise is that of the centres and of the limit for thin ellipses. Outlines leave stickers
-        out.
+        The noise is for the centres and for the limit of thin ellipses. Stickers are omitted at
+        random, because the test of outlines also rejects a few good stickers.
         """
         n = len(self._estimator.platform.sticker_ids)
         return rng.standard_normal((frames, 2, n, 3)), rng.random((frames, n)) >= OUTLINE_CHANCE
 
 
 def _eyes(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> Eyes:
-    """Return the cameras and all that they look at, as the kernels take them."""
+    """Return the cameras and their scene in the form of the kernels."""
     settings = estimator.settings
     taught = estimator.taught
     own = camera.scene.owners == 0

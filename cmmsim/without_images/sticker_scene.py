@@ -1,4 +1,4 @@
-"""True places of stickers, and the convex solids that may hide them."""
+"""True places of stickers, and the convex solids that can hide them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,16 +14,17 @@ from cmmsim.imaging.scene_bodies import ConvexSolid, Mesh, SceneBody
 if TYPE_CHECKING:
     from cmmsim.without_images.hiding_kernels import Solids
 
-# Radii of a sticker within which nothing may stand before it and its ring: about the fitted part.
+# Radius around a sticker within which nothing must be hidden, in sticker radii. It is about the
+# size of the fitted part.
 CLEAR = 1.75
 
 
 @dataclass(frozen=True)
 class StickerScene:
-    """Stickers of one radius, m, and the solids of all bodies.
+    """Stickers with a common radius, m, and the solids of all bodies.
 
-    They are at places (m, 3) with normals (m, 3) in the axes of their owners (m,), bodies 0 and 1.
-    Solids that carry no stickers come last.
+    Stickers have places (m, 3) and normals (m, 3) in the axes of the bodies ``owners`` (m,), which
+    are 0 or 1. Solids without stickers come last.
     """
 
     places: Array
@@ -50,10 +51,11 @@ class StickerScene:
         )
 
     def placed(self, moves: Array) -> tuple[Array, Array]:
-        """Return places and normals (m, 3) in the axes of a camera, where bodies stand at (b, 4,
-        4).
+        """Return the places and normals (m, 3) of the stickers in the axes of a camera.
+
+        ``moves`` (b, 4, 4) are camera_from_body of the bodies.
         """
-        # Late, as numba takes time to import.
+        # Imported late, because importing numba takes time.
         from cmmsim.geometry.disc_kernels import place_discs
 
         places = np.empty_like(self.places)
@@ -64,9 +66,10 @@ class StickerScene:
     def hidden(
         self, moves: Array, places: Array, normals: Array, asked: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Tell whether a solid stands before any part of stickers (m,).
+        """Return the mask (m,) of stickers of which a solid hides any part.
 
-        They have places and normals (m, 3) in camera axes; only those ``asked`` (m,) are looked at.
+        Stickers have places and normals (m, 3) in camera axes. Stickers that are not ``asked`` (m,)
+        count as not hidden.
         """
         from cmmsim.without_images.hiding_kernels import hidden_stickers
 
@@ -78,7 +81,7 @@ class StickerScene:
 
     @cached_property
     def hiding(self) -> "Solids":
-        """Solids as ``hidden_stickers`` takes them."""
+        """Solids in the form of ``hidden_stickers``."""
         from cmmsim.without_images.hiding_kernels import Solids
 
         faces = [solid.faces for solid in self.solids]

@@ -66,7 +66,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Entries of all methods. The preparation of common candidates and functions is timed in s."""
+    """Entries of all methods, and the time for preparing their common candidates, in s."""
 
     criterion: str
     seed: int
@@ -85,7 +85,7 @@ def compare_methods(design: Design, known: Knowledge, seed: int, progress: Progr
     count = max(design.settings.candidates, FEWEST_MEMBERS)
     settings = design.settings.model_copy(update={"method": "gradient", "candidates": count})
     design = replace(design, settings=settings)
-    # Compilation comes first, so that no method's time contains it.
+    # Compilation comes first, so that the times of the methods do not contain it.
     with progress.stage("compile the robot", 1) as advance:
         prepare(robot)
         advance()

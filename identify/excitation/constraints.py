@@ -10,11 +10,11 @@ lie between -1 and 1.
                   `dynamics.workspace`)
     conditioning  2-norm condition number of the scaled J_a2 over its limit; the expressions use
                   the condition number in a Schatten norm, which is smooth and 0 to 3 % larger
-    visibility    angle to grazing, and place in the image, of four stickers per plane for both
-                  cameras; left out if the whole box is proved to be in sight
+    visibility    angle of incidence, and place in the image, of four stickers per plane for both
+                  cameras; omitted if the stickers are proved visible in the whole box
 
-By its form, the trajectory starts at home and at rest. It ends there because the run lasts whole
-periods.
+The form of the trajectory ensures that it starts at home and at rest. It also ends there, because
+the run lasts a whole number of periods.
 """
 
 from collections.abc import Collection
@@ -50,7 +50,7 @@ CONDITIONING = "conditioning"
 
 
 def required_stickers(sight: SightLines, home: Array) -> list[int]:
-    """Return the stickers that must stay visible: those of each plane that face the cameras best.
+    """Return the stickers that must stay visible: in each plane those farthest from their limits.
 
     Raises TrajectoryError if too few stickers of a plane are visible at home. The message names the
     plane.

@@ -51,7 +51,7 @@ class StereoView:
     """Camera images of one pose (6,) [m, rad], drawn with noise.
 
     ``images`` (2, h, w) are parts of the whole images. ``corners`` (2, 2) are the places (x, y) of
-    their first pixels. ``found`` holds the stickers of the bodies "platform" and "base".
+    their first pixels. ``found`` maps the bodies "platform" and "base" to their detected stickers.
     """
 
     pose: Array
@@ -61,9 +61,9 @@ class StereoView:
 
 
 class StereoEye:
-    """Sensor of a workcell that draws images at given poses, and finds the stickers in them.
+    """Sensor of a workcell that draws images at given poses, and detects the stickers in them.
 
-    The sensor is not taught: a sticker is searched near its nominal place.
+    The sensor is not taught, so a sticker is searched near its nominal place.
 
     Parameters
     ----------

@@ -47,9 +47,9 @@ LIBRARY_ENDS = "THREE.GLTFLoader=GLTFLoader;})();"
 
 
 def write_page(path: Path | str, motion: Motion, progress: Progress | None = None) -> None:
-    """Write the page of a motion, whole or not at all.
+    """Write the page of a motion. An incomplete file is never left behind.
 
-    Before the drawing, a check is made whether the file can be written.
+    Whether the file can be written is checked before anything is drawn.
 
     Raises
     ------

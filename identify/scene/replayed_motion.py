@@ -19,7 +19,7 @@ from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
 from identify.scenario import load_scenario
 from identify.scene.workcell import Workcell, workcell
 
-# Names of the poses of a motion, as the page knows them.
+# Names of the poses of a motion in the data of the page.
 TRUE = "true"
 MEASURED = "measured"
 IDENTIFIED = "identified"
@@ -94,7 +94,7 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
     Raises
     ------
     OutputFolderError
-        The folder holds no record.
+        The folder contains no record.
     RecordError
         A file is damaged or of an older version, there is no such motion, or the files are not of
         one run.
@@ -114,7 +114,7 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
     truth = _truth(run, name)
     if truth is None:
         notes.append(
-            "The record holds no truth, so no images can be drawn, and the robot is shown at "
+            "The record contains no truth, so no images can be drawn, and the robot is shown at "
             "the measured poses."
         )
     else:
@@ -146,7 +146,7 @@ def _cell(run: RunFolder, record: xr.Dataset, notes: list[str]) -> Workcell:
 
 
 def _truth(run: RunFolder, name: str) -> Array | None:
-    """Return the true poses (N, 6) of a motion, or None if its file holds none."""
+    """Return the true poses (N, 6) of a motion, or None if its file contains none."""
     # Validation runs are groups of one file. The excitation has a separate file.
     path, group = (run.experiment, "") if name == EXCITATION else (run.validation, name)
     inside = f"{group}/{TRUTH_GROUP}" if group else TRUTH_GROUP
@@ -166,7 +166,7 @@ def _models(
         notes.append(f"The run is not validated yet, {missing} {run.path}.")
         return {}
     result = load_result(run.result)
-    # Identifying again drops the entry of the validation, whose models are then outdated.
+    # A new identification removes the entry of the validation, because its models are outdated.
     if "validation" not in result:
         notes.append(f"The run was identified again and not validated since, {missing} {run.path}.")
         return {}
@@ -179,5 +179,5 @@ def _models(
         IDENTIFIED: poses(files.model[name], "identified"),
         STARTING: poses(files.model[name], "initial"),
     }
-    # A model that has diverged from the start has no pose to show.
+    # A model that diverges in the first frame has no pose to show.
     return {kind: values for kind, values in found.items() if np.isfinite(values).any()}

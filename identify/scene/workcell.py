@@ -182,7 +182,7 @@ class Workcell:
         return apply(pose_to_transform(pose), self.bodies[0].places[lines.visible(pose)])
 
     def marked(self, name: str) -> MarkedBody:
-        """Return the nominal stickers of the "platform" or the "base", as the sensor knows them."""
+        """Return the nominal stickers of the "platform" or the "base" from the sensor file."""
         assert self.sensor is not None
         return marked_body(name, getattr(self.sensor, name))
 

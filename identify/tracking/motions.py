@@ -1,8 +1,8 @@
-"""Motions to follow, all from rest.
+"""Motions to follow, which all start at rest.
 
-They are the Fourier trajectories of the validation, a circle, a square, and a user's own poses.
-Circle and square lie in the first two coordinates of the platform, within the box of the scenario's
-excitation. They start at home.
+They are the Fourier trajectories of the validation, a circle, a square, and motions through poses
+from a file. Circle and square lie in the first two coordinates of the platform, within the box of
+the scenario's excitation, and start at home.
 """
 
 from collections.abc import Callable
@@ -75,7 +75,7 @@ def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMot
     box = box_of(
         robot.geometry.chart, limits.position_amplitude_m, limits.orientation_amplitude_rad
     )
-    # A turn takes one period of the highest harmonic.
+    # One turn takes one period of the highest harmonic.
     turn_s = 1 / (limits.fundamental_hz * limits.harmonics)
     found.append(NamedMotion("circle", circle(robot, float(box[0]) / 2, turn_s), duration))
     found.append(NamedMotion("corner", square(robot, float(box[:2].min()), duration / 5), duration))
@@ -83,9 +83,10 @@ def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMot
 
 
 def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
-    """Return a motion that goes round a circle through home.
+    """Return a motion along a circle through home, with a radius in m.
 
-    A turn takes ``turn_s``, in s. The speed rises smoothly within the first ``turn_s``.
+    At full speed one turn takes ``turn_s``, in s. The speed rises smoothly during the first
+    ``turn_s``.
     """
     home = robot.coordinates(robot.home_pose)
     speed = 2 * np.pi / turn_s
@@ -125,8 +126,9 @@ def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
 def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
     """Return a motion along a square from home.
 
-    It goes along the first coordinate, then the second, and back. Each edge takes ``edge_s``, in s.
-    It is a polynomial of fifth degree from rest to rest, with a jerk of at most 60 side / edge_s^3.
+    It moves along the first coordinate, then along the second, and back in the same order. Each
+    edge takes ``edge_s``, in s, and is a polynomial of fifth degree from rest to rest. Its jerk is
+    at most 60 side / edge_s^3.
     """
     home = robot.coordinates(robot.home_pose)
     corners = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])

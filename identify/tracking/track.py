@@ -94,15 +94,15 @@ def track(
             "requested"
         )
     if set(laws) == {"pid"}:
-        # This law knows no model, so no model has to be identified.
+        # This law uses no model, so no model has to be identified.
         models = ["initial"]
     known = {name: known_model(plant, name) for name in models if name != "identified"}
     if run_folder and "identified" in models:
         known["identified"] = model_of_run(plant, run_folder, scenario.robot)
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
-    # The check whether a law can follow a motion works with any model.
+    # Whether a law can follow a motion does not depend on the model, so any model will do.
     true = known_model(plant, "true")
-    # The check comes before the teaching of the sensor, which takes long.
+    # This check precedes the teaching of the sensor, because teaching takes long.
     for law in laws:
         for motion in followed:
             prepared(plant, law, true, motion, unseen)
@@ -125,7 +125,7 @@ def track(
 
 
 def known_model(plant: Plant, model: str) -> KnownModel:
-    """Return the "initial" or the "true" model of a plant."""
+    """Return the model of a plant with the name "initial" or "true"."""
     if model == "true":
         return KnownModel(plant.parameters, plant.switches.drive, FITTED)
     start = plant.loop.side.model
@@ -137,14 +137,14 @@ def known_model(plant: Plant, model: str) -> KnownModel:
 def model_of_run(plant: Plant, run_folder: Path, own: str) -> KnownModel:
     """Return the model that was identified in a run folder.
 
-    ``own`` is the robot's name or file. Raises RecordError if the folder holds no result with
-    estimates, or a run of another robot.
+    ``own`` is the name or the file of the plant's robot. Raises RecordError if the folder contains
+    no result with estimates, or if its run belongs to another robot.
     """
     path = run_folder / "result.json"
     RunFolder(run_folder).require("scenario.toml", "result.json")
     other = load_scenario(RunFolder(run_folder).whole_scenario).robot
     if other != own:
-        raise RecordError(f"{run_folder} holds a run of {other}, not of {own}")
+        raise RecordError(f"{run_folder} contains a run of {other}, not of {own}")
     try:
         identification = load_result(path).get("identification")
         names = plant.nominal.layout.names
@@ -224,7 +224,7 @@ def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
 def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dict[str, Any]:
     """Return the entry of one law with one model on all motions.
 
-    The model is None for a law that reads none.
+    The model is None for a law that uses no model.
     """
     robot = task.plant.robot
     known = task.models[model or next(iter(task.models))]

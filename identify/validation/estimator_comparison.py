@@ -51,11 +51,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 START = "starting guess"
+"""Key of the initial guess in the results."""
 
 
 @dataclass(frozen=True)
 class Examination:
-    """Truth by which estimators are judged.
+    """Truth against which estimators are compared.
 
     Attributes
     ----------
@@ -209,7 +210,7 @@ def compare_on_record(
 ) -> list[Score]:
     """Score estimators on a record with its truth and the channels of its joints.
 
-    They are also judged on (record, truth) pairs of validation runs, `unseen`.
+    `unseen` are the (record, truth) pairs of validation runs, which determine the pose distance.
     """
     record, truth = experiment
     known = true_parameters(truth)
@@ -236,7 +237,7 @@ def examination(
     robot = side.robot
     base = structure(robot)
     driven = evidence.problem.driven_by_commands()
-    # With a fixed seed, the choice of the judged parameters is always the same.
+    # With a fixed seed, the choice of the compared parameters is always the same.
     uncertainty = estimate_uncertainty(driven, true, np.random.default_rng(0))
     guess = evidence.problem.guess
     groups = group_estimates(base, guess, identifiability(guess, robot), true, uncertainty)
@@ -259,7 +260,7 @@ def compare(
     The note of a failed estimator states the reason.
     """
     guess = evidence.problem.guess
-    start = Estimator(START, "", lambda given: Estimate(guess.values, guess.std))
+    start = Estimator("initial guess", "", lambda given: Estimate(guess.values, guess.std))
     scores = [_score(START, start, evidence, asked)]
     with progress.stage("estimators", len(estimators)) as advance:
         for name, estimator in estimators.items():

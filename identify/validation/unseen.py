@@ -1,6 +1,6 @@
 """Validation: plant and models on trajectories that were not used for the estimate (section 4.3).
 
-The expected difference of plant and model is also predicted.
+The expected difference between plant and model is also predicted.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ def predict_poses(
     rng: np.random.Generator,
     learned: Mapping[str, float] | None = None,
 ) -> PosePrediction:
-    """Predict a run with estimated parameters.
+    """Return the predicted poses of a run with estimated parameters.
 
     The prediction uses the reference, the sensor's covariance and the lost frames of the run, but
     not its measured poses.
@@ -241,11 +241,12 @@ def predict_poses(
 def _known_in_common(
     run: LoopModel, covariance: Array, parameters: int, learned: Mapping[str, float]
 ) -> tuple[Array, Array, Array]:
-    """Return the knowledge of the common errors of a run's poses.
+    """Return what is known beforehand about the common errors of a run's poses.
 
-    The first array (k,) holds the most likely values of the independent numbers of these errors.
-    The second is the matrix (k, k) from known numbers to these numbers. The third is the covariance
-    (p + k, p + k) of parameters and known numbers.
+    The errors are a linear function of k independent numbers. The first result (k,) is the most
+    likely values of these numbers. The second is the matrix (k, k) from the numbers with known
+    covariance to these numbers. The third is the covariance (p + k, p + k) of the parameters and
+    the numbers with known covariance.
     """
     names = run.common.all_names
     if names and tuple(learned) == names:

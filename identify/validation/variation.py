@@ -4,13 +4,14 @@ The robot is identified from each of several runs separately. The paper gives no
 "variation measure". Here it is the standard deviation of a parameter's estimates in per cent of
 their mean, for the parameters that every run identifies. It is compared with the value that is
 expected from the standard deviations of the runs. As in the paper, all runs share one weighing of
-the platform and one teaching of the sensor, so their errors do not contribute.
+the platform and one teaching of the sensor. The errors of weighing and teaching therefore do not
+contribute.
 
-The masses of the links of `rss6` vary most, because they act only through accelerations. By the
-information of designed runs at the true parameters, without noise in the servo, the worst mass is
-known to 4.6, 3.5 and 3.1 % from 20, 40 and 60 s at the paper's fundamental of 0.1 Hz. From 20 s at
-0.3 Hz, with the whole velocity limit of 2 rad/s, it is known to 2.4 %. A faster motion is thus
-better than a longer motion.
+The masses of the links of `rss6` vary most, because they act only through accelerations. The
+information of designed runs at the true parameters, without noise in the servo, shows how well the
+worst mass can be known. Its standard deviation is 4.6, 3.5 and 3.1 % after 20, 40 and 60 s at the
+paper's fundamental of 0.1 Hz. It is 2.4 % after 20 s at 0.3 Hz, with the whole velocity limit of 2
+rad/s. A faster motion is thus better than a longer motion.
 """
 
 from collections.abc import Callable, Sequence

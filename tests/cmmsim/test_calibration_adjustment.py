@@ -169,8 +169,12 @@ MIXED = [PairView(a.name, a.left, b.right) for a, b in zip(PLAIN, noisy_pairs(13
 @pytest.mark.parametrize(
     ("pairs", "least", "message"),
     [
-        (PLAIN[:2] + UNSEEN[2:5], 3, r"2 of 5 pairs .* 3 needed; without it: 02.png \(both: no ch"),
-        (PLAIN[:5], 12, "12 needed"),
+        (
+            PLAIN[:2] + UNSEEN[2:5],
+            3,
+            r"2 of 5 pairs, 3 are needed; pairs without it: 02.png \(both: no ch",
+        ),
+        (PLAIN[:5], 12, "12 are needed"),
         (UNSEEN, 3, r"02.png \(both: no chessboard of 8 x 7 found\) and 9 more$"),
         (
             [
@@ -178,7 +182,7 @@ MIXED = [PairView(a.name, a.left, b.right) for a, b in zip(PLAIN, noisy_pairs(13
                 for a, b in zip(PLAIN, noisy_pairs(13), strict=True)
             ],
             3,
-            "pairs agree on where",
+            "pairs agree on the place",
         ),
     ],
 )
@@ -234,7 +238,10 @@ def test_swapped_folders_are_named_with_the_place_of_the_right_camera():
     ("unit", "size"), [(1e3, "400 x 300 m"), (1e2, "40 x 30 m"), (1e-3, "0.0004 x 0.0003 m")]
 )
 def test_lengths_that_are_no_metres_are_named(unit, size):
-    (line,) = lines_with("other units", BOARD.model_copy(update={"spacing": unit * BOARD.spacing}))
+    (line,) = lines_with(
+        "the lengths in the board file in m?",
+        BOARD.model_copy(update={"spacing": unit * BOARD.spacing}),
+    )
     assert size in line
     assert float(line.split("cameras ")[1].split()[0]) == pytest.approx(
         unit * np.linalg.norm(SHIFT), rel=0.01
@@ -257,7 +264,9 @@ def test_wrong_radius_of_dots_is_warned_of_with_both(measured, warned):
     seen = [PairView(p.name, *(replace(v, radius=measured) for v in p.sides)) for p in PLAIN]
     assert (
         bool(
-            lines_with(f"radius 0.014 m, in the pictures they measure {measured:g} m", board, seen)
+            lines_with(
+                f"radius 0.014 m, but in the pictures the radius is {measured:g} m", board, seen
+            )
         )
         == warned
     )

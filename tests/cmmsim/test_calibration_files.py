@@ -123,16 +123,16 @@ def test_folders_that_make_no_pairs_are_refused(tmp_path):
     left = files(tmp_path / "a", ["1.png", "2.png", "4.png"])
     for right, message in (
         (tmp_path / "missing", r"no folder .*missing"),
-        (files(tmp_path / "empty", []), r"holds no images, which end in \.bmp"),
+        (files(tmp_path / "empty", []), r"contains no images, which end in \.bmp"),
         (
             files(tmp_path / "b", ["1.png", "2.png"]),
-            r"holds 3 images and .* 2; .*left: 4; only on the right: none",
+            r"has 3 images and .* has 2; .*left: 4; only on the right: none",
         ),
         (
             files(tmp_path / "c", ["1.png", "2.png", "3.png"]),
             "Only on the left: 4; only on the right: 3",
         ),
-        (left, "named for both cameras"),
+        (left, "given for both cameras"),
     ):
         with pytest.raises(CalibrationError, match=message):
             pair_images(left, right)
@@ -150,5 +150,5 @@ def test_images_that_cannot_be_read_or_differ_in_size_are_refused(tmp_path):
         ):
             view_pairs([ImagePair(left, right)], DOTS)
     cv2.imwrite(str(right), np.zeros((8, 10), np.uint8))
-    with pytest.raises(CalibrationError, match=r"b.1\.png is 10 x 8 px, .*a.1\.png 8 x 8"):
+    with pytest.raises(CalibrationError, match=r"b.1\.png is 10 x 8 px, .*a.1\.png is 8 x 8"):
         view_pairs([ImagePair(left, right)], DOTS)

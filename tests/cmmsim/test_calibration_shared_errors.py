@@ -169,7 +169,7 @@ def test_halves_of_the_pictures_agree_as_they_state(kind):
     assert apart.squares.shape == (6, 24)
     assert 0.6 < apart.mean_square < 1.5
     with pytest.raises(
-        CalibrationError, match="halves of 5 pairs of pictures are fewer than 3 each"
+        CalibrationError, match="each half of 5 pairs of pictures has 2 pairs, fewer than 3"
     ):
         compare(pairs[:5], rng=np.random.default_rng(8))
 

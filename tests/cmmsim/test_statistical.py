@@ -265,22 +265,22 @@ def test_it_is_taught_and_measures_with_a_rig_that_drifts():
     [
         (
             {"detection.detector": "dual_conic"},
-            "not proved for detection.detector 'dual_conic', only for maximum_like",
+            "not verified for detection.detector 'dual_conic', only for maximum_like",
         ),
-        ({"camera.noise": False}, "not proved for camera.noise false"),
-        ({"camera.prnu": 0.01}, "not proved for camera.prnu 0.01"),
+        ({"camera.noise": False}, "not verified for camera.noise false"),
+        ({"camera.prnu": 0.01}, "not verified for camera.prnu 0.01"),
         (
             {"camera.dark_noise": 1.0},
-            "not proved for noise of .* grey values in the dark, only for at least 1.2",
+            "not verified for noise of .* grey values in the dark, only for at least 1.2",
         ),
         (
             {"camera.electrons_at_white": 2500.0, "camera.full_well": 4000.0},
-            "not proved for rings and stickers of",
+            "not verified for rings and stickers of",
         ),
-        ({"lens.psf_px": 2.0}, "not proved for lens.psf_px 2, only for at most 1"),
+        ({"lens.psf_px": 2.0}, "not verified for lens.psf_px 2, only for at most 1"),
         (
             {"stickers.ring_radius": 0.005},
-            "not proved for stickers.ring_radius 0.005 m, only for at least 2.4",
+            "not verified for stickers.ring_radius 0.005 m, only for at least 2.4",
         ),
     ],
 )
@@ -292,7 +292,7 @@ def test_what_it_was_not_proved_for_is_refused(changes, message):
 def test_images_are_refused():
     sensor, message = (
         statistical(),
-        "'statistical' draws no images.*: analytic, pyrender draw them|analytic, pyrender draw",
+        "'statistical' draws no images.*: analytic, pyrender draw images|analytic, pyrender draw",
     )
     refused(lambda: sensor.capture(sensor.home), message)
     refused(lambda: sensor.look(sensor.home).windows(np.zeros((2, 1, 2), int), 16), message)
@@ -302,7 +302,10 @@ def test_images_are_refused():
 def test_long_streaks_are_refused():
     sensor = statistical(changes={"timing.exposure": 0.01})
     fast = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
-    message = f"drawn out over .* px by the exposure, only for at most {LONGEST_STREAK_PX:g} px"
+    message = (
+        "stickers that move by .* px during the exposure, only for at most "
+        f"{LONGEST_STREAK_PX:g} px"
+    )
     refused(lambda: sensor.measure(sensor.home, pose_rate=fast), message)
     refused(lambda: sensor.measure_many([sensor.home], [fast]), message)
 

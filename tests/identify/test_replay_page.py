@@ -198,7 +198,7 @@ def test_a_record_without_truth_and_models_is_shown_with_what_it_has(replayed, b
     assert command("replay", folder.path, "--quiet") == 0
     page = opened(browser(), folder)
     said = page.run("return document.body.innerText")
-    assert "holds no truth" in said
+    assert "contains no truth" in said
     assert "not validated yet" in said
     measured = stored(folder, "experiment.nc", "", "measured_")
     np.testing.assert_allclose(sought(page, 20)["drawn"], measured[20], rtol=0, atol=1e-12)

@@ -186,7 +186,7 @@ def test_what_a_run_lacks_is_left_out_and_said(run_folder):
     assert list(motion.poses) == ["true", "measured"]
     write_groups(run_folder.experiment, {"": read_group(run_folder.experiment)})
     blind = read_motion(run_folder.path)
-    assert "holds no truth" in blind.notes[0]
+    assert "contains no truth" in blind.notes[0]
     assert list(blind.poses) == ["measured"]
     lost = ~np.isfinite(blind.poses["measured"]).all(axis=1)
     assert lost.any()

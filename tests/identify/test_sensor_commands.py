@@ -110,7 +110,7 @@ def test_options_reach_a_calibration_whose_cameras_no_sensor_can_have(pictures, 
     assert all(line.startswith("warning: ") for line in lines)
     said = "\n".join(lines)
     assert "swap the folders LEFT and RIGHT" in said
-    assert "the cameras stand 1 m apart, those of the sensor file" in said
+    assert "the calibrated cameras stand 1 m apart, but" in said
     assert (
         "sensor.toml is not written, because no sensor can have these cameras: rig.right_from_left"
         in said
@@ -147,14 +147,14 @@ def test_pictures_of_another_size_and_too_few_of_the_board_are_one_line_and_leav
 ):
     """The size is refused before the board is looked for, which takes minutes."""
     few = (
-        "0 of 8 pairs show the board to both cameras, 9 needed; without it: 000.png (both: "
+        "both cameras see the board in 0 of 8 pairs, 9 are needed; pairs without it: 000.png (both: "
         "nothing found)"
     )
     for options, find, said in (
         (
             ("--sensor", "ctrack780"),
             pytest.fail,
-            "640 x 480 px, those of the sensor file ctrack780 2048 x 1536",
+            "640 x 480 px, but the sensor file ctrack780 states 2048 x 1536 px",
         ),
         (("--min-images", 9), lambda *_: "nothing found", few),
     ):

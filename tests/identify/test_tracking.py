@@ -389,7 +389,7 @@ def test_the_identified_model_is_that_of_a_run(tmp_path):
     known = tracking.model_of_run(chosen, tmp_path, "rss6").parameters
     assert np.array_equal(known, np.arange(len(estimates)))
     said = refusal(RecordError, tracking.model_of_run, plant(robot="rus6"), tmp_path, "rus6")
-    assert "holds a run of rss6, not of rus6" in said
+    assert "contains a run of rss6, not of rus6" in said
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 "use strict";
 /* Curves over time in small panels, with a cursor that all of them share. */
 
-/* Return about so many round numbers between two values. */
+/* Return about ``count`` round numbers between two values. */
 function roundNumbers(low, high, count) {
   const rough = (high - low) / count;
   const decade = 10 ** Math.floor(Math.log10(rough));
@@ -48,7 +48,7 @@ class Panel {
     return span;
   }
 
-  /* Draw curves anew. Each has values, one a frame and NaN if there is none, a colour and a dash pattern. */
+  /* Replace the curves. Each has a value per frame (NaN if there is none), a colour and a dash pattern. */
   draw(curves) {
     this.svg.replaceChildren();
     this.box.querySelectorAll(".tick").forEach((span) => span.remove());

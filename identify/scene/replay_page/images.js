@@ -2,14 +2,14 @@
 /* Camera images of a frame, with the ellipses that were found in them. */
 
 class Images {
-  /* time is a function of a frame that returns its time in s, or null if nothing moves. */
+  /* time is a function that returns the time of a frame in s, or null if nothing moves. */
   constructor(time) {
     this.time = time;
     this.shown = null;
     this.listen();
   }
 
-  /* Magnify an image around the place that is clicked, or show all of it again. */
+  /* On a click, magnify an image around the clicked place, or show the whole image again. */
   listen() {
     document.querySelectorAll(".image button").forEach((button) => {
       button.addEventListener("click", (event) => {
@@ -23,7 +23,7 @@ class Images {
     });
   }
 
-  /* look holds the images of a frame, their places in the whole images, and the stickers found. */
+  /* look contains the images of a frame, their corners in the whole images, and the detected stickers. */
   show(look) {
     if (look === this.shown) return;
     this.shown = look;

@@ -1,14 +1,14 @@
 "use strict";
-/* Player of the page: one time for scene, images, figures and curves.
-   Other scripts can drive it by `window.replay`. */
+/* Player of the page: it sets a common time for scene, images, figures and curves.
+   Other scripts can control it through `window.replay`. */
 
 const WORDS = {
   legs: "legs", cameras: "cameras and their field of view", rays: "rays to the stickers that were found",
   ellipsoid: "ellipsoid of the measured position × ", stickers: "ellipsoids of the stickers × ",
   measured: "measured, difference × ", identified: "identified model, difference × ",
-  starting: "starting model, difference × ", true: "true pose, in which the robot is drawn",
+  starting: "initial model, difference × ", true: "true pose, in which the robot is drawn",
 };
-const SHORT = { true: "true", measured: "measured", identified: "identified model", starting: "starting model" };
+const SHORT = { true: "true", measured: "measured", identified: "identified model", starting: "initial model" };
 const DASHES = { true: "none", measured: "none", identified: "7 2", starting: "2 3" };
 const WIDTHS = { true: 2.4, measured: 1, identified: 1.6, starting: 1.6 };
 const SAMPLES = {
@@ -197,7 +197,7 @@ class Replay {
     this.writeFigures();
   }
 
-  /* Explain the coloured outlines in the scene itself, so that a picture of it says what they are. */
+  /* Explain the coloured outlines inside the scene, so that a screenshot contains the explanation. */
   writeBadge(times) {
     const badge = document.getElementById("badge");
     badge.hidden = !this.scene || this.data.frames === 1;

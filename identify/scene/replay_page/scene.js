@@ -59,7 +59,7 @@ class Scene {
     this.layers = {};
   }
 
-  /* Read the glTF file and build all else. Resolves when the first picture can be drawn. */
+  /* Read the glTF file and build the scene. Resolves when the first picture can be drawn. */
   async build(colours) {
     const raw = numbers(this.data.gltf, Uint8Array).buffer;
     const gltf = await new Promise((done, failed) => new THREE.GLTFLoader().parse(raw, "", done, failed));
@@ -134,7 +134,7 @@ class Scene {
   }
 
   /* Add outlines of the platform at measured and modelled poses, with enlarged differences, and the
-     ellipsoids. The exact groups stay empty: they only keep the poses that shown() reads. */
+     ellipsoids. The groups named "exact" have no content; they store the poses that shown() reads. */
   addKinds(colours) {
     this.exact = {};
     this.ghosts = {};
@@ -273,7 +273,7 @@ class Scene {
     this.draw();
   }
 
-  /* Draw with the browser's next picture, and only once however often this is called. */
+  /* Request one drawing at the browser's next frame, however often this is called before. */
   draw() {
     this.stale = true;
   }
