@@ -266,8 +266,8 @@ def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> f
 
     Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. A dot's
     share of the area of its cell is the mean grey value of the cell above the ground, divided by
-    the contrast of dot and ground. The radius comes out too large if blur leaves no level top: by a
-    quarter at 2.5 px radius and 1 px of blur.
+    the contrast of dot and ground. The radius is overestimated if a dot is so blurred that its
+    middle is not uniform: by a quarter at 2.5 px radius and 1 px of blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0

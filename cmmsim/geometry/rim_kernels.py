@@ -102,7 +102,7 @@ def crossings(centre: float, reach: float, crossed: Array) -> None:
     """Fill ``crossed`` (n, 2) for the n lines that bound n - 1 pixels along one axis.
 
     The first column is the distance of a line from the centre, in units of the half extent
-    ``reach`` of the ellipse. The second is half the length of the line inside the unit circle.
+    ``reach`` of the ellipse. The second is half the length of the chord inside the unit circle.
     """
     share = 1.0 / reach
     for k in range(len(crossed)):

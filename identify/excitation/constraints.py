@@ -292,7 +292,7 @@ class MotionConstraints:
     def shares_of(self, names: Collection[str]) -> ca.Function:
         """Return the function `shares` for some of the limits."""
         rows = ca.vertcat(*[limit.share for limit in self.limits if limit.name in names])
-        # `cse` evaluates the kinematics once that the limits have in common.
+        # With `cse`, the kinematics that the limits have in common is evaluated only once.
         return ca.Function("shares", [self._pose, self._rate], ca.cse([rows]))
 
     def worst(self, trajectory: FourierTrajectory, times: Array) -> list[Worst]:
