@@ -167,9 +167,9 @@ class Ellipses(NamedTuple):
     """Ellipses of m stickers in both images.
 
     Their centres are (2, m, 2), shapes (2, m, 2, 2) and smears (2, m, 2), px. ``seen`` (2, m) is
-    True for ellipses of which nothing is hidden. ``noise`` (2, m, 6) are unit normal numbers: two
-    for the centre, three for the shape, and one for the limit of thin ellipses. Contrasts and
-    grounds (2, m) are grey values.
+    True for wholly visible ellipses. ``noise`` (2, m, 6) are unit normal numbers: two for the
+    centre, three for the shape, and one for the limit of thin ellipses. Contrasts and grounds (2,
+    m) are grey values.
     """
 
     centres: Array

@@ -80,7 +80,7 @@ class Limits(NamedTuple):
 class Eyes(NamedTuple):
     """Cameras, and the scene in front of them.
 
-    ``looking`` are the true cameras, and ``measuring`` the cameras as the sensor knows them.
+    ``looking`` are the true cameras, and ``measuring`` the cameras that the estimator assumes.
     ``owners`` (n,) are the bodies of the stickers, here all 0 for the platform. The taught
     base_from_camera and camera_from_base are (4, 4).
     """

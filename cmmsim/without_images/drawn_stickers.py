@@ -203,7 +203,7 @@ class StatisticalStereoCamera:
     def side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return centres (m, 2) and shapes (m, 2, 2) of the ellipses in one image, px.
 
-        The third result is the mask (m,) of stickers of which nothing is hidden.
+        The third result is the mask (m,) of wholly visible stickers.
         """
         places, normals = self.scene.placed(moves)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)

@@ -66,7 +66,7 @@ class StickerScene:
     def hidden(
         self, moves: Array, places: Array, normals: Array, asked: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return the mask (m,) of stickers of which a solid hides any part.
+        """Return the mask (m,) of stickers that a solid hides wholly or partly.
 
         Stickers have places and normals (m, 3) in camera axes. Stickers that are not ``asked`` (m,)
         count as not hidden.

@@ -26,7 +26,7 @@ from identify.errors import ScenarioError
 from identify.experiment.sensor_in_loop import check_platform, robot_meshes, robot_transforms
 
 PLATE_M = 0.012
-"""Half the thickness, in m, of the plate drawn for a platform of which only joints are known."""
+"""Half the thickness, in m, of the plate drawn for a platform without a given shape."""
 
 
 @dataclass(frozen=True)

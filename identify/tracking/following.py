@@ -86,7 +86,7 @@ def follow(
     seen: Seen,
     latencies: Latencies = USUAL,
 ) -> Followed:
-    """Follow a motion under a law that knows a model.
+    """Follow a motion under a law that uses a model.
 
     ``latencies`` replace the latencies of the scenario. Raises the errors of `prepared`, and
     LoopFailure if the loop is unstable.

@@ -61,7 +61,7 @@ class Examination:
     Attributes
     ----------
     side : ModelSide
-        Robot and loop as the estimator knows them.
+        Robot and loop that the estimator assumes.
     true : ndarray, shape (p,)
         True parameters.
     combinations : ndarray, shape (k, p)
