@@ -1,12 +1,12 @@
 """Synthetic stereo optical CMM: it renders a posed platform with stickers and measures its pose.
 
 Sensor
-    load_sensor(name_or_path, seed)    -> Sensor, built in (`built_in_names()`) or of a TOML file
+    load_sensor(name_or_path, seed)    -> Sensor, built in (`built_in_names()`) or from a TOML file
     Sensor.measure(pose)               -> Measurement: pose (6,) m, rad and its covariance (6, 6)
     Sensor.measure_many(poses)         -> MeasuredPoses of many frames at once
     Sensor.capture(pose)               -> StereoFrame: both whole images
     Sensor.teach()                     -> Taught, for sensors with the same cameras and bodies
-    require_opengl()                   raises OpenGLMissingError where pyrender cannot draw
+    require_opengl()                   raises OpenGLMissingError if pyrender cannot draw
 
 Images from elsewhere
     measure_frame(StereoFrame(left, right), sensor.estimator)  -> Measurement
@@ -24,11 +24,11 @@ Geometry
 Faults of images
     FaultGenerator(sensor.estimator).draw(kind, pose, rng)  -> Fault
     FaultyImages(images, fault, noise, rng)                 images with a fault laid over them
-    fault_bodies()                                          the boxes that stand in the way
+    fault_bodies()                                          boxes that hide stickers
 
 Every error that a user can cause is a CmmError, except OpenGLMissingError. The packages
-`cmmsim.calibration` and `cmmsim.acceptance` are public as well. `cmmsim.allowed_plugins` finds
-detectors and renderers of a user's own, once `allow_plugin(module)` allows them. Everything else is
+`cmmsim.calibration` and `cmmsim.acceptance` are public as well. Users can write their own detectors
+and renderers: `allow_plugin(module)` allows a module of the user to run. Everything else is
 private.
 
 Names are imported on first use: the command `cmmsim` begins in this package and must not wait for

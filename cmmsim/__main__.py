@@ -11,39 +11,40 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-# Text that our `identify/__init__.py` contains, and no other.
+# Text that only our `identify/__init__.py` contains.
 OURS = "IdentifyError"
 
 
 def foreign_identify() -> str:
-    """Return one line that names another package `identify` and says what to do; empty if ours is
-    found.
+    """Return one line that names the wrong package `identify` and says what to do.
+
+    The line is empty if our `identify` is found.
     """
     spec = find_spec("identify")
     found = Path(spec.origin) if spec and spec.origin else None
     if found and found.is_file() and OURS in found.read_text(encoding="utf-8", errors="replace"):
         return ""
     where = (
-        f"another package stands in the place of cmmsim's `identify`: {found.parent}"
+        f"another package is imported instead of cmmsim's `identify`: {found.parent}"
         if found
         else "no `identify`"
     )
     return (
-        f"{where}; install cmmsim alone into a virtual environment of its own (a PyPI package has "
-        "the same name)"
+        f"{where}; install cmmsim into a virtual environment of its own (a PyPI package has the "
+        "same name)"
     )
 
 
 @cache
 def warn_of_foreign_identify() -> None:
-    """Warn of a foreign `identify`, once, when the first name of this package is imported."""
+    """Warn once if another package is imported as `identify`."""
     said = foreign_identify()
     if said:
         warnings.warn(said, stacklevel=4)
 
 
 def main() -> None:
-    """Run the command, or exit with status 1 and one line where `identify` is another package."""
+    """Run the command, or exit with status 1 and one line if `identify` is another package."""
     said = foreign_identify()
     if said:
         sys.exit(f"error: {said}")

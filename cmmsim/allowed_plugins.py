@@ -1,12 +1,12 @@
 """Detectors and renderers by name: built-in ones, and a user's own as ``module:name``.
 
-A built-in part is a file of its own and one line here. Its module is imported when its name is
-first used.
+A built-in part has its own file and one line in a table of this module. Its file is imported when
+its name is first used.
 
-``module:name`` may stand wherever a built-in name may. The module's folder must be on PYTHONPATH,
-so that other processes find it. Scenarios, sensor files and studies are passed around, so a name in
-them runs code only where its module is allowed: by ``--plugin my_module`` on the command line, in
-the environment variable ``CMMSIM_PLUGINS``, or by `allow_plugin`.
+``module:name`` can be used wherever a built-in name can be used. The module's folder must be on
+PYTHONPATH, so that other processes find it. People exchange scenarios, sensor files and studies.
+A name in such a file therefore runs code only if its module is allowed: by ``--plugin my_module``
+on the command line, by the environment variable ``CMMSIM_PLUGINS``, or by `allow_plugin`.
 """
 
 import importlib
@@ -32,13 +32,13 @@ RENDERERS = {
     "statistical": "cmmsim.without_images.drawn_stickers:STATISTICAL",
 }
 AUTO = "auto"  # pyrender where OpenGL works, else analytic
-ALLOWED = "CMMSIM_PLUGINS"  # modules, separated by commas; processes that are started inherit it
+ALLOWED = "CMMSIM_PLUGINS"  # modules, separated by commas; child processes inherit the variable
 
 
 def allow_plugin(*modules: str) -> None:
-    """Allow parts of these modules to run, in this process and in those that it starts.
+    """Allow the code of these modules to run, in this process and in processes that it starts.
 
-    A package allows the modules within it, too.
+    The name of a package allows all modules within it.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def allow_plugin(*modules: str) -> None:
     Raises
     ------
     CmmError
-        If no module can have a name.
+        If a name is not a possible name of a module.
 
     Examples
     --------
@@ -62,34 +62,34 @@ def allow_plugin(*modules: str) -> None:
     """
     for module in modules:
         if not _is_module(module):
-            raise CmmError(f"{module!r} is no name of a module, such as my_module")
+            raise CmmError(f"{module!r} is not the name of a module, such as my_module")
     os.environ[ALLOWED] = ",".join(dict.fromkeys([*allowed_plugins(), *modules]))
 
 
 def allowed_plugins() -> tuple[str, ...]:
-    """Names of the modules whose parts may run."""
+    """Names of the modules whose code is allowed to run."""
     names = os.environ.get(ALLOWED, "").split(",")
     return tuple(name.strip() for name in names if name.strip())
 
 
 def is_own(name: str) -> bool:
-    """Tell whether a name is ``module:name`` of a user's own."""
+    """Tell whether a name has the form ``module:name`` of a user's own part."""
     return ":" in name
 
 
 def own_part(option: str, name: str) -> Any:
-    """Import the part of a user's own that ``module:name`` names.
+    """Import the user's own part that ``module:name`` names.
 
-    ``option`` is what the part is to be, for messages. Raises CmmError if the module is not allowed
-    to run, cannot be imported, or has no such part.
+    ``option`` states the kind of part in messages, such as "detector". Raises CmmError if the
+    module is not allowed to run, cannot be imported, or has no such part.
     """
     module, _, attribute = name.partition(":")
     if not (_is_module(module) and attribute.isidentifier()):
-        raise CmmError(f"{option} {name!r} is no module:name, such as my_module:my_part")
+        raise CmmError(f"{option} {name!r} is not of the form module:name, as my_module:my_part")
     # The dots keep "my_module" from allowing "my_module_2".
     if not any(f"{module}.".startswith(f"{allowed}.") for allowed in allowed_plugins()):
         raise CmmError(
-            f"{option} {name!r} is code of the module {module}, which is not allowed to run; where "
+            f"{option} {name!r} is code of the module {module}, which is not allowed to run; if "
             f"you trust it, add --plugin {module} to the command, set {ALLOWED}={module}, or call "
             f"cmmsim.allow_plugin({module!r}) in Python"
         )
@@ -97,18 +97,17 @@ def own_part(option: str, name: str) -> Any:
         return getattr(importlib.import_module(module), attribute)
     except (Exception, SystemExit) as error:
         raise CmmError(
-            f"{option} {name!r} is no importable module:name: {error}; its folder must be on "
-            "PYTHONPATH"
+            f"{option} {name!r} cannot be imported: {error}; its folder must be on PYTHONPATH"
         ) from error
 
 
 @dataclass(frozen=True)
 class Telling:
-    """A user's own function. Its errors are reported in one line with their place in its file.
+    """User's own function whose errors are reported in one line with file and line number.
 
-    ``part`` is its name in messages. ``refusal`` is the class of the error that is raised, and
-    ``known`` are classes that pass unchanged. ``check`` is called with the part's name, the result
-    and the arguments; it raises a known error where the result is not what it should be.
+    ``part`` is the function's name in messages. Errors of the classes ``known`` pass unchanged, and
+    any other error is raised anew as a ``refusal``. ``check`` is called with the part's name, the
+    result and the arguments; it raises a known error if the result is wrong.
     """
 
     part: str
@@ -126,9 +125,8 @@ class Telling:
             return found
         except self.known:
             raise
-        except (Exception, SystemExit) as error:  # a part does not end the program
-            # The first entry is the call above; the second, where there is one, is in the user's
-            # file.
+        except (Exception, SystemExit) as error:  # the user's function must not end the program
+            # The first entry is the call above; the second, if it exists, is in the user's file.
             at = traceback.extract_tb(error.__traceback__)[:2][-1]
             place = f"{Path(at.filename).name}, line {at.lineno}"
             said = f"{self.part} raised {type(error).__name__}: {error} ({place})"
@@ -136,12 +134,14 @@ class Telling:
 
 
 def require_detector(name: str) -> str:
-    """Return the name of a built-in detector or ``module:name``. Raises UnknownOptionError."""
+    """Return the name if it is a built-in detector or ``module:name``; else raise
+    UnknownOptionError.
+    """
     return _required("detector", name, DETECTORS)
 
 
 def require_renderer(name: str) -> str:
-    """Return the name of a built-in renderer, "auto" or ``module:name``. Raises
+    """Return the name if it is a built-in renderer, "auto" or ``module:name``; else raise
     UnknownOptionError.
     """
     return _required("renderer", name, {AUTO: "", **RENDERERS})
@@ -154,15 +154,16 @@ def find(
     kind: type[K],
     check: Callable[..., None],
 ) -> K:
-    """Return the Detector or Renderer, as ``kind`` says, of a built-in name or of ``module:name``.
+    """Return the Detector or Renderer that a built-in name or ``module:name`` names.
 
-    A user's own part may be an instance of the kind, a function, or a class that is made without
-    arguments and called like the function. A function becomes an instance of the kind, with those
-    of the kind's figures that it carries as attributes. ``check`` judges its results, see
+    ``kind`` is the class Detector or Renderer. A user's own part can be an instance of ``kind``, a
+    function, or a class whose instances are called like the function and need no arguments. A
+    function becomes an instance of ``kind``. Attributes of the function with the names of numeric
+    fields of ``kind`` become the values of these fields. ``check`` checks its results, see
     `Telling`.
 
-    Raises UnknownOptionError with the valid names. Raises CmmError for a part that cannot be
-    called, and for a module that is not allowed to run.
+    Raises UnknownOptionError, which lists the valid names, for an unknown name. Raises CmmError for
+    a part that cannot be called, and for a module that is not allowed to run.
     """
     name = _required(option, name, built_in)
     if name in built_in:
@@ -171,7 +172,7 @@ def find(
     part = own_part(option, name)
     said = f"{option} {name!r}"
     found = Telling(said, part, CmmError)() if isinstance(part, type) else part
-    # The kind's fields are its name, what it does, and figures with defaults.
+    # The fields of a kind are its name, its function, and numbers with defaults.
     _, does, *figures = fields(kind)
     function = getattr(found, does.name) if isinstance(found, kind) else found
     if not callable(function):
@@ -182,7 +183,7 @@ def find(
 
 
 def _figure(part: str, owner: Any, field: Any) -> Any:
-    """Return a figure that a user's own function carries, such as its ``bias_px``."""
+    """Return a number that is an attribute of a user's own function, such as ``bias_px``."""
     value = getattr(owner, field.name)
     kind = type(field.default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1000:

@@ -1,6 +1,6 @@
 """Checks of arguments and of entries in TOML files.
 
-A value is either accepted, or refused with a message that states the given and the wanted value.
+A value is either accepted, or refused with a message that states the value and what is required.
 """
 
 import operator
@@ -21,10 +21,11 @@ from cmmsim.errors import CmmError, ShapeError
 SHOWN_CHARACTERS = 120
 # Bytes of a file: far more than a person writes, and still read within seconds.
 LARGEST = 500_000
-# Nesting of tables and lists, and parts of a dotted key.
+# Largest nesting depth of tables and lists, and largest number of parts of a dotted key.
 DEEPEST = 16
 TOO_DEEP = f"keys, tables or lists more than {DEEPEST} deep"
-# Names of sensors become names of files. A file's name has at most 255 bytes, in any script.
+# Names of sensors become file names. A file name has at most 255 bytes, and one letter of some
+# scripts takes 4 bytes.
 NAME = r"^\w[\w .+-]*$"
 LONGEST_NAME = 60
 # Complaints about one file that a message lists.
@@ -44,14 +45,15 @@ _TEXTS = re.compile(
 
 
 def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDArray[np.float64]:
-    """Return values as an array of that shape.
+    """Return values as an array of the given shape.
 
-    Raises ShapeError, which says what is ``wanted``, for anything but finite real numbers.
+    Raises ShapeError for another shape, and for values that are not finite real numbers. Its
+    message begins with ``wanted``, a sentence that states what is required.
     """
     try:
         found = np.asarray(values)
         numbers = found.astype(float) if found.dtype.kind in "fiubO" else None
-    except (TypeError, ValueError, OverflowError):  # ragged, or objects that are no numbers
+    except (TypeError, ValueError, OverflowError):  # ragged lists, or objects that are not numbers
         numbers = None
     if numbers is None:
         raise ShapeError(f"{wanted}, got {_shown(values)}")
@@ -65,14 +67,15 @@ def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDAr
 
 
 def require_kind(value: object, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raise CmmError, which says what is ``wanted``, unless a value is an instance of ``kind``."""
+    """Raise CmmError, beginning with the text ``wanted``, unless a value is of type ``kind``."""
     if not isinstance(value, kind):
         raise CmmError(f"{wanted}, got {_shown(value)} of type {type(value).__name__}")
 
 
 class Section(BaseModel):
-    """Section of a TOML file: unknown keys and infinite numbers are refused, and entries are
-    frozen.
+    """Section of a TOML file.
+
+    Unknown keys and infinite numbers are refused, and entries cannot be changed.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -82,7 +85,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def check_name(name: str) -> str:
-    """Return the name. Raises ValueError if it cannot be that of a file."""
+    """Return the name. Raises ValueError if it cannot be a file name."""
     if re.fullmatch(NAME, name) and len(name) <= LONGEST_NAME:
         return name
     raise ValueError(
@@ -94,13 +97,13 @@ def check_name(name: str) -> str:
 def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
     """Return the text of a file.
 
-    ``source`` is how messages call it, such as "board file x". Raises ``refusal`` if the file
+    ``source`` names the file in messages, such as "board file x". Raises ``refusal`` if the file
     cannot be read, or has more than `LARGEST` bytes.
     """
     try:
         place = Path(path)
         if place.exists() and not (place.is_file() or place.is_dir()):
-            raise refusal(f"cannot read {source}: it is no regular file")
+            raise refusal(f"cannot read {source}: it is not a regular file")
         with place.open("rb") as file:
             content = file.read(LARGEST + 1)
         if len(content) > LARGEST:
@@ -113,9 +116,9 @@ def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
 
 
 def parsed(text: str, source: str, refusal: type[CmmError]) -> dict[str, Any]:
-    """Return the content of a TOML text, which the caller may change.
+    """Return the content of a TOML text as a new dictionary, which the caller is free to change.
 
-    Raises ``refusal`` if the text is not TOML, nests tables deeper than `DEEPEST`, or holds
+    Raises ``refusal`` if the text is not TOML, nests tables deeper than `DEEPEST`, or contains
     integers beyond 64 bits or control characters.
     """
     try:
@@ -129,9 +132,9 @@ def parsed(text: str, source: str, refusal: type[CmmError]) -> dict[str, Any]:
 
 
 def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[CmmError]) -> M:
-    """Return a content as a model.
+    """Return the content of a file as an instance of ``model``.
 
-    Raises ``refusal``, which lists what is wrong, with the valid names beside an unknown key.
+    Raises ``refusal``, which lists what is wrong and, for an unknown key, the valid keys.
     """
     try:
         return model.model_validate(content)
@@ -145,13 +148,14 @@ def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[
 
 @lru_cache(maxsize=8)
 def _parsed(text: str) -> dict[str, Any]:
-    """Parse a TOML text. Raises ValueError, which says what the text has.
+    """Parse a TOML text. Raises ValueError, which names the content that is refused.
 
-    The result is cached: a study reads the same sensor for every row, and parsing it takes an
-    eighth of the row's time.
+    The result is cached: a study reads the same sensor file for every row, and parsing would take
+    an eighth of the computing time per row.
     """
     bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
-    # tomllib takes time with the square of a dotted key's parts, so they are counted beforehand.
+    # The time that tomllib takes grows with the square of the number of parts of a dotted key, so
+    # the parts are counted first.
     if any(key.count(".") >= DEEPEST for key in bare):
         raise ValueError(TOO_DEEP)
     try:
@@ -166,7 +170,7 @@ def _parsed(text: str) -> dict[str, Any]:
 
 
 def _fault(content: dict[str, Any]) -> str:
-    """Describe the first value that is beyond the limits; empty where there is none."""
+    """Describe the first value that is beyond the limits; empty if all values are within them."""
     left: list[tuple[Any, int]] = [(content, 0)]
     while left:
         value, depth = left.pop()
@@ -216,7 +220,7 @@ def _shown(values: object) -> str:
 
 
 def checked_seed(seed: int) -> int:
-    """Return the seed. Raises CmmError unless it is a whole number from 0 on."""
+    """Return the seed. Raises CmmError unless it is a whole number, 0 or more."""
     try:
         number = operator.index(seed)
     except TypeError:

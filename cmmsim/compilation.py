@@ -1,7 +1,7 @@
 """Compilation of kernels by numba, once, into a cache on disk.
 
-Modules called ``*kernels`` hold functions of numbers and arrays only. Importing numba takes time,
-so they are imported where they are first needed.
+Modules whose names end in ``kernels`` contain functions of numbers and arrays only. Importing numba
+takes time, so other modules import kernels inside the functions that use them.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from numba import njit
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher
 
-# An array of any type and shape: the docstrings state them.
+# An array of any type and shape. Docstrings state type and shape.
 Array = np.ndarray
 F = TypeVar("F", bound=Callable)
 
 
-# Write permission for anybody but the owner.
+# Write permission for users other than the owner.
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 class CompilationWarning(UserWarning):
-    """Kernels are compiled anew in every process, which takes time."""
+    """Warning that kernels are compiled anew in every process, which takes time."""
 
 
 def compiled(function: F) -> Dispatcher[F]:
     """Compile a kernel on its first call, or load it from the cache.
 
-    The cache lies beside the source, or else in the user's cache folder. Code that somebody else
-    may have put there is not loaded.
+    The cache is a folder beside the source, or the user's cache folder if that cannot be written
+    to. Cached code is not loaded if an untrusted user could have written it.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     try:
         kernel = njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder can be written to
+    except RuntimeError:  # numba found no folder that it can write to
         return njit(**options)(function)
     if not hasattr(kernel, "_cache"):
         return kernel
@@ -53,20 +53,20 @@ def compiled(function: F) -> Dispatcher[F]:
     kernel._cache.save_overload = partial(
         _save_closed, kernel._cache.save_overload, kernel._cache.cache_path
     )
-    # numba asks only whether the function's own file has changed, but kernels call kernels of
-    # other files
+    # numba checks only whether the function's own file has changed, but kernels call kernels of
+    # other files. The digest covers all of them.
     file = kernel._cache._cache_file
     file._source_stamp = _stamp()
-    # numba unpickles an index of its own version only, and one of older kernels may name modules
-    # that are gone
+    # numba unpickles a cache index only if the version matches. With the digest in the version, it
+    # skips an index of older kernels, which might name modules that no longer exist.
     file._version = f"{numba.__version__} {_stamp()}"
     return kernel
 
 
 def _save_closed(save: Callable[..., None], folder: str, *what: object) -> None:
-    """Let numba write files that only the owner may change, whatever the umask is.
+    """Let numba write files that only the owner is allowed to change, whatever the umask is.
 
-    A warning says so where they cannot be written.
+    A CompilationWarning is issued if the files cannot be written.
     """
     umask = os.umask(OTHERS)
     os.umask(umask | OTHERS)
@@ -74,8 +74,8 @@ def _save_closed(save: Callable[..., None], folder: str, *what: object) -> None:
         save(*what)
     except OSError as error:
         warnings.warn(
-            f"kernels cannot be kept in {folder} ({error.strerror}), so that every process "
-            "compiles anew; name another folder with NUMBA_CACHE_DIR",
+            f"compiled kernels cannot be saved in {folder} ({error.strerror}), so every process "
+            "compiles them anew; set NUMBA_CACHE_DIR to another folder",
             CompilationWarning,
             stacklevel=2,
         )
@@ -87,15 +87,16 @@ def _save_closed(save: Callable[..., None], folder: str, *what: object) -> None:
 def _ours_alone(folder: Path, source: Path) -> bool:
     """Tell whether only trusted users can have written into a folder of compiled code.
 
-    Trusted are the user, root, and whoever may change the source as well. The user's own folders
-    are first closed to others; the user's own files that were open are removed. One warning says so
-    where somebody else remains. Windows keeps others out by itself.
+    The user and root are trusted, and so are users who can change the source. First, write
+    permission for others is removed from the user's own folders, and the user's own files that
+    others could write to are deleted. If an untrusted user could still have written, one warning
+    is issued. Windows protects the folder by itself.
     """
     if not hasattr(os, "geteuid"):
         return True
     trusted = {0, os.geteuid()}
     if folder.parent == source:
-        # Whoever may write there can change the source itself.
+        # Users who can write into this folder can change the source itself.
         if source.stat().st_mode & OTHERS:
             return True
         trusted.add(source.stat().st_uid)
@@ -106,14 +107,14 @@ def _ours_alone(folder: Path, source: Path) -> bool:
         if _is_open(file) and file.lstat().st_uid == os.geteuid():
             file.unlink(missing_ok=True)
     files = list(folder.glob("*.nb?"))
-    # With the sticky bit, as in /tmp, nobody can rename what is another user's.
+    # With the sticky bit, as in /tmp, nobody can rename another user's folder.
     above = _is_open(folder.parent) and not folder.parent.stat().st_mode & stat.S_ISVTX
     owners = {one.lstat().st_uid for one in (folder.parent, folder, *files)}
     ours = not above and not any(map(_is_open, (folder, *files))) and owners <= trusted
     if not ours:
         warnings.warn(
-            f"others may write into {folder}, so that every process compiles anew; remove what is "
-            "there, or name another folder with NUMBA_CACHE_DIR",
+            f"other users can write into {folder}, so every process compiles kernels anew; delete "
+            "the files in it, or set NUMBA_CACHE_DIR to another folder",
             CompilationWarning,
             stacklevel=3,
         )
@@ -121,7 +122,7 @@ def _ours_alone(folder: Path, source: Path) -> bool:
 
 
 def _is_open(path: Path) -> bool:
-    """Tell whether anybody but its owner may write to a file or into a folder."""
+    """Tell whether users other than the owner have permission to write a file or a folder."""
     return bool(path.stat(follow_symlinks=path.is_dir()).st_mode & OTHERS)
 
 

@@ -1,8 +1,9 @@
 """Leaderboard of the detectors: their errors on images of tilted discs, and the Cramer-Rao bound.
 
-The discs are drawn exactly. Their centres are known and lie anywhere within a pixel, and the camera
-adds its noise. An error is the distance from the ellipse's centre; the eccentricity of the disc's
-centre is not included. Two ways that OpenCV offers are compared as well.
+The discs are drawn exactly, at known random positions within a pixel, and the camera's noise is
+added. An error is the distance between the detected centre and the centre of the ellipse. The
+disc's own centre is imaged beside the ellipse's centre (eccentricity); errors do not include this
+distance. Two methods of OpenCV are compared as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,18 +31,17 @@ from cmmsim.geometry.pose import Array, apply, pose_to_transform
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.sensor import Sensor
 
-# Discs that are drawn at once.
+# Number of discs that are drawn together.
 TOGETHER = 100
 SMALLEST_RADIUS_PX = 1.0
 LARGEST_RADIUS_PX = 50.0
 LARGEST_TILT_DEG = 80.0
-# Pixels between a disc's rim and the edge of the fitted part.
+# Pixels between a disc's rim and the edge of the fitted part of the window.
 FREE_PX = 3
 RESAMPLES = 1000
 CONFIDENCE = 0.95
-# The leaderboard is about accuracy. If the noise is below half a grey value, the rounding errors of
-# neighbouring pixels are correlated. A limit on the misfit, which assumes independent errors, would
-# reject good windows.
+# If the noise is below half a grey value, the rounding errors of neighbouring pixels are
+# correlated. A limit on the misfit assumes independent errors, so it would reject good windows.
 LIMITS = FitLimits(largest_misfit=np.inf)
 
 
@@ -49,9 +49,10 @@ LIMITS = FitLimits(largest_misfit=np.inf)
 class Condition:
     """Conditions under which a disc is seen.
 
-    ``radius_px`` is the long half axis of the disc's image. ``tilt`` is the angle between its
-    normal and the view, rad. ``noise`` is the standard deviation of a grey value half-way up the
-    edge, as a share of the contrast. ``psf_px`` is the sigma of the Gaussian point spread.
+    ``radius_px`` is the long half axis of the disc's image. ``tilt`` is the angle between the
+    disc's normal and the line of sight, rad. ``noise`` is the standard deviation of a grey value
+    half-way up the edge, as a share of the contrast. ``psf_px`` is the sigma of the Gaussian point
+    spread function.
     """
 
     radius_px: float
@@ -77,7 +78,7 @@ class Condition:
         if self.radius_px > LARGEST_RADIUS_PX:
             raise CmmError(
                 f"radius {self.radius_px:g} px is more than {LARGEST_RADIUS_PX:g} px: time and "
-                "memory grow with its square, and errors only fall with its root"
+                "memory grow with its square, but errors fall only with its square root"
             )
 
     def __str__(self) -> str:
@@ -91,7 +92,8 @@ class Condition:
 class Scene:
     """Properties that all conditions share.
 
-    They are the camera's noise, the levels 0 to 1 of disc and ground, and the focal length in px.
+    They are the camera's noise, the radiances 0 to 1 of disc and ground, and the focal length in
+    px.
     """
 
     noise: CameraNoise
@@ -118,16 +120,16 @@ class Scene:
         )
 
     def with_noise(self, share: float) -> "Scene":
-        """Return the scene with as much light and gain that ``edge_noise`` becomes ``share``.
+        """Return the scene with light and gain changed such that ``edge_noise`` equals ``share``.
 
-        Raises CmmError where rounding alone makes more noise.
+        Raises CmmError if the noise of rounding alone is larger.
         """
         rounding = 1.0 / 12.0
         analog = (self.edge_noise * self.contrast) ** 2 - rounding
         wanted = (share * self.contrast) ** 2 - rounding
         if wanted <= 0.0:
             raise CmmError(
-                f"noise of {share:.2%} of the contrast is less than that of rounding, "
+                f"noise of {share:.2%} of the contrast is less than the noise of rounding, "
                 f"{np.sqrt(rounding) / self.contrast:.2%}"
             )
         light = analog / wanted
@@ -145,7 +147,7 @@ class Scene:
 
 
 def scene_of(file: SensorFile) -> Scene:
-    """Return the scene of a sensor file's stickers and left camera."""
+    """Return the scene that a sensor file's stickers and left camera determine."""
     rig = rig_from_file(file.rig)[0]
     # The fixed pattern is the same in all images, so it is not part of the noise.
     noise = replace(Sensor(file).noise, prnu=0.0, dsnu=0.0)
@@ -184,10 +186,10 @@ def working_point(file: SensorFile) -> Condition:
 def random_ellipses(
     condition: Condition, focal_px: float, size: int, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return ellipses of discs that are tilted towards random sides.
+    """Return the ellipses of discs that are tilted towards random directions.
 
-    Their centres (count, 2) lie anywhere in the middle pixel of a window; shapes are (count, 2, 2)
-    px.
+    The ellipses have centres (count, 2) at random places in the middle pixel of a window, and
+    shapes (count, 2, 2), both in px.
     """
     middle = 0.5 * (size - 1)
     camera = PinholeCamera(focal_px, middle, middle, size, size)
@@ -210,7 +212,7 @@ def draw_discs(
 
 
 def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
-    """Split discs into those that are drawn at once."""
+    """Split discs into parts of at most `TOGETHER` discs."""
     return [
         (centres[k : k + TOGETHER], shapes[k : k + TOGETHER])
         for k in range(0, len(centres), TOGETHER)
@@ -221,9 +223,10 @@ def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
 class Score:
     """Score of one detector under one condition, in px and per axis.
 
-    ``rms_px`` is the error of the windows that it did not lose. ``ratio`` is that error over the
-    Cramer-Rao bound ``bound_px``, with a 95 % interval. ``bias_px`` is the rms error without noise,
-    and ``lost`` the share of lost windows.
+    ``rms_px`` is the rms error over the windows in which the detector found a disc. ``ratio`` is
+    ``rms_px`` divided by the Cramer-Rao bound of these windows, with a 95 % interval from
+    ``ratio_low`` to ``ratio_high``. ``bound_px`` is the bound over all windows. ``bias_px`` is the
+    rms error without noise, and ``lost`` is the share of windows without a found disc.
     """
 
     detector: str
@@ -247,9 +250,9 @@ def compete(
 ) -> list[Score]:
     """Return the scores of all detectors under all conditions, with ``draws`` discs each.
 
-    The detectors are the built-in ones and OpenCV's unless others are given. ``report(done,
-    total)`` is called after each condition. Raises CmmError for impossible conditions, before any
-    work is done.
+    Without ``detectors``, the built-in detectors and two methods of OpenCV compete.
+    ``report(done, total)`` is called after each condition. Raises CmmError for impossible
+    conditions, before any computation.
     """
     if draws < 2:
         raise CmmError(f"a leaderboard needs at least 2 draws, got {draws}")
@@ -277,7 +280,8 @@ def _round(
     bounds = _bounds(scene, condition.psf_px, centres, shapes, fit_size + 2)
     scores = []
     for detector in detectors:
-        # The same windows with noise and without: their errors are noise and bias.
+        # The errors in windows with noise show the noise; in the same windows without noise, the
+        # bias.
         found, without_noise = (
             detector.detect(
                 SpotWindows(
@@ -320,7 +324,9 @@ def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: in
 def _ratio_interval(
     squared: Array, bounds: Array, rng: np.random.Generator
 ) -> tuple[float, float, float]:
-    """Return the root of mean squared error over mean bound, and its 95 % bootstrap interval."""
+    """Return the root of the ratio of mean squared error to mean bound, and its 95 % bootstrap
+    interval.
+    """
     if len(squared) == 0:
         return np.inf, np.inf, np.inf
     drawn = rng.integers(len(squared), size=(RESAMPLES, len(squared)))
@@ -330,16 +336,16 @@ def _ratio_interval(
 
 
 def _root_mean(squared: Array) -> float:
-    """Return the root of the mean; infinite for a detector that found nothing."""
+    """Return the square root of the mean; infinite without values."""
     return float(np.sqrt(squared.mean())) if squared.size else np.inf
 
 
 def _by_window(
     find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], given: SpotWindows
 ) -> DetectedCentres:
-    """Return the centres that a function finds in each 8-bit window alone.
+    """Return the centres that a function finds, called with each window as an 8-bit image.
 
-    OpenCV states no covariance, so it is zero.
+    OpenCV states no covariance, so the covariances are zero.
     """
     grey = np.rint(given.windows * (255.0 / given.noise.white_level)).astype(np.uint8)
     found = [find(window) for window in grey]
@@ -349,8 +355,9 @@ def _by_window(
 
 
 def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
-    """Return the largest bright blob of ``cv2.SimpleBlobDetector``, with its filters of shape
-    off.
+    """Return the centre of the largest bright blob that ``cv2.SimpleBlobDetector`` finds.
+
+    Its shape filters are off.
     """
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
@@ -367,7 +374,7 @@ def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
 
 
 def detect_by_contour(given: SpotWindows) -> DetectedCentres:
-    """Return ``cv2.fitEllipse`` of the longest contour, after Otsu's threshold."""
+    """Return the centre of ``cv2.fitEllipse`` for the longest contour at Otsu's threshold."""
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:
         mask = cv2.threshold(window, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[1]

@@ -5,7 +5,7 @@ Each message carries the evidence: the value, the limit, the valid names.
 
 from collections.abc import Iterable
 
-# Characters of a message.
+# Largest number of characters of a message.
 LONGEST = 4000
 
 
@@ -25,13 +25,13 @@ class CmmError(ValueError):
     """
 
     def __str__(self) -> str:
-        """Return the message on one line of at most `LONGEST` characters, whatever a file held."""
+        """Return the message on one line, cut after `LONGEST` characters."""
         text = " ".join(super().__str__().splitlines())
         return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 class UnknownSensorError(CmmError):
-    """A sensor's name is neither built in nor a file."""
+    """A sensor's name is neither a built-in name nor the path of a file."""
 
     def __init__(self, name: str, valid_names: Iterable[str]) -> None:
         super().__init__(
@@ -41,13 +41,13 @@ class UnknownSensorError(CmmError):
 
 
 class SensorFileError(CmmError):
-    """A sensor file cannot be read, or holds an unknown key or a wrong value."""
+    """A sensor file cannot be read, or contains an unknown key or a wrong value."""
 
 
 class UnknownOptionError(CmmError):
-    """An option has a value that is not on its list.
+    """An option has a value that is not one of its valid values.
 
-    ``own`` says that ``module:name`` of a user's own is valid as well.
+    ``own`` is True if ``module:name`` of a user's own part is valid as well.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class UnknownOptionError(CmmError):
 
 
 class UnknownBodyError(CmmError):
-    """An obstacle was posed that was never registered."""
+    """A pose was given for an obstacle that was never registered."""
 
     def __init__(self, name: str, valid_names: Iterable[str]) -> None:
         names = ", ".join(sorted(valid_names)) or "none registered: call add_bodies first"
@@ -66,7 +66,7 @@ class UnknownBodyError(CmmError):
 
 
 class ShapeError(CmmError):
-    """An array does not have the shape or the finite values that are needed."""
+    """An array has the wrong shape, or values that are not finite."""
 
 
 class LostError(CmmError):
@@ -81,7 +81,7 @@ class TeachingError(CmmError):
 
 
 class OpenGLMissingError(RuntimeError):
-    """pyrender found no OpenGL to draw with."""
+    """pyrender found no OpenGL library that works."""
 
     def __init__(self, cause: BaseException) -> None:
         super().__init__(
@@ -92,8 +92,8 @@ class OpenGLMissingError(RuntimeError):
 
 
 class CalibrationError(CmmError):
-    """Images, board or poses allow no calibration; the message says which, and how to go on."""
+    """Images, board or poses allow no calibration; the message states the cause and a remedy."""
 
 
 class AcceptanceError(CmmError):
-    """A volume is not seen, lines break a rule, or an artefact cannot be measured."""
+    """A volume cannot be seen, measuring lines break a rule, or an artefact cannot be measured."""

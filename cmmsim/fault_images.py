@@ -1,8 +1,9 @@
 """Images with a fault laid over them: marks painted into their grey values, or both images swapped.
 
 Marks are opaque discs and plates, added light, and whole images of one level. They are laid over
-grey values that already hold noise. A pixel of which a mark hides the share s keeps (1 - s) of what
-it showed and gets s of the mark's light. Noise is added until its variance is that of its new mean.
+grey values that already contain noise. If a mark hides the share s of a pixel, the pixel's new
+light is (1 - s) of its old light plus s of the mark's light. Noise is then added until the pixel's
+variance equals the camera's variance at the new mean.
 """
 
 from __future__ import annotations
@@ -29,21 +30,24 @@ class Mark(Protocol):
 
     @property
     def side(self) -> int:
-        """Image of the mark: 0 left, 1 right."""
+        """Image that the mark lies in: 0 left, 1 right."""
 
     def box(self) -> tuple[float, float, float, float]:
-        """Return the first x, y and the last x, y that the mark reaches, px of the image."""
+        """Return the smallest x, y and the largest x, y that the mark reaches, px of the image."""
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
-        """Return the share hidden (h, w), 0 to 1, and the radiance added (h, w).
+        """Return the hidden share (h, w), 0 to 1, and the added radiance (h, w) of each pixel.
 
-        They are those of the part of the image that begins at pixel ``corner`` (x, y).
+        The pixels are the part of the image that begins at pixel ``corner`` (x, y) and has the
+        given shape.
         """
 
 
 @dataclass(frozen=True)
 class DiscMark:
-    """Opaque ellipse with a centre (2,) px, a symmetric shape A (2, 2) px and a radiance 0 to 1."""
+    """Opaque ellipse with a centre (2,) px, a symmetric shape matrix (2, 2) px, which maps the unit
+    circle to the rim, and a radiance 0 to 1.
+    """
 
     side: int
     centre: Array
@@ -64,7 +68,7 @@ class DiscMark:
 
 @dataclass(frozen=True)
 class PlateMark:
-    """Opaque rectangle with softly sampled edges.
+    """Opaque rectangle whose edges cover pixels in part.
 
     It has a centre (2,) px, half sides (2,) px, an angle in rad and a radiance 0 to 1.
     """
@@ -98,9 +102,10 @@ class PlateMark:
 class GlintMark:
     """Added light: a Gaussian core and a straight tail.
 
-    ``peak`` is the core's radiance, which saturates above 1, and ``core`` its width in px. The tail
-    begins with ``tail_peak``, decays over ``tail`` px in the direction ``angle``, rad, and is as
-    wide as the core.
+    ``peak`` is the core's largest radiance; radiance above 1 saturates. ``core`` is the standard
+    deviation of the core in px. The tail lies along the direction ``angle``, rad, on both sides of
+    the centre. Its radiance is ``tail_peak`` at the centre and falls by the factor e over ``tail``
+    px. The tail is as wide as the core.
     """
 
     side: int
@@ -134,7 +139,7 @@ class GlintMark:
 class FillMark:
     """Whole image of one radiance.
 
-    A dropped frame or a covered lens shows 0, a saturated frame more than 1.
+    The radiance is 0 for a dropped frame or a covered lens, and above 1 for a saturated frame.
     """
 
     side: int
@@ -152,9 +157,9 @@ class FillMark:
 def paint(
     grey: Array, corner: NDArray[np.int_], mark: Mark, noise: CameraNoise, rng: np.random.Generator
 ) -> None:
-    """Lay a mark over the grey values (h, w), float, of a part of an image.
+    """Lay a mark over a part of an image: float grey values (h, w), which are changed in place.
 
-    The part begins at pixel ``corner`` (x, y).
+    The part begins at pixel ``corner`` (x, y) of the image.
     """
     first_x, first_y, last_x, last_y = mark.box()
     height, width = grey.shape
@@ -175,14 +180,14 @@ def paint(
 
 
 def _box(centre: Array, reach: Array | float) -> tuple[float, float, float, float]:
-    """Return the first x, y and the last x, y within ``reach`` px around a centre (2,)."""
+    """Return the smallest x, y and the largest x, y within ``reach`` px around a centre (2,)."""
     return (*(centre - reach), *(centre + reach))
 
 
 def _offsets(
     centre: Array, corner: NDArray[np.int_], shape: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """Return the distances along x (1, w) and y (h, 1) of a part's pixels from a centre."""
+    """Return the distances in x (1, w) and in y (h, 1) of a part's pixels from a centre, px."""
     x = corner[0] + np.arange(shape[1]) - centre[0]
     y = corner[1] + np.arange(shape[0]) - centre[1]
     return x[None, :], y[:, None]
@@ -192,9 +197,9 @@ def _offsets(
 class Fault:
     """Fault of a stereo frame.
 
-    ``marks`` are laid over the images, and ``swapped`` takes the left image for the right one.
-    ``obstacles`` are bodies of ``fault_bodies`` that stand before the platform, base_from_body (4,
-    4) by name.
+    ``marks`` are laid over the images. If ``swapped`` is True, the left and the right image are
+    exchanged. ``obstacles`` are transforms base_from_body (4, 4) of bodies that stand before the
+    platform, by their names in ``fault_bodies``.
 
     Examples
     --------
@@ -212,7 +217,7 @@ class Fault:
 
 
 class FaultyImages:
-    """Images with a fault laid over them, which are read like the images themselves.
+    """Images with a fault laid over them. They are read like images without a fault.
 
     Parameters
     ----------
@@ -223,12 +228,12 @@ class FaultyImages:
     noise : CameraNoise
         Noise of the camera, such as ``sensor.noise``.
     rng : numpy.random.Generator
-        Source of the marks' noise.
+        Generator of the marks' noise.
 
     Raises
     ------
     CmmError
-        If an argument is of another kind.
+        If an argument is of another type.
 
     Examples
     --------
@@ -270,16 +275,17 @@ class FaultyImages:
         )
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Return the grey values (2, n, size, size) of windows.
-
-        Their first pixels are ``corners`` (2, n, 2) as (x, y).
+        """Return the grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n,
+        2) as (x, y).
         """
         order = slice(None, None, -1) if self._fault.swapped else slice(None)
         windows = self._images.windows(corners[order], size)[order]
         return np.stack([self._spoilt(side, windows[side], corners[side]) for side in range(2)])
 
     def _spoilt(self, side: int, images: NDArray, corners: NDArray[np.int_]) -> NDArray:
-        """Return images (n, h, w) of one camera, with first pixels (n, 2), under its marks."""
+        """Return parts (n, h, w) of one camera's image, first pixels (n, 2), with marks laid over
+        them.
+        """
         marks = [m for m in self._fault.marks if m.side == side]
         if not marks:
             return images

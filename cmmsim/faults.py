@@ -1,4 +1,4 @@
-"""Faults of stereo images, drawn at random: a measurement has to survive or to refuse them.
+"""Random faults of stereo images, for tests that a measurement corrects or refuses such images.
 
     faults = cmmsim.FaultGenerator(sensor.estimator)
     fault = faults.draw("false_discs", pose, np.random.default_rng(1))
@@ -6,10 +6,10 @@
     images = cmmsim.FaultyImages(sensor.look(pose), fault, sensor.noise, rng)
     cmmsim.Tracker(sensor.estimator).measure(images)
 
-Faults are laid over grey values, so they can be laid over pictures from anywhere. Only bodies that
-hide stickers from both cameras consistently have to be drawn with the scene: register them by
-``sensor.add_bodies(fault_bodies())`` once, then call ``sensor.look(pose,
-obstacles=fault.obstacles)``.
+Faults are laid over grey values, so they can be laid over images from any source. The kinds
+"obstacles" and "several" also contain bodies, which have to be drawn with the scene. Register these
+bodies once by ``sensor.add_bodies(fault_bodies())``, then call
+``sensor.look(pose, obstacles=fault.obstacles)``.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator
 
 # Sides of the boxes that hide stickers, m.
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)
+# Half of all faults that change several stickers change at most this number of them.
 FEW = 4
-# Each kind is drawn by the method of its name, as marks or as a whole fault.
+# The method with the name of a kind, after an underscore, returns its marks or the whole fault.
 KINDS = (
     *(
         "hidden",
@@ -68,7 +69,7 @@ def fault_bodies() -> dict[str, trimesh.Trimesh]:
 
 
 class FaultGenerator:
-    """Generator of faults where an estimator's stickers are.
+    """Generator of random faults at the places in the images where stickers are expected.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ class FaultGenerator:
     Raises
     ------
     CmmError
-        If the estimator is of another kind.
+        If the estimator is of another type.
 
     Examples
     --------
@@ -98,16 +99,20 @@ class FaultGenerator:
     def kinds(self) -> tuple[str, ...]:
         """Names of the kinds of faults.
 
-        ======================  ========================================================== hidden
-        stickers covered in one or both images half_hidden             stickers cut by a straight
-        edge obstacles               bodies before the platform one_camera_dark         a black
-        image one_camera_covered      an image of one level false_discs             discs like
-        stickers in single images false_points            discs in both images, where one point in
-        space would show glint                   saturated light with a tail, on or beside stickers
-        merging                 discs that touch stickers swapped                 the left image
-        taken for the right one black, saturated        whole frames several                 two or
-        three faults at once that leave something to measure ======================
-        ==========================================================
+        ==================  ===============================================================
+        hidden              stickers that are covered in one image or in both
+        half_hidden         stickers that are cut off by a straight edge
+        obstacles           bodies before the platform
+        one_camera_dark     one black image
+        one_camera_covered  one image of a single grey level
+        false_discs         discs that look like stickers, each in one image only
+        false_points        discs at consistent places in both images
+        glint               bright light with a tail, on stickers or beside them
+        merging             discs that overlap stickers, touch them or leave a small gap
+        swapped             left and right image exchanged
+        black, saturated    both images black or saturated
+        several             two or three of the faults that leave some stickers to measure
+        ==================  ===============================================================
         """
         return KINDS
 
@@ -121,7 +126,7 @@ class FaultGenerator:
         pose : array_like, shape (6,)
             Pose of the platform, m and rad.
         rng : numpy.random.Generator
-            Source of chance.
+            Generator of the random numbers.
 
         Returns
         -------
@@ -134,7 +139,7 @@ class FaultGenerator:
         ShapeError
             If the pose is not six finite numbers.
         CmmError
-            If ``rng`` is no generator.
+            If ``rng`` is not a numpy.random.Generator.
         """
         if kind not in KINDS:
             raise UnknownOptionError("fault", kind, KINDS)
@@ -147,9 +152,9 @@ class FaultGenerator:
     def _outlines(
         self, pose: Array, stickers: slice = slice(None), off: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Return the ellipses of n stickers that are moved by ``off`` (3,) m.
+        """Return centres (2, n, 2) and shapes (2, n, 2, 2), px, of the ellipses of n stickers.
 
-        Centres are (2, n, 2) and shapes (2, n, 2, 2), px.
+        The stickers are moved on the platform by ``off`` (3,) m.
         """
         camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
         places = self._taught.platform_places[stickers] + off
@@ -157,9 +162,9 @@ class FaultGenerator:
         return sticker_outlines(self._rig, camera_from_platform, places, normals, self._radius)
 
     def _some(self, rng: np.random.Generator, most: int | None = None) -> NDArray[np.int_]:
-        """Choose random stickers, at most ``most``.
+        """Choose at least one random sticker and at most ``most``, by default all.
 
-        As often as not they are up to FEW, otherwise up to all.
+        With probability one half, at most FEW stickers are chosen.
         """
         count = len(self._taught.platform_places)
         largest = min(most or count, FEW if rng.random() < 0.5 else count, count)
@@ -170,16 +175,15 @@ class FaultGenerator:
         sides = _one_or_both(rng)
         for k in self._some(rng):
             for side in sides:
-                # The larger singular value of the shape: the plate holds the ellipse at any angle.
+                # The largest singular value of the shape: the plate covers the ellipse at any
+                # angle.
                 half = np.linalg.norm(shapes[side, k], 2) + rng.uniform(1.0, 12.0, 2)
                 yield PlateMark(
                     side, centres[side, k], half, rng.uniform(0.0, np.pi), DARK_RADIANCE
                 )
 
     def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Hide stickers behind an edge between their nearest and farthest rim, often close to the
-        nearest.
-        """
+        """Hide a part of each sticker behind a straight edge; the hidden part is often small."""
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
         for k in self._some(rng):
@@ -228,7 +232,7 @@ class FaultGenerator:
             yield DiscMark(side, centre, rng.uniform(0.7, 1.4) * shape, _radiance(rng))
 
     def _false_points(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Lay discs in space, on the platform's planes or around; they hide what is behind them."""
+        """Lay discs at places in space near stickers; they cover what the images show there."""
         for _ in range(rng.integers(1, 21)):
             k = rng.integers(len(self._taught.platform_places))
             off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)
@@ -238,9 +242,9 @@ class FaultGenerator:
                 yield DiscMark(side, centres[side, 0], shapes[side, 0], radiance)
 
     def _glint(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Add the glint of one surface.
+        """Add glints near stickers, in one image or in both.
 
-        Both cameras see it near the same sticker, in unlike directions and strengths.
+        The two cameras see the glint of a surface in different directions and strengths.
         """
         centres, shapes = self._outlines(pose)
         for k in self._some(rng, 6):
@@ -296,12 +300,12 @@ class FaultGenerator:
 
 
 def _one_or_both(rng: np.random.Generator) -> tuple[int, ...]:
-    """Choose the left image, the right one, or, as often as not, both."""
+    """Choose both images with probability one half, otherwise the left or the right one."""
     return ((0,), (1,), (0, 1), (0, 1))[rng.integers(4)]
 
 
 def _radiance(rng: np.random.Generator) -> float:
-    """Choose the radiance of a sticker, or another bright one."""
+    """Choose the radiance of a sticker, or with probability one half a random radiance."""
     return STICKER_RADIANCE if rng.random() < 0.5 else float(rng.uniform(0.3, 1.3))
 
 

@@ -1,7 +1,7 @@
-"""Instrument: the part of a sensor that exists before it measures.
+"""Instrument: the part of a sensor that is the same in all runs.
 
-It holds the true cameras and scene, the known parameters of the cameras, and the result of
-teaching.
+It consists of the true cameras and scene, the parameters of the cameras as the estimator knows
+them, and the result of teaching.
 """
 
 from __future__ import annotations
@@ -61,18 +61,19 @@ class Instrument:
         known: KnownRig | None = None,
     ) -> None:
         require_kind(
-            file, SensorFile, "a sensor is made of a SensorFile; load_sensor takes a name or a path"
+            file, SensorFile, "Sensor takes a SensorFile; load_sensor takes a name or a path"
         )
         if method not in METHODS:
             raise UnknownOptionError("method", method, METHODS)
         find_detector(file.detection.detector)
         self._asked_renderer = require_renderer(file.renderer if renderer is None else renderer)
-        # A user's own renderer is imported at once, so that an error names it before work begins.
+        # A user's own renderer is imported now, so that its errors are reported before work begins.
         if is_own(self._asked_renderer):
             choose_renderer(self._asked_renderer)
         if progress is not None and not callable(progress):
             raise CmmError(
-                f"progress must be a function of the steps done and their number, got {progress!r}"
+                "progress must be a function of the number of steps done and their total, got "
+                f"{progress!r}"
             )
         self._file = file
         self._seed = checked_seed(seed)
@@ -87,7 +88,7 @@ class Instrument:
         self.platform = marked_body("platform", file.platform)
         self.base = marked_body("base", file.base)
         if taught is not None:
-            require_kind(taught, Taught, "taught must be what another sensor's teach() returned")
+            require_kind(taught, Taught, "taught must be a result of another sensor's teach()")
             require_taught_for(taught, file, len(self.platform.nominal))
         bodies = self.platform, self.base
         self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
@@ -106,12 +107,12 @@ class Instrument:
 
     @property
     def renderer(self) -> str:
-        """Name of the renderer that draws; "auto" is decided on first use."""
+        """Name of the renderer in use. "auto" is resolved on first use."""
         return self.true_cameras.renderer.name
 
     @cached_property
     def _view(self) -> StickerView:
-        """Stickers as the known rig is expected to see them."""
+        """Stickers at their expected places in the images of the known rig."""
         place = self.true_cameras.camera_from_base
         return StickerView(
             self._file, self.platform, self.base, self.rig, self._known, place, self.optics
@@ -124,13 +125,14 @@ class Instrument:
 
     @property
     def timing(self) -> Timing:
-        """Frame rate, exposure, latency with its jitter, and dropout, as the file states them."""
+        """Frame rate, exposure, latency with its jitter, and dropout, from the sensor file."""
         return self._file.timing
 
     @property
     def note(self) -> str:
-        """Warning about the file's figures, such as that they are assumed; empty if there is
-        none.
+        """Warning about the numbers in the sensor file, for example that they are assumed.
+
+        The text is empty if there is no warning.
         """
         return self._file.note
 
@@ -146,15 +148,15 @@ class Instrument:
 
     @property
     def truth(self) -> Taught:
-        """True places of rig and stickers, for studies of the observation noise alone.
+        """Result of a teaching without errors: the true places of rig and stickers.
 
-        The measurement does not use them.
+        Measurements do not use it. It is for studies of the observation noise alone.
         """
         return exactly_taught(self._file)
 
     @property
     def estimator(self) -> PoseEstimator:
-        """Part that turns images into poses, also images from elsewhere."""
+        """Estimator that computes poses from images, including images from other sources."""
         common = None
         if self._known is not None:
             known = self._known.covariance
@@ -167,17 +169,17 @@ class Instrument:
 
     @cached_property
     def _geometry(self) -> MeasuringGeometry:
-        """Set-up as it is known once it is taught."""
+        """Geometry of cameras, bodies and taught frames, as the estimator knows it."""
         return MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
 
     @property
     def observer(self) -> Observer:
-        """Part that finds stickers in images, which needs no teaching."""
+        """Observer that finds stickers in images. It needs no teaching."""
         return Observer(self.rig, self.noise, self.settings)
 
     @property
     def camera(self) -> VirtualStereoCamera | StatisticalStereoCamera:
-        """Both cameras before the true scene, as they are at teaching."""
+        """Both cameras in front of the true scene, in their state at teaching."""
         return self.true_cameras.at_rest
 
     def teach(self, progress: Progress | None = None) -> Taught:
@@ -186,7 +188,7 @@ class Instrument:
         Parameters
         ----------
         progress : callable, optional
-            Called with the number of steps done and their total.
+            Function that is called with the number of steps done and of all steps.
 
         Returns
         -------
@@ -196,7 +198,7 @@ class Instrument:
         Raises
         ------
         TeachingError
-            If a sticker cannot be seen, or the planes of a body meet in no point.
+            If a sticker cannot be seen, or the three planes of a body do not meet in one point.
 
         Examples
         --------
@@ -215,7 +217,7 @@ class Instrument:
         return self._taught
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
-        """Register further rigid bodies that may hide stickers.
+        """Register further rigid bodies, which can hide stickers.
 
         The argument ``obstacles`` of `Sensor.look` places them in an exposure.
 
@@ -227,7 +229,7 @@ class Instrument:
         Raises
         ------
         CmmError
-            If ``meshes`` are not meshes by name.
+            If ``meshes`` is not a mapping of names to meshes.
 
         Examples
         --------
@@ -242,14 +244,15 @@ class Instrument:
         Parameters
         ----------
         changes : mapping of str to float
-            Amounts by the names of ``stereo_rig.PARAMETER_NAMES``, as ``{"right.cx_px": 0.1}``.
+            Amounts by parameter name, as ``{"right.cx_px": 0.1}``. The names are listed in
+            ``stereo_rig.PARAMETER_NAMES``.
         right_later : float
-            Time by which the right camera exposes later, s.
+            Delay of the right camera's exposure after the left camera's exposure, s.
 
         Raises
         ------
         CmmError
-            If a rig has no such name.
+            If a name is not a parameter of the rig.
         ShapeError
             If an amount is not a finite number.
 
@@ -261,21 +264,22 @@ class Instrument:
         self.true_cameras.move(changes, right_later)
 
     def drift_rig(self, changes: Mapping[str, float], frames: int) -> None:
-        """Change the true rig evenly in each run from now on; the estimator's known rig does not
-        change.
+        """Let the true rig drift linearly with time in each run from now on.
+
+        The estimator's known rig does not change.
 
         Parameters
         ----------
         changes : mapping of str to float
             Amounts by name, as in `move_rig`. An empty mapping ends the drift.
         frames : int
-            Number of frames from the first to the last change.
+            Number of frames over which the amounts are reached. Later frames do not drift further.
 
         Raises
         ------
         CmmError
-            If a rig has no such name, there are fewer than two frames, or the stickers leave an
-            image.
+            If a name is not a parameter of the rig, there are fewer than two frames, or the drift
+            moves stickers out of an image.
         ShapeError
             If an amount is not a finite number.
 
@@ -287,7 +291,7 @@ class Instrument:
         self.true_cameras.drift(changes, frames)
 
     def common_errors(self, poses: ArrayLike, rates: ArrayLike) -> CommonErrors:
-        """Return the errors of the rig and of the taught frames that all poses have in common.
+        """Return the errors of the rig and of the taught frames, which all poses have in common.
 
         Parameters
         ----------
@@ -297,14 +301,14 @@ class Instrument:
         Returns
         -------
         CommonErrors
-            Errors, and how they move these poses.
+            Errors, and the changes of these poses that they cause.
 
         Raises
         ------
         CmmError
             If the method is "planes".
         ShapeError
-            If poses or rates are not rows of six finite numbers.
+            If a row of poses or rates is not six finite numbers.
 
         Examples
         --------
@@ -312,14 +316,14 @@ class Instrument:
         >>> sensor.common_errors(poses, 0.0 * poses).changes.shape[:2]
         (1, 6)
         """
-        self._require_registration("common errors are known of")
+        self._require_registration("common errors can be computed for")
         known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
         at = np.asarray(poses, dtype=float)
         along = np.asarray(rates, dtype=float)
         return self._geometry.common_errors(at, along, known.covariance, known.exposure_std)
 
     def _require_registration(self, what: str) -> None:
-        """Raise CmmError unless poses come from registration; ``what`` begins the message."""
+        """Raise CmmError unless the method is "registration"; ``what`` begins the message."""
         if self.method != "registration":
             raise CmmError(f"{what} poses by registration only, not by {self.method}")
 
@@ -328,8 +332,8 @@ class Instrument:
 class StickerView:
     """Stickers of both bodies as a rig sees them, with the platform at home.
 
-    ``known`` says how well the rig is known; None means exactly. ``camera_from_base`` (4, 4) is the
-    place that the file states.
+    ``known`` states how well the rig is known; None means exactly. ``camera_from_base`` (4, 4) is
+    the transform that the sensor file states.
     """
 
     file: SensorFile
@@ -342,7 +346,7 @@ class StickerView:
 
     @cached_property
     def sizes(self) -> WindowSizes:
-        """Sizes of windows: large and blurred stickers need a wider view."""
+        """Sizes of windows. Large and blurred stickers need larger windows."""
         radius = self.file.stickers.radius
         place = self.camera_from_base
         at_target = radius_at(self.rig, place, np.array(self.file.rig.target), radius)
@@ -354,7 +358,7 @@ class StickerView:
         return window_sizes(at_target, at_teaching, self.optics.psf_px, blurred)
 
     def settings(self, noise: CameraNoise, centre_error_px: float) -> DetectionSettings:
-        """Settings of the search for stickers in windows.
+        """Return the settings of the search for stickers in windows.
 
         ``centre_error_px`` is the error of a sticker's centre that the renderer causes, px rms.
         """

@@ -36,13 +36,15 @@ def load_sensor(
     taught : Taught, optional
         Result of an earlier teaching of the same cameras and bodies.
     progress : callable, optional
-        Called while teaching, with the number of steps done and their total.
+        Function that is called during teaching with the number of steps done and of all steps.
     renderer : {"pyrender", "analytic", "auto", "statistical"}, optional
-        Renderer instead of the one that the file names.
+        Renderer to use instead of the renderer that the file names. ``module:name`` names a user's
+        own renderer.
     changes : mapping, optional
-        Entries that replace the file's entries, by dotted key.
+        Entries that replace entries of the file, by dotted key.
     known : KnownRig, optional
-        Rig that the estimator uses, if it differs from the file's rig, which forms the images.
+        Rig that the estimator uses, if it differs from the file's rig. The file's rig forms the
+        images.
 
     Returns
     -------
@@ -53,7 +55,7 @@ def load_sensor(
     UnknownSensorError
         If no built-in sensor has the name.
     SensorFileError
-        If the file cannot be read or holds a wrong value.
+        If the file cannot be read or contains a wrong value.
     UnknownOptionError
         If there is no such method, renderer or detector.
     TeachingError

@@ -1,7 +1,7 @@
-"""Many frames at once: drawn, read and measured in blocks, on all cores.
+"""Measurement of many frames at once, in blocks and on all cores.
 
-Windows are read, ellipses are fitted and stickers are triangulated for all exposures together. Each
-exposure is then solved separately.
+For all exposures of a block together, windows are read, ellipses are fitted and stickers are
+triangulated. The pose of each exposure is then solved separately.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ BLOCK = 32
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a platform at poses (N, 6) in motion at rates (N, 6), each with its own noise.
+    """Frames of a platform at poses (N, 6) that moves at rates (N, 6), each with its own noise.
 
-    Stickers are looked for ``near`` poses (N, 6). Obstacles stand still at base_from_body (4, 4).
+    Stickers are searched near the poses ``near`` (N, 6). Obstacles stand still at base_from_body
+    (4, 4), by name.
     """
 
     estimator: PoseEstimator
@@ -55,9 +56,9 @@ class Frames:
 
 
 def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[ManySeen]:
-    """Measure frames block by block, with their movement assumed known.
+    """Measure frames block by block. The movement during each exposure is assumed to be known.
 
-    The number of threads that share the blocks changes nothing in the result.
+    The result does not depend on the number of threads.
     """
     estimator = frames.estimator
     poses = frames.poses
@@ -65,7 +66,7 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Many
     rngs = frames.rngs
     expected = frames.expected
     half = 0.5 * camera.exposure * rates
-    # The true movement is laid onto the expected pose.
+    # The movement is that of the true pose, applied to the expected pose.
     back = expected @ invert(transforms_of(poses))
     first = back @ transforms_of(poses - half)
     last = back @ transforms_of(poses + half)
@@ -79,7 +80,7 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Many
 
 
 def measure_without_images(camera: StatisticalStereoCamera, frames: Frames) -> list[Measurement]:
-    """Measure as ``measure_frames`` with cameras that draw nothing, one by one."""
+    """Measure frames one by one with cameras that give the detected stickers without images."""
     found = []
     rows = zip(frames.poses, frames.rates, frames.expected, frames.rngs, strict=True)
     for pose, rate, expected, rng in rows:
@@ -93,10 +94,11 @@ def measure_without_images(camera: StatisticalStereoCamera, frames: Frames) -> l
 
 @dataclass(frozen=True)
 class ManySeen:
-    """N exposures, measured together: their poses, and the measurement of each.
+    """Result of N exposures that were measured together.
 
-    ``solved`` holds the stickers of all of them. ``others`` are the measurements, by number, of
-    exposures that are lost, or whose poses are made by another method than registration.
+    ``found`` contains their poses, and ``solved`` their stickers. ``others`` are measurements by
+    number of the exposure. It contains the exposures that are lost, and all exposures if the method
+    is not registration.
     """
 
     estimator: PoseEstimator
@@ -118,8 +120,8 @@ def measure_exposures(
 ) -> ManySeen:
     """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4).
 
-    ``swept`` (N,4,4) are the expected ones at the beginning and at the end of the exposures. Each
-    is measured as ``PoseEstimator.measure`` does.
+    ``swept`` are the expected camera_from_platform (N,4,4) at the beginning and at the end of the
+    exposures. The results equal those of ``PoseEstimator.measure`` for each exposure.
     """
     places = estimator.taught.platform_places
     normals = estimator.platform.sticker_normals
@@ -139,9 +141,9 @@ def measure_exposures(
 
 
 def on_all_cores(work: Callable[[T], R], parts: Sequence[T], renderer: Renderer) -> Iterator[R]:
-    """Yield the results of work on independent parts, in their order.
+    """Yield the results of ``work`` on independent parts, in the order of the parts.
 
-    OpenGL may be called from one thread only, so there is one unless the renderer is analytic.
+    Several threads are used with the analytic renderer only: OpenGL must be called from one thread.
     """
     threads = threads_at_most() if renderer is ANALYTIC else 1
     if threads == 1 or len(parts) < 2:
@@ -152,18 +154,19 @@ def on_all_cores(work: Callable[[T], R], parts: Sequence[T], renderer: Renderer)
 
 
 def threads_at_most() -> int:
-    """Return the number of threads: one for each core, or NUMBA_NUM_THREADS."""
-    from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
+    """Return the largest number of threads: NUMBA_NUM_THREADS, but at most the number of cores."""
+    # Imported late, because importing numba takes time.
+    from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set at run time
 
     return min(int(NUMBA_NUM_THREADS), os.cpu_count() or 1)
 
 
 def pose_rows(poses: ArrayLike) -> Array:
-    """Return poses (N, 6), checked; an empty list holds none."""
+    """Return poses as an array (N, 6); N is 0 for an empty list. Raises ShapeError."""
     if isinstance(poses, list) and not poses:
         return np.zeros((0, 6))
     try:
         count = len(poses)  # type: ignore[arg-type]  # a number has no length
     except TypeError:
         count = 1
-    return finite_array(poses, (count, 6), "poses are rows of six finite numbers, m and rad")
+    return finite_array(poses, (count, 6), "each pose is a row of six finite numbers, m and rad")

@@ -1,4 +1,4 @@
-"""The synthetic sensor: an instrument that looks at a posed platform, run after run."""
+"""The synthetic sensor: it takes images of a posed platform and measures its pose."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ DROPOUT_STREAM = 2
 
 
 class Sensor(Instrument):
-    """Stereo optical CMM that looks at a posed platform.
+    """Stereo optical CMM that measures the pose of a platform.
 
-    It teaches itself on first use. Use `load_sensor` to make one by name.
+    It teaches itself on first use. `load_sensor` makes a sensor by name.
 
     Parameters
     ----------
     file : SensorFile
         Content of a sensor file. Its cameras form the images.
     seed, method, taught, progress, renderer
-        As of `load_sensor`.
+        See `load_sensor`.
     known : KnownRig, optional
-        Rig that the estimator uses, if it differs from the file's rig, which forms the images. With
-        ``taught``, the estimator uses the rig that was known at teaching.
+        Rig that the estimator uses, if it differs from the file's rig. The file's rig forms the
+        images. If ``taught`` is given, the estimator uses the rig that was known at teaching.
 
     Raises
     ------
     CmmError
-        If an argument is of another kind.
+        If an argument is of another type.
     UnknownOptionError
         If there is no such method, renderer or detector.
     TeachingError
@@ -77,10 +77,10 @@ class Sensor(Instrument):
         self.start_run(seed)
 
     def start_run(self, seed: int) -> None:
-        """Begin a new run: new noise, and the next measurement searches the whole images.
+        """Begin a new run, with new noise. The next measurement searches the whole images.
 
-        Every frame has its own noise stream, so a dropped frame does not change the noise of
-        others.
+        Every frame has its own noise stream, so a dropped frame does not change the noise of other
+        frames.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class Sensor(Instrument):
         Raises
         ------
         CmmError
-            If the seed is not a whole number from 0 on.
+            If the seed is not a whole number, 0 or more.
 
         Examples
         --------
@@ -114,31 +114,32 @@ class Sensor(Instrument):
         obstacles: Mapping[str, Array] | None = None,
         pose_rate: ArrayLike | None = None,
     ) -> StereoImages | DrawnStickers:
-        """Take one exposure. Only the parts of the images that are read are drawn.
+        """Take one exposure. The images are drawn only where they are read.
 
         Parameters
         ----------
         pose : array_like, shape (6,)
             Pose of the platform in the middle of the exposure, m and rad.
         obstacles : mapping of str to ndarray, shape (4, 4), optional
-            Places base_from_body of bodies of `add_bodies`. They stand still.
+            Transforms base_from_body of bodies that `add_bodies` registered, by name. They stand
+            still.
         pose_rate : array_like, shape (6,), optional
-            Time derivative of the pose, m/s and rad/s. It blurs the image where the sensor's
-            exposure takes time.
+            Time derivative of the pose, m/s and rad/s. It blurs the images if the exposure time of
+            the sensor is above zero.
 
         Returns
         -------
         StereoImages or DrawnStickers
-            Images, or for the renderer "statistical" the stickers that would be detected in them.
+            Images, or with the renderer "statistical" the stickers that would be detected.
 
         Raises
         ------
         ShapeError
-            If pose or rate are not six finite numbers.
+            If the pose or its rate is not six finite numbers.
         UnknownBodyError
-            If an obstacle was never added.
+            If an obstacle was never registered.
         CmmError
-            If the blur is too long, or obstacles are not transforms by name.
+            If the blur is too long, or ``obstacles`` is not a mapping of names to transforms.
 
         Examples
         --------
@@ -174,7 +175,7 @@ class Sensor(Instrument):
         Raises
         ------
         CmmError
-            If the sensor draws no images.
+            If the renderer is "statistical", which draws no images.
 
         Examples
         --------
@@ -193,8 +194,8 @@ class Sensor(Instrument):
     ) -> Measurement:
         """Measure the platform in one frame.
 
-        The result is the pose in the middle of the exposure. A frame that drops out is lost, and no
-        image is formed.
+        The result is the pose in the middle of the exposure. If the frame drops out, the result is
+        a lost measurement.
 
         Parameters
         ----------
@@ -208,7 +209,7 @@ class Sensor(Instrument):
         Raises
         ------
         TeachingError
-            If the sensor teaches itself and cannot.
+            If the sensor is not yet taught, and its teaching fails.
 
         Examples
         --------
@@ -219,7 +220,7 @@ class Sensor(Instrument):
         images = self.look(pose, obstacles, pose_rate)
         if self._tracker is None:
             self._tracker = self._new_tracker()
-        # One number for every frame, so that runs over other poses lose the same frames.
+        # One random number per frame, so that runs over different poses lose the same frames.
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
             share = f"a share of {self.timing.dropout:.3g} drops out"
@@ -231,13 +232,13 @@ class Sensor(Instrument):
         return measured
 
     def watch_drift(self, base: bool = False, chance: float = CHANCE) -> DriftWatch:
-        """Watch from now on, in each run separately, whether the rig has moved since teaching.
+        """Begin to test, in each run separately, whether the rig has moved since teaching.
 
         Parameters
         ----------
         base : bool
-            True to observe the base's stickers as well. This takes twice the time. It shows smaller
-            movements, and also movements of the whole rig.
+            True to observe the stickers of the base as well. This doubles the computing time. It
+            detects smaller movements, and movements of the whole rig.
         chance : float
             Probability of a false alarm in a run.
 
@@ -248,14 +249,14 @@ class Sensor(Instrument):
         Raises
         ------
         CmmError
-            If the method is "planes", or ``chance`` is no probability.
+            If the method is "planes", or ``chance`` is not a probability.
 
         Examples
         --------
         >>> watch = sensor.watch_drift()
         """
-        self._require_registration("drift is told from")
-        # A centre's systematic errors stay constant while the sticker stands still.
+        self._require_registration("drift can be detected in")
+        # The systematic errors of a sticker's centre are constant while the sticker stands still.
         offset = float(np.hypot(self.settings.centre_error_px, self.observer.detector.bias_px))
         period = 1.0 / self.timing.frame_rate
         self._watch = DriftWatch(self._geometry, self._known, period, chance, offset, base)
@@ -280,7 +281,7 @@ class Sensor(Instrument):
         pose_rates : array_like, shape (N, 6), optional
             Time derivatives of the poses.
         obstacles : mapping of str to ndarray, shape (4, 4), optional
-            Places of bodies that stand still, as of `look`.
+            Transforms of bodies that stand still, as in `look`.
         near : array_like, shape (N, 6), optional
             Poses near which stickers are searched, instead of the true poses.
 
@@ -291,7 +292,7 @@ class Sensor(Instrument):
         Raises
         ------
         ShapeError
-            If poses, rates or ``near`` are not rows of six finite numbers.
+            If a row of poses, rates or ``near`` is not six finite numbers.
 
         Examples
         --------
@@ -299,10 +300,10 @@ class Sensor(Instrument):
         (3, 6)
         """
         at = pose_rows(poses)
-        wanted = "there is a pose rate to each pose, six finite numbers, m/s and rad/s"
+        wanted = "each pose needs a pose rate of six finite numbers, m/s and rad/s"
         rates = finite_array(0.0 * at if pose_rates is None else pose_rates, at.shape, wanted)
         around = finite_array(
-            at if near is None else near, at.shape, "there is a pose near each pose, finite"
+            at if near is None else near, at.shape, "near needs six finite numbers per pose"
         )
         camera = self.camera
         placed = self.true_cameras.placed(obstacles)
@@ -324,7 +325,7 @@ class Sensor(Instrument):
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
         """Measure a platform at rest in many frames, without dropouts.
 
-        Without images, stickers are looked for in windows as well.
+        The search in windows takes place even with the renderer "statistical".
 
         Parameters
         ----------
@@ -338,7 +339,7 @@ class Sensor(Instrument):
         Raises
         ------
         ShapeError
-            If poses or ``near`` are not rows of six finite numbers.
+            If a row of ``poses`` or ``near`` is not six finite numbers.
 
         Examples
         --------
@@ -347,7 +348,7 @@ class Sensor(Instrument):
         """
         at = pose_rows(poses)
         camera = self.camera
-        around = finite_array(near, at.shape, "there is a pose near each pose, finite")
+        around = finite_array(near, at.shape, "near needs six finite numbers per pose")
         frames = self._frames(at, 0.0 * at, around, {})
         if isinstance(camera, StatisticalStereoCamera):
             return measure_without_images(camera, frames)
@@ -356,9 +357,9 @@ class Sensor(Instrument):
     def _frames(
         self, at: Array, rates: Array, around: Array, placed: Mapping[str, Array]
     ) -> Frames:
-        """Return the next frames.
+        """Return the next N frames, at poses ``at`` (N, 6) with rates (N, 6).
 
-        They are at poses ``at`` with rates, and stickers are looked for ``around``, all (N, 6).
+        Stickers are searched near the poses ``around`` (N, 6).
         """
         first = self._frame
         self._frame += len(at)
@@ -370,7 +371,7 @@ class Sensor(Instrument):
         """Return a tracker, which measures frame after frame."""
         if self.renderer != STATISTICAL.name or self.method != "registration":
             return Tracker(self.estimator)
-        # Imported late, because numba takes time to import.
+        # Imported late, because importing numba takes time.
         from cmmsim.without_images.statistical_tracker import StatisticalTracker
 
         return StatisticalTracker(self.estimator)

@@ -1,16 +1,17 @@
 """Teaching (paper section 4.2): the frames of base and platform from their sticker planes.
 
 The base stands still, and its stickers are averaged over many exposures. The platform follows a
-smooth path. Its stickers are observed at each pose, all observations are laid onto each other by
-registration, and the planes are put through the mean constellation. Different poses put the
-stickers on different parts of a pixel, which averages out the image formation's own error as well.
+smooth path. Its stickers are observed at each pose, and registration lays all observations onto
+each other. The planes are fitted to the mean constellation. Because the stickers lie on different
+sub-pixel positions at different poses, errors of the image formation are averaged out as well.
 
-The centres are always those of the maximum-likelihood fit, whatever detector the sensor measures
-with. The base is seen at one pose only, so that a detector's bias would stay in every pose.
+The centres always come from the maximum-likelihood fit, whichever detector the sensor measures
+with. The base is seen at one pose only, so the bias of another detector would stay in every
+measured pose.
 
-The search windows hold the largest image of a sticker. This is the larger of two images: the one at
-the nearest working distance, assumed a fifth nearer than the rig's target, and the largest one that
-both cameras see at teaching.
+The search windows are made for the largest image of a sticker. This is the larger of two images:
+the image at the nearest working distance, assumed a fifth nearer than the rig's target, and the
+largest image in view of both cameras at teaching.
 """
 
 from collections.abc import Callable
@@ -42,22 +43,22 @@ from cmmsim.measuring.taught import Taught, setup_of
 from cmmsim.radiometry.stereo_images import StereoImages
 
 Progress = Callable[[int, int], None]
-# Reach of the teaching path about home, m and rad.
+# Amplitude of the teaching path about home, m and rad.
 SHIFT = 0.008
 TURN = 0.03
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
-# m: in averaged exposures, a whole sticker is within a few microns of its place.
+# m: in averaged exposures, an unhidden sticker is seen within a few micrometres of its place.
 LARGEST_GAP = 1e-4
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
-# Half the side of the fitted part over a sticker's radius at the rig's target.
+# Ratio of half the side of the fitted part to a sticker's radius at the rig's target.
 ROOM = 1.35
-# px on each side of the largest sticker at teaching: half a pixel is lost to rounding.
+# px of free margin around the largest sticker at teaching. Rounding can take half a pixel.
 SMALLEST_ROOM_PX = 0.7
 SMALLEST_FIT = 12
 SMALLEST_BLURRED_FIT = 14
-# px on each side, at least, for the blur of point spread and exposure.
+# Smallest margin in px on each side for the blur of point spread and exposure.
 BLUR_ROOM = 1.0
-# Side of a window over that of the part that is fitted.
+# Ratio of the side of a window to the side of the fitted part.
 WINDOW_SHARE = 7 / 6
 
 
@@ -65,8 +66,8 @@ WINDOW_SHARE = 7 / 6
 class TeachingPlan:
     """Plan of teaching.
 
-    It states the quality of the base's views, the quality and number of the platform's views, and
-    the sizes of windows in px.
+    It states the quality of the views of the base, the quality and the number of the views of the
+    platform, and the sizes of windows in px.
     """
 
     base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))
@@ -78,7 +79,7 @@ class TeachingPlan:
 
 
 class Camera(Protocol):
-    """Two cameras before the true scene."""
+    """Two cameras in front of the true scene."""
 
     def look(
         self, pose: Array, rng: np.random.Generator, *, quality: Quality | None = None
@@ -86,12 +87,12 @@ class Camera(Protocol):
         """Take one exposure of the platform at a pose (6,)."""
 
     def centre_error_px(self, quality: Quality) -> float:
-        """Return the error of a sticker's centre that drawing leaves, px rms."""
+        """Return the error of a sticker's centre that drawing causes, px rms."""
 
 
 @dataclass(frozen=True)
 class Teacher:
-    """Instruments and plan of teaching."""
+    """Teaching of a sensor: its cameras, its observer, both bodies and the plan."""
 
     camera: Camera
     observer: Observer
@@ -119,7 +120,7 @@ class Teacher:
                 for body in (self.base, self.platform)
             ]
             report(1, steps)
-            # The error of this one view stays in every pose, so it is averaged longest.
+            # The error of this single view stays in every measured pose, so it is averaged longest.
             base = self._look_at(
                 self.base,
                 start[0],
@@ -158,12 +159,12 @@ class Teacher:
         quality: Quality,
         window_size: int,
     ) -> StickerObservation:
-        """Observe all stickers of a body in averaged exposures. Raises LostError when one is
+        """Observe all stickers of a body in averaged exposures. Raises LostError if a sticker is
         missing.
         """
         usual = self.observer.settings
-        # Averaged exposures have so little noise that the model's own error shows: no misfit is too
-        # large.
+        # Averaged exposures have so little noise that errors of the model dominate the misfit, so
+        # the misfit is not limited.
         settings = replace(
             usual,
             window_size=window_size,
@@ -186,7 +187,7 @@ class Teacher:
         return seen
 
     def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
-        """Name the missing stickers that lie beside an image, where no window could find them."""
+        """Return a text that names the missing stickers outside of an image; empty if none is."""
         outside = missing[~np.all(self.observer.rig.project(points[missing])[1], axis=0)]
         return (
             f"; {', '.join(body.sticker_ids[outside])} lie outside of an image"
@@ -197,15 +198,13 @@ class Teacher:
     def _platform_views(
         self, rough: Array, path: Array, rng: np.random.Generator, report: Callable[[int], None]
     ) -> list[StickerObservation]:
-        """Observe the platform along the teaching path, near the pose predicted from the views
-        before.
-        """
+        """Observe the platform along the teaching path, near poses predicted from earlier views."""
         places = self.platform.nominal
         last = rough
         step = np.eye(4)
         seen = []
         for k, pose in enumerate(path):
-            # Two views must be seen before the movement can be predicted: wider windows until then.
+            # The movement can be predicted after two views. Until then, windows are larger.
             size = self.plan.first_window if k < 2 else self.plan.platform_window
             seen.append(
                 self._look_at(
@@ -227,8 +226,8 @@ class Teacher:
     def _require_rigid(
         self, places: Array, camera_from_body: Array, seen: StickerObservation
     ) -> None:
-        """Raise LostError when a sticker has moved against the others, because it is partly
-        hidden.
+        """Raise LostError if a sticker has moved against the others, as a partly hidden sticker
+        does.
         """
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         depth = np.linalg.norm(seen.points, axis=1).max()
@@ -238,7 +237,7 @@ class Teacher:
             worst = self.platform.sticker_ids[gaps.argmax()]
             raise LostError(
                 f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its "
-                f"place, at most {limit * 1e6:.0f} um; it may be partly hidden"
+                f"place, allowed are {limit * 1e6:.0f} um; perhaps it is partly hidden"
             )
 
 
@@ -247,7 +246,7 @@ def platform_frame(
 ) -> tuple[Array, Array, Array]:
     """Return sticker places (n, 3) on the platform with their covariances (n, 3, 3).
 
-    The third result is the covariance (6, 6) of the platform frame. Each view observes all
+    The third result is the covariance (6, 6) of the platform frame. Each view must contain all
     stickers.
     """
     views = np.stack([one.points for one in seen]), np.stack([one.covariances for one in seen])
@@ -265,9 +264,10 @@ def platform_frame(
 
 
 def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> Array:
-    """Return the sticker places (c, n, 3) that each of c teachings finds, as ``platform_frame``.
+    """Return the sticker places (c, n, 3) of c teachings, as ``platform_frame`` does for one.
 
-    The stickers are seen at points (c, v, n, 3) with covariances (c, v, n, 3, 3) in v views each.
+    Each teaching has v views of the stickers, at points (c, v, n, 3) with covariances (c, v, n, 3,
+    3).
     """
     mean, covariances = mean_constellation(points, covariances)
     towards = _towards(platform, register_sets(platform.nominal, mean, covariances).transform)
@@ -277,29 +277,31 @@ def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> 
 def teaching_path(home: Array, count: int) -> Array:
     """Return a smooth closed path of poses (count, 6) that starts near ``home``.
 
-    It visits many sub-pixel positions.
+    Along the path, the stickers pass many sub-pixel positions.
     """
     angle = 2.0 * np.pi * np.arange(count)[:, None] / count * CYCLES + PHASES
     return home + np.array([SHIFT] * 3 + [TURN] * 3) * np.sin(angle)
 
 
 def _towards(body: MarkedBody, camera_from_body: Array) -> Array:
-    """Return normals (..., 3, 3) of the planes in the camera frame, for camera_from_body (..., 4,
-    4).
+    """Return the normals (..., 3, 3) of a body's planes in the camera frame.
+
+    The body stands at camera_from_body (..., 4, 4).
     """
     return np.asarray(body.normals @ camera_from_body[..., :3, :3].swapaxes(-1, -2))
 
 
 def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Return the weighted mean (..., n, 3) of views of the same stickers, laid onto each other.
+    """Return the weighted mean (..., n, 3) of v views of the same stickers, laid onto each other.
 
-    The mean lies near the first view. The second result is its covariances (..., n, 3, 3). Views
-    are (..., v, n, 3) with covariances (..., v, n, 3, 3).
+    The mean has about the place and orientation of the first view. The second result contains its
+    covariances (..., n, 3, 3). Views are points (..., v, n, 3) with covariances (..., v, n, 3, 3).
     """
     weights = np.linalg.inv(covariances)
     mean = points[..., 0, :, :]
     spread = covariances[..., 0, :, :, :]
-    # The weights turn with the views, so mean and transforms are found in turns; three settle them.
+    # Mean and transforms depend on each other, because the weights rotate with the views. Three
+    # alternating steps are enough for convergence.
     for _ in range(3):
         sets = np.broadcast_to(mean[..., None, :, :], points.shape).reshape(-1, *points.shape[-2:])
         found = register_sets(
@@ -318,7 +320,7 @@ def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]
 class WindowSizes:
     """Sides in px of windows, and of the fitted part around the bright spot.
 
-    ``growth`` is the fitted part's side over that for the smallest stickers.
+    ``growth`` is the ratio of the fitted part's side to its smallest side.
     """
 
     window: int
@@ -335,10 +337,11 @@ class WindowSizes:
 
 
 def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bool) -> WindowSizes:
-    """Return sizes for stickers whose radius is ``target_px`` at the rig's target.
+    """Return window sizes for stickers with the image radius ``target_px`` at the rig's target.
 
-    At teaching it is up to ``largest_px``. The point spread has the sigma ``psf_px``; ``blurred``
-    says that it or a moving platform blurs the stickers.
+    ``largest_px`` is the largest image radius at teaching, and ``psf_px`` the sigma of the point
+    spread. ``blurred`` is True if the point spread or movement during the exposure blurs the
+    stickers.
     """
     smallest, blur = (
         (SMALLEST_BLURRED_FIT, max(BLUR_ROOM, psf_px)) if blurred else (SMALLEST_FIT, 0.0)
@@ -349,9 +352,9 @@ def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bo
 
 
 def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: float) -> float:
-    """Return the radius in px of a sticker of ``radius`` m at ``target`` (3,) m in base axes.
+    """Return the image radius in px of a sticker of ``radius`` m at ``target`` (3,) m in base axes.
 
-    The sticker faces the nearer camera.
+    The sticker faces the camera that shows it larger.
     """
     distances = [
         float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera
@@ -365,8 +368,9 @@ def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: fl
 def largest_radius(
     rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float
 ) -> float:
-    """Return the longest half axis in px of the stickers of a body that both cameras see; 0 without
-    any.
+    """Return the longest half axis in px of a body's stickers that both cameras see.
+
+    The result is 0 if both cameras see no sticker.
     """
     normals = body.sticker_normals
     seen = np.all(rig.project(apply(camera_from_body, body.nominal))[1], axis=0)
@@ -378,10 +382,9 @@ def largest_radius(
 
 
 def exactly_taught(file: SensorFile) -> Taught:
-    """Return what teaching without any error would find: the true frames and places of a sensor
-    file.
+    """Return the result of a teaching without errors: the true frames and sticker places.
 
-    All covariances are zero, for studies of the observation noise alone. Raises SensorFileError.
+    All covariances are zero. Raises SensorFileError.
     """
     _, camera_from_base = rig_from_file(file.rig)
     platform, base = (

@@ -1,6 +1,6 @@
 """Measurement frame after frame.
 
-The place to look next comes from the last measurements, never from the true pose.
+Stickers are searched at a pose predicted from the last measurements, never at the true pose.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator, require_fitting
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 
-# A tracked frame that shows less than this share of the stickers seen before is searched as a whole
-# too: most windows may have been laid beside their stickers.
+# If the predicted windows show less than this share of the stickers that the last frame showed, the
+# whole images are searched as well. A wrong prediction can lay windows beside their stickers.
 EXPECTED_SHARE = 0.7
 
 
 class Tracker:
-    """Tracker that measures frame after frame, and remembers the last two poses.
+    """Tracker that measures frame after frame, near a pose predicted from the last two poses.
 
-    If the prediction fails, the whole frame is searched. If this search finds fewer stickers than
-    the predicted windows, the stickers in the predicted windows are used. Moving stickers are
-    fitted with the smear of the exposure at the speed since the last frame. In the first frame of a
-    run, and in the first after a loss, the speed is estimated from the smear.
+    If the predicted windows show too few stickers, the whole images are searched as well, and the
+    result with more stickers is used. Moving stickers are blurred during the exposure. The fit
+    takes the blur from the speed since the last frame. In the first frame of a run, and in the
+    first frame after a loss, the speed is estimated from the blur.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Tracker:
     Raises
     ------
     CmmError
-        If the estimator is of another kind.
+        If the estimator is of another type.
 
     Examples
     --------
@@ -47,18 +47,18 @@ class Tracker:
         self.forget()
 
     def forget(self) -> None:
-        """Search the next frame as a whole."""
+        """Forget the last poses, so that the next measurement searches the whole images."""
         self._last: Array | None = None
         self._step_before: Array | None = None
         self._seen = 0
 
     def measure(self, images: StereoImages | StereoFrame) -> Measurement:
-        """Measure one frame; whatever is in the images, it raises nothing.
+        """Measure one frame. No content of the images raises an error.
 
         Parameters
         ----------
         images : StereoFrame or images of ``sensor.look``
-            Images of the rig that the estimator knows.
+            Images that the estimator's rig took.
 
         Returns
         -------
@@ -70,7 +70,7 @@ class Tracker:
         ShapeError
             If a StereoFrame has another size or bit depth.
         CmmError
-            If ``images`` are no images.
+            If ``images`` is neither a StereoFrame nor images of ``sensor.look``.
         """
         if isinstance(images, StereoFrame):
             require_fitting(images, self._estimator)
@@ -101,9 +101,9 @@ class Tracker:
             self._last = self._predicted()
 
     def _tracked(self, images: StereoImages) -> tuple[Measurement, Array] | None:
-        """Return the measurement in the predicted windows.
+        """Return the measurement in the predicted windows, or None.
 
-        The result is None without a prediction, or if the predicted windows give no pose.
+        The result is None without a last pose, and if the predicted windows give no pose.
         """
         if self._last is None:
             return None
@@ -125,11 +125,10 @@ class Tracker:
         return self._estimator.measure(images, found, self._swept(found))
 
     def _swept(self, middle: Array) -> tuple[Array, Array] | None:
-        """Return camera_from_platform (4, 4) at the beginning and at the end of an exposure about
-        ``middle``.
+        """Return camera_from_platform (4, 4) at the beginning and at the end of an exposure.
 
-        The speed is that since the last frame. The result is None where there was none, or where
-        the exposure takes no time.
+        It is ``middle`` in the middle of the exposure, and the speed is the mean speed since the
+        last frame. The result is None without a last frame, or if the exposure takes no time.
         """
         share = self._estimator.settings.exposed_share
         if self._last is None or share == 0.0:
@@ -138,11 +137,11 @@ class Tracker:
         return middle @ part_of_step(step, -0.5 * share), middle @ part_of_step(step, 0.5 * share)
 
     def _predicted(self) -> Array:
-        """Return camera_from_platform (4, 4) if the last movement goes on."""
+        """Return camera_from_platform (4, 4) of the next frame if the last movement continues."""
         assert self._last is not None
         return self._last if self._step_before is None else self._last @ self._step_before
 
 
 def part_of_step(step: Array, share: float) -> Array:
-    """Return a ``share`` of a small movement (4, 4), to first order."""
+    """Return the ``share`` of a small movement (4, 4), to first order."""
     return rigid(rotation_exp(share * rotation_log(step[:3, :3])), share * step[:3, 3])

@@ -1,6 +1,6 @@
-"""The true side of a sensor: its cameras, the scene before them, and how the cameras move in a run.
+"""The true side of a sensor: its cameras, their scene, and the drift of the cameras in a run.
 
-The estimator knows nothing of it.
+The estimator does not know any of it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from cmmsim.without_images.sticker_scene import StickerScene
 
 @dataclass(frozen=True)
 class Drift:
-    """Changes (24,) of the rig's parameters that grow evenly over a number of frames."""
+    """Changes (24,) of the rig's parameters that grow linearly over a number of frames."""
 
     changes: Array
     frames: int
@@ -43,15 +43,16 @@ class Drift:
     def after(self, frame: int) -> Array:
         """Return the changes (24,) at a frame, counted from 0.
 
-        After the last frame of the drift, the changes stay constant.
+        The changes are constant after the last frame of the drift.
         """
         return min(frame / (self.frames - 1), 1.0) * self.changes
 
 
 class TrueCameras:
-    """Both cameras, and platform and base with their stickers at their true places.
+    """Both true cameras in front of platform and base, with all stickers at their true places.
 
-    `Sensor` describes the arguments and errors of methods with the same names.
+    The methods `add_bodies`, `move` and `drift` belong to `add_bodies`, `move_rig` and `drift_rig`
+    of `Sensor`, which describe arguments and errors.
     """
 
     def __init__(
@@ -79,8 +80,10 @@ class TrueCameras:
         self._drift: Drift | None = None
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
-        """Register further bodies, as `Sensor.add_bodies`."""
-        require_kind(meshes, Mapping, "bodies must be meshes by name, as {'link': rod(0.3, 0.01)}")
+        """Register further bodies; see `Sensor.add_bodies`."""
+        require_kind(
+            meshes, Mapping, "bodies must be a mapping to meshes, as {'link': rod(0.3, 0.01)}"
+        )
         for name, mesh in meshes.items():
             require_kind(name, str, "the name of a body must be text")
             require_kind(mesh, trimesh.Trimesh, f"body {name!r} must be a trimesh.Trimesh")
@@ -89,15 +92,19 @@ class TrueCameras:
         self._draw_anew()
 
     def placed(self, obstacles: Mapping[str, Array] | None) -> Mapping[str, Array]:
-        """Return obstacles at base_from_body (4, 4) each, checked. Raises as `Sensor.look`."""
-        # The legs of a robot are passed in every frame. They are checked together.
+        """Return the transforms base_from_body (4, 4) of obstacles after checks.
+
+        Raises the same errors as `Sensor.look`.
+        """
+        # The legs of a robot are passed in every frame, so they are checked together, which is
+        # fast.
         if isinstance(obstacles, PlacedBodies) and self._are_placed(obstacles):
             return obstacles
         obstacles = {} if obstacles is None else obstacles
         require_kind(
             obstacles,
             Mapping,
-            "obstacles must be transforms by name, as {'link': base_from_body}, or None",
+            "obstacles must be a mapping to transforms, as {'link': base_from_body}, or None",
         )
         for name in obstacles:
             if name not in self.obstacles:
@@ -117,7 +124,7 @@ class TrueCameras:
         }
 
     def _are_placed(self, bodies: PlacedBodies) -> bool:
-        """Tell whether bodies are all the obstacles in their order, at rigid transforms."""
+        """Tell whether ``bodies`` are all obstacles, in their order and with rigid transforms."""
         shape = len(self.obstacles), 4, 4
         if (
             bodies.names != tuple(self.obstacles)
@@ -128,38 +135,36 @@ class TrueCameras:
         return all_rigid(bodies.together)
 
     def move(self, changes: Mapping[str, float], right_later: float) -> None:
-        """Change the true rig, as `Sensor.move_rig`."""
+        """Change the true rig; see `Sensor.move_rig`."""
         self.rig = self.rig.moved(rig_changes(changes))
         self.right_later = right_later
         self._draw_anew()
 
     def drift(self, changes: Mapping[str, float], frames: int) -> None:
-        """Change the true rig in each run, as `Sensor.drift_rig`."""
+        """Let the true rig drift in each run; see `Sensor.drift_rig`."""
         drift = Drift(rig_changes(changes), frames)
         if not drift.changes.any():
             self._drift = None
             return
         if frames < 2:
-            raise CmmError(
-                f"cameras drift from the first to the last of some frames, at least 2, got {frames}"
-            )
+            raise CmmError(f"the number of frames of a drift must be at least 2, got {frames}")
         self._require_in_sight(
             drift.changes, ", ".join(f"{name} by {value:g}" for name, value in changes.items())
         )
         self._drift = drift
 
     def at(self, frame: int) -> VirtualStereoCamera | StatisticalStereoCamera:
-        """Return both cameras before the scene, as they are at a frame of a run, counted from 0."""
+        """Return both cameras in their state at a frame of a run, counted from 0."""
         return self.at_rest if self._drift is None else self.at_rest.moved(self._drift.after(frame))
 
     @cached_property
     def renderer(self) -> Renderer:
-        """Renderer that draws; decided on first use."""
+        """Renderer in use. It is chosen on first use."""
         return choose_renderer(self._asked_renderer)
 
     @cached_property
     def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
-        """Both cameras before the scene, without drift.
+        """Both cameras in front of the scene, without drift.
 
         Raises CmmError if the statistical renderer is not validated for this sensor file.
         """
@@ -181,9 +186,9 @@ class TrueCameras:
         )
 
     def _drawing(self) -> VirtualStereoCamera:
-        """Return cameras that draw.
+        """Return cameras that draw images.
 
-        Stickers are drawn first, so that surfaces hidden behind them need not be drawn.
+        Stickers are drawn first, because surfaces that they hide then need not be drawn.
         """
         file = self._file
         patches = [p for body in self.scene for p in body.stickers] + [
@@ -207,12 +212,13 @@ class TrueCameras:
         )
 
     def _draw_anew(self) -> None:
-        """Have the cameras built anew before the next picture."""
+        """Delete the cached cameras, so that new ones are made before the next exposure."""
         self.__dict__.pop("at_rest", None)
 
     def _require_in_sight(self, changes: Array, what: str) -> None:
-        """Raise CmmError where changes (24,) of the rig move stickers out of an image that shows
-        them at home.
+        """Raise CmmError if changes (24,) of the rig move stickers out of an image.
+
+        Only stickers that the image shows with the platform at home are considered.
         """
         moved = self.rig.moved(changes)
         places = (pose_to_transform(self._file.platform.home), np.eye(4))

@@ -1,6 +1,6 @@
-"""Stickers of the platform that both cameras can look for at a pose, and the stated accuracy there.
+"""Stickers of the platform that both cameras see at a pose, and the stated accuracy at that pose.
 
-A sticker can be searched when it lies in both images, at least a detection window from their edges,
+A sticker counts as visible if it lies in both images, at least a detection window from their edges,
 and neither camera sees it at grazing incidence. Obstacles are not considered.
 """
 
@@ -34,8 +34,9 @@ EDGE_PX = DetectionSettings().window_size
 
 @dataclass(frozen=True)
 class SightLines:
-    """Geometry of sight: a platform with nominal sticker places, a rig, and camera_from_base (4,
-    4).
+    """Geometry that decides visibility.
+
+    It consists of a platform with nominal sticker places, a rig, and camera_from_base (4, 4).
     """
 
     platform: MarkedBody
@@ -48,9 +49,7 @@ class SightLines:
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     def visible(self, pose: ArrayLike) -> NDArray[np.bool_]:
-        """Tell for each sticker (n,) whether both cameras can look for it, with the platform at a
-        pose (6,).
-        """
+        """Tell for each sticker (n,) whether both cameras see it at a pose (6,) of the platform."""
         base_from_platform = pose_to_transform(pose)
         seen = np.ones(len(self.platform.sticker_ids), dtype=bool)
         for camera, from_base in zip(self.rig.cameras, self.cameras_from_base, strict=True):
@@ -63,8 +62,7 @@ class SightLines:
 
 
 def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> SightLines:
-    """Return the geometry of sight of a built-in sensor or a sensor file, with changes to its
-    entries.
+    """Return the sight lines of a built-in sensor or a sensor file, with changes to its entries.
 
     Raises UnknownSensorError, SensorFileError.
     """
@@ -81,19 +79,18 @@ def expected_covariance(
 ) -> Array:
     """Return the covariance (6, 6) that a sensor would state for a pose (6,), m and rad.
 
-    One exposure is drawn without OpenGL, and the sensor is taken as taught without error. Raises
-    LostError where the stickers do not suffice, and all that `load_sensor` raises.
+    One exposure is drawn without OpenGL. Teaching is assumed to be free of errors. Raises LostError
+    if the stickers do not determine the pose, and the same errors as `load_sensor`.
     """
     sensor = load_sensor(name, 0, method, renderer="analytic", changes=changes)
     return stated_covariance(sensor, sight_lines(name, changes), pose)
 
 
 def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Array:
-    """Return the covariance (6, 6) that a sensor states for a pose (6,), m and rad, from one
-    exposure.
+    """Return the covariance (6, 6) that a sensor states for a pose (6,), m and rad.
 
-    Nothing is taught or searched: the stickers are where the pose says. Raises as
-    `expected_covariance`.
+    One exposure is drawn, and its stickers are read at the places that follow from the pose,
+    without teaching or search. Raises the same errors as `expected_covariance`.
     """
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform

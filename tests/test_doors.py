@@ -125,8 +125,8 @@ def test_a_foreign_package_of_the_name_identify_is_named(tmp_path, rooms):
     for room in rooms:
         (foreign / room).symlink_to(ROOT / "identify" / room)
     said = (
-        f"another package stands in the place of cmmsim's `identify`: {foreign}; install "
-        "cmmsim alone"
+        f"another package is imported instead of cmmsim's `identify`: {foreign}; install "
+        "cmmsim into a virtual"
     )
     warned = python("-c", "from cmmsim import load_sensor", cwd=tmp_path, path=[tmp_path, ROOT])
     assert warned.returncode == 0

@@ -207,7 +207,7 @@ def test_kernels_that_another_user_planted_in_numbas_cache_are_not_loaded(common
     shared = commons / "shared"
     stranger("mkdir", "-m", "777", shared)
     said = run(NUMBA_CACHE_DIR=shared)
-    assert "CompilationWarning: others may write into" in said
+    assert "CompilationWarning: other users can write into" in said
 
 
 def plant(files, mark):

@@ -1,8 +1,9 @@
 """Acceptance tests of the sensor in the style of standards.
 
-VDI/VDE 2634-1 tests lengths, ASTM E3064-16 a moving bar, and ASTM E3124 latency. The artefacts are
-imaged by the sensor's own virtual cameras, and measured by its own detection and triangulation.
-Their true sizes and poses are used only to judge the result.
+Lengths are tested in the style of VDI/VDE 2634-1, a moving bar in that of ASTM E3064-16, and
+latency in that of ASTM E3124. The sensor's own virtual cameras take images of the artefacts, and
+its own detection and triangulation measure them. True sizes and poses of the artefacts are used
+only to compute the errors.
 """
 
 from cmmsim.acceptance.artefacts import SensorUnderTest

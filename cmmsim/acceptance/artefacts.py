@@ -1,4 +1,4 @@
-"""Artefacts of the tests, and the sensor before them.
+"""Artefacts of the acceptance tests, and the sensor under test.
 
 An artefact is a long board with a ridge and stickers on its three upper sides. Its frame has x
 along it, z out of its front side A, and its origin in the middle of that side. Sides B and C slope
@@ -24,33 +24,33 @@ from cmmsim.sensor import Sensor
 
 H = TypeVar("H", bound=HalfSpace)
 SLOPE = np.deg2rad(15.0)
-# m: half the width of side A.
+# m: half of the width of side A.
 HALF_RIDGE = 0.020
 # m: width of sides B and C.
 SIDE = 0.060
 # m: length of the board beyond its outermost stickers.
 END = 0.020
-# m behind the cameras.
+# m: distance by which the base is moved behind the cameras.
 OUT_OF_SIGHT = 100.0
-# m between the origins of the rigid bar's ends, which lie on its x axis.
+# m: distance between the origins of the two ends of the rigid bar, which lie on its x axis.
 LENGTH = 0.300
 HALF_LENGTH = 0.5 * LENGTH + 0.065
 HALF_WIDTH = HALF_RIDGE + SIDE
-# True first_from_second of the ends.
+# True transform from the frame of the second end to the frame of the first end.
 END_FROM_END = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
 
 StickerRow = tuple[ArrayLike, ArrayLike]
-"""Stickers of one side, along (n,) and across (n,), m.
+"""Places of the stickers of one side: along (n,) and across (n,) the artefact, m.
 
-Along is counted from the middle of the artefact, across from the middle line of side A, or on sides
-B and C from the edge of A.
+Along is counted from the middle of the artefact. Across is counted from the middle line of side A,
+or on sides B and C from the edge to side A.
 """
 
 
 def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
-    """Return the sensor-file section of an artefact with rows of stickers on its sides.
+    """Return the sensor-file section of an artefact with rows of stickers on its sides A, B and C.
 
-    They are A, B (towards +y) and C (towards -y).
+    Side B lies towards +y, and side C towards -y.
     """
     reach = max(float(np.abs(along).max()) for along, _ in (a, b, c)) + END
     sine = float(np.sin(SLOPE))
@@ -75,9 +75,9 @@ def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
 
 
 def artefact_file(file: SensorFile, artefact: Platform) -> SensorFile:
-    """Return the sensor file with an artefact in place of the platform, and nothing else in sight.
+    """Return the sensor file with an artefact instead of the platform, and the base out of sight.
 
-    The artefact's stickers sit exactly at the places that its certificate states.
+    The artefact's stickers lie exactly at the places that its certificate states.
     """
     stickers = file.stickers.model_copy(update={"placement": (0.0, 0.0)})
     return file.model_copy(
@@ -93,7 +93,8 @@ def _side(
 ) -> StickerPlane:
     """Return one side with its stickers.
 
-    u runs along the artefact, and v = n x u points to +y on all sides, so that C counts backwards.
+    The axis u runs along the artefact, and v = n x u points to +y on all sides. On side C, the
+    ``sign`` is -1, because places across are counted towards -y.
     """
     stickers = [(float(u), sign * float(v)) for u, v in np.column_stack(row)]
     return StickerPlane(normal=normal, point=point, across=(1.0, 0.0, 0.0), stickers=stickers)
@@ -113,16 +114,18 @@ def rigid_bar() -> Platform:
 
 
 def bar_ends(bar: MarkedBody) -> tuple[MarkedBody, MarkedBody]:
-    """Return the clusters at -x and at +x as bodies whose axes are parallel to those of the bar.
+    """Return the sticker clusters at -x and at +x as two bodies with axes parallel to the bar's.
 
-    Their origins lie on the bar's axis, ``LENGTH`` apart.
+    The origins of the bodies lie on the bar's x axis, ``LENGTH`` apart.
     """
     return _end(bar, "first end of the bar", -1.0), _end(bar, "second end of the bar", 1.0)
 
 
 def _end(bar: MarkedBody, name: str, side: float) -> MarkedBody:
-    """Return the stickers on one side of the bar, as a body whose origin is half a length from the
-    middle.
+    """Return the stickers at one end of the bar as a body.
+
+    The end lies towards -x or +x, as the sign ``side`` states. The body's origin lies half of
+    ``LENGTH`` from the middle of the bar.
     """
     keep = np.flatnonzero(side * bar.nominal[:, 0] > 0.0)
     origin = np.array([0.5 * side * LENGTH, 0.0, 0.0])
@@ -158,14 +161,17 @@ def _moved(half_space: H, shift: Array) -> H:
 
 @dataclass(frozen=True)
 class SensorUnderTest:
-    """Sensor file under test, the seed of all its noise, and a renderer, or None for the file's."""
+    """Sensor under test: its file, the seed of all its noise, and the name of a renderer.
+
+    Without a renderer, the renderer that the file names is used.
+    """
 
     file: SensorFile
     seed: int = 0
     renderer: str | None = None
 
     def facing(self, artefact: Platform, stream: int) -> Sensor:
-        """Return the sensor with an artefact in place of its platform.
+        """Return the sensor with an artefact instead of its platform.
 
         Different values of ``stream`` give independent noise.
         """
@@ -174,9 +180,10 @@ class SensorUnderTest:
         return sensor
 
     def renderer_name(self) -> str:
-        """Return the name of the renderer that will draw.
+        """Return the name of the renderer in use; "auto" is resolved.
 
-        Raises UnknownOptionError, or OpenGLMissingError where it cannot draw.
+        Raises UnknownOptionError, and OpenGLMissingError if the renderer needs OpenGL that is
+        missing.
         """
         name = choose_renderer(self.renderer or self.file.renderer).name
         if name == "pyrender":
@@ -185,16 +192,16 @@ class SensorUnderTest:
 
     @property
     def base_from_camera(self) -> Array:
-        """Stated place of the rig (4,4)."""
+        """Transform base_from_camera (4, 4) from the sensor file."""
         return invert(rig_from_file(self.file.rig)[1])
 
 
 def estimator_of(
     sensor: Sensor, body: MarkedBody, base_from_camera: Array | None = None
 ) -> PoseEstimator:
-    """Return the sensor's pose estimator for a body whose certificate states its sticker places.
+    """Return the sensor's pose estimator for a body with certified sticker places.
 
-    Poses are in the camera frame unless the place of the base is given.
+    Poses are in the base frame if ``base_from_camera`` (4, 4) is given, else in the camera frame.
     """
     place = np.eye(4) if base_from_camera is None else base_from_camera
     taught = Taught.without_error(sensor.name, place, body.nominal.copy(), np.zeros((0, 3)))
@@ -202,8 +209,9 @@ def estimator_of(
 
 
 def locate(estimator: PoseEstimator, images: StereoImages) -> Array:
-    """Find a rough camera_from_body (4, 4) in whole images. Raises AcceptanceError that names the
-    body.
+    """Find a rough camera_from_body (4, 4) in whole images.
+
+    Raises AcceptanceError, which names the body, if it is not found.
     """
     try:
         return estimator.locate(images)

@@ -1,9 +1,9 @@
 """Latency in the style of ASTM E3124: the time from a motion to the report of its pose.
 
-A body moves on a circle, and a reference with an exact clock knows its true place. Each reported
-pose is compared with the true motion at the time of its report. The latency is the time shift of
-the motion that fits the reports best. Frames are tracked one after the other, because the tracker
-is part of the instrument under test.
+A body moves on a circle, and its true position is known at every time. The reported positions are
+compared with the true motion at the times of the reports. The latency is the time shift of the true
+motion that fits the reports best. Frames are tracked one after the other, because the tracker is
+part of the instrument under test.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from cmmsim.geometry.pose import Array, apply
 from cmmsim.tracker import Tracker
 
 STREAM = 201
-# Circle in m and s: the speed is 0.31 m/s.
+# Radius of the circle in m, and time of one revolution in s. The speed is 0.31 m/s.
 RADIUS = 0.05
 PERIOD = 1.0
 FRAMES = 180
@@ -43,8 +43,8 @@ Motion = Callable[[Array], Array]
 class Latency:
     """Delays (n,) of the reports, s, with their mean, standard deviation and maximum.
 
-    ``interval`` is the 95 % interval of the mean. ``resolution`` is the standard deviation of a
-    single delay that the noise of the positions alone causes.
+    ``interval`` is the 95 % interval of the mean. ``resolution`` is the standard deviation that the
+    noise of the positions causes in a single delay.
     """
 
     delays: Array
@@ -57,8 +57,11 @@ class Latency:
 
 @dataclass(frozen=True)
 class LatencyTest:
-    """Latency found, the times (n,) of the reports, and the latency that the sensor's file states,
-    s.
+    """Result of a latency test.
+
+    ``latency`` is the estimated latency, and ``stated`` the latency in the sensor file, s.
+    ``reported`` (n,) are the times of the reports, s. ``frame_period`` is in s, and ``lost`` is the
+    number of lost frames.
     """
 
     latency: Latency
@@ -77,10 +80,11 @@ def estimate_latency(
 ) -> Latency:
     """Estimate the delay of each report by least squares.
 
-    The model is positions(k) = motion(reported(k) - delay(k)) + offset, with a constant offset (3,)
-    that is not a result. Reports are at times (n,) s with positions (n, 3) m and covariances (n, 3,
-    3). Latencies from 0 to ``largest`` s are searched, at most half the period of the motion.
-    Raises ShapeError for less than four reports, and for a motion that stands still.
+    The model is positions(k) = motion(reported(k) - delay(k)) + offset. The constant offset (3,) is
+    estimated as well, but not returned. Reports are at times ``reported`` (n,) s with ``positions``
+    (n, 3) m and ``covariances`` (n, 3, 3). The search begins with common delays from 0 to
+    ``largest`` s, which must be at most half the period of the motion. Raises ShapeError for fewer
+    than four reports, and for a motion that stands still.
     """
     if len(reported) < 4 or positions.shape != (len(reported), 3):
         raise ShapeError(
@@ -95,7 +99,7 @@ def estimate_latency(
         squared = np.sum(velocity**2, axis=1)
         if squared.min() < 1e-8:
             raise ShapeError(
-                "latency needs a motion that never stands still: its lowest speed is "
+                "latency needs a motion without standstill: its lowest speed is "
                 f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed"
             )
         residuals = positions - motion(times) - offset
@@ -117,7 +121,7 @@ def estimate_latency(
 
 
 def require_room(volume: MeasuringVolume) -> None:
-    """Raise AcceptanceError unless the body's circle fits into the volume."""
+    """Raise AcceptanceError unless the body stays inside the volume on its circle."""
     needed = 2.0 * np.array([HALF_LENGTH + RADIUS, HALF_WIDTH + RADIUS, 0.0])
     if np.any(needed > volume.size):
         raise AcceptanceError(
@@ -132,9 +136,10 @@ def latency_test(
     frames: int = FRAMES,
     advance: Callable[[], None] = lambda: None,
 ) -> LatencyTest:
-    """Move a body on a circle in the middle of the volume, and report its measured positions.
+    """Move a body on a circle in the middle of the volume, and estimate the latency of the reports.
 
-    ``advance`` is called after each frame. Raises AcceptanceError when the body is not measured.
+    ``advance`` is called after each frame. Raises AcceptanceError if the volume is too small, or if
+    fewer than four frames are measured.
     """
     require_room(volume)
     sensor = under_test.facing(rigid_bar(), STREAM)
@@ -149,7 +154,7 @@ def latency_test(
     def motion(times: Array) -> Array:
         return apply(volume.base_from_volume, _circle(times))
 
-    # An error about a body that is not found is raised before any frame is tracked.
+    # If the body cannot be found, the error is raised here, before the frames are tracked.
     locate(estimator, sensor.look(pose(0.0)))
     tracker = Tracker(estimator)
     taken = np.arange(frames) / sensor.timing.frame_rate
@@ -181,10 +186,9 @@ def _circle(times: Array) -> Array:
 
 
 def _coarse_delay(reported: Array, positions: Array, motion: Motion, largest: float) -> float:
-    """Return the best of a grid of common delays.
+    """Return the common delay, from a grid, with the smallest variance of the residuals.
 
-    The best delay has the smallest variance of the residuals, after the best constant offset is
-    removed.
+    The variance does not depend on a constant offset.
     """
     grid = np.linspace(0.0, largest, 101)
     misfit = [np.var(positions - motion(reported - delay), axis=0).sum() for delay in grid]
@@ -192,7 +196,7 @@ def _coarse_delay(reported: Array, positions: Array, motion: Motion, largest: fl
 
 
 def _common_step(residuals: Array, velocity: Array) -> tuple[float, Array]:
-    """Return the least-squares change of a common delay and of the offset (3,)."""
+    """Return least-squares changes of the common delay and of the offset (3,)."""
     columns = np.zeros((residuals.size, 4))
     columns[:, 0] = -velocity.ravel()
     columns[:, 1:] = np.tile(np.eye(3), (len(residuals), 1))
@@ -201,9 +205,9 @@ def _common_step(residuals: Array, velocity: Array) -> tuple[float, Array]:
 
 
 def _resolution(velocity: Array, covariances: Array | None) -> float:
-    """Return the standard deviation of a delay from the positions' noise, rms over the reports.
+    """Return the standard deviation of a delay due to the noise of positions, rms over reports.
 
-    It is 0 without covariances.
+    The result is 0 without covariances.
     """
     if covariances is None:
         return 0.0

@@ -1,9 +1,10 @@
 """Length measurement error in the style of VDI/VDE 2634-1.
 
-An artefact with a row of six stickers stands on each measuring line. The distances of five of them
-from the first are the test lengths. A length is the mean of a few exposures of the standing
-artefact. Its error is the measured length minus the certified length. The magnitude of the error
-must stay within a limit. Sphere form and spacing are not tested: the targets are flat stickers.
+An artefact with a row of six stickers stands on each measuring line. The test lengths are the
+distances from the first sticker to the other five. A measured length is the mean over a few
+exposures of the artefact at rest. Its error is the measured length minus the certified length. The
+standard limits the magnitude of the error. The standard's tests of sphere form and sphere spacing
+are omitted, because the targets are flat stickers.
 """
 
 from collections.abc import Callable
@@ -21,10 +22,10 @@ from cmmsim.many_frames import on_all_cores
 from cmmsim.sensor import Sensor
 
 STREAM = 1
-# Exposures of the standing artefact, whose lengths are averaged.
+# Number of exposures of the artefact at rest over which lengths are averaged.
 EXPOSURES = 5
-# Irregular stickers by which the artefact is recognised, from its middle, as shares of the longest
-# length.
+# Irregular places of the stickers that serve to recognise the artefact. Along the artefact, they
+# are counted from its middle, as shares of the longest length. Across, they are in m.
 RECOGNITION_B = (-0.37, -0.08, 0.31)
 RECOGNITION_C = (-0.29, 0.13, 0.4)
 RECOGNITION_ACROSS = (0.044, 0.025, 0.040)
@@ -32,10 +33,10 @@ RECOGNITION_ACROSS = (0.044, 0.025, 0.040)
 
 @dataclass(frozen=True)
 class MeasuredLength:
-    """Length on a line, with its certified value ``true``, m.
+    """Measured length on a line.
 
-    ``measured`` (k,) is the length in each of k exposures, m, and ``std`` the stated standard
-    deviation of one of them.
+    ``true`` is the certified length, m. ``measured`` (k,) are the lengths in k exposures, m, and
+    ``std`` is the stated standard deviation of the length in one exposure.
     """
 
     line: str
@@ -45,7 +46,7 @@ class MeasuredLength:
 
     @property
     def error(self) -> float:
-        """Length measurement error E: mean of the exposures less the certified length, m."""
+        """Length measurement error E: mean over exposures minus certified length, m."""
         return float(self.measured.mean()) - self.true
 
 
@@ -74,19 +75,23 @@ class LengthTest:
 
     @property
     def variance_ratio(self) -> float:
-        """Mean square of single exposures' errors in units of their stated variance, which is right
-        at 1.
+        """Mean square of the errors in single exposures, in units of their stated variance.
+
+        A value of 1 means that the stated variance is right.
         """
         stds = np.array([length.std for length in self.lengths])
         return float(np.mean((self.single_errors / stds[:, None]) ** 2))
 
     def of_line(self, name: str) -> tuple[MeasuredLength, ...]:
-        """The measured lengths of one line."""
+        """Return the measured lengths of one line."""
         return tuple(length for length in self.lengths if length.line == name)
 
 
 def length_artefact(line: MeasuringLine) -> Platform:
-    """The artefact of a line: six stickers in a row on side A, the first at the line's start."""
+    """Return the artefact of a line, with six stickers in a row on side A.
+
+    The first of them lies at the start of the line.
+    """
     longest = float(line.lengths.max())
     along = np.concatenate([[0.0], line.lengths]) - 0.5 * longest
     return board(
@@ -104,8 +109,8 @@ def length_test(
 ) -> LengthTest:
     """Measure five lengths on each of the seven lines of a volume.
 
-    The lines share all cores, and each has noise of its own. ``advance`` is called after each line.
-    Raises AcceptanceError when a line breaks a rule or a sticker is not measured.
+    The lines are measured on all cores, each with its own noise. ``advance`` is called after each
+    line. Raises AcceptanceError if a line breaks a rule or a sticker is not measured.
     """
     lines = seven_lines(volume)
     lengths: list[MeasuredLength] = []
@@ -125,14 +130,15 @@ def length_test(
 def measure_line(
     sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, exposures: int
 ) -> list[MeasuredLength]:
-    """Measure the lengths of one line, whose artefact the sensor faces, in ``exposures``
-    pictures.
+    """Measure the lengths of one line in a number of exposures.
+
+    The platform of ``sensor`` must be the artefact of the line.
     """
     pose = volume.pose(line.direction, 0.5 * (line.start + line.end))
     body = sensor.platform
     estimator = estimator_of(sensor, body)
     expected = locate(estimator, sensor.look(pose))
-    count = 1 + len(line.lengths)  # the row comes first among the stickers
+    count = 1 + len(line.lengths)  # the stickers of the row are the first of the artefact
     values = np.empty((exposures, len(line.lengths)))
     stds = np.empty((exposures, len(line.lengths)))
     for k in range(exposures):
@@ -151,10 +157,10 @@ def measure_line(
 
 
 def lengths_from_first(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Return the distances (n - 1,) m of points (n, 3) from the first, and their standard
+    """Return the distances (n - 1,) m of points from the first point, and their standard
     deviations.
 
-    The points have covariances (n, 3, 3).
+    The points are (n, 3) with covariances (n, 3, 3).
     """
     steps = points[1:] - points[0]
     lengths = np.linalg.norm(steps, axis=1)

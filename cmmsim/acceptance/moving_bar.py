@@ -1,14 +1,15 @@
 """Relative pose error of a moving rigid bar in the style of ASTM E3064-16.
 
-The bar moves along two rasters in three orientations, after standing still at the start of each
-raster. One raster goes to and fro along the volume's x axis while it advances along y; the other
-exchanges these axes. A bar that points at the cameras hides its flat stickers. The third
-orientation therefore leans only ``TOWARDS_DEPTH`` out of the image plane. In addition the bar turns
-smoothly about all its axes.
+The bar moves along two rasters, each in three orientations. At the start of each raster, it first
+stands still. One raster goes to and fro along the volume's x axis while it advances along y. The
+other raster exchanges these axes. If the bar pointed at the cameras, its flat stickers would not be
+visible. In the third orientation, the bar is therefore inclined by only ``TOWARDS_DEPTH`` to the
+image plane. In addition, the bar rotates smoothly about all its axes.
 
-The sensor measures the poses of the clusters at both ends in the same exposure. Their certified
-relative pose is compared with the measured one, for the standing and for the moving bar. Frames are
-tracked one after the other, because the tracker is part of the instrument under test.
+The sensor measures the poses of the sticker clusters at both ends in the same exposure. The
+measured pose of one end relative to the other is compared with the certified relative pose, for the
+bar at rest and for the moving bar. Frames are tracked one after the other, because the tracker is
+part of the instrument under test.
 """
 
 from collections.abc import Callable
@@ -43,10 +44,10 @@ from cmmsim.measuring.measurement import Measurement
 from cmmsim.sensor import Sensor
 from cmmsim.tracker import Tracker
 
-# Seconds of motion in a run, and movements to and fro in this time.
+# Duration of the motion in a run, s, and number of movements to and fro in this time.
 SECONDS = 3.0
 CYCLES = 1.5
-# Reach of the turning about each axis.
+# Amplitude of the rotation about each axis, and number of its cycles in a run.
 TURN = np.deg2rad(8.0)
 TURN_CYCLES = np.array([1.0, 1.5, 0.5])
 TOWARDS_DEPTH = np.deg2rad(35.0)
@@ -54,10 +55,10 @@ TOWARDS_DEPTH = np.deg2rad(35.0)
 STEP = 1e-4
 SPEED_SAMPLES = 100
 STREAM = 101
-# Exposures of the standing bar before each run.
+# Number of exposures of the bar at rest at the start of each run.
 STANDING = 15
-# Frames lost in a row that end a run: each costs a search of whole images, and the rest would be
-# lost as well.
+# Number of consecutive lost frames that ends a run. After each lost frame, the whole images are
+# searched, which takes time, and further frames would probably be lost as well.
 GIVEN_UP = 5
 RASTERS = {"x": 0, "y": 1}
 ORIENTATIONS = {
@@ -71,8 +72,8 @@ ORIENTATIONS = {
 class BarPath:
     """Path of the bar in a volume.
 
-    ``fast`` is the index of the raster's fast axis, and ``along`` (3,) the direction of the bar in
-    volume axes.
+    ``fast`` is the index of the axis along which the bar moves to and fro. ``along`` (3,) is the
+    direction of the bar in volume axes.
     """
 
     name: str
@@ -81,9 +82,9 @@ class BarPath:
     volume: MeasuringVolume
 
     def pose(self, time: float) -> Array:
-        """Return the pose (6,) of the bar in the base frame, ``time`` s after it starts to move.
+        """Return the pose (6,) of the bar in the base frame, ``time`` s after its start from rest.
 
-        It starts from rest.
+        The speed is zero at time 0.
         """
         phase = 2.0 * np.pi * time / SECONDS
         slow = -np.cos(0.5 * phase) * self.reach
@@ -92,7 +93,7 @@ class BarPath:
         return self.volume.pose(self.along, slow, turn)
 
     def pose_rate(self, time: float) -> Array:
-        """Rate (6,) of the pose, by central differences."""
+        """Return the time derivative (6,) of the pose, from central differences."""
         return (self.pose(time + STEP) - self.pose(time - STEP)) / (2.0 * STEP)
 
     @property
@@ -103,20 +104,21 @@ class BarPath:
 
     @property
     def reach(self) -> Array:
-        """Distances (3,), m, by which the bar's middle may move from the middle of the volume with
-        the whole bar still inside.
+        """Largest distances (3,), m, of the bar's middle from the middle of the volume.
+
+        The whole bar stays inside the volume.
         """
         return 0.5 * self.volume.size - room_of_bar(self.along)
 
 
 def room_of_bar(along: Array) -> Array:
-    """Return half the sides (3,) of the cuboid in which a bar stays that turns by up to TURN, m."""
+    """Return half the sides (3,), m, of a cuboid that contains a bar rotated by up to TURN."""
     across = HALF_WIDTH + HALF_LENGTH * np.sqrt(3.0) * np.sin(TURN)
     return np.asarray(HALF_LENGTH * np.abs(along) + across * np.sqrt(1.0 - along**2))
 
 
 def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
-    """Return the six paths of a volume. Raises AcceptanceError if the bar does not fit into it."""
+    """Return the six paths in a volume. Raises AcceptanceError if the bar does not fit into it."""
     paths = tuple(
         BarPath(f"raster {raster}, bar {name}", axis, along, volume)
         for raster, axis in RASTERS.items()
@@ -135,12 +137,13 @@ def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
 class BarRun:
     """One run of the bar, which begins to move at time 0.
 
-    ``time`` (n,) holds the times of the measured frames, s. ``errors`` (n, 6) are the errors of the
-    relative pose, [shift, turn] in axes of the first end, m and rad. ``distance_errors`` (n,) are
-    the errors of the distance between the ends, m. ``variance_ratios`` (n,) are squared errors in
-    units of the stated covariance, divided by 6. ``lost`` counts frames in which an end was not
-    measured. ``given_up`` is the reason why the run ended after GIVEN_UP lost frames in a row. The
-    remaining frames then count as lost.
+    ``time`` (n,) are the times of the measured frames, s. ``errors`` (n, 6) are the errors of the
+    relative pose as shift and rotation vector, in axes of the first end, m and rad.
+    ``distance_errors`` (n,) are the errors of the distance between the ends, m. ``variance_ratios``
+    (n,) are squared errors in units of the stated covariance, divided by 6. ``lost`` is the number
+    of frames in which an end was not measured. If GIVEN_UP consecutive frames are lost, the run
+    ends, and its remaining frames count as lost. ``given_up`` is then the reason, and otherwise
+    empty.
     """
 
     name: str
@@ -159,7 +162,11 @@ class BarRun:
 
 @dataclass(frozen=True)
 class BarTest:
-    """Measuring volume, the runs in it, the exposure in s, and the bar's largest speed in m/s."""
+    """Result of the bar test.
+
+    It contains the measuring volume, the runs, the exposure time in s, and the largest speed of the
+    bar in m/s.
+    """
 
     volume: MeasuringVolume
     runs: tuple[BarRun, ...]
@@ -168,29 +175,27 @@ class BarTest:
 
     @property
     def frames(self) -> int:
-        """Measured and lost frames of all runs."""
+        """Number of frames of all runs, measured or lost."""
         return sum(len(run.time) + run.lost for run in self.runs)
 
     @property
     def lost(self) -> int:
-        """Lost frames of all runs."""
+        """Number of lost frames of all runs."""
         return sum(run.lost for run in self.runs)
 
     def errors(self, moving: bool) -> Array:
-        """Return the errors (n, 6), m and rad, of the moving or of the standing bar in all runs."""
+        """Return the errors (n, 6), m and rad, of the bar in motion or at rest in all runs."""
         return np.concatenate([run.errors[run.moving == moving] for run in self.runs])
 
     def distance_errors(self, moving: bool) -> Array:
-        """Return the errors (n,) of the ends' distance, m, of the moving or of the standing bar in
-        all runs.
-        """
+        """Return the errors (n,) of the ends' distance, m, in motion or at rest in all runs."""
         return np.concatenate([run.distance_errors[run.moving == moving] for run in self.runs])
 
     @property
     def variance_ratio(self) -> float:
         """Mean squared error in units of the stated covariance.
 
-        1 means that the covariance is right.
+        A value of 1 means that the covariance is right.
         """
         return float(np.concatenate([run.variance_ratios for run in self.runs]).mean())
 
@@ -202,10 +207,11 @@ def bar_test(
     standing: int = STANDING,
     advance: Callable[[], None] = lambda: None,
 ) -> BarTest:
-    """Move the bar along the six paths of a volume; ``advance`` is called after each.
+    """Move the bar along the six paths of a volume, and measure its relative pose errors.
 
-    ``seconds`` of motion are measured from the start of each path. Raises AcceptanceError if the
-    bar does not fit into the volume, or is not found in the first images.
+    In each run, the bar is measured in ``standing`` exposures at rest and in the first ``seconds``
+    of its motion. ``advance`` is called after each run. Raises AcceptanceError if the bar does not
+    fit into the volume, or if it is not found in the first images.
     """
     sensor = under_test.facing(rigid_bar(), STREAM)
     rate = sensor.timing.frame_rate
@@ -222,10 +228,10 @@ def bar_test(
 
 
 def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
-    """Measure the bar at ``times`` (n,) s of a path; it stands still before time 0."""
+    """Measure the bar at ``times`` (n,) s of a path. Before time 0, the bar stands still."""
     estimators = [estimator_of(sensor, end) for end in bar_ends(sensor.platform)]
     for estimator in estimators:
-        # An error about an end that is not found is raised before any frame is tracked.
+        # If an end cannot be found, the error is raised here, before the frames are tracked.
         locate(estimator, sensor.look(path.pose(0.0)))
     trackers = [Tracker(estimator) for estimator in estimators]
     rows = []
@@ -248,7 +254,8 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
                 break
     if not (seen and seen[0] < 0.0 <= seen[-1]):
         raise AcceptanceError(
-            f"{path.name}: no frame of the standing or none of the moving bar is measured: {reason}"
+            f"{path.name}: the bar must be measured at rest and in motion, but no frame of one of "
+            f"them is measured: {reason}"
         )
     errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
     given_up = reason if in_a_row == GIVEN_UP else ""
@@ -258,10 +265,11 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
 
 
 def relative_error(first: Measurement, second: Measurement) -> tuple[Array, float, float]:
-    """Return the error (6,) of the second end's pose relative to the first, in axes of the first.
+    """Return the error (6,) of the second end's pose relative to the first end.
 
-    The other results are the error of the ends' distance, and the squared error in units of the
-    stated covariance, divided by 6.
+    The error is a shift and a rotation vector in axes of the first end. The second result is the
+    error of the ends' distance. The third result is the squared error in units of the stated
+    covariance, divided by 6.
     """
     measured = invert(pose_to_transform(first.pose)) @ pose_to_transform(second.pose)
     turn = rotation_log(measured[:3, :3] @ END_FROM_END[:3, :3].T)
@@ -272,20 +280,21 @@ def relative_error(first: Measurement, second: Measurement) -> tuple[Array, floa
 
 
 def relative_covariance(first: Measurement, second: Measurement) -> Array:
-    """Return the covariance (6, 6) of the relative pose's small error [shift, turn].
+    """Return the covariance (6, 6) of the small error [shift, rotation] of the relative pose.
 
-    It is in axes of the first end.
+    The error is in axes of the first end.
     """
     by_first = -np.eye(6)
-    # A turn of the first end moves the second one by the lever between them.
+    # A rotation of the first end shifts the second end, because there is a lever between them.
     by_first[:3, 3:] = skew(second.pose[:3] - first.pose[:3])
     total = by_first @ _small_covariance(first) @ by_first.T + _small_covariance(second)
     return compose_covariance(invert(pose_to_transform(first.pose)), total)
 
 
 def _small_covariance(measurement: Measurement) -> Array:
-    """Return the covariance (6, 6) of a pose's small error [shift, turn] instead of its Euler
-    angles.
+    """Return the covariance (6, 6) of a pose's small error [shift, rotation vector].
+
+    The measurement states the covariance for Euler angles.
     """
     turn = np.eye(6)
     turn[3:, 3:] = euler_rates_matrix(measurement.pose)

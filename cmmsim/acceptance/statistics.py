@@ -1,7 +1,7 @@
-"""Statistics of errors with 95 % intervals, and the published figures that stand beside ours.
+"""Statistics of errors with 95 % intervals, and published values for comparison.
 
-Makers and laboratories published the figures for real instruments. Each figure has its own test,
-volume and targets. None was measured here.
+Makers and laboratories published these values for real instruments. They come from different tests
+with different volumes and targets, and were not measured with this package.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of values, in their unit.
+    """Statistics of values, in the unit of the values.
 
-    ``interval`` holds the 95 % intervals of mean, rms and p95, which come from resampling blocks; a
-    maximum has none.
+    ``interval`` contains the 95 % intervals of mean, rms and p95 by name, from a block bootstrap.
     """
 
     count: int
@@ -39,13 +38,13 @@ class Statistics:
 def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statistics:
     """Return the statistics of magnitudes (n,) of errors.
 
-    Neighbouring values are not independent, so they are resampled in blocks of ``block`` values;
-    scipy.stats.bootstrap resamples single values only. Raises ShapeError for no values and for
-    values that are not finite.
+    Neighbouring values are not independent, so they are resampled in blocks of ``block`` values.
+    scipy.stats.bootstrap cannot do this, because it resamples single values only. Raises ShapeError
+    without values, and for values that are not finite.
     """
     _require_finite(values)
     starts = rng.integers(0, len(values), (RESAMPLES, -(-len(values) // block)))
-    # Blocks go on at the beginning, so that all values are drawn equally often.
+    # Blocks continue at the beginning of the values, so that all values are drawn equally often.
     drawn = ((starts[:, :, None] + np.arange(block)) % len(values)).reshape(RESAMPLES, -1)[
         :, : len(values)
     ]
@@ -63,7 +62,7 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
 
 
 def _figures(values: Array) -> dict[str, Array]:
-    """Mean, root mean square and 95th percentile of values (..., n)."""
+    """Return mean, root mean square and 95th percentile of values (..., n)."""
     return {
         "mean": np.mean(values, axis=-1),
         "rms": np.sqrt(np.mean(values**2, axis=-1)),
@@ -72,8 +71,9 @@ def _figures(values: Array) -> dict[str, Array]:
 
 
 def interval_of_mean(values: Array) -> Interval:
-    """Return the 95 % interval of the mean of independent normal values (n,), n >= 2, by Student's
-    t.
+    """Return the 95 % interval of the mean of independent normal values (n,), n >= 2.
+
+    It is computed from Student's t distribution.
     """
     _require_finite(values)
     if len(values) < 2:
@@ -87,15 +87,16 @@ def interval_of_mean(values: Array) -> Interval:
 def _require_finite(values: Array) -> None:
     if values.ndim != 1 or len(values) == 0 or not np.all(np.isfinite(values)):
         raise ShapeError(
-            f"statistics need at least one value and finite values (n,), got shape {values.shape}"
+            "statistics need at least one value and only finite values (n,), got shape "
+            f"{values.shape}"
         )
 
 
 @dataclass(frozen=True)
 class PublishedFigure:
-    """Figure that was published for an instrument.
+    """Accuracy or latency that was published for an instrument.
 
-    ``value`` has the published unit, and ``note`` says what kind of figure it is.
+    ``value`` is in the published ``unit``. ``note`` states how the value was published.
     """
 
     instrument: str
@@ -134,7 +135,8 @@ PUBLISHED = (
 
 
 def published(quantity: str) -> tuple[PublishedFigure, ...]:
-    """Return the published figures of one quantity, such as "position, static"; there may be
-    none.
+    """Return the published values of one quantity, such as "position, static".
+
+    The result can be empty.
     """
     return tuple(figure for figure in PUBLISHED if figure.quantity == quantity)

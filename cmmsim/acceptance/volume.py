@@ -1,10 +1,8 @@
-"""The measuring volume, a cuboid that both cameras see whole, and the seven lines of VDI/VDE
-2634-1.
+"""Measuring volume, a cuboid wholly visible to both cameras, and the seven lines of VDI/VDE 2634-1.
 
-Volume axes are x to the right and y downwards as the rig sees them, and z away from it along the
-line from the middle of the baseline to the target; the origin is the target. Four lines are the
-space diagonals, with ends in all corners of the volume. The others are one diagonal of each of
-three faces that meet in a corner.
+The origin of the volume axes is the target of the rig. As seen from the rig, x points to the right
+and y downwards; z points away from the middle of the baseline. Four lines are the space diagonals.
+The other three lines are face diagonals, one on each of three faces that meet in a corner.
 """
 
 from __future__ import annotations
@@ -21,20 +19,20 @@ from cmmsim.files.schema import Rig
 from cmmsim.geometry.pose import Array, apply, frozen, invert, rigid, transform_to_pose
 from cmmsim.geometry.stereo_rig import StereoRig
 
-# Distance of the corners from the image edges, which leaves space for the artefacts' width.
+# Smallest distance of the corners from the image edges. It leaves space for the artefacts' width.
 MARGIN_PX = 40.0
-# the front face stays beyond a fifth of the way from the baseline to the target
+# Largest ratio of half the volume's depth to the distance of the target from the baseline.
 LARGEST_SHARE = 0.8
-# m: the stickers of an artefact do not fit into a smaller volume.
+# m: smallest side of a volume. The stickers of an artefact do not fit into a smaller volume.
 SMALLEST_SIZE = 0.1
 CORNERS = frozen(list(product((-0.5, 0.5), repeat=3)))
 FEWEST_LINES = 7
 FEWEST_LENGTHS = 5
-# Least share of the volume's space diagonal that the longest test length must have.
+# Smallest ratio of the longest test length to the space diagonal of the volume.
 LONGEST_SHARE = 2.0 / 3.0
-# of a line between the sides of the volume; the rest is room for the ends of the artefact
+# Share of a diagonal that its line uses. The rest leaves space for the ends of the artefact.
 USED_SHARE = 0.9
-# Test lengths of a line, as shares of its longest.
+# Test lengths of a line, as shares of its longest test length.
 LENGTH_SHARES = frozen([0.19, 0.41, 0.6, 0.82, 1.0])
 # Ends of the lines, in half sides of the volume.
 LINES = {
@@ -79,9 +77,9 @@ class MeasuringVolume:
     def pose(self, along: Array, position: Array, turn: Array | None = None) -> Array:
         """Return the pose (6,) of an artefact in the base frame.
 
-        It stands at ``position`` (3,) m in volume axes. Its x axis points along ``along`` (3,), of
-        any length, and its side A towards the rig. Then it is turned by ``turn`` (3, 3) in its own
-        axes.
+        The artefact's origin is at ``position`` (3,) m in volume axes. Its x axis has the direction
+        ``along`` (3,), which need not have length one, and its side A faces the rig. Finally the
+        artefact is rotated by ``turn`` (3, 3) in its own axes.
         """
         x = along / np.linalg.norm(along)
         towards = np.array([0.0, 0.0, -1.0])
@@ -94,25 +92,26 @@ class MeasuringVolume:
 
     @property
     def diagonal(self) -> float:
-        """Space diagonal, m."""
+        """Length of the space diagonal, m."""
         return float(np.linalg.norm(self.size))
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """Nearest and furthest distance of the volume from the baseline along its z axis, m."""
+        """Smallest and largest distance of the volume from the baseline, along its z axis, m."""
         return self.distance - 0.5 * float(self.size[2]), self.distance + 0.5 * float(self.size[2])
 
 
 def common_volume(place: Rig) -> MeasuringVolume:
-    """Return the largest cube around the target of a sensor file's rig that both cameras see whole.
+    """Return the largest cube around the target of a rig that is wholly visible to both cameras.
 
-    It keeps MARGIN_PX from the edges of the images. Raises AcceptanceError when nothing is seen.
+    The images of its corners lie at least MARGIN_PX from the image edges. Raises AcceptanceError if
+    even a cube with sides SMALLEST_SIZE is not visible.
     """
     rig, camera_from_base = rig_from_file(place)
     frame, distance = _volume_frame(rig, camera_from_base, place)
     low = 0.0
     high = 2.0 * LARGEST_SHARE * distance
-    # Bisection: after 40 halvings the side is known to rounding.
+    # After 40 steps of bisection, the side is accurate to rounding.
     for _ in range(40):
         middle = 0.5 * (low + high)
         if _unseen(rig, camera_from_base @ frame, np.full(3, middle), distance) is None:
@@ -128,9 +127,10 @@ def common_volume(place: Rig) -> MeasuringVolume:
 
 
 def volume_of_size(place: Rig, size: Array) -> MeasuringVolume:
-    """Return the cuboid of ``size`` (3,) m around the target of a sensor file's rig.
+    """Return the cuboid of ``size`` (3,) m around the target of a rig.
 
-    Raises AcceptanceError naming a corner that is not seen, and the largest cube that is.
+    Raises AcceptanceError, which names an invisible corner and the largest visible cube, if the
+    cuboid is not wholly visible.
     """
     rig, camera_from_base = rig_from_file(place)
     frame, distance = _volume_frame(rig, camera_from_base, place)
@@ -140,14 +140,15 @@ def volume_of_size(place: Rig, size: Array) -> MeasuringVolume:
         largest = 1e3 * common_volume(place).size[0]
         raise AcceptanceError(
             f"measuring volume {volume} is not wholly visible to both cameras: {hidden}; the "
-            f"largest cube that is has sides of {largest:.0f} mm"
+            f"largest visible cube has sides of {largest:.0f} mm"
         )
     return volume
 
 
 def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[Array, float]:
-    """Return base_from_volume (4, 4), x along the baseline, and the target's distance from its
-    middle, m.
+    """Return base_from_volume (4, 4), and the distance of the target from the baseline's middle, m.
+
+    The x axis of the volume is the direction of the baseline, made perpendicular to z.
     """
     centres = [invert(move @ camera_from_base)[:3, 3] for move in rig.from_camera]
     view = np.array(place.target) - 0.5 * (centres[0] + centres[1])
@@ -159,7 +160,10 @@ def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[
 
 
 def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: float) -> str | None:
-    """Name a corner of a cuboid that a camera does not see; None when both see all of them."""
+    """Return a text that names a corner of a cuboid that a camera does not see.
+
+    The result is None if both cameras see all corners.
+    """
     corners = CORNERS * size
     if 0.5 * size[2] > LARGEST_SHARE * distance:
         return (
@@ -185,9 +189,10 @@ def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: fl
 
 @dataclass(frozen=True)
 class MeasuringLine:
-    """Measuring line from ``start`` to ``end`` (3,) of its longest test length, m in volume axes.
+    """Measuring line from ``start`` (3,) to ``end`` (3,), m in volume axes.
 
-    ``lengths`` (k,) are the test lengths from the start, m.
+    ``lengths`` (k,) are the test lengths, m. All begin at the start, and the longest ends at the
+    end.
     """
 
     name: str
@@ -208,7 +213,7 @@ class MeasuringLine:
 def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
     """Return the seven lines of a volume, with five test lengths each.
 
-    Raises AcceptanceError when a rule is broken.
+    Raises AcceptanceError if the lines break a rule.
     """
     lines = []
     for name, corners in LINES.items():
@@ -221,8 +226,9 @@ def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
 
 
 def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> None:
-    """Raise AcceptanceError, which names rule, line, value and limit, where measuring lines break a
-    rule.
+    """Raise AcceptanceError if measuring lines break a rule.
+
+    The message names the line, the value and the limit.
     """
     if len(lines) < FEWEST_LINES:
         raise AcceptanceError(f"{len(lines)} measuring lines, at least {FEWEST_LINES} are needed")
@@ -242,7 +248,7 @@ def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> No
                 "nearer to a cube"
             )
         for point in (line.start, line.end):
-            # Rounding may put an end a little outside.
+            # Rounding errors can put an end slightly outside.
             if np.any(np.abs(point) > 0.5 * volume.size + 1e-9):
                 raise AcceptanceError(
                     f"line {line.name} leaves the volume at {np.round(1e3 * point)} mm"

@@ -1,6 +1,4 @@
-"""Sensor files (TOML): their schema, how they are read, and the rig and the bodies that they
-describe.
-"""
+"""Sensor files (TOML): schema, reading, and the rig and the bodies that they describe."""
 
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import built_in_names, dotted, read_sensor_file

@@ -1,8 +1,8 @@
-"""The instrument that a sensor file describes: its stereo rig, and the bodies that carry stickers.
+"""Stereo rig, and bodies with stickers, that a sensor file describes.
 
-A rig is nominal and toed in, or calibrated. A body carries its stickers on three machined planes.
-The planes are exact, but the sticker places are nominal: a sticker can be displaced by up to about
-a millimetre.
+A rig is either nominal, with both cameras toed in to the target, or calibrated. A body has its
+stickers on three machined planes. The planes are exact, but the places of the stickers are nominal:
+a sticker can lie up to about a millimetre from its nominal place.
 """
 
 from dataclasses import dataclass, replace
@@ -17,25 +17,25 @@ from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig
 
-# Points along each side of the image at which the distortion model must hold.
+# Number of points along each side of the image at which the distortion is checked.
 BORDER_POINTS = 65
 SHORTEST_BASELINE = 1e-3  # m
-# Volume that the unit normals of three planes span: that of a cube's corner is 1.
+# Smallest volume that the unit normals of three planes span. For a corner of a cube, it is 1.
 SMALLEST_CORNER = 0.001
 
 
 def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
     """Return the rig and the true camera_from_base (4, 4).
 
-    Raises SensorFileError, which names the camera at fault.
+    Raises SensorFileError, which names the wrong entry, if the rig is impossible.
     """
     position = np.array(section.position)
     target = np.array(section.target)
     # The horizontal axis of a view straight up or down is not defined.
     if np.linalg.norm(np.cross(target - position, [0.0, 0.0, 1.0])) < 1e-6:
         raise SensorFileError(
-            f"rig.target {list(section.target)} must not stand straight above or below, or at, "
-            f"rig.position {list(section.position)}"
+            f"rig.target {list(section.target)} must not be equal to rig.position "
+            f"{list(section.position)}, or lie vertically above or below it"
         )
     middle = (0.5 * (section.width - 1), 0.5 * (section.height - 1))
     nominal = PinholeCamera(section.focal_px, *middle, section.width, section.height)
@@ -63,7 +63,7 @@ def _camera(calibrated: Calibrated | None, nominal: PinholeCamera, name: str) ->
 
 
 def _require_whole_image(camera: PinholeCamera, name: str) -> None:
-    """Raise SensorFileError where a part of the image is beyond the fold of the distortion."""
+    """Raise SensorFileError if the distortion has no inverse in some part of the image."""
     x = np.linspace(-0.5, camera.width - 0.5, BORDER_POINTS)
     y = np.linspace(-0.5, camera.height - 0.5, BORDER_POINTS)
     border = np.concatenate(
@@ -89,20 +89,21 @@ def _right_from_left(section: RightFromLeft) -> Array:
         )
     if right_centre[0] <= 0.0 or right_from_left[2, 2] <= 0.0:
         raise SensorFileError(
-            "rig.right_from_left: the right camera must stand on the right of the left one "
-            "(translation x below zero where both look the same way) and look its way, got "
-            f"{section.model_dump()}"
+            "rig.right_from_left: the right camera must stand to the right of the left camera "
+            "(translation x below zero if both look in the same direction) and look in about the "
+            f"same direction, got {section.model_dump()}"
         )
     return right_from_left
 
 
 @dataclass(frozen=True)
 class MarkedBody:
-    """Planes and nominal stickers in body axes.
+    """Body with planes and nominal sticker places, in body axes.
 
-    Planes A, B, C are n . p = d with ``normals`` (3, 3) by row and ``offsets`` (3,), m. Stickers
-    have ``sticker_ids`` (n,) such as "A1", a ``plane_index`` (n,), places ``nominal`` (n, 3) m, and
-    ``in_plane`` (n, 3, 2), the u and v axes of their planes.
+    Planes A, B, C fulfil n . p = d. The rows of ``normals`` (3, 3) are n, and ``offsets`` (3,) are
+    d, m. ``sticker_ids`` (n,) are the names of the stickers, such as "A1". ``plane_index`` (n,) is
+    the plane of each sticker, 0 to 2. ``nominal`` (n, 3) are the nominal places, m. ``in_plane``
+    (n, 3, 2) are the u and v axes of each sticker's plane.
     """
 
     name: str
@@ -129,7 +130,7 @@ class MarkedBody:
 
 
 def marked_body(name: str, body: Body) -> MarkedBody:
-    """Return the body of a sensor file's section."""
+    """Return the body that a section of a sensor file describes."""
     planes = [getattr(body.planes, plane) for plane in PLANE_NAMES]
     normals = np.stack([unit(p.normal) for p in planes])
     offsets = np.array([n @ np.array(p.point) for n, p in zip(normals, planes, strict=True)])
@@ -155,19 +156,21 @@ def marked_body(name: str, body: Body) -> MarkedBody:
 
 
 def require_corner(body: MarkedBody) -> None:
-    """Raise TeachingError unless the planes of a body meet in one point, from which its frame
-    hangs.
+    """Raise TeachingError unless the planes of a body meet in one point.
+
+    This point is needed to define the body's frame.
     """
     volume = abs(float(np.linalg.det(body.normals)))
     if volume < SMALLEST_CORNER:
         raise TeachingError(
-            f"{body.name}: planes A, B and C meet in no point, so no frame can be taught: their "
-            f"unit normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is needed"
+            f"{body.name}: planes A, B and C do not meet in one point, so no frame can be taught: "
+            f"their unit normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is "
+            "needed"
         )
 
 
 def _plane_axes(plane: StickerPlane) -> Array:
-    """Return the u and v axes (3, 2) in the plane."""
+    """Return the u and v axes (3, 2) of a plane as columns."""
     normal = unit(plane.normal)
     across = np.array(plane.across)
     u = unit(across - (across @ normal) * normal)

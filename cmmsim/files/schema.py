@@ -1,8 +1,8 @@
 """Schema of a sensor file (TOML), with units and ranges.
 
-The ranges cover stereo cameras from microscopes to surveying. A number outside its range is a
-typing error or has a wrong unit, and would make the computed results meaningless. Schemas for
-editors show the ranges as well.
+The ranges cover stereo cameras from microscopes to surveying instruments. A number outside of its
+range probably has a typing error or a wrong unit, so it is refused. The JSON schema for editors
+contains the ranges as well.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ from cmmsim.errors import SensorFileError
 from cmmsim.geometry.pose import Array
 
 Level = Annotated[int, Field(ge=0, le=255)]
-# Standard deviations: no frame's latency is farther from the mean.
+# Largest deviation of a frame's latency from the mean, in standard deviations.
 WIDEST_JITTER = 3.0
-# px: a narrower point spread is lost between the points that images are drawn on.
+# px: narrowest point spread that the samples of drawn images can resolve.
 NARROWEST_PSF = 0.1
 
 
 @dataclass(frozen=True)
 class Within:
-    """Range of a number from ``least`` to ``most``, in a unit; ``zero`` says that 0 is valid as
-    well.
+    """Range of a number from ``least`` to ``most``, in a unit.
+
+    If ``zero`` is True, 0 is valid as well.
     """
 
     least: float
@@ -49,13 +50,13 @@ class Within:
             return value
         also = "0 or " if self.zero else ""
         words = f"{also}{self.least:g} to {self.most:g} {self.unit}".rstrip()
-        raise ValueError(f"{value:g} is beyond what a machine can have, {words}")
+        raise ValueError(f"{value:g} is out of range, must be {words}")
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         inner = handler(source)
-        # Neither texts nor truth values are numbers.
+        # Strict: texts and truth values are not accepted as numbers.
         if inner["type"] == "float":
             inner = {**inner, "strict": True, "allow_inf_nan": False}
         return core_schema.no_info_after_validator_function(self.check, inner)
@@ -64,7 +65,7 @@ class Within:
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         least = min(self.least, 0.0) if self.zero else self.least
-        # A field may have narrower limits of its own, which hold as well.
+        # A field can have narrower limits of its own, which apply as well.
         shown = handler(schema)
         return {
             **shown,
@@ -79,7 +80,7 @@ Place = Annotated[float, Within(-1e3, 1e3, "m")]
 """Coordinate of a point."""
 Angle = Annotated[float, Within(-1e2, 1e2, "rad")]
 Component = Annotated[float, Within(-1e6, 1e6)]
-"""Component of a direction, whose length does not count."""
+"""Component of a direction. The length of the direction has no meaning."""
 Pixels = Annotated[float, Within(1.0, 1e7, "px")]
 ImagePlace = Annotated[float, Within(-1e6, 1e6, "px")]
 Distortion = Annotated[float, Within(-1e4, 1e4)]
@@ -96,21 +97,22 @@ Direction3 = tuple[Component, Component, Component]
 
 
 def quantity(default: Any, unit: str, what: str) -> Any:
-    """Return a field with a unit, which may be empty; the default ``...`` means that there is
-    none.
+    """Return a field with a unit and a description.
+
+    The unit can be empty. With the default ``...``, the entry is required.
     """
     return Field(default, description=what, json_schema_extra={"unit": unit} if unit else None)
 
 
 class Timing(Section):
-    """Times of the exposures, and of the use of their poses.
+    """Timing of exposures and of the use of measured poses.
 
     A measured pose is the pose in the middle of its exposure.
     """
 
-    frame_rate: Frequency = quantity(..., "Hz", "stereo frames a second")
+    frame_rate: Frequency = quantity(..., "Hz", "stereo frames per second")
     exposure: Duration = quantity(
-        0.0, "s", "time in which a picture gathers light; 0 is an instant"
+        0.0, "s", "exposure time of an image; 0 means an instantaneous image without blur"
     )
     latency: Duration = quantity(
         0.0, "s", "mean delay from the middle of the exposure to the use of the pose"
@@ -119,15 +121,15 @@ class Timing(Section):
         0.0, "s", "standard deviation of the latency from frame to frame"
     )
     dropout: Annotated[float, Field(ge=0.0, le=1.0)] = quantity(
-        0.0, "", "probability that a frame is lost"
+        0.0, "", "probability that a frame drops out"
     )
 
     @model_validator(mode="after")
     def _possible(self) -> Timing:
         if self.exposure * self.frame_rate > 1.0 + 1e-9:
             raise ValueError(
-                f"exposure {self.exposure:g} s is longer than a frame of {self.frame_rate:g} Hz, "
-                f"{1.0 / self.frame_rate:.4g} s"
+                f"exposure {self.exposure:g} s is longer than the frame period at "
+                f"{self.frame_rate:g} Hz, {1.0 / self.frame_rate:.4g} s"
             )
         if self.latency_jitter > self.latency:
             raise ValueError(
@@ -138,16 +140,16 @@ class Timing(Section):
 
     @property
     def largest_latency(self) -> float:
-        """The longest latency that can be drawn, s."""
+        """Largest latency that `drawn_latencies` can return, s."""
         return self.latency + self._widest_deviation
 
     def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array:
-        """Draw the latency of each frame (frames,), s, from the middle of its exposure to the
-        pose's use.
+        """Draw a random latency (frames,) per frame, s.
 
-        It is normal about ``latency`` with standard deviation ``latency_jitter``. Its deviation is
-        clipped to 3 standard deviations or to ``latency``, whichever is less. So no latency is
-        negative, and the mean remains ``latency``.
+        It is the time from the middle of the exposure to the use of the pose. It is normal with
+        mean ``latency`` and standard deviation ``latency_jitter``. Deviations from the mean are
+        clipped to 3 standard deviations or to ``latency``, whichever is less. Therefore no latency
+        is negative, and the mean remains ``latency``.
         """
         widest = self._widest_deviation
         return self.latency + np.clip(rng.normal(0.0, self.latency_jitter, frames), -widest, widest)
@@ -158,12 +160,12 @@ class Timing(Section):
 
 
 class Calibrated(Section):
-    """A camera as calibrated; distortion in OpenCV's order and meaning."""
+    """Calibrated parameters of a camera, with the distortion coefficients of OpenCV."""
 
     focal_px: tuple[Pixels, Pixels] = quantity(..., "px", "focal lengths along x and y")
     centre_px: tuple[ImagePlace, ImagePlace] = quantity(..., "px", "principal point")
     distortion: tuple[Distortion, Distortion, Distortion, Distortion, Distortion] = quantity(
-        (0.0, 0.0, 0.0, 0.0, 0.0), "", "k1, k2, p1, p2, k3 of Brown and Conrady"
+        (0.0, 0.0, 0.0, 0.0, 0.0), "", "k1, k2, p1, p2, k3 of the Brown-Conrady model"
     )
 
 
@@ -171,19 +173,20 @@ class RightFromLeft(Section):
     """Place of the right camera: x_right = R(rotation_vector) x_left + translation."""
 
     translation: Vector3 = quantity(
-        ..., "m", "place of the left camera's origin in the right camera's frame"
+        ..., "m", "position of the left camera in the right camera's frame"
     )
     rotation_vector: Turn3 = quantity(
-        ..., "rad", "rotation from the left camera's frame to the right one's"
+        ..., "rad", "rotation from the left camera's frame to the right camera's frame"
     )
 
 
 class Rig(Section):
     """Both cameras and their places.
 
-    With ``distance``, the position is moved along its line to the target to stand that far from it.
-    ``left`` and ``right`` replace focal_px and the principal point in the middle of the image.
-    ``right_from_left`` replaces the baseline and the toe-in towards the target.
+    If ``distance`` is given, ``position`` is moved along the line to ``target`` until it has this
+    distance from ``target``. ``left`` and ``right`` replace ``focal_px`` and the principal point in
+    the middle of the image. ``right_from_left`` replaces ``baseline`` and the toe-in of both
+    cameras towards ``target``.
     """
 
     baseline: Length = quantity(..., "m", "distance between the cameras")
@@ -210,26 +213,26 @@ class Rig(Section):
 
 
 class Camera(Section):
-    """EMVA 1288 figures of a camera.
+    """Noise parameters of a camera after EMVA 1288.
 
-    ``noise = false`` leaves out all noise, and the pattern of prnu and dsnu. ``pattern_seed`` makes
-    another specimen.
+    ``noise = false`` switches off all noise, including the fixed pattern of prnu and dsnu.
+    ``pattern_seed`` is the seed of the fixed pattern.
     """
 
-    electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a white pixel")
-    gain: GreyPerElectron = quantity(..., "grey values per electron", "grey values per electron")
-    dark_noise: Electrons = quantity(..., "electrons", "dark noise, rms")
-    full_well: Electrons = quantity(..., "electrons", "electrons that a pixel holds")
-    black_level: Grey = quantity(0.0, "grey values", "grey value of black")
-    noise: bool = quantity(True, "", "whether pictures have noise")
-    bit_depth: Literal[8, 10, 12] = quantity(8, "bit", "bits of a grey value")
+    electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a pixel that is white")
+    gain: GreyPerElectron = quantity(..., "grey values per electron", "system gain")
+    dark_noise: Electrons = quantity(..., "electrons", "temporal noise in the dark, rms")
+    full_well: Electrons = quantity(..., "electrons", "saturation capacity of a pixel")
+    black_level: Grey = quantity(0.0, "grey values", "grey value without light")
+    noise: bool = quantity(True, "", "true for images with noise")
+    bit_depth: Literal[8, 10, 12] = quantity(8, "bit", "number of bits of a grey value")
     prnu: Annotated[float, Field(ge=0.0, le=0.2)] = quantity(
-        0.0, "", "relative differences between the gains of pixels, rms"
+        0.0, "", "relative differences between the sensitivities of pixels, rms"
     )
     dsnu: Electrons = quantity(
-        0.0, "electrons", "differences between the dark levels of pixels, rms"
+        0.0, "electrons", "differences between the dark signals of pixels, rms"
     )
-    pattern_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "which specimen of a camera")
+    pattern_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "seed of the fixed pattern")
 
     @model_validator(mode="after")
     def _black_below_white(self) -> Camera:
@@ -242,7 +245,7 @@ class Camera(Section):
 
 
 class Lens(Section):
-    """Effects of both lenses beside the distortion that stands with each camera.
+    """Blur and vignetting of both lenses. Distortion belongs to the entries of each camera.
 
     The vignetting grows with the square of the distance from the principal point.
     """
@@ -251,7 +254,7 @@ class Lens(Section):
         0.0, "px", "standard deviation of the Gaussian point spread"
     )
     vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = quantity(
-        0.0, "", "share of the light missing in the farthest corner"
+        0.0, "", "share of the light that is lost in the farthest corner of the image"
     )
 
     @model_validator(mode="after")
@@ -262,21 +265,22 @@ class Lens(Section):
 
 
 class Detection(Section):
-    """Detector of stickers in windows when poses are measured, see :mod:`cmmsim.allowed_plugins`.
+    """Detection of stickers during measurement.
 
-    Teaching always uses the maximum-likelihood detector, see :mod:`cmmsim.teaching`.
+    :mod:`cmmsim.allowed_plugins` lists the detectors. Teaching always uses the maximum-likelihood
+    detector, see :mod:`cmmsim.teaching`.
     """
 
     detector: Annotated[str, AfterValidator(require_detector)] = quantity(
-        DEFAULT_DETECTOR, "", "what finds the centres of stickers"
+        DEFAULT_DETECTOR, "", "detector of the centres of stickers"
     )
 
 
 class Stickers(Section):
-    """Bright discs in dark rings.
+    """Stickers, which are bright discs in dark rings, and grey levels of the scene.
 
-    ``per_plane`` puts that many stickers on each plane of the platform instead of those listed
-    there, evenly on an ellipse.
+    ``per_plane`` replaces the listed stickers on each plane of the platform by this number of
+    stickers, evenly distributed on an ellipse.
     """
 
     radius: Length = quantity(..., "m", "radius of a sticker")
@@ -284,14 +288,14 @@ class Stickers(Section):
     placement: tuple[Distance, Distance] = quantity(
         (0.0, 0.0), "m", "smallest and largest distance of a sticker from its nominal place"
     )
-    placement_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "which places of the stickers")
-    sticker_level: Level = quantity(..., "", "grey level of a sticker, of 255")
-    ring_level: Level = quantity(..., "", "grey level of its ring, of 255")
-    body_level: Level = quantity(..., "", "grey level of the bodies, of 255")
-    obstacle_level: Level = quantity(..., "", "grey level of what stands in the way, of 255")
-    background_level: Level = quantity(0, "", "grey level of the background, of 255")
+    placement_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "seed of the stickers' places")
+    sticker_level: Level = quantity(..., "", "grey level of stickers, 0 to 255")
+    ring_level: Level = quantity(..., "", "grey level of the dark rings, 0 to 255")
+    body_level: Level = quantity(..., "", "grey level of platform and base, 0 to 255")
+    obstacle_level: Level = quantity(..., "", "grey level of obstacles, 0 to 255")
+    background_level: Level = quantity(0, "", "grey level of the background, 0 to 255")
     per_plane: Annotated[int, Field(ge=3, le=1000)] | None = quantity(
-        None, "", "stickers on each plane of the platform"
+        None, "", "number of stickers on each plane of the platform, instead of the listed ones"
     )
 
     @model_validator(mode="after")
@@ -299,31 +303,35 @@ class Stickers(Section):
         if self.ring_radius < self.radius:
             raise ValueError(
                 f"ring_radius {self.ring_radius:g} m must be at least radius {self.radius:g} m: "
-                "stickers are found as bright discs within dark rings"
+                "stickers are detected as bright discs in dark rings"
             )
         if self.sticker_level <= self.ring_level:
             raise ValueError(
                 f"sticker_level {self.sticker_level} must be above ring_level {self.ring_level}: "
-                "stickers are found as bright discs within dark rings"
+                "stickers are detected as bright discs in dark rings"
             )
         if self.placement[0] > self.placement[1]:
             raise ValueError(
-                f"placement {list(self.placement)} m is the smallest and the largest distance, in "
-                "this order"
+                f"placement {list(self.placement)} m must be the smallest and the largest "
+                "distance, in this order"
             )
         return self
 
 
 class HalfSpace(Section):
-    """Half space with an outward normal of any length, and a point on its plane, m."""
+    """Half space with an outward normal and a point on its plane, m.
+
+    The normal need not have length one.
+    """
 
     normal: Direction3
     point: Vector3
 
 
 class StickerPlane(HalfSpace):
-    """Plane with stickers at nominal places [u, v], m from its point; ``across`` gives the u
-    axis.
+    """Plane with stickers at nominal places [u, v], m, counted from its point.
+
+    The u axis is ``across``, projected onto the plane.
     """
 
     across: Direction3
@@ -331,7 +339,7 @@ class StickerPlane(HalfSpace):
 
 
 class Planes(Section):
-    """The three planes of a body."""
+    """Three planes of a body, with stickers."""
 
     A: StickerPlane
     B: StickerPlane
@@ -339,14 +347,14 @@ class Planes(Section):
 
 
 class Body(Section):
-    """A convex body with stickers on three planes."""
+    """Convex body with stickers on three planes. ``cuts`` are its other sides."""
 
     planes: Planes
     cuts: list[HalfSpace]
 
 
 class Platform(Body):
-    """Moving body; ``home`` is its pose at teaching, m and rad."""
+    """Moving body. ``home`` is its pose at teaching, m and rad."""
 
     home: tuple[Place, Place, Place, Angle, Angle, Angle] = quantity(
         ..., "m, rad", "pose of the platform at teaching"
@@ -354,23 +362,23 @@ class Platform(Body):
 
 
 class SensorFile(Section):
-    """Whole sensor file.
+    """Sensor file.
 
-    ``based_on`` names a built-in sensor, or a file by its path from this file's folder. It supplies
-    the entries that this file lacks. ``note`` is a warning about the figures, such as that they are
-    assumed. ``renderer`` is one of :mod:`cmmsim.allowed_plugins`; "auto" takes pyrender where
-    OpenGL works, and otherwise analytic.
+    ``based_on`` is a built-in sensor, or the path of another sensor file relative to the folder of
+    this file. It supplies the entries that this file lacks. ``note`` is a warning about the
+    numbers, for example that they are assumed. :mod:`cmmsim.allowed_plugins` lists the values of
+    ``renderer``; "auto" selects pyrender if OpenGL works, and otherwise analytic.
     """
 
     name: Annotated[str, AfterValidator(check_name)] = quantity(..., "", "name of the sensor")
     based_on: str | None = quantity(
         None,
         "",
-        "built-in sensor, or path of a file from this folder; supplies missing entries",
+        "built-in sensor, or path relative to this file's folder; supplies missing entries",
     )
-    note: str = quantity("", "", "what a user must know of the figures")
+    note: str = quantity("", "", "warning about the numbers in this file")
     renderer: Annotated[str, AfterValidator(require_renderer)] = quantity(
-        AUTO, "", "what draws the images, or says what would be found in them"
+        AUTO, "", "renderer of the images, or statistical for detected stickers without images"
     )
     timing: Timing
     rig: Rig
@@ -383,7 +391,7 @@ class SensorFile(Section):
 
 
 def unit(vector: Vector3 | Array) -> Array:
-    """Return a vector (3,) of length one. Raises SensorFileError for a zero vector."""
+    """Return a vector (3,), scaled to length one. Raises SensorFileError for a zero vector."""
     values = np.asarray(vector, dtype=float)
     length = float(np.linalg.norm(values))
     if length < 1e-9:

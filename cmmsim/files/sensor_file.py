@@ -1,7 +1,7 @@
 """Reading of sensor files (TOML), by name or path, with changes.
 
-Changes are entries that replace the file's entries, by dotted key as
-``{"camera.dark_noise": 40.0}`` or nested as in the file.
+Changes are entries that replace entries of the file. They have dotted keys, as
+``{"camera.dark_noise": 40.0}``, or are nested like the tables of the file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cmmsim.geometry.pose import Array
 
 
 def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Return changes by dotted key, from dotted keys or nested tables.
+    """Return changes with dotted keys, from changes with dotted keys or nested tables.
 
     A later change replaces an earlier change of the same key.
     """
@@ -33,18 +33,18 @@ def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
 
 
 def require_keys(name: str | Path, changes: object) -> None:
-    """Raise SensorFileError for changes that are no tables with names for keys."""
+    """Raise SensorFileError unless changes are mappings with text keys, or None."""
     if changes is None:
         return
     if not isinstance(changes, Mapping):
         raise SensorFileError(
-            f"sensor file {name}: changes = {changes!r} must be given by key, as "
+            f"sensor file {name}: changes = {changes!r} must be a mapping of keys to values, as "
             "{'camera.dark_noise': 40.0}"
         )
     for key, value in changes.items():
         if not isinstance(key, str):
             raise SensorFileError(
-                f"sensor file {name}: key {key!r} of the changes is no name such as "
+                f"sensor file {name}: key {key!r} of the changes is not a text such as "
                 "'camera.dark_noise'"
             )
         if isinstance(value, Mapping):
@@ -52,10 +52,11 @@ def require_keys(name: str | Path, changes: object) -> None:
 
 
 def change(content: dict[str, Any], changes: Mapping[str, Any], source: str) -> None:
-    """Put changes in their places in a file's content.
+    """Apply changes to the content of a file.
 
-    Unknown keys are found later, with the valid names. ``source`` names the content in messages.
-    Raises SensorFileError for what cannot be a change.
+    Unknown keys are accepted here; the schema refuses them later. ``source`` names the content in
+    messages. Raises SensorFileError for a change of ``based_on``, for a value instead of a section,
+    and for an entry inside a value.
     """
     for path, value in dotted(changes).items():
         if path == "based_on":
@@ -79,12 +80,11 @@ def _replace(content: dict[str, Any], path: str, value: Any, source: str) -> Non
 
 
 def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array:
-    """Return places (count, 2) [u, v], m, on the ellipse of one standard deviation of those listed
-    (n, 2).
+    """Return places (count, 2) [u, v], m, on the one-standard-deviation ellipse of listed places.
 
-    Points evenly spaced in angle on an ellipse have the same mean and second moments whatever their
-    number is, from three on. So the accuracy of a plane or pose improves with sqrt(n) for n
-    stickers.
+    ``listed`` (n, 2) are the listed places. Three or more points at equal angles on an ellipse have
+    the same mean and the same second moments, whatever their number. Therefore the accuracy of a
+    plane or a pose improves with the square root of the number of stickers.
     """
     places = np.asarray(listed, dtype=float)
     reach = np.linalg.cholesky(np.cov(places.T, bias=True))
@@ -95,12 +95,12 @@ def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array
 
 
 def closest(places: Array) -> float:
-    """Smallest distance between two neighbours of a ring (n, 2), m."""
+    """Return the smallest distance between neighbours on a ring of places (n, 2), m."""
     return float(np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1).min())
 
 
 def built_in_names() -> list[str]:
-    """Return the names of the sensors that come with the package.
+    """Return the names of the sensors that are part of the package.
 
     Returns
     -------
@@ -119,10 +119,10 @@ def built_in_names() -> list[str]:
 
 
 def sensor_text(name: str | Path) -> str:
-    """Return the text of the sensor file of a built-in name or a path.
+    """Return the text of the sensor file with a built-in name or a path.
 
     Raises UnknownSensorError for a name that is neither, SensorFileError for a file that cannot be
-    read, and CmmError for what is neither text nor a path.
+    read, and CmmError if ``name`` is neither a text nor a path.
     """
     require_kind(
         name, (str, PathLike), "a sensor must be a built-in name or the path of a TOML file"
@@ -145,10 +145,10 @@ def sensor_text(name: str | Path) -> str:
 
 
 def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
-    """Read the sensor file of a built-in name or a path.
+    """Read the sensor file with a built-in name or a path.
 
-    Changes replace the file's entries. Raises UnknownSensorError for a name that is neither, and
-    SensorFileError, with the valid names, for a bad content.
+    Changes replace entries of the file. Raises UnknownSensorError for a name that is neither, and
+    SensorFileError for wrong content; its message lists the valid keys for an unknown key.
     """
     require_keys(name, changes)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
@@ -158,9 +158,9 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
 
 
 def sensor_schema() -> dict[str, Any]:
-    """Return the JSON schema of sensor files, for editors; `sensors/sensor.schema.json` holds it.
+    """Return the JSON schema of sensor files, which `sensors/sensor.schema.json` contains.
 
-    A file that is based on another may lack tables, and entries of tables.
+    In a file with ``based_on``, tables and entries are optional.
     """
     schema = SensorFile.model_json_schema()
     tables = {
@@ -177,7 +177,7 @@ def sensor_schema() -> dict[str, Any]:
 
 
 def _with_stickers(file: SensorFile, source: str) -> SensorFile:
-    """Return the file with as many stickers on each plane of the platform as it asks for."""
+    """Return the file with ``stickers.per_plane`` stickers on each plane of the platform."""
     count = file.stickers.per_plane
     room = 2.0 * file.stickers.ring_radius
     if count is None:
@@ -187,8 +187,8 @@ def _with_stickers(file: SensorFile, source: str) -> SensorFile:
         places = ring_of_stickers(plane.stickers, count)
         if closest(places) < room:
             raise SensorFileError(
-                f"{source}: stickers.per_plane = {count} puts stickers {closest(places):.4f} m "
-                f"apart on plane {name}, two rings need {room:g} m"
+                f"{source}: with stickers.per_plane = {count}, stickers on plane {name} are "
+                f"{closest(places):.4f} m apart, but their rings need {room:g} m"
             )
         planes[name] = plane.model_copy(update={"stickers": [(u, v) for u, v in places.tolist()]})
     platform = file.platform.model_copy(
@@ -198,9 +198,9 @@ def _with_stickers(file: SensorFile, source: str) -> SensorFile:
 
 
 def _content(name: str | Path) -> dict[str, Any]:
-    """Return the content of a file, completed by the sensor that it is based on.
+    """Return the content of a file, completed from the sensor that it is based on.
 
-    Each section is completed entry by entry, and no deeper.
+    Missing tables, and missing entries of a table, are added; tables within tables are not merged.
     """
     own = _table(name)
     basis = own.get("based_on")
@@ -213,8 +213,8 @@ def _content(name: str | Path) -> dict[str, Any]:
         raise SensorFileError(f"sensor file {name}: based_on: {error}") from error
     if "based_on" in base:
         raise SensorFileError(
-            f"sensor file {name}: based_on = {basis!r}, which is itself based on "
-            f"{base['based_on']!r}: name a sensor whose file is complete"
+            f"sensor file {name}: based_on = {basis!r} is itself based on {base['based_on']!r}: "
+            "name a sensor with a complete file"
         )
     merged = {
         key: {**base[key], **value}

@@ -1,1 +1,1 @@
-"""The true side: scene, renderers and exposure. Estimators must not import it."""
+"""True scene, renderers and exposure of the cameras. Estimators must not import this package."""

@@ -1,12 +1,12 @@
-"""Drawing without OpenGL: each disc covers exactly its share of each pixel.
+"""Drawing without OpenGL. The share of each pixel that a disc covers is computed exactly.
 
-Layers are laid over each other: the background, solids from far to near, then discs. A disc turned
-away is not drawn. Where a solid stands before any of a disc's probed points, the disc shows only
-outside of that solid's outline.
+Layers are drawn over each other: first the background, then solids from far to near, then discs. A
+disc that faces away from the camera is not drawn. Some points of each disc are probed. If a solid
+hides one of these points, the disc is drawn only outside of the solid's outline.
 
 Three things are simpler than in `pyrender`. Solids are convex hulls, ordered by the depth of their
-middles. Their edges are sampled by scan lines. In a pixel with the edges of two layers, the covered
-shares are taken as independent.
+middles. Their edges are sampled by scan lines. If a pixel contains edges of two layers, the shares
+that the layers cover are assumed to be independent.
 """
 
 from collections.abc import Sequence
@@ -29,9 +29,9 @@ def draw_windows(
 ) -> NDArray[np.float32]:
     """Draw the radiance (n, h, w) float32, 0 to 1, of n windows of one size.
 
-    ``supersampling`` is the number of scan lines a pixel at edges.
+    ``supersampling`` is the number of scan lines per pixel that sample edges of solids.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.imaging.view_kernels import draw_view
 
     if drawable not in _SCENES:
@@ -55,8 +55,8 @@ ANALYTIC = Renderer("analytic", draw_windows)
 
 
 def scene_of(drawable: Drawable) -> "Scene":
-    """Return the discs, in the axes of their bodies, and the solids of a drawable."""
-    # Late, as numba takes time to import.
+    """Return the discs and the solids of a drawable as arrays, in the axes of their bodies."""
+    # Imported late, because importing numba takes time.
     from cmmsim.imaging.view_kernels import Scene
 
     rows = [
@@ -82,13 +82,13 @@ def scene_of(drawable: Drawable) -> "Scene":
 
 
 def _joined(parts: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
-    """Return arrays (k, 3) one after the other, and where each begins."""
+    """Return arrays (k, 3) joined to one, and the index at which each begins."""
     starts = np.cumsum([0, *(len(part) for part in parts)])
     return np.ascontiguousarray(np.concatenate([np.zeros((0, 3)), *parts])), starts
 
 
 def _faces(faces: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, NDArray[np.int_]]:
-    """Return normals and offsets of the faces of solids, and where those of each begin."""
+    """Return normals and offsets of the faces of all solids, and the first index of each solid."""
     normals, starts = _joined([normal for normal, _ in faces])
     return normals, np.concatenate([np.zeros(0), *(offset for _, offset in faces)]), starts
 

@@ -1,19 +1,20 @@
 """Image formation from posed bodies to the light on each pixel, before noise.
 
-Windows are drawn through perfect lenses on a grid finer than the pixels, with a margin for the
-light that comes in from outside. Distortion resamples each fine pixel from its ideal place. The
-point spread, the mean over each pixel, and the relative illumination follow. All of it is linear
-light. A perfect lens with no point spread is drawn on the pixels at once.
+Windows are drawn through perfect lenses on a grid finer than the pixels. A margin around each
+window supplies the light that the point spread brings in from outside. Distortion resamples each
+fine pixel from its ideal place. Then the point spread, the mean over each pixel, and the relative
+illumination are applied. All steps are linear in light. For a perfect lens without point spread,
+the pixels are drawn directly.
 
-The ideal place of each pixel is exact on three by three nodes of a window, and interpolated by
+The ideal place of each pixel is exact at three by three nodes of a window, and interpolated by
 quadratics in between. In windows of some tens of pixels, the interpolation error is below 1e-4 px.
-Values between drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so that no
-edge is moved or widened. Source: R. G. Keys, Cubic convolution interpolation for digital image
-processing, IEEE Trans. ASSP 29 (1981).
+Values between drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so it
+neither moves nor widens edges. Source: R. G. Keys, Cubic convolution interpolation for digital
+image processing, IEEE Trans. ASSP 29 (1981).
 
 A whole image is drawn finely only around bright spots. Most of the scene stands still during an
-exposure: a window without any body shows the background and is not drawn, and a window without a
-moving body is drawn once.
+exposure. A window without any body is filled with the background, and a window without a moving
+body is drawn only once.
 """
 
 from collections.abc import Sequence
@@ -34,31 +35,31 @@ _QUADRATIC = frozen([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
 # a point spread, sharp edges need more fine pixels.
 SUB_PIXELS = 6
 SHARP_SUB_PIXELS = 12
-# px: sides of drawn windows are multiples of this, so that few frame buffers serve all.
+# px: sides of drawn windows are multiples of this, so that few sizes of frame buffers are needed.
 SIDE_STEP = 4
-# Drawn pixels that the cubic needs on either side.
+# Number of drawn pixels that the cubic needs on either side.
 REACH = 2
 # px: side of the finely drawn window around a bright spot.
 PASTED_SIZE = 24
-# px: a larger spot is drawn coarsely only.
+# px: largest side of a finely drawn window; larger spots are drawn coarsely.
 LARGEST_PASTED_SIZE = 96
-# px: rim around a spot longer than a sticker, drawn finely together with the spot.
+# px: margin that is drawn finely around a large spot.
 DARK_RIM = 8
 # Radiance above which a spot is drawn finely.
 BRIGHT = 0.4
-# px: side of the pieces that are bent and blurred at a time.
+# px: side of the pieces in which a whole image is distorted and blurred.
 TILE = 64
-# Drawn samples per pixel and axis away from bright spots.
+# Number of drawn samples per pixel and axis away from bright spots.
 COARSE = 2
 
 
 def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.float32]:
-    """Return windows (n, size, size) whose pixels are taken from drawn windows (n, h, w).
+    """Return windows (n, size, size) that are resampled from drawn windows (n, h, w).
 
-    Nodes (n, 3, 3, 2) are places (x, y) in the drawn window for the first, middle and last row and
-    column.
+    ``nodes`` (n, 3, 3, 2) are the places (x, y) in the drawn window of the pixels in the first,
+    middle and last row and column.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.imaging.window_kernels import resample_windows
 
     coefficients = np.einsum("ar,bc,nrcx->nabx", _QUADRATIC, _QUADRATIC, nodes)
@@ -69,9 +70,7 @@ def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class Side:
-    """One camera, camera_from_body transforms (b, 4, 4), and the first pixels (k, 2) of its
-    windows.
-    """
+    """Camera with camera_from_body transforms (b, 4, 4) and the first pixels (k, 2) of windows."""
 
     camera: PinholeCamera
     bodies: Array
@@ -80,7 +79,9 @@ class Side:
 
 @dataclass(frozen=True)
 class ImageFormation:
-    """Renderer, drawn bodies, radiance of the background, and lenses."""
+    """Image formation by a renderer, with the drawn bodies, the radiance of the background, and the
+    optics of the lenses.
+    """
 
     renderer: Renderer
     drawable: Drawable
@@ -88,17 +89,17 @@ class ImageFormation:
     optics: Optics
 
     def centre_error_px(self, cameras: Sequence[PinholeCamera], supersampling: int) -> float:
-        """Return the error of a sticker's centre due to drawing at a supersampling, px rms."""
+        """Return the error of a sticker's centre due to drawing with ``supersampling``, px rms."""
         fine = 1 if self.draws_pixels(cameras) else self.sub_pixels
         return self.renderer.centre_error_px(-(-supersampling // fine) * fine)
 
     @property
     def sub_pixels(self) -> int:
-        """Fine pixels along each side of a pixel."""
+        """Number of fine pixels along each side of a pixel."""
         return SHARP_SUB_PIXELS if self.optics.psf_px == 0.0 else SUB_PIXELS
 
     def draws_pixels(self, cameras: Sequence[PinholeCamera]) -> bool:
-        """Tell whether images need no finer grid than their pixels."""
+        """Tell whether images are drawn directly on their pixels, without a finer grid."""
         return self.optics.psf_px == 0.0 and all(camera.distortion.is_zero for camera in cameras)
 
     def windows(
@@ -111,9 +112,9 @@ class ImageFormation:
     ) -> list[NDArray[np.float32]]:
         """Return the radiance (k, size, size) of each side's windows.
 
-        ``supersampling`` is the least number of drawn samples per pixel and axis. ``sub_pixels``
-        overrides the default numbers of sub-pixels. ``shade`` lays the relative illumination over
-        the windows.
+        ``supersampling`` is the smallest number of drawn samples per pixel and axis. ``sub_pixels``
+        replaces the default number of fine pixels. If ``shade`` is True, the windows are multiplied
+        by the relative illumination.
         """
         if self.draws_pixels([side.camera for side in sides]):
             windows = self._drawn(
@@ -136,10 +137,11 @@ class ImageFormation:
         size: int,
         sub_pixels: int | None = None,
     ) -> NDArray[np.bool_]:
-        """Return the mask of the patches that may show at each of several moments (m, k, patches).
+        """Return a mask (m, k, patches) of the patches that could be visible in k windows at m
+        moments.
 
-        Bodies (b, 4, 4) stand at each moment, and windows have first pixels ``corners`` (k, 2).
-        Size and sub_pixels are as of ``windows``.
+        Each moment states camera_from_body (b, 4, 4). Windows have first pixels ``corners`` (k, 2).
+        See ``windows`` for ``size`` and ``sub_pixels``.
         """
         first = corners
         drawn_size = size
@@ -164,7 +166,7 @@ class ImageFormation:
     def _formed(
         self, sides: Sequence[Side], size: int, supersampling: int, sub_pixels: int
     ) -> list[NDArray[np.float32]]:
-        """Return windows drawn finely, bent, spread and averaged."""
+        """Return windows that are drawn finely, distorted, blurred and averaged over pixels."""
         margin = self.optics.margin_px
         fine_size = (size + 2 * margin) * sub_pixels
         nodes = [_shown_places(s.camera, s.corners, size, margin, fine_size) for s in sides]
@@ -185,10 +187,9 @@ class ImageFormation:
 def _shown_places(
     camera: PinholeCamera, corners: NDArray[np.int_], size: int, margin: int, fine_size: int
 ) -> Array:
-    """Return ideal pixels (k, 3, 3, 2) that show in the first, middle and last fine rows and
-    columns.
+    """Return the ideal places (k, 3, 3, 2) of the first, middle and last fine rows and columns.
 
-    The windows include their margins.
+    Rows and columns are those of k windows with their margins.
     """
     half = 0.5 * (size + 2 * margin) * (1.0 - 1.0 / fine_size)
     ticks = 0.5 * (size - 1) + half * np.array([-1.0, 0.0, 1.0])
@@ -197,10 +198,10 @@ def _shown_places(
 
 
 def _drawn_parts(nodes: Sequence[Array]) -> tuple[list[NDArray[np.int_]], int]:
-    """Return the first ideal pixels (k, 2) on each side, and the common size in px, of the drawn
-    parts.
+    """Return the parts of ideal images that have to be drawn.
 
-    The parts hold the places (k, 3, 3, 2).
+    The results are their first pixels (k, 2) for each camera, and their common size in px. The
+    parts contain the places ``nodes`` (k, 3, 3, 2) of each camera.
     """
     first = [np.floor(places.min(axis=(1, 2))).astype(int) - REACH for places in nodes]
     reach = max(
@@ -213,9 +214,9 @@ def _drawn_parts(nodes: Sequence[Array]) -> tuple[list[NDArray[np.int_]], int]:
 def _bent(
     side: Side, drawn: NDArray[np.float32], nodes: Array, fine_size: int
 ) -> NDArray[np.float32]:
-    """Return fine windows (k, fine_size, fine_size) as the lens shows them.
+    """Return distorted fine windows (k, fine_size, fine_size).
 
-    For a perfect lens, the windows are only cut out.
+    For a lens without distortion, the windows are only cut out.
     """
     if not side.camera.distortion.is_zero:
         return resample(drawn, nodes, fine_size)
@@ -234,7 +235,7 @@ def _finer(camera: PinholeCamera, sub_pixels: int) -> PinholeCamera:
     return replace(
         camera,
         focal_px=camera.focal_px * sub_pixels,
-        # Pixel coordinates refer to pixel centres, and only the image corners stay in place.
+        # Pixel coordinates refer to pixel centres, which move; the image corners stay in place.
         centre_x_px=(camera.centre_x_px + 0.5) * sub_pixels - 0.5,
         centre_y_px=(camera.centre_y_px + 0.5) * sub_pixels - 0.5,
         width=camera.width * sub_pixels,
@@ -244,12 +245,11 @@ def _finer(camera: PinholeCamera, sub_pixels: int) -> PinholeCamera:
 
 @lru_cache(maxsize=32)
 def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> NDArray[np.float32]:
-    """Return the weights (size, (size + 2 margin) sub_pixels) of drawn sub-pixels in each pixel of
-    a row.
+    """Return the weights of drawn sub-pixels in each pixel of a row.
 
-    They are the mean over a pixel of a Gaussian of standard deviation ``psf_px``. Each drawn
-    sub-pixel is a mean over its own width, so the sum over sub-pixels is the exact mean over a
-    pixel.
+    They have the shape (size, (size + 2 margin) sub_pixels). They average a Gaussian of standard
+    deviation ``psf_px`` over each pixel. Each drawn sub-pixel is a mean over its own width, so the
+    sum over sub-pixels is the exact mean over a pixel.
     """
     total = (size + 2 * margin) * sub_pixels
     into_pixels = np.kron(
@@ -275,13 +275,14 @@ def exposed_windows(
     supersampling: int,
     sub_pixels: int | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the mean and the largest radiance (k, size, size) of windows over moments.
+    """Return the mean and the largest radiance (k, size, size) of windows over several moments.
 
-    Bodies stand at (b, 4, 4) at each moment, windows have first pixels ``corners`` (k, 2), and
-    there is no vignetting. Supersampling and sub_pixels are as of ``ImageFormation.windows``.
+    Each moment states camera_from_body (b, 4, 4). Windows have first pixels ``corners`` (k, 2). The
+    result has no vignetting. See ``ImageFormation.windows`` for ``supersampling`` and
+    ``sub_pixels``.
     """
     reached = formation.reached(camera, moments, corners, size, sub_pixels)
-    # Bodies move if their transforms change from moment to moment.
+    # Mask of the patches whose bodies move.
     moves = np.ptp(np.stack(moments), axis=0).any(axis=(1, 2))[formation.drawable.body_index]
     drawn_often = np.asarray(reached[:, :, moves].any(axis=(0, 2)))
     drawn_once = np.asarray(reached.any(axis=(0, 2))) & ~drawn_often
@@ -309,10 +310,10 @@ def exposed_windows(
 def whole_image(
     formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array], supersampling: int
 ) -> NDArray[np.float32]:
-    """Return the mean radiance (height, width) of one camera's image over moments.
+    """Return the mean radiance (height, width) of one camera's image over several moments.
 
-    Bodies stand at (b, 4, 4) at each moment. The image is drawn coarsely, except for finely drawn
-    windows around bright spots.
+    Each moment states camera_from_body (b, 4, 4). The image is drawn coarsely, except for finely
+    drawn windows around bright spots.
     """
     image, bright = _coarse(formation, camera, moments)
     corners, size = _spots(
@@ -333,9 +334,9 @@ def whole_image(
 def _coarse(
     formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the mean radiance (height, width) with COARSE² drawn samples per pixel.
+    """Return the mean radiance (height, width), drawn with COARSE² samples per pixel.
 
-    The second result is a mask of the pixels that are bright at any moment.
+    The second result is a mask of the pixels that are bright at one moment at least.
     """
     if len(moments) == 1 and formation.draws_pixels([camera]):
         view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))

@@ -1,4 +1,4 @@
-"""Compiled: layers of convex solids and discs, drawn without OpenGL, see ``analytic``."""
+"""Compiled functions that draw layers of convex solids and discs, see ``analytic``."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from cmmsim.geometry.rim_kernels import cover_window
 
 
 class Solids(NamedTuple):
-    """Solids from far to near.
+    """Outlines of solids in an image, from far to near.
 
-    ``half_planes`` (m, 3) are a, b, c of a x + b y <= c, px; those of solid k stand from starts[k]
-    to starts[k + 1]. ``boxes`` (k, 4) are lowest x, y and highest x, y. ``slots`` (k,) are the
-    indices at which the covers of solids are stored, or -1.
+    ``half_planes`` (m, 3) contains a, b, c of a x + b y <= c, px. Rows starts[k] to starts[k + 1]
+    belong to solid k. ``boxes`` (k, 4) are lowest x, y and highest x, y. ``slots`` (k,) are the
+    indices under which the covered shares of pixels are stored, or -1.
     """
 
     half_planes: Array
@@ -27,10 +27,10 @@ class Solids(NamedTuple):
 
 
 class Discs(NamedTuple):
-    """Discs in the order in which they are laid.
+    """Discs in the order in which they are drawn.
 
     Their ellipses have centres (m, 2), shapes (m, 2, 2) and half extents (m, 2), px. ``behind`` (m,
-    slots) says whether the solid of that slot stands before the disc.
+    slots) states whether the disc lies behind the solid with that slot.
     """
 
     centres: Array
@@ -42,7 +42,7 @@ class Discs(NamedTuple):
 
 @compiled
 def polygon_holds(half_planes: Array, x: float, y: float, width: int, height: int) -> bool:
-    """Tell whether the box from (x, y) on lies wholly inside a convex polygon."""
+    """Tell whether a box with its first corner at (x, y) lies wholly inside a convex polygon."""
     for k in range(len(half_planes)):
         a, b, c = half_planes[k]
         if max(a * x, a * (x + width)) + max(b * y, b * (y + height)) > c:
@@ -52,9 +52,10 @@ def polygon_holds(half_planes: Array, x: float, y: float, width: int, height: in
 
 @compiled
 def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: Array) -> None:
-    """Fill the share (h, w) of the pixels of a box from (x, y) on that a convex polygon covers.
+    """Fill ``share`` (h, w) with the share of each pixel that a convex polygon covers.
 
-    It is exact along x, and the mean of ``lines`` scan lines along y.
+    The first pixel begins at (x, y). The share is exact along x, and along y it is the mean over
+    ``lines`` scan lines.
     """
     height, width = share.shape
     share[:] = 0.0
@@ -82,7 +83,11 @@ def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: 
 
 @compiled
 def lay_solids(image: Array, x: float, y: float, solids: Solids, lines: int, covers: Array) -> None:
-    """Lay solids over a window (h, w) whose first pixel begins at (x, y), and note their covers."""
+    """Draw solids over a window (h, w) and store the shares of pixels that they cover.
+
+    The first pixel of the window begins at (x, y). The shares are stored in ``covers`` (slots, h,
+    w).
+    """
     height, width = image.shape
     share = np.empty((height, width))
     for k in range(len(solids.levels)):
@@ -103,7 +108,7 @@ def lay_solids(image: Array, x: float, y: float, solids: Solids, lines: int, cov
 
 @compiled
 def shown_share(behind: Array, covers: Array, row: int, column: int) -> float:
-    """Return the share of a pixel that none of the solids before a disc covers."""
+    """Return the share of a pixel that is not covered by any solid in front of a disc."""
     shown = 1.0
     for slot in range(len(behind)):
         if behind[slot]:
@@ -115,7 +120,7 @@ def shown_share(behind: Array, covers: Array, row: int, column: int) -> float:
 def lay_disc(
     image: Array, centre_x: float, centre_y: float, k: int, discs: Discs, covers: Array
 ) -> None:
-    """Lay disc ``k`` over a window (h, w), its centre given in px of the window."""
+    """Draw disc ``k`` over a window (h, w). Its centre is in px of the window."""
     height, width = image.shape
     extent_x, extent_y = discs.extents[k]
     first = max(0, math.ceil(centre_x - extent_x - 0.5))
@@ -142,8 +147,9 @@ def lay_disc(
 def lay_layers(
     images: Array, group: Array, corners: Array, solids: Solids, lines: int, discs: Discs
 ) -> None:
-    """Lay solids, then discs, over the windows ``images[group]`` (h, w) with first pixels (n,
-    2).
+    """Draw solids, then discs, over the windows ``images[group]`` (n, h, w).
+
+    The windows have first pixels ``corners`` (n, 2).
     """
     _, height, width = images.shape
     covers = np.empty((discs.behind.shape[1], height, width))
@@ -169,11 +175,11 @@ def lay_layers(
 def enters(
     eye: Array, point: Array, normals: Array, offsets: Array, wider: float, touching: float
 ) -> bool:
-    """Tell whether the solid normal . x + offset <= ``wider`` stands between ``eye`` and ``point``
-    (3,).
+    """Tell whether a solid stands between ``eye`` (3,) and ``point`` (3,).
 
-    All are in its axes. Meeting the solid within the share ``touching`` of the way to the point
-    counts as the point's lying on it.
+    The solid is normal . x + offset <= ``wider``; all coordinates are in its axes. A point lies on
+    the solid, and not behind it, if the line of sight enters the solid within the last share
+    ``touching`` of its length.
     """
     enter = -np.inf
     leave = np.inf
@@ -183,8 +189,8 @@ def enters(
         for i in range(3):
             distance -= normals[k, i] * eye[i]
             closing += normals[k, i] * (point[i] - eye[i])
-        # Each face cuts the way from the eye to the point: the solid is entered at the last face
-        # that is met from outside, and left at the first one from inside.
+        # The line of sight enters the solid at the last face that it crosses inwards, and leaves
+        # the solid at the first face that it crosses outwards.
         if closing < 0.0:
             enter = max(enter, distance / closing)
         elif closing > 0.0:
@@ -205,9 +211,9 @@ def hidden_points(
     touching: float,
     hidden: Array,
 ) -> None:
-    """Fill ``hidden`` (n,): whether a convex solid stands between the camera and points (n, 3).
+    """Fill ``hidden`` (n,) with whether a convex solid stands between the camera and each point.
 
-    The points are in camera axes. The solid is normal . x + offset <= 0 in its own axes.
+    The points (n, 3) are in camera axes. The solid is normal . x + offset <= 0 in its own axes.
     """
     eye = np.empty(3)
     point = np.empty(3)

@@ -1,15 +1,16 @@
-"""Meshes for pyrender: stickers as softened triangles, and patches laid over each other in order.
+"""Meshes for pyrender: stickers with soft rims, and windows that are drawn without depth tests.
 
-**Soft discs.** The rim of a sharp disc aliases between the samples that a pixel is drawn with. Here
-the level of the uppermost disc falls off to the level around it over RIM_SAMPLES distances of
-samples. This changes neither its centre nor its light, and the drawing comes close to the disc with
-fewer samples than that of a sharp rim.
+**Soft discs.** A sharp rim would show aliasing, because a pixel has few drawn samples. Therefore
+the level of the uppermost disc falls gradually to the level around it. The transition is
+RIM_SAMPLES sample distances wide. It changes neither the disc's centre nor its total light, and it
+needs fewer samples than a sharp rim for the same accuracy.
 
-**Painter's order.** Windows need no depths if they show one solid and at most one stack of discs
-that lies on it. A camera before the plane of a disc sees the disc, for all of the solid lies behind
-that plane. A convex solid that fills a window shows only its level. A sticker's dark ring then
-fills most of the window, so the window is cleared to the ring's level. The solid is drawn over it
-as a band around the ring. The edge is the same, and far fewer pixels are drawn.
+**Painter's order.** A window needs no depth test if it shows one solid and at most one stack of
+discs that lies on the solid. The solid is drawn first, then the discs. If the camera stands in
+front of the plane of a disc, it sees the disc, because the whole solid lies behind that plane. If
+the solid fills the window, it shows only one level. The dark ring of a sticker then fills most of
+the window, so the window is cleared to the ring's level, and the solid is drawn as a band around
+the ring. The image is the same, but far fewer pixels are drawn.
 """
 
 from collections.abc import Sequence
@@ -24,29 +25,30 @@ from cmmsim.imaging.renderer import FAR, NEAR, Drawable, Exposure, Views
 from cmmsim.imaging.scene_bodies import ConvexSolid, Disc, DiscStack, Mesh
 
 RIM_SAMPLES = 1.8
-# Samples by which a side of the polygon may fall short of the rim.
+# Largest distance between a side of the polygon and the rim, in samples.
 LARGEST_SAG = 0.08
 FEWEST_SIDES = 16
 GROUND_SIDES = 16
-# Radii of a ring to which a band around it reaches.
+# Ratio of the outer radius of a band to the radius of the ring inside it.
 BAND_REACH = 5.0
-# px around a window that the solid must fill as well: far more than rounding.
+# px around a window that the solid must fill as well, to be safe against rounding.
 RIM_PX = 0.5
-# m by which a disc must lie over its solid.
+# Smallest distance in m between a disc and the solid below it.
 CLEARANCE = 1e-6
-# Volume of a solid over that of a cube as long; a flatter one fills no window.
+# Ratio of a solid's volume to that of a cube with its longest side. Solids with a smaller ratio
+# are drawn with depth tests.
 FLATTEST = 1e-6
-# Slope of a ray across a disc's plane, below which it runs along it.
+# Smallest slope between a ray and a disc's plane. Flatter rays count as parallel to the plane.
 SMALLEST_SLOPE = 1e-3
 OUTWARDS = frozen([-1.0, -1.0, 1.0, 1.0])
-CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # of bounds: lowest x, y and highest x, y
+CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # indices into (lowest x, y, highest x, y)
 
 
 def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
-    """Return triangles of discs that are drawn with samples ``sample`` m apart.
+    """Return the triangles of a stack of discs for drawing with samples ``sample`` m apart.
 
-    The uppermost disc has a soft rim where another one lies below it; the others are coarse and
-    sharp.
+    The uppermost disc has a soft rim if another disc lies below it. The lower discs are polygons
+    with few sides and sharp rims.
     """
     *grounds, top = stack.discs
     uppermost = (
@@ -58,9 +60,10 @@ def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
 
 
 def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
-    """Return ``disc_mesh`` where the lowest of several discs is a window's ground.
+    """Return the triangles of a stack of discs for a window that is cleared to the lowest disc's
+    level.
 
-    A band of ``level`` lies around it.
+    They are as in ``disc_mesh``, but a band of ``level`` around the lowest disc replaces this disc.
     """
     lowest, *grounds = stack.discs[:-1]
     corners = [_corners(lowest, reach * lowest.radius, GROUND_SIDES) for reach in (1.0, BAND_REACH)]
@@ -85,7 +88,7 @@ def _joined(pieces: Sequence[Mesh]) -> Mesh:
 
 
 def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
-    """Return a disc whose level falls to that ``around`` it within a band about its rim."""
+    """Return a disc whose level falls to the level ``around`` it within a band at its rim."""
     width = min(RIM_SAMPLES * sample, disc.radius)
     middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # as much light as the sharp disc
     sides = _sides(disc.radius, sample)
@@ -105,23 +108,25 @@ def _sharp_disc(disc: Disc, sides: int) -> Mesh:
 
 
 def _sides(radius: float, sample: float) -> int:
-    """Return the number of sides of a polygon that follows a circle to LARGEST_SAG."""
+    """Return the number of sides of a polygon that deviates from a circle by LARGEST_SAG
+    samples.
+    """
     return max(FEWEST_SIDES, int(np.ceil(np.pi * np.sqrt(radius / (2.0 * LARGEST_SAG * sample)))))
 
 
 def _corners(disc: Disc, radius: float, sides: int) -> Array:
-    """Return corners (sides, 3) of the regular polygon in a disc's plane with the area of the
-    circle.
+    """Return corners (sides, 3) of the regular polygon in a disc's plane with the area of a circle
+    of that radius.
     """
     u, v = np.linalg.svd(disc.normal[None])[2][1:]
     angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
-    # The polygon has the area of the circle, and so as much light.
+    # Polygon and circle have the same area, so they have the same total light.
     fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
     return disc.centre + fill * radius * (np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v)
 
 
 def _band_triangles(sides: int) -> NDArray[np.int_]:
-    """Return triangles (2 sides, 3) between ``sides`` corners and as many around them."""
+    """Return triangles (2 sides, 3) between an inner and an outer polygon of ``sides`` corners."""
     here = np.arange(sides)
     there = np.roll(np.arange(sides), -1)
     return np.concatenate(
@@ -133,9 +138,9 @@ def _band_triangles(sides: int) -> NDArray[np.int_]:
 
 
 def _balanced_triangles(sides: int) -> NDArray[np.int_]:
-    """Return triangles (sides - 2, 3) of a convex polygon, with large ones inside.
+    """Return triangles (sides - 2, 3) of a convex polygon, with large triangles in the middle.
 
-    They are faster to draw than a fan of slivers.
+    They are faster to draw than a fan of thin triangles.
     """
     triangles: list[tuple[int, int, int]] = []
     arcs = [(0, sides - 1)]
@@ -150,11 +155,11 @@ def _balanced_triangles(sides: int) -> NDArray[np.int_]:
 
 @dataclass(frozen=True)
 class Laid:
-    """Windows that need no depths.
+    """Windows that need no depth test.
 
-    ``solid`` (n,) is the patch of a window's only solid, or -1 where depths are needed. ``filled``
-    says whether that solid fills the window. ``ringed`` is the stack whose lowest disc may then be
-    taken for its ground, or -1.
+    ``solid`` (n,) is the patch of a window's only solid, or -1 if a depth test is needed.
+    ``filled`` (n,) states whether this solid fills the window. ``ringed`` (n,) is the stack to
+    whose lowest disc's level the window can be cleared, or -1.
     """
 
     solid: NDArray[np.int_]
@@ -165,7 +170,8 @@ class Laid:
 class LaidSolids:
     """Convex solids of a drawable, each of one level, and the stacks of discs that lie on them.
 
-    ``levels`` (patches,) are those of the solids and of the lowest discs of stacks; NaN for others.
+    ``levels`` (patches,) is the level of a solid or of the lowest disc of a stack, and NaN for
+    other patches.
     """
 
     def __init__(self, drawable: Drawable) -> None:
@@ -192,7 +198,7 @@ class LaidSolids:
         self._ring_centres = np.array(
             [np.zeros(3) if ring is None else ring.centre for ring in lowest]
         )
-        # The inner circle of the polygon that bounds a band.
+        # Radius, in radii of the ring, of the circle inside the outer polygon of a band.
         inside = BAND_REACH * np.cos(np.pi / GROUND_SIDES)
         self._ring_reach = np.array(
             [0.0 if ring is None else inside * ring.radius for ring in lowest]
@@ -219,11 +225,11 @@ class LaidSolids:
         }
 
     def laid(self, views: Views, reaching: NDArray[np.bool_]) -> Laid:
-        """Tell which windows need no depths; ``reaching`` is that of Drawable."""
+        """Tell which windows need no depth test; ``reaching`` comes from `Drawable.reaching`."""
         laid = Laid(
             np.full(len(views), -1), np.zeros(len(views), dtype=bool), np.full(len(views), -1)
         )
-        # One solid, and one stack of discs on it at most.
+        # At most two patches: a solid and a stack of discs.
         few = reaching.sum(axis=1) <= 2
         bounds = views.bounds
         for shown in views.exposures:
@@ -250,15 +256,17 @@ class LaidSolids:
         return laid
 
     def carrier(self, stack: int) -> int | None:
-        """Return the solid on which a stack with a lowest disc lies, or None."""
+        """Return the solid on which a stack of several discs lies, or None."""
         return next(
             (k for k in self._solids if self._ring_reach[stack] > 0.0 and self._lying[k][stack]),
             None,
         )
 
     def _seen_over(self, solid: int, view: Exposure) -> NDArray[np.bool_]:
-        """Tell which patches show over a solid: itself, and the stacks on it that show their upper
-        side.
+        """Return a mask of the patches that are visible without a depth test if only they are
+        drawn.
+
+        They are the solid itself and the stacks on it that face the camera.
         """
         move = view.camera_from_bodies[self._body_index[solid]]
         eye = -move[:3, 3] @ move[:3, :3]
@@ -267,9 +275,9 @@ class LaidSolids:
         return seen
 
     def _fills(self, solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
-        """Tell whether the solid shows along ``rays`` (n, 4, 3) to all corners of windows.
+        """Tell whether a solid fills windows, given the ``rays`` (n, 4, 3) to their corners.
 
-        It is convex, so that it then shows all over them.
+        The solid is convex, so it fills a window if it is met along the rays to all corners.
         """
         move = view.camera_from_bodies[self._body_index[solid]]
         depths = self._solids[solid].vertices @ move[2, :3] + move[2, 3]
@@ -282,10 +290,10 @@ class LaidSolids:
     ) -> NDArray[np.bool_]:
         """Tell whether a band around each stack's lowest disc covers the corners of its window.
 
-        The stacks (n,) lie on the solid, and the corners along ``rays`` (n, 4, 3).
+        The stacks (n,) lie on the solid. The corners lie on ``rays`` (n, 4, 3).
         """
         move = view.camera_from_bodies[self._body_index[solid]]
-        # From the camera, in the axes of the body.
+        # Vectors from the camera to the rings' centres, in the axes of the body.
         gaps = self._ring_centres[stacks] + move[:3, 3] @ move[:3, :3]
         along = rays @ move[:3, :3]
         normals = self._normals[stacks]
@@ -297,7 +305,7 @@ class LaidSolids:
 
 
 def _is_plain_convex(mesh: Mesh) -> bool:
-    """Tell whether a mesh is the whole surface of a convex solid, of one level."""
+    """Tell whether a mesh is the closed surface of a convex solid and has a single level."""
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
     if not solid.is_watertight or np.ptp(mesh.levels) > 0.0:
         return False
@@ -309,7 +317,7 @@ def _is_plain_convex(mesh: Mesh) -> bool:
 
 
 def _lies_over(stack: DiscStack, vertices: Array) -> bool:
-    """Tell whether discs are parallel, each over the one before, and all above vertices (n,3)."""
+    """Tell whether the discs are parallel, in rising order, and all above the vertices (n, 3)."""
     normal = stack.discs[0].normal
     heights = np.array([disc.centre @ normal for disc in stack.discs])
     parallel = all(np.allclose(disc.normal, normal, rtol=0.0, atol=1e-9) for disc in stack.discs)

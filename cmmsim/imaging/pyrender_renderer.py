@@ -1,16 +1,16 @@
 """Rendering of many small windows in one pass. It is the only module that imports pyrender.
 
-pyrender supplies the OpenGL context, the mesh buffers and the flat shader. The frame buffers hold
-one channel only, which draws faster than pyrender's four. Each window is drawn into its own cell of
-one large frame buffer, with its own projection. It is drawn larger by the supersampling factor and
-averaged in linear light. Every drawn pixel has one sample: multisampling costs more than it gains
-on the stickers' soft rims.
+pyrender supplies the OpenGL context, the mesh buffers and the flat shader. The frame buffers have
+one channel only, which draws faster than pyrender's four. One large frame buffer, the atlas, has a
+cell for each window. Each window is drawn into its cell with its own projection. It is enlarged by
+the supersampling factor and then averaged in linear light. Every drawn pixel has one sample:
+multisampling would take more time than its accuracy on the stickers' soft rims is worth.
 
-A cell draws only the patches whose bounding box reaches into it. Projection and camera_from_body
-are multiplied in double precision, so that the shader sees one well-scaled matrix. Depths are asked
-for only where they are needed. A solid that fills a cell, or the dark ring of its sticker, is the
-cell's ground, see ``LaidSolids``. Pieces of the atlas are handed over as they are ready, so that
-OpenGL fills them while the next ones are prepared.
+In a cell, only patches whose bounding box reaches into it are drawn. Projection and
+camera_from_body are multiplied in double precision, so that the shader gets one well-scaled matrix.
+Depth tests are used only where they are needed. If a solid or the dark ring of a sticker fills a
+cell, the cell is cleared to its level, see ``LaidSolids``. Each piece of the atlas is sent to
+OpenGL as soon as it is ready. OpenGL draws it while the next piece is prepared.
 """
 
 import ctypes
@@ -31,7 +31,7 @@ from cmmsim.imaging.scene_bodies import DiscStack, Mesh, Patch
 
 ATLAS_SIDE_PX = 2048
 KEPT_FRAME_BUFFERS = 12
-# Pieces of an atlas that are handed over one after another.
+# Number of pieces in which an atlas is sent to OpenGL.
 PIECES = 3
 
 
@@ -43,7 +43,7 @@ def render_windows(
     Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises
     OpenGLMissingError.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.imaging.window_kernels import mean_of_cells
 
     views = Views.of(views)
@@ -71,21 +71,21 @@ def require_opengl() -> None:
     Raises
     ------
     OpenGLMissingError
-        If it cannot; the message names the packages to install.
+        If pyrender cannot draw. The message names the packages to install.
     """
     _shared_atlas()
 
 
 @lru_cache(maxsize=1)
 def _shared_atlas() -> "_Atlas":
-    """Return the only renderer of this process; making another would leak memory."""
+    """Return the only atlas of this process. A second one would leak memory."""
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     try:
         import pyrender
 
         return _Atlas(pyrender)
-    except Exception as error:  # PyOpenGL's platform plugins fail with many types
+    except Exception as error:  # PyOpenGL's platform plugins raise errors of many types
         raise OpenGLMissingError(error) from error
 
 
@@ -93,8 +93,9 @@ def _shared_atlas() -> "_Atlas":
 class _Patch:
     """Patch in OpenGL's memory.
 
-    The ``indices`` of its triangles stand from the front to the back; as many for the other way
-    begin at ``backwards``, in bytes. ``solid`` says that it is no stack of discs.
+    ``indices`` is the number of indices of its triangles, in order from front to back. The same
+    number of indices in reverse order begins at ``backwards``, in bytes. ``solid`` is False for a
+    stack of discs.
     """
 
     vertex_array: int
@@ -105,10 +106,10 @@ class _Patch:
 
 @dataclass(frozen=True)
 class _Uploaded:
-    """Uploaded parts of a drawable.
+    """Parts of a drawable in OpenGL's memory.
 
-    ``patches`` are known by the number of drawn pixels a radian, and so are those that may be
-    ``ringed``: drawn around their own lowest disc.
+    ``patches`` contains all patches by the number of drawn pixels per radian. In ``ringed``, stacks
+    of discs are made for cells that are cleared to the level of their lowest disc.
     """
 
     patches: dict[float, list[_Patch]]
@@ -159,7 +160,7 @@ class _Atlas:
         The result is valid until the next call.
         """
         self._context._platform.make_current()
-        # Drawn pixels a radian.
+        # Drawn pixels per radian.
         samples = views.exposures[0].camera.focal_px * cell[0] / views.size[0]
         known = self._uploaded(drawable, samples)
         frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
@@ -196,9 +197,7 @@ class _Atlas:
         return frame_buffer.read()
 
     def _draw_by_depth(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
-        """Draw the patches shown in a cell, of which the nearest is seen; ``matrices`` are
-        addresses.
-        """
+        """Draw the patches of a cell with depth tests. ``matrices`` are addresses by patch."""
         gl = self._gl
         triangles, unsigned = self._constants
         gl.glEnable(gl.GL_DEPTH_TEST)
@@ -209,10 +208,9 @@ class _Atlas:
         gl.glDisable(gl.GL_DEPTH_TEST)
 
     def _lay(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
-        """Draw the patches shown in a cell over each other: the solid, then the stack that lies on
-        it.
+        """Draw the patches of a cell over each other: the solid, then the stack that lies on it.
 
-        All belong to one body.
+        ``matrices`` are addresses by patch. All patches belong to one body.
         """
         triangles, unsigned = self._constants
         for p in sorted(matrices, key=lambda p: not patches[p].solid):
@@ -223,7 +221,7 @@ class _Atlas:
     def _clear(
         self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool
     ) -> None:
-        """Give each cell its ground's level, and the farthest depth where depths are needed."""
+        """Clear each cell to its level in ``grounds``, and the depths if ``with_depth``."""
         gl = self._gl
         level = float(grounds[0])
         gl.glClearColor(level, level, level, 1.0)
@@ -240,7 +238,7 @@ class _Atlas:
     def _uploaded(self, drawable: Drawable, samples: float) -> _Uploaded:
         """Return the drawable with its patches in OpenGL's memory.
 
-        Discs are made for ``samples`` drawn pixels a radian.
+        Discs are triangulated for ``samples`` drawn pixels per radian.
         """
         known = self._known.get(drawable)
         if known is None:
@@ -290,12 +288,12 @@ class _Atlas:
 
     @cached_property
     def _matrix_location(self) -> int:
-        """Location of the bound shader's matrix."""
+        """Location of the matrix P of the bound shader."""
         return int(self._gl.glGetUniformLocation(self._program._program_id, "P"))
 
     @cached_property
     def _program(self) -> Any:
-        """pyrender's flat shader with all matrices identity but P."""
+        """pyrender's flat shader, in which all matrices except P are the identity."""
         from pyrender.constants import ProgramFlags
 
         anything = self._upload(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros(3)))
@@ -323,7 +321,7 @@ class _FrameBuffer:
     """Frame buffer with a red channel and depth, one sample per pixel."""
 
     def __init__(self, gl: Any, width: int, height: int) -> None:
-        from OpenGL.raw.GL.VERSION import GL_1_0  # reads into given memory
+        from OpenGL.raw.GL.VERSION import GL_1_0  # its glReadPixels writes to a given address
 
         self._gl = gl
         self._size = (width, height)
@@ -341,18 +339,18 @@ class _FrameBuffer:
             raise CmmError(f"OpenGL cannot draw {self._size} px: frame buffer state {state}")
 
     def bind(self) -> None:
-        """Draw here from now on, and read from here."""
+        """Make this frame buffer the target of drawing and reading."""
         self._gl.glBindFramebuffer(self._gl.GL_FRAMEBUFFER, self._name)
 
     def read(self) -> NDArray[np.uint8]:
-        """Return the image (height, width), in memory that the next one overwrites."""
+        """Return the image (height, width). The next call overwrites its memory."""
         self._read_pixels(
             0, 0, *self._size, self._gl.GL_RED, self._gl.GL_UNSIGNED_BYTE, self._target
         )
         return self._pixels
 
     def delete(self) -> None:
-        """Give the memory back."""
+        """Free the frame buffer's memory."""
         self._gl.glDeleteFramebuffers(1, [self._name])
         self._gl.glDeleteRenderbuffers(len(self._buffers), self._buffers)
 

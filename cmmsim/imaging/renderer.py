@@ -1,6 +1,7 @@
-"""Contract of all renderers: windows of a scene, the result, and the choice of a renderer.
+"""Interface of all renderers, their input, and the choice of a renderer by name.
 
-A renderer draws windows of cameras with perfect lenses, from the patches that reach into each.
+A renderer draws windows of cameras with perfect lenses. In each window it draws the patches that
+reach into it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ FAR = 10.0
 class View:
     """One window of a camera with a perfect lens.
 
-    It has camera_from_body transforms (b, 4, 4), its first pixel (x, y) and its size (w, h), px.
+    ``camera_from_bodies`` (b, 4, 4) are the places of the bodies. ``corner`` is the window's first
+    pixel (x, y), and ``size`` its size (w, h), px.
     """
 
     camera: PinholeCamera
@@ -42,8 +44,9 @@ class View:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Camera with a perfect lens, camera_from_body transforms (b, 4, 4), and the windows (k,) of
-    both.
+    """Camera with a perfect lens that sees bodies at camera_from_body (b, 4, 4).
+
+    ``windows`` (k,) are the numbers of the windows that belong to this camera and these places.
     """
 
     camera: PinholeCamera
@@ -52,7 +55,7 @@ class Exposure:
 
 
 class Views(Sequence[View]):
-    """Windows of one size (w, h) px with first pixels ``corners`` (n, 2), by their exposures."""
+    """Windows of one size (w, h) px with first pixels ``corners`` (n, 2), grouped by exposure."""
 
     def __init__(
         self, exposures: Sequence[Exposure], corners: Array, size: tuple[int, int]
@@ -63,7 +66,7 @@ class Views(Sequence[View]):
 
     @classmethod
     def of(cls, views: Sequence[View]) -> Views:
-        """Gather single windows by camera and exposure."""
+        """Group single windows by camera and places of bodies."""
         if isinstance(views, Views):
             return views
         groups: dict[tuple[int, int], list[int]] = {}
@@ -83,9 +86,10 @@ class Views(Sequence[View]):
     def of_sides(
         cls, sides: Sequence[tuple[PinholeCamera, Array, NDArray]], size: tuple[int, int]
     ) -> Views:
-        """Return windows of cameras that see bodies (b, 4, 4), one side after the other.
+        """Return the windows of several cameras, one camera after the other.
 
-        Each side has the first pixels (k, 2) of its windows.
+        Each side is a camera, its camera_from_body (b, 4, 4), and the first pixels (k, 2) of its
+        windows.
         """
         starts = np.cumsum([0, *(len(corners) for _, _, corners in sides)])
         shown = [
@@ -123,17 +127,15 @@ class Views(Sequence[View]):
 
     @property
     def bounds(self) -> Array:
-        """Lowest x, y and highest x, y (n, 4) of the windows, px: the outer edges of their
-        outermost pixels.
-        """
+        """Lowest x, y and highest x, y (n, 4) of the windows, at the outer edges of pixels, px."""
         return np.hstack([self.corners - 0.5, self.corners - 0.5 + self.size])
 
     @property
     def projections(self) -> Array:
         """Clip-from-camera matrices (n, 4, 4) for OpenCV camera axes.
 
-        Row 0 of a drawing is a window's top row. The half pixel turns OpenCV's pixel-centre
-        convention into OpenGL's pixel-corner convention.
+        Row 0 of a drawn image is the top row of a window. OpenCV's pixel coordinates refer to pixel
+        centres, OpenGL's to pixel corners. Half a pixel is added for this reason.
         """
         matrices = np.zeros((len(self), 4, 4))
         for shown in self.exposures:
@@ -155,16 +157,16 @@ class Views(Sequence[View]):
         return matrices
 
 
-# Warnings that this process has given, which are not repeated.
+# Warnings that were issued in this process. They are not repeated.
 _WARNED: dict[str | tuple[str, type[Warning], int], int] = {}
 
 
 class Drawable:
     """Patches of several bodies.
 
-    ``body_index`` tells the body of each, and ``boxes`` (n, 4, 8) the corners of its bounding box
-    as columns, m and 1. Discs are triangulated for ``distance`` m, from which they are usually
-    seen.
+    ``body_index`` (n,) is the body of each patch. ``boxes`` (n, 4, 8) are the corners of each
+    patch's bounding box as columns (x, y, z in m, 1). ``distance`` in m is the usual distance from
+    the cameras, for which discs are triangulated.
     """
 
     def __init__(
@@ -178,8 +180,8 @@ class Drawable:
         self.distance = distance
 
     def reaching(self, views: Views) -> NDArray[np.bool_]:
-        """Return the mask (n views, n patches) of those that may show in each window, by bounding
-        boxes.
+        """Return a mask (n views, n patches) of the patches whose bounding box reaches into each
+        window.
         """
         windows = views.bounds
         result = np.zeros((len(views), len(self.patches)), dtype=bool)
@@ -192,13 +194,13 @@ class Drawable:
     def reaching_windows(
         self, camera: PinholeCamera, camera_from_bodies: Array, bounds: Array
     ) -> NDArray[np.bool_]:
-        """Return the mask of the patches that may show in each window (n windows, n patches) of one
-        camera.
+        """Return a mask (n windows, n patches) of the patches whose bounding box reaches into each
+        window.
 
-        The camera has a perfect lens. Bodies stand at (b, 4, 4), and ``bounds`` (n, 4) are lowest
-        x, y and highest x, y, px.
+        All windows belong to one camera with a perfect lens. Bodies stand at ``camera_from_bodies``
+        (b, 4, 4). ``bounds`` (n, 4) are lowest x, y and highest x, y of the windows, px.
         """
-        # Late, as numba takes time to import.
+        # Imported late, because importing numba takes time.
         from cmmsim.imaging.window_kernels import boxes_reaching
 
         reaching = np.empty((len(bounds), len(self.patches)), dtype=bool)
@@ -216,18 +218,18 @@ class Drawable:
 class DrawWindows(Protocol):
     """Function that draws the radiance (n, h, w) float32, 0 to 1, of n views of one size.
 
-    Row 0 is a window's top row.
+    Row 0 is the top row of a window.
     """
 
     def __call__(
         self, drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
     ) -> NDArray[np.float32]:
-        """Draw; ``supersampling`` says how finely edges are sampled within a pixel."""
+        """Draw the views with about ``supersampling`` samples per pixel and axis at edges."""
 
 
 @dataclass(frozen=True)
 class Renderer:
-    """Renderer with a name and its function.
+    """Renderer with its name and its drawing function.
 
     ``sampling_error_px`` is the rms error of a sticker's centre at supersampling 9, see
     ``centre_error_px``.
@@ -240,28 +242,30 @@ class Renderer:
     def centre_error_px(self, supersampling: int) -> float:
         """Return the error of a sticker's centre due to sampling, px rms.
 
-        It was measured with pyrender: 0.0041 at supersampling 3, and 0.000069 at 32.
+        The exponent fits errors measured with pyrender: 0.0041 px at supersampling 3, and 0.000069
+        px at 32.
         """
         return self.sampling_error_px * (9.0 / supersampling) ** 1.7
 
 
 def choose_renderer(name: str) -> Renderer:
-    """Return the renderer of a name.
+    """Return the renderer with a name.
 
-    "auto" is pyrender where OpenGL works, and otherwise analytic, with one line of warning.
-    ``module:name`` of a user's own is a Renderer, or a function as ``DrawWindows``, which may carry
-    its ``sampling_error_px``. Raises UnknownOptionError with the valid names, and CmmError for what
-    cannot be imported or called.
+    "auto" selects pyrender if OpenGL works, and otherwise analytic, with a warning of one line.
+    ``module:name`` is a user's own Renderer, or a function as described by ``DrawWindows``. Such a
+    function can have an attribute ``sampling_error_px``. Raises UnknownOptionError, which lists the
+    valid names, and CmmError if a user's own renderer cannot be imported or called.
     """
     if name == AUTO:
-        from cmmsim.imaging.pyrender_renderer import require_opengl  # which imports this module
+        # Imported here, because the module imports this one.
+        from cmmsim.imaging.pyrender_renderer import require_opengl
 
         try:
             require_opengl()
         except OpenGLMissingError as error:
             reason = " ".join(str(error.__cause__ or error).split())
             text = f"images are drawn by the analytic renderer, pyrender found no OpenGL: {reason}"
-            # A place without source, so that the warning is one line.
+            # With line 0, Python cannot add a source line, so the warning is one line.
             warnings.warn_explicit(text, UserWarning, __name__, 0, registry=_WARNED)
             return _renderer("analytic")
         return _renderer("pyrender")
@@ -276,7 +280,7 @@ def _renderer(name: str) -> Renderer:
 def _check_images(
     part: str, found: object, drawable: Drawable, views: Sequence[View], *_: object
 ) -> None:
-    """Raise CmmError unless a renderer of a user's own has returned what it should."""
+    """Raise CmmError unless a user's own renderer returned finite radiance of the right shape."""
     width, height = views[0].size
     shape = (len(views), height, width)
     wanted = f"{part} must return finite radiance {shape}"

@@ -1,6 +1,6 @@
-"""Solid bodies before the cameras, with the true places of stickers.
+"""Solid bodies in front of the cameras, with the true places of stickers.
 
-Only the renderer sees this truth.
+Only renderers use these true places, never the estimator.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from cmmsim.files.schema import Body, Stickers, unit
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, invert
 
-# m by which the solid surface lies below the sticker planes, and a dark ring below its sticker.
+# Depth in m of the solid surface below the sticker planes, and of a dark ring below its sticker.
 SUNK = 0.0003
 RING_SUNK = 0.0001
-# m: the direction of a shorter rod is rounding.
+# m: the direction of a shorter rod would be dominated by rounding errors.
 SHORTEST_ROD = 1e-9
-# Share of the way to a point in which meeting a solid counts as lying on it.
+# A point counts as lying on a solid, and not behind it, if the line of sight enters the solid
+# within this last share of its length.
 TOUCHING = 1e-6
 
 
@@ -42,12 +43,12 @@ class ConvexSolid:
 
     @property
     def faces(self) -> tuple[Array, Array]:
-        """Outward normals (f, 3) and offsets (f,) of its faces: normal . x + offset <= 0 inside."""
+        """Outward normals (f, 3) and offsets (f,) of the faces: normal . x + offset <= 0 inside."""
         return self._normals, self._offsets
 
     def hides(self, camera_from_body: Array, points: Array) -> NDArray[np.bool_]:
         """Tell whether the solid stands between the camera and points (..., 3) in camera axes."""
-        # Late, as numba takes time to import.
+        # Imported late, because importing numba takes time.
         from cmmsim.imaging.layer_kernels import hidden_points
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
@@ -70,10 +71,7 @@ class Disc:
 
 @dataclass(frozen=True)
 class DiscStack:
-    """Discs that lie over each other, the largest and lowest first.
-
-    Each renderer draws them in its own way.
-    """
+    """Discs that lie over each other; the first is the largest and lowest."""
 
     discs: tuple[Disc, ...]
 
@@ -89,8 +87,9 @@ class DiscStack:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Vertices (n, 3) m, faces (m, 3), and levels (n,) 0 to 1 of the vertices; a solid has one
-    level.
+    """Triangle mesh with vertices (n, 3) in m, faces (m, 3) and levels (n,) 0 to 1 of the vertices.
+
+    All vertices of a solid have the same level.
     """
 
     vertices: Array
@@ -109,7 +108,7 @@ Patch = DiscStack | Mesh
 
 @dataclass(frozen=True)
 class SceneBody:
-    """Rigid body as drawn: its solid and one stack of discs for each sticker.
+    """Rigid body for drawing: its solid and one stack of discs per sticker.
 
     ``sticker_places`` (n, 3) are the true places, m.
     """
@@ -122,7 +121,8 @@ class SceneBody:
 def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
     """Return the true sticker places (n, 3).
 
-    They are the nominal places, moved within their planes by a seeded distance and direction.
+    They are the nominal places, moved within their planes by random distances and directions from
+    ``placement_seed`` and ``stream``.
     """
     rng = np.random.default_rng([stickers.placement_seed, stream])
     distance = rng.uniform(*stickers.placement, len(body.nominal))
@@ -132,7 +132,7 @@ def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
 
 
 def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int) -> SceneBody:
-    """Return the drawn body of a sensor file's section."""
+    """Return the body for drawing that a section of a sensor file describes."""
     places = placed_stickers(body, stickers, stream)
     drawn = tuple(
         _sticker(place, axes, stickers) for place, axes in zip(places, body.in_plane, strict=True)
@@ -142,13 +142,13 @@ def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int)
 
 
 def solid_mesh(mesh: trimesh.Trimesh, level: float) -> Mesh:
-    """Return a solid in one grey level."""
+    """Return a solid of a single level, 0 to 1."""
     vertices = np.asarray(mesh.vertices, dtype=float)
     return Mesh(vertices, np.asarray(mesh.faces), np.full(len(vertices), level))
 
 
 def rod(length: float, radius: float) -> trimesh.Trimesh:
-    """Return a cylinder from the origin to (0, 0, length): a crank, or a link between two points.
+    """Return a cylinder from the origin to (0, 0, length), such as a crank or a link of a robot.
 
     Parameters
     ----------
@@ -184,12 +184,12 @@ def rod(length: float, radius: float) -> trimesh.Trimesh:
 
 
 def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
-    """Return the place of a rod between two points.
+    """Return the transform that places a rod between two points.
 
     Parameters
     ----------
     start, end : array_like, shape (3,)
-        Points at which the rod begins, and to which it leads, in the base frame, m.
+        First and last point of the rod's axis in the base frame, m.
 
     Returns
     -------
@@ -219,7 +219,7 @@ def rod_transforms(starts: Array, ends: Array) -> Array:
 
     Raises CmmError for a rod that is too short.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.imaging.view_kernels import place_rods
 
     transforms = np.zeros((len(starts), 4, 4))
@@ -228,16 +228,16 @@ def rod_transforms(starts: Array, ends: Array) -> Array:
     if not lengths.min(initial=np.inf) >= SHORTEST_ROD:
         k = np.flatnonzero(~(lengths >= SHORTEST_ROD))[0]
         raise CmmError(
-            f"a rod of {lengths[k]:g} m from {starts[k].tolist()} m points nowhere, at least "
-            f"{SHORTEST_ROD:g} m is needed"
+            f"a rod of {lengths[k]:g} m from {starts[k].tolist()} m has no direction: its length "
+            f"must be at least {SHORTEST_ROD:g} m"
         )
     return transforms
 
 
 class PlacedBodies(Mapping[str, Array]):
-    """Mapping of bodies, by their names, to base_from_body ``together`` (k, 4, 4).
+    """Mapping of names of bodies to base_from_body, stored in one array ``together`` (k, 4, 4).
 
-    A sensor that is asked for every frame need not put the matrices together again.
+    With the array, a sensor need not join the matrices again in every frame.
     """
 
     def __init__(self, names: tuple[str, ...], together: Array) -> None:
@@ -258,9 +258,10 @@ class PlacedBodies(Mapping[str, Array]):
 
 
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
-    """Return the convex solid of the sunk sticker planes and the cuts.
+    """Return the convex solid that a body's planes and cuts enclose.
 
-    Raises SensorFileError where they enclose none.
+    The planes are the sticker planes, lowered by SUNK. Raises SensorFileError if they enclose no
+    solid.
     """
     normals = [*body.normals, *(unit(c.normal) for c in section.cuts)]
     points = [
@@ -268,7 +269,7 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
         *(np.array(c.point) for c in section.cuts),
     ]
     half_spaces = np.array([[*n, -(n @ p)] for n, p in zip(normals, points, strict=True)])
-    # A point a centimetre below the middle of the stickers must lie within all half spaces.
+    # The point one centimetre below the middle of the stickers must lie inside all half spaces.
     inside = body.nominal.mean(axis=0) - 0.01 * body.normals.sum(axis=0)
     outside = half_spaces @ [*inside, 1.0]
     if outside.max() >= 0.0:
@@ -278,14 +279,14 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
         ]
         raise SensorFileError(
             f"{body.name}: the middle of its stickers, {np.round(inside, 4).tolist()} m, lies "
-            f"{outside.max():.4f} m outside of {side[outside.argmax()]}: the stickers do not sit "
+            f"{outside.max():.4f} m outside of {side[outside.argmax()]}: the stickers do not lie "
             "on the solid that its planes and cuts enclose"
         )
     try:
         corners = HalfspaceIntersection(half_spaces, inside).intersections
         if not np.isfinite(corners).all():
             raise SensorFileError(
-                f"{body.name}: its planes and cuts enclose no solid, it is open on a side"
+                f"{body.name}: its planes and cuts enclose no solid, one side is open"
             )
         return trimesh.convex.convex_hull(corners)
     except QhullError as error:
@@ -296,7 +297,7 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
 
 
 def _sticker(place: Array, axes: Array, stickers: Stickers) -> DiscStack:
-    """Return a bright disc, and RING_SUNK below it a dark one that shows as a ring."""
+    """Return a bright disc and, RING_SUNK below it, a larger dark disc, which appears as a ring."""
     normal = np.cross(axes[:, 0], axes[:, 1])
     return DiscStack(
         (

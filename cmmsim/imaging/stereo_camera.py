@@ -1,4 +1,4 @@
-"""Exposures of two cameras: the poses that they see, and the light and noise over them."""
+"""Exposures of two cameras: poses during the exposure, mean light, and noise."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from cmmsim.imaging.scene_bodies import DiscStack
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 from cmmsim.radiometry.stereo_images import StereoFrame, Windows
 
-# No sticker moves farther between two sub-frames.
+# Largest movement of a sticker between two sub-frames.
 LARGEST_STEP_PX = 0.3
 MOST_SUB_FRAMES = 500
 SUPERSAMPLING = 9
@@ -27,11 +27,12 @@ Moments = Sequence[Sequence[Array]]
 def sub_frame_poses(
     poses: Array, pose_rates: Array, exposure: float, sticker_pixels: Callable[[Array], Array]
 ) -> list[Array]:
-    """Return, for each of N exposures, poses (m, 6) whose mean image is that of the whole exposure.
+    """Return, for each of N exposures, poses (m, 6) whose mean image is the image of the exposure.
 
-    The exposures are centred at ``poses`` (N, 6), and ``pose_rates`` (N, 6) are constant; the
-    midpoint rule divides them. ``sticker_pixels`` gives places (2, N, n, 2) px of all stickers at
-    poses (N, 6). Raises CmmError where the stickers move farther than an image can show.
+    Each exposure is divided into m equal parts, and the poses are those in the middle of the parts.
+    ``poses`` (N, 6) are the poses in the middle of the exposures, and ``pose_rates`` (N, 6) are
+    constant. ``sticker_pixels`` returns the places (2, N, n, 2) px of all stickers at poses (N, 6).
+    Raises CmmError if a sticker moves too far for MOST_SUB_FRAMES parts.
     """
     halves = 0.5 * exposure * pose_rates
     moved = np.linalg.norm(
@@ -54,7 +55,9 @@ def sub_frame_poses(
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of windows: supersampling a pixel and axis, and the number of exposures that are
+    """Quality of windows.
+
+    It states the number of drawn samples per pixel and axis, and the number of exposures that are
     averaged.
     """
 
@@ -64,12 +67,12 @@ class Quality:
 
 @dataclass(frozen=True)
 class VirtualStereoCamera:
-    """Two cameras that look at the true scene and hand out noisy grey values.
+    """Two cameras that take noisy images of the true scene.
 
     ``rig`` and ``camera_from_base`` (4, 4) have their true values. In the drawable of
-    ``formation``, body 0 is the platform and body 1 the base; the others are ``obstacle_names`` in
-    order. ``exposure`` is in s. ``pattern_seed`` is the seed of the differences from pixel to
-    pixel. The right camera exposes ``right_later`` s later.
+    ``formation``, body 0 is the platform and body 1 the base. The further bodies are the obstacles,
+    in the order of ``obstacle_names``. ``exposure`` is in s. ``pattern_seed`` is the seed of the
+    fixed pattern. The right camera exposes ``right_later`` s after the left camera.
     """
 
     rig: StereoRig
@@ -89,10 +92,10 @@ class VirtualStereoCamera:
         quality: Quality | None = None,
         pose_rate: Array | None = None,
     ) -> "LiveImages":
-        """Take one exposure of the platform, and of obstacles at base_from_body (4, 4) each.
+        """Take one exposure of the platform, and of obstacles at base_from_body (4, 4) by name.
 
-        ``pose`` (6,) is that in the middle of the exposure, and ``pose_rate`` (6,) its time
-        derivative; obstacles stand still.
+        ``pose`` (6,) is the pose in the middle of the exposure, and ``pose_rate`` (6,) its time
+        derivative. Obstacles stand still.
         """
         rates = None if pose_rate is None else pose_rate[None]
         return LiveImages(
@@ -106,16 +109,16 @@ class VirtualStereoCamera:
         obstacles: Mapping[str, Array],
         pose_rates: Array,
     ) -> "ManyLiveImages":
-        """Take exposures of the platform at poses (N, 6) in motion at pose_rates (N, 6), as
-        ``look`` each.
+        """Take one exposure at each of N poses (N, 6), with rates ``pose_rates`` (N, 6).
 
-        Each has its own noise.
+        Each exposure is taken as in ``look`` and has its own noise.
         """
         return ManyLiveImages(self, self._moments(poses, pose_rates, obstacles), rngs)
 
     def moved(self, changes: Array) -> "VirtualStereoCamera":
-        """Return the cameras with changes (24,) of their rig's parameters; their pixels stay the
-        same.
+        """Return the cameras after changes (24,) of the rig's parameters.
+
+        The fixed pattern of their pixels does not change.
         """
         camera = replace(self, rig=self.rig.moved(changes))
         camera.__dict__["patterns"] = self.patterns
@@ -128,12 +131,11 @@ class VirtualStereoCamera:
         size: int,
         supersampling: int,
     ) -> list[NDArray[np.float32]]:
-        """Return the mean radiance (2, n, size, size) of windows over the moments of several
-        exposures.
+        """Return the mean radiance (2, n, size, size) of windows over the moments of each exposure.
 
-        The windows begin at ``corners`` (2, n, 2) in the left and right image, for each exposure.
-        One moment of all exposures is drawn after the other, so that no more is held at once than
-        without motion.
+        For each exposure, the windows have first pixels ``corners`` (2, n, 2) in the left and the
+        right image. The first moments of all exposures are drawn together, then the second ones,
+        and so on. In this way no more memory is needed than without motion.
         """
         light = self._drawn([first for first, *_ in moments], corners, size, supersampling)
         for k in range(1, max(map(len, moments))):
@@ -155,10 +157,10 @@ class VirtualStereoCamera:
         size: int,
         supersampling: int,
     ) -> list[NDArray[np.float32]]:
-        """Return ``radiances`` of one moment each.
+        """Return the radiance (2, n, size, size) of windows at one moment of each exposure.
 
-        Exposures are drawn together where nothing finer than their pixels is drawn. Finer windows
-        of many exposures would not fit into the processor's caches.
+        Exposures are drawn together if their pixels are drawn directly. With a finer grid, they are
+        drawn one by one, because many of them would not fit into the processor's caches.
         """
         sides = [
             Side(*side)
@@ -184,7 +186,7 @@ class VirtualStereoCamera:
         return whole_image(self.formation, self.rig.cameras[side], moments, supersampling)
 
     def centre_error_px(self, quality: Quality) -> float:
-        """Return the error of a sticker's centre that drawing leaves, px rms."""
+        """Return the error of a sticker's centre that drawing causes, px rms."""
         return self.formation.centre_error_px(self.rig.cameras, quality.supersampling)
 
     @cached_property
@@ -193,9 +195,7 @@ class VirtualStereoCamera:
 
     @cached_property
     def patterns(self) -> Sequence[FixedPattern | None]:
-        """Differences from pixel to pixel of the left and of the right camera; None where there are
-        none.
-        """
+        """Fixed patterns of the left and of the right camera; None if the pixels do not differ."""
         prnu = self.noise.prnu
         dsnu = self.noise.dsnu
         if not (self.noise.enabled and (prnu > 0.0 or dsnu > 0.0)):
@@ -207,9 +207,7 @@ class VirtualStereoCamera:
         ]
 
     def pattern_in(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
-        """Return the differences from pixel to pixel in windows of a size at ``corners`` (2, n,
-        2).
-        """
+        """Return the fixed pattern in windows of one size at ``corners`` (2, n, 2), or None."""
         cut = [
             p.windows(at, size)
             for p, at in zip(self.patterns, corners, strict=True)
@@ -224,7 +222,7 @@ class VirtualStereoCamera:
     def _moments(
         self, poses: Array, rates: Array | None, obstacles: Mapping[str, Array]
     ) -> list[Moments]:
-        """Return the moments of exposures at poses (N, 6) in motion at rates (N, 6)."""
+        """Return the moments of N exposures at poses (N, 6) that change at rates (N, 6)."""
         parts = list(poses[:, None])
         lag = np.zeros(poses.shape)
         if rates is not None:
@@ -243,9 +241,9 @@ class VirtualStereoCamera:
     ) -> list[tuple[Array, Array]]:
         """Return camera_from_body (b, 4, 4) of all bodies for both cameras, for each of N moments.
 
-        Each camera has its own poses (N, 6) of the platform.
+        ``left`` and ``right`` (N, 6) are the platform's poses when each camera exposes.
         """
-        # An obstacle without a place stands far behind both cameras.
+        # An obstacle without a transform is placed far behind both cameras.
         absent = rigid(np.eye(3), (0.0, 0.0, -1e3))
         still = np.stack(
             [np.eye(4), *(obstacles.get(name, absent) for name in self.obstacle_names)]
@@ -278,7 +276,7 @@ class VirtualStereoCamera:
 
 
 class LiveImages:
-    """One exposure, drawn as far as it is read."""
+    """Images of one exposure. Only the windows that are read are drawn."""
 
     def __init__(
         self,
@@ -302,8 +300,9 @@ class LiveImages:
         return StereoFrame(*images)
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Return the grey values (2, n, size, size) of windows with first pixels (2, n, 2) as (x,
-        y).
+        """Return the grey values (2, n, size, size) of windows with first pixels ``corners``.
+
+        The first pixels (2, n, 2) are (x, y).
         """
         (radiance,) = self._camera.radiances(
             [self._moments], [corners], size, self._quality.supersampling
@@ -317,7 +316,7 @@ class LiveImages:
 
 
 class ManyLiveImages:
-    """Exposures, drawn as far as they are read, each with noise of its own stream."""
+    """Images of several exposures, each with its own noise. Windows are drawn when read."""
 
     def __init__(
         self,
@@ -332,10 +331,10 @@ class ManyLiveImages:
     def windows_of(
         self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
     ) -> Windows:
-        """Return the grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n,
-        2).
+        """Return the grey values (2, n, size, size) of windows of several exposures.
 
-        They belong to ``exposures`` (n,), in rising order.
+        The windows have first pixels ``corners`` (2, n, 2) and belong to ``exposures`` (n,), which
+        are in rising order.
         """
         camera = self._camera
         shown = np.unique(exposures)

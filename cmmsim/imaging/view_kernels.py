@@ -1,4 +1,4 @@
-"""Compiled: the view of a camera on a scene of discs and convex solids, see ``analytic``."""
+"""Compiled functions that draw a scene of discs and convex solids, see ``analytic``."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.disc_kernels import place_discs, probe_discs, project_all
 from cmmsim.imaging.layer_kernels import Discs, Solids, enters, lay_layers
 
-# Points on a disc's rim that are probed, with its middle, for solids that hide them.
+# Number of points on a disc's rim that are tested, in addition to its centre, for solids in front.
 PROBES = 8
-# m: a solid that comes nearer has no outline.
+# m: a solid with a vertex at a smaller depth is not drawn.
 NEAREST = 1e-3
 
 
 class Scene(NamedTuple):
     """Discs and convex solids, in the axes of their bodies.
 
-    Discs have places and normals (m, 3), radii, levels and owners (m,). Solids belong to ``bodies``
-    (s,) and have levels (s,) and middles (s, 3). Vertices (v, 3) of solid k stand from
-    vertex_starts[k] on. Its faces normal . x + offset <= 0 stand from face_starts[k] on.
+    Discs have places and normals (m, 3), radii (m,), levels (m,) and bodies ``owners`` (m,). Solids
+    have bodies (s,), levels (s,) and middles (s, 3). The vertices (v, 3) of solid k begin at
+    vertex_starts[k]. Its faces, normal . x + offset <= 0, begin at face_starts[k].
     """
 
     places: Array
@@ -42,10 +42,11 @@ class Scene(NamedTuple):
 
 @compiled
 def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) -> None:
-    """Fill base_from_body (k, 4, 4), zero before, of rods along their z axes, and their lengths
-    (k,).
+    """Fill ``transforms`` with base_from_body (k, 4, 4) of rods, and ``lengths`` (k,).
 
-    The rods lead from starts to ends (k, 3). x is across z and the axis that is farthest from it.
+    The rods lead from ``starts`` to ``ends`` (k, 3) along their z axes. Their x axes are
+    perpendicular to z and to the base axis with the smallest component along z. ``transforms`` must
+    contain zeros.
     """
     for k in range(len(starts)):
         move = transforms[k]
@@ -75,7 +76,7 @@ def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) ->
 def convex_hull(points: Array) -> Array:
     """Return corners (k, 2) of the convex hull of points (n, 2), by Andrew's monotone chain."""
     n = len(points)
-    # Sorted by x, then y, by insertion: there are never many.
+    # Insertion sort by x, then y; the points are few.
     for i in range(1, n):
         for j in range(i, 0, -1):
             before = points[j - 1]
@@ -99,15 +100,16 @@ def convex_hull(points: Array) -> Array:
             hull[count, 0] = point[0]
             hull[count, 1] = point[1]
             count += 1
-        count -= 1  # where one chain ends the other begins
+        count -= 1  # the last point of one chain is the first point of the other
     return hull[: max(count, 1)]
 
 
 @compiled
 def half_planes_of(corners: Array, half_planes: Array) -> int:
-    """Fill half planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n, 2).
+    """Fill ``half_planes`` with a, b, c of a x + b y <= c for the sides of a convex polygon.
 
-    Return their number; sides without length are left out.
+    The polygon has ``corners`` (n, 2). Sides without length are omitted. The result is the number
+    of half planes.
     """
     n = len(corners)
     count = 0
@@ -131,10 +133,10 @@ def half_planes_of(corners: Array, half_planes: Array) -> int:
 
 @compiled
 def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near: float) -> tuple:
-    """Return the discs turned towards the camera, far to near and outer before inner.
+    """Return the discs that face the camera, from far to near and larger before smaller.
 
-    The results are their numbers (m,), the centres (m, 2), shapes (m, 2, 2) and extents (m, 2) of
-    their ellipses, px, and points (m, k, 3) m on them.
+    The results are their numbers (m,); the centres (m, 2), shapes (m, 2, 2) and extents (m, 2) of
+    their ellipses, px; and points on them (m, k, 3), m, in camera axes.
     """
     total = len(scene.radii)
     places = np.empty((total, 3))
@@ -151,7 +153,7 @@ def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near
         )
         if not (facing and places[n, 2] - scene.radii[n] > near):
             continue
-        # Depths are compared to a millimetre, so that the discs of one sticker keep their order.
+        # Depths are rounded to millimetres, so that the discs of a sticker are ordered by radius.
         depth = np.rint(1e3 * places[n, 2])
         at = count
         while at > 0:
@@ -189,10 +191,11 @@ def stand_before(
     touching: float,
     slots: Array,
 ) -> Array:
-    """Tell whether solids stand before discs (m, h), of each solid that stands before any disc.
+    """Return a mask (m, h) of the discs that lie behind each of h solids.
 
-    ``slots`` (s,) is filled with the column of each solid, or -1. The discs have owners (m,) and
-    probes (m, k, 3).
+    The h solids are those that hide a probe of at least one disc. ``slots`` (s,) is filled with the
+    column of each solid in the mask, or -1. The discs belong to bodies ``owners`` (m,) and have
+    ``probes`` (m, k, 3).
     """
     behind = np.zeros((len(owners), len(slots)), np.bool_)
     hiding = 0
@@ -227,9 +230,9 @@ def stand_before(
 
 @compiled
 def outlined(scene: Scene, moves: Array, focal: Array, principal: Array, slots: Array) -> Solids:
-    """Return the solids wholly before the camera, from far to near.
+    """Return the outlines of solids that lie wholly in front of the camera, from far to near.
 
-    ``slots`` (s,) say where the cover of each is kept, or -1.
+    ``slots`` (s,) are the indices under which the shares that solids cover are stored, or -1.
     """
     total = len(slots)
     depths = np.empty(total)
@@ -256,7 +259,7 @@ def outlined(scene: Scene, moves: Array, focal: Array, principal: Array, slots: 
             nearest = min(nearest, depth)
             for i in range(2):
                 at = move[i, 0] * x + move[i, 1] * y + move[i, 2] * z + move[i, 3]
-                # Single precision: finer edges would not show.
+                # Single precision is sufficient for edges in an image.
                 pixels[v, i] = np.float32(at / depth * focal[i] + principal[i])
         if nearest <= NEAREST:
             continue
@@ -287,10 +290,11 @@ def draw_view(
     corners: Array,
     lines: int,
 ) -> None:
-    """Draw the windows ``images[group]`` (h, w) of one exposure of a camera with a perfect lens.
+    """Draw the windows ``images[group]`` (n, h, w) of one exposure of a camera with a perfect lens.
 
-    They have first pixels ``corners`` (n, 2). The camera has focal lengths (2,) and a principal
-    point (2,), px, and bodies stand at ``moves`` (b, 4, 4).
+    They have first pixels ``corners`` (n, 2). The camera has the focal lengths ``focal`` (2,) and
+    the principal point ``principal`` (2,), px. Bodies stand at camera_from_body ``moves`` (b, 4,
+    4).
     """
     kept, pixels, shapes, extents, probes = shown_discs(scene, moves, focal, principal, near)
     slots = np.empty(len(scene.bodies), np.int64)

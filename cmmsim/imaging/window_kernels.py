@@ -1,4 +1,4 @@
-"""Compiled: patches that reach into windows, means of drawn cells, and bent windows."""
+"""Compiled functions that find patches in windows, average drawn cells, and resample windows."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def boxes_reaching(
     near: float,
     reaching: Array,
 ) -> None:
-    """Fill ``reaching`` (n, patches) for windows (n, 4) of one exposure.
+    """Fill ``reaching`` (n, patches) with whether each patch's box reaches into each window.
 
-    Windows are lowest x, y and highest x, y, px. ``boxes`` (patches, 4, 8) are the corners of each
-    patch's box as columns, m and 1. A box that is not wholly farther than ``near`` may show
-    anywhere, and one behind the camera nowhere.
+    The windows (n, 4) of one exposure are lowest x, y and highest x, y, px. ``boxes`` (patches, 4,
+    8) are the corners of each box as columns (x, y, z in m, 1). A box that is partly nearer than
+    ``near`` counts as reaching into all windows, and a box behind the camera into none.
     """
     box = np.empty(4)
     point = np.empty(3)
@@ -58,15 +58,15 @@ def boxes_reaching(
 
 @compiled
 def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array) -> None:
-    """Fill windows (n, h, w) float32, 0 to 1, with the means of ``supersampling``² drawn pixels, 0
-    to 255.
+    """Fill windows (n, h, w) float32, 0 to 1, with means of ``supersampling``² drawn pixels.
 
-    ``drawn`` holds the cell of each window in reading order, ``columns`` of them in a row.
+    ``drawn`` contains the cell of each window, pixels 0 to 255, in reading order with ``columns``
+    cells per row.
     """
     count, height, width = windows.shape
     share = np.float32(1.0 / (supersampling * supersampling))
     white = np.float32(255.0)
-    # Sums of 8-bit pixels are exact in whole numbers.
+    # Integer sums of 8-bit pixels are exact.
     sums = np.empty(width * supersampling, dtype=np.uint32)
     for n in range(count):
         top = n // columns * height * supersampling
@@ -86,8 +86,9 @@ def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array
 
 @compiled
 def keys_weights(share: float) -> tuple:
-    """Return the weights of the four pixels around a place that lies ``share``, 0 to 1, after the
-    second.
+    """Return Keys' weights of four pixels in a row, for a place between the second and the third.
+
+    The place lies the share ``share``, 0 to 1, of a pixel after the second.
     """
     s = min(max(share, 0.0), 1.0)
     return (
@@ -102,8 +103,8 @@ def keys_weights(share: float) -> tuple:
 def mark_plain(drawn: Array, along: Array, plain: Array) -> None:
     """Mark in ``plain`` (h, w) the pixels of a drawn window (h, w) that equal all their neighbours.
 
-    The neighbours reach from one before to two behind in both directions; ``along`` (h, w) is
-    overwritten.
+    The neighbours are the pixels from one before to two after in both directions. ``along`` (h, w)
+    is working memory.
     """
     height, width = drawn.shape
     for y in range(height):
@@ -122,9 +123,10 @@ def mark_plain(drawn: Array, along: Array, plain: Array) -> None:
 
 @compiled
 def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
-    """Fill windows (n, size, size) from drawn ones (n, h, w).
+    """Fill ``result`` (n, size, size) with windows resampled from drawn windows (n, h, w).
 
-    The places are biquadratic, with coefficients (n, 3, 3, 2).
+    Each pixel's place in the drawn window is a biquadratic function of its row and column, with
+    ``coefficients`` (n, 3, 3, 2).
     """
     n, height, width = drawn.shape
     size = result.shape[1]
@@ -134,7 +136,7 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
     for k in range(n):
         mark_plain(drawn[k], along, plain)
         for row in range(size):
-            # From -1 to 1 over the window, as the nodes of the quadratic stand.
+            # From -1 to 1 over the window: the nodes of the quadratic are at -1, 0 and 1.
             t = 2.0 * row / (size - 1) - 1.0
             for b in range(3):
                 for axis in range(2):
@@ -149,7 +151,7 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
                 y = at[0, 1] + s * (at[1, 1] + s * at[2, 1])
                 first_x = min(max(int(np.floor(x)), 1), width - 3)
                 first_y = min(max(int(np.floor(y)), 1), height - 3)
-                # The weights add up to one.
+                # The weights add up to one, so equal pixels need no interpolation.
                 if plain[first_y, first_x]:
                     result[k, row, column] = drawn[k, first_y, first_x]
                 else:
@@ -158,9 +160,9 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
 
 @compiled
 def interpolated(drawn: Array, x: float, y: float, first_x: int, first_y: int) -> float:
-    """Return the value of a drawn window (h, w) at a place between pixels.
+    """Return the value of a drawn window (h, w) at a place (x, y) between pixels.
 
-    It comes from those from one before the first pixel to two behind it.
+    It is computed from the pixels from one before (first_x, first_y) to two after it.
     """
     weights_x = keys_weights(x - first_x)
     weights_y = keys_weights(y - first_y)

@@ -1,3 +1,1 @@
-"""Measurement of a pose and its covariance from detected stickers. It knows nothing of true
-poses.
-"""
+"""Measurement of a pose and its covariance from detected stickers, without use of true poses."""

@@ -1,20 +1,22 @@
-"""Poses of a body from its observed stickers, which must agree with each other.
+"""Poses of a body from its observed stickers, without stickers that contradict the others.
 
-The taught places are laid onto the observed stickers. A sticker is left out, the worst one first,
-in two cases:
+The taught places are fitted to the observed stickers. Stickers are rejected one by one, the worst
+one first, in two cases:
 
-- Its place differs from where all others put it. This is data snooping: the residual r is judged by
-  its own covariance S - J C J', which a sticker's pull on the pose makes smaller than its noise S.
-- Its ellipse in one image differs from that of a whole sticker. A partly hidden sticker, or a
-  bright spot that touches it, moves the centre and the rim alike.
+- The place of a sticker differs from the place that the other stickers predict. This test is data
+  snooping. The residual r is compared with its own covariance S - J C J'. It is smaller than the
+  sticker's noise S, because each sticker pulls the pose towards itself.
+- The ellipse of a sticker in one image differs from the ellipse of an unhidden sticker. If a
+  sticker is partly hidden or touches another bright spot, its centre and its rim both move.
 
 Undetected errors of both kinds are then of the size of the noise. At least four stickers must
 remain, because a wrong sticker among three cannot be identified. More stickers must remain than
-were left out.
+were rejected.
 
 All residuals can be larger than noise, for example if a camera has drifted since its calibration,
-or several stickers are slightly misplaced. Places are then judged by the residuals of the others,
-and the covariances grow by the same factor (Birge ratio), up to a limit.
+or several stickers are slightly misplaced. Each place is then compared with the size of the other
+stickers' residuals. All covariances are multiplied by the mean square of the residuals in units of
+their noise (squared Birge ratio), up to a limit.
 
 The computation is compiled, in ``solver_kernels``.
 """
@@ -39,28 +41,30 @@ from cmmsim.measuring.observation import Observer, StickerObservation
 if TYPE_CHECKING:
     from cmmsim.measuring.solver_kernels import Belief, Outlines
 
-# Probability that a good sticker is left out, for its place and for each of its two ellipses.
+# Probability that a good sticker is rejected, for its place and for each of its two ellipses.
 CHANCE = 1e-4
-# Probability that a good frame's residuals are taken for larger than noise.
+# Probability that the residuals of a good frame count as larger than noise.
 EXCESS_CHANCE = 1e-4
-# Largest mean square of the residuals over that of noise.
+# Largest mean square of the residuals in units of their noise.
 LARGEST_EXCESS = 6.0
 LARGEST_MISFIT = float(chdtri(3, CHANCE))
+# Smallest number of stickers that must remain.
 FEWEST = 4
-# Share of a sticker's noise in its residual, below which nothing can be checked.
+# Smallest share of a sticker's noise that must appear in its residual; below, it is not tested.
 SMALLEST_SHARE = 0.01
-# rad: turn of the last step of a fit.
+# rad: a fit ends after a step with a smaller rotation.
 SETTLED = 1e-8
 
 
 @dataclass(frozen=True)
 class SolvedFrames:
-    """Poses of a body in f frames, and the stickers that they rest on.
+    """Poses of a body in f frames, and the stickers from which they were computed.
 
-    ``moves`` (f,4,4) are camera_from_body, and ``covariances`` (f,6,6) those of their small errors
-    [dt, dphi]. ``stickers`` are all of them, with covariances that have grown where residuals are
-    larger than noise; ``used`` (k,) says which agree, and ``starts`` (f + 1,) where those of each
-    frame begin. ``verdicts`` (f,) and ``body`` tell why a frame is lost.
+    ``moves`` (f,4,4) are camera_from_body. ``covariances`` (f,6,6) are the covariances of their
+    small errors [dt, dphi]. ``stickers`` are the k stickers of all frames; their covariances are
+    enlarged if residuals are larger than noise. ``used`` (k,) is False for rejected stickers. The
+    stickers of frame f begin at ``starts[f]`` and end at ``starts[f + 1]``. ``verdicts`` (f,
+    COLUMNS) states why frames are lost. ``places`` (n, 3) are the taught places on ``body``.
     """
 
     moves: Array
@@ -78,8 +82,9 @@ class SolvedFrames:
         return self.verdicts[:, 0] != 0
 
     def of(self, frame: int) -> StickerObservation:
-        """Return the stickers that a frame's pose rests on, with their index into the body's
-        stickers.
+        """Return the stickers from which the pose of a frame was computed.
+
+        Their index refers to the body's stickers.
         """
         own = np.zeros(len(self.used), dtype=bool)
         own[self.starts[frame] : self.starts[frame + 1]] = True
@@ -88,7 +93,7 @@ class SolvedFrames:
 
     def reason(self, frame: int) -> str:
         """Return the reason why a frame is lost."""
-        # Late, as numba takes time to import.
+        # Imported late, because importing numba takes time.
         from cmmsim.measuring.solver_kernels import FIRST
 
         verdict = self.verdicts[frame]
@@ -102,11 +107,11 @@ class SolvedFrames:
 def solve_frames(
     seen: StickerObservation, near: Array, observer: Observer, body: MarkedBody, places: Array
 ) -> SolvedFrames:
-    """Solve f frames near camera_from_body (f,4,4), with a body's stickers taught at ``places``.
+    """Solve f frames near camera_from_body ``near`` (f,4,4), with stickers taught at ``places``.
 
-    The observation's index says frame and sticker, as that of ``Observer.read``.
+    The observation's index of sticker k in frame f is f n + k, as in ``Observer.read``.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.measuring import solver_kernels as kernels
 
     frames = len(near)
@@ -144,10 +149,10 @@ def solve_frames(
 def consistent(
     seen: StickerObservation, near: Array, observer: Observer, body: MarkedBody, places: Array
 ) -> tuple[StickerObservation, Array, Array]:
-    """Return the stickers of one frame that agree, camera_from_body (4, 4) and its covariance (6,
-    6).
+    """Return the stickers of one frame that agree with each other, and the pose from them.
 
-    ``near`` (4, 4) is about camera_from_body. Raises LostError when too few agree.
+    The pose is camera_from_body (4, 4) with its covariance (6, 6). ``near`` (4, 4) is a first guess
+    of it. Raises LostError if too few stickers agree.
     """
     solved = solve_frames(seen, near[None], observer, body, places)
     if solved.lost[0]:
@@ -156,10 +161,8 @@ def consistent(
 
 
 def belief_for(stickers: int, settled: float = SETTLED) -> Belief:
-    """Return the limits for frames with up to so many stickers, as the compiled solver takes
-    them.
-    """
-    # Late, as numba takes time to import.
+    """Return the compiled solver's limits for frames with at most this number of stickers."""
+    # Imported late, because importing numba takes time.
     from cmmsim.measuring.solver_kernels import Belief
 
     return Belief(
@@ -176,10 +179,10 @@ def belief_for(stickers: int, settled: float = SETTLED) -> Belief:
 def lost_reason(verdict: Array, first: str, left: Array) -> str:
     """Return the reason why a frame is lost.
 
-    ``first`` names the sticker that was left out first, and ``left`` (n, 3) are the places of those
-    that were not.
+    ``first`` names the sticker that was rejected first. ``left`` (n, 3) are the taught places of
+    the stickers that were not rejected.
     """
-    # Late, as numba takes time to import.
+    # Imported late, because importing numba takes time.
     from cmmsim.measuring import solver_kernels as kernels
 
     seen = int(verdict[kernels.SEEN])
@@ -190,26 +193,28 @@ def lost_reason(verdict: Array, first: str, left: Array) -> str:
         except LostError as error:
             return str(error)
     if verdict[kernels.FIRST] < 0:
-        return f"{seen} visible stickers, at least {FEWEST} are needed to tell a wrong one"
+        return f"{seen} visible stickers, at least {FEWEST} are needed to detect a wrong one"
     place = verdict[kernels.PLACE]
     outline = verdict[kernels.OUTLINE]
     misfit = f"{place:.0f} of its place" if place >= outline else f"{outline:.0f} of its outline"
     return (
-        f"{seen} visible stickers contradict each other, {count} are left where at least {FEWEST} "
-        f"and more than the {seen - count} that were left out are needed; the first was {first}: "
-        f"squared misfit {misfit}, at most {LARGEST_MISFIT:.1f}"
+        f"{seen} visible stickers contradict each other, {count} are left and {seen - count} "
+        f"rejected; at least {FEWEST}, and more than the rejected ones, must be left; rejected "
+        f"first was {first} with squared misfit {misfit}, at most {LARGEST_MISFIT:.1f}"
     )
 
 
 @lru_cache(maxsize=16)
 def _largest_totals(freedom: int) -> Array:
-    """Return sums of squares (freedom + 1,), by their freedom, beyond which they exceed noise."""
+    """Return the largest sum of squared residuals that noise explains, for 0 to ``freedom`` degrees
+    of freedom.
+    """
     return np.asarray(chdtri(np.maximum(np.arange(freedom + 1), 1), EXCESS_CHANCE))
 
 
 def no_outlines(rig: StereoRig) -> Outlines:
-    """Return the outlines of a detector that states none, as the compiled solver takes them."""
-    # Late, as numba takes time to import.
+    """Return the compiled solver's input for a detector that states no ellipses."""
+    # Imported late, because importing numba takes time.
     from cmmsim.measuring.solver_kernels import Outlines
 
     shapes = np.zeros((0, 2, 3))
@@ -217,7 +222,7 @@ def no_outlines(rig: StereoRig) -> Outlines:
 
 
 def _outlines(seen: StickerObservation, observer: Observer, normals: Array) -> Outlines:
-    """Return the ellipses of stickers with normals (k, 3), as the compiled solver takes them."""
+    """Return the compiled solver's input with the ellipses of stickers with normals (k, 3)."""
     known = no_outlines(observer.rig)
     if seen.outlines is None:
         return known

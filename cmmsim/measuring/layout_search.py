@@ -1,10 +1,11 @@
 """Search of whole images without a prior pose: bright spots, their pairs, and the known layout.
 
-Bright spots that a window holds are fitted with ellipses. Spots of both images that lie on each
-other's epipolar lines are pairs, true and false ones together, and each pair is a point in space.
-The known layout of the stickers is looked for in this cloud of points. Three stickers far from each
-other are found by their three mutual distances, and each matching triple of points proposes a pose.
-A pose is judged by the number of stickers of the layout that then have a point close by.
+Ellipses are fitted to bright spots that are small enough for a window. A spot of the left image and
+a spot of the right image form a pair if they lie on each other's epipolar lines. Each pair is a
+point in space, and false pairs occur. The known layout of the stickers is searched in this cloud of
+points. Three stickers far from each other match three points with the same mutual distances. Each
+match proposes a pose. The best pose is the one at which most stickers of the layout have a point
+close by.
 """
 
 from collections.abc import Iterator
@@ -27,35 +28,35 @@ from cmmsim.radiometry.noise import GreyImage, cut_windows
 from cmmsim.radiometry.stereo_images import StereoImages
 
 SMALLEST_AREA_PX = 8
-# Largest area of a bright spot, as a share of a square with the largest side.
+# Largest area of a bright spot, as a share of a square with the largest allowed side.
 LARGEST_SHARE = 25 / 36
-# Share of the image's pixels that are taken as the brightest.
+# Share of the pixels of an image that count as the brightest.
 BRIGHT_SHARE = 1e-4
-# Step between the ground and the brightest pixels, as a share of the largest grey value.
+# Smallest step from the ground to the brightest pixels, as a share of the largest grey value.
 SMALLEST_STEP = 40.0 / 255.0
 SMALLEST_WINDOW_PX = 24
-# Distance of a bright spot's rough centre from a prediction of it.
+# Margin of windows for the error of a bright spot's rough centre.
 ROOM_PX = 8
-# Fewest stickers by which a platform with taught places is found.
+# Fewest recognised stickers of a platform with taught places.
 FEWEST_TAUGHT = 4
 LINE_TOLERANCE_PX = 0.5
-# Limit of the rig's errors on the distance from an epipolar line, in standard deviations.
+# Factor on the standard deviation that the rig's errors add to the distance from epipolar lines.
 LINE_STDS = 4.0
-# m from the camera.
+# Limits of a point's distance from the camera, m.
 NEAREST = 0.3
 FURTHEST = 6.0
-# m²: area.
+# Smallest area of a triangle of stickers, m².
 SMALLEST_TRIANGLE = 0.002
-# Triangles that are judged together.
+# Largest number of triangles that are tried together.
 MOST_TOGETHER = 64
-# Share of the layout that ends the search.
+# Share of the layout's stickers whose recognition ends the search.
 ENOUGH = 0.8
 
 
 def bright_ellipses(
     images: StereoImages | StickerExposure, observer: Observer
 ) -> tuple[EllipseFits, EllipseFits]:
-    """Fit ellipses of any misfit to all bright spots of both images that a window holds."""
+    """Fit ellipses to all bright spots of both images that fit into a window, with any misfit."""
     if isinstance(images, StickerExposure):
         return images.bright(observer)
     frame = images.full()
@@ -78,16 +79,16 @@ def bright_ellipses(
 def candidate_points(
     ellipses: tuple[EllipseFits, EllipseFits], observer: Observer, limits: FitLimits
 ) -> Array:
-    """Return points (m, 3) in the camera frame that may be stickers.
+    """Return points (m, 3) in the camera frame that are possible stickers.
 
-    They are triangulated from ellipses within ``limits``, and include false pairs. Raises LostError
-    where there are too few bright spots.
+    They are triangulated from pairs of ellipses within ``limits``; some pairs are false. Raises
+    LostError if an image has no bright spots.
     """
     left, right = (fits.centres[fits.within(limits, observer.noise).good] for fits in ellipses)
     if not len(left) or not len(right):
         raise LostError(
             f"{len(left)} bright spots in the left image and {len(right)} in the right, at least "
-            f"{FEWEST_TAUGHT} in each needed"
+            f"{FEWEST_TAUGHT} are needed in each"
         )
     ideal = []
     for camera, centres in zip(observer.rig.cameras, (left, right), strict=True):
@@ -114,17 +115,17 @@ def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
     sides = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
     keep = (area >= SMALLEST_AREA_PX) & (area <= round(LARGEST_SHARE * largest_side**2))
     keep &= sides.max(axis=1) <= largest_side
-    # A disc fills pi/4 of its box, a tilted one less; streaks and frames of other shapes fill
-    # little.
+    # A disc fills pi/4 of its bounding box, and a tilted disc less. Streaks and outlines fill only
+    # a small part.
     keep &= area > 0.4 * sides.prod(axis=1)
     return centres[1:][keep]
 
 
 def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
-    """Return the distance (n, m) of each right pixel (m, 2) from the epipolar line of each left
-    one.
+    """Return the distances (n, m) of right pixels (m, 2) from the epipolar lines of left pixels (n,
+    2).
 
-    All are ideal px.
+    All pixels are ideal.
     """
     lines = np.column_stack([left, np.ones(len(left))]) @ rig.fundamental.T
     lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
@@ -134,12 +135,12 @@ def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
 def candidate_pairs(
     rig: StereoRig, left: Array, right: Array, off_line: float = LINE_TOLERANCE_PX
 ) -> tuple[NDArray[np.int_], Array]:
-    """Return all pairs (m, 2) of left and right spots that may be one point, and their points (m,
+    """Return pairs (m, 2) of left and right spots that are possibly one point, and the points (m,
     3).
 
-    Spots (k, 2) and (l, 2) are in ideal px. A spot can be up to ``off_line`` px from the epipolar
-    line of its partner. It can appear in several pairs: the known layout decides later which pair
-    is true.
+    Spots (k, 2) and (l, 2) are in ideal px. The spots of a pair are at most ``off_line`` px from
+    each other's epipolar lines. A spot can belong to several pairs: the known layout decides later
+    which pair is true.
     """
     pairs = np.argwhere(epipolar_distance(rig, left, right) < off_line)
     points = linear_triangulation(rig, left[pairs[:, 0]], right[pairs[:, 1]])
@@ -152,10 +153,11 @@ def find_layout(
 ) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
     """Find the pose of a layout in a cloud of points.
 
-    The layout (n, 3) m is in body axes and the points (m, 3) m in the camera frame. The layout's
-    places have a tolerance in m, and ``fewest`` stickers must be found. Return camera_from_body (4,
-    4), and the indices of the stickers (k,) and of their points (k,). Raises LostError when fewer
-    are found, or when two different poses explain the points about equally well.
+    The layout (n, 3) m is in body axes and the points (m, 3) m in the camera frame. Each place in
+    the layout has the ``tolerance`` in m. The results are camera_from_body (4, 4), the indices of
+    the found stickers (k,) and of their points (k,). Raises LostError if fewer than ``fewest``
+    stickers are found, or if two different poses explain the points about equally well. ``name`` is
+    the body's name in messages.
     """
     gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
     tree = cKDTree(points)
@@ -174,14 +176,14 @@ def find_layout(
                 best = poses[k]
                 count = int(counts[k])
             if count >= ENOUGH * len(layout):
-                # This triangle's other finds may still be rivals.
+                # Other poses from the same triangle can still be rivals.
                 ended = min(ended, proposer[k])
         if count >= ENOUGH * len(layout):
             break
     if best is None or count < fewest:
         raise LostError(
             f"{name}: {count} of {len(layout)} stickers recognised among {len(points)} points, at "
-            f"least {fewest} needed"
+            f"least {fewest} are needed"
         )
     if rival > count - 2:
         raise LostError(f"{name}: two poses explain the points, with {count} and {rival} stickers")
@@ -191,16 +193,16 @@ def find_layout(
 
 
 def _triangles(layout: Array) -> NDArray[np.int_]:
-    """Return triples (t, 3) of stickers with a large triangle, in a fixed mixed order."""
+    """Return triples (t, 3) of stickers that form large triangles, in a fixed random order."""
     triples = np.array(list(combinations(range(len(layout)), 3)), dtype=int).reshape(-1, 3)
     a, b, c = layout[triples.T]
     triples = triples[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 2.0 * SMALLEST_TRIANGLE]
-    # The order is random, so that the first triangles differ, and fixed, so that results repeat.
+    # In random order, the first triangles differ much. The seed makes results repeatable.
     return np.random.default_rng(0).permutation(triples)
 
 
 def _blocks(triples: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
-    """Yield the triples (t, 3) in parts that are judged together.
+    """Yield the triples (t, 3) in parts that are tried together.
 
     The first parts are small, because the first triples usually end the search.
     """
@@ -212,9 +214,9 @@ def _blocks(triples: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
 
 
 def _congruent(gaps: Array, corners: Array, tolerance: float) -> NDArray[np.int_]:
-    """Return all ordered triples (c, 3) of points with the distances of three corners (3, 3).
+    """Return all ordered triples (c, 3) of points with the same mutual distances as three corners.
 
-    ``gaps`` (m, m) are the distances of the points.
+    The corners are (3, 3). ``gaps`` (m, m) are the mutual distances of the points.
     """
     d01, d02, d12 = (np.linalg.norm(corners[a] - corners[b]) for a, b in ((0, 1), (0, 2), (1, 2)))
     first, second = np.nonzero(np.abs(gaps - d01) < tolerance)
@@ -231,14 +233,15 @@ def _proposed(
     tree: cKDTree,
     tolerance: float,
 ) -> tuple[NDArray[np.int_], Array, NDArray[np.int_]]:
-    """Find poses (c, 4, 4) that triples (t, 3) of stickers propose.
+    """Return c poses that triples (t, 3) of stickers propose.
 
-    A triple proposes a pose if three points have the same mutual distances. Return the index (c,)
-    of the proposing triple, the poses refitted to all stickers with a point close by, and the
-    number (c,) of stickers with a point close to the refitted pose. Poses with fewer than three are
-    left out.
+    A triple proposes a pose if three points have the same mutual distances. The first result is the
+    index (c,) of the proposing triple. The second result contains the poses (c, 4, 4), refitted to
+    all stickers with a point close by. The third result is the number (c,) of stickers with a point
+    close by at the refitted pose. Poses with fewer than three such stickers before refitting are
+    omitted.
     """
-    # Both ends of a side may be off by the tolerance.
+    # Both ends of a side can be off by the tolerance.
     corners = [_congruent(gaps, layout[triple], 2.0 * tolerance) for triple in triples]
     proposer = np.repeat(np.arange(len(triples)), [len(c) for c in corners])
     start = rigid_starts(
@@ -252,10 +255,9 @@ def _proposed(
 
 
 def _nearest(poses: Array, layout: Array, tree: cKDTree, tolerance: float) -> NDArray[np.int_]:
-    """Return the measured point (c, n) of each sticker within the tolerance at poses (c, 4, 4), or
-    -1.
+    """Return the index (c, n) of the point nearest to each sticker at poses (c, 4, 4).
 
-    Each point is used once.
+    It is -1 if no point lies within 1.5 tolerances, or if the point is nearer to another sticker.
     """
     places = layout @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
     nearest = tree.query(places, distance_upper_bound=1.5 * tolerance)[1]
@@ -269,7 +271,7 @@ def _nearest(poses: Array, layout: Array, tree: cKDTree, tolerance: float) -> ND
 
 
 def _same(first: Array, second: Array, layout: Array, tolerance: float) -> bool:
-    """Tell whether two poses put the layout in the same place."""
+    """Tell whether two poses put the layout in about the same place."""
     return bool(
         np.linalg.norm(apply(first, layout) - apply(second, layout), axis=1).max() < 4.0 * tolerance
     )

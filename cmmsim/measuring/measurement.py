@@ -1,6 +1,6 @@
-"""Measurement of a stereo frame: a pose with its covariance, or the reason why it was lost.
+"""Measurement of a stereo frame: a pose with its covariance, or the reason why the frame is lost.
 
-The poses of many frames stand together as well.
+A second class contains the poses of many frames.
 """
 
 from __future__ import annotations
@@ -17,46 +17,46 @@ from cmmsim.geometry.pose import Array
 
 
 def _nothing_in_common(pose: Array) -> Array:
-    """Return the covariance (6, 6) that a pose (6,) has in common with others: zero, or NaN if
-    lost.
-    """
+    """Return a zero common covariance (6, 6), or NaN if the pose (6,) is NaN."""
     return np.full((6, 6), 0.0 if np.isfinite(pose).all() else np.nan)
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Pose of the platform in the base frame, with the stickers that it rests on.
+    """Pose of the platform in the base frame, with the stickers from which it was computed.
 
     The error of a pose has two parts, which are stated separately. The noise is new in every frame.
     The common part comes from errors of the known rig and of the taught frames. It is the same in
-    every frame, so a mean over frames does not reduce it. The mean of N frames errs by covariance /
-    N + common_covariance. ``Sensor.common_errors`` relates the common parts of different poses.
+    every frame, so a mean over frames does not reduce it. The mean of N frames has the covariance
+    covariance / N + common_covariance. ``Sensor.common_errors`` relates the common parts of
+    different poses.
 
     Attributes
     ----------
     pose : ndarray, shape (6,)
-        Pose in m and rad; NaN where the frame is lost.
+        Pose in m and rad; NaN if the frame is lost.
     covariance : ndarray, shape (6, 6)
-        Covariance of the noise; NaN where the frame is lost.
+        Covariance of the noise; NaN if the frame is lost.
     points, point_covariances : ndarray, shapes (n, 3) and (n, 3, 3)
-        Stickers in the camera frame, m.
+        Places of the stickers in the camera frame, m, and their covariances.
     left_pixels, right_pixels : ndarray, shape (n, 2)
-        Sticker centres in the images as they are, distorted.
+        Sticker centres in the distorted images.
     target_ids : ndarray of str, shape (n,)
         Names of the stickers, such as "A1".
     ok : bool
-        False where nothing could be measured.
+        False if the frame is lost.
     reason : str
         Reason why the frame is lost; empty otherwise.
     common_at : callable
-        Function that gives the common covariance at a pose (6,).
+        Function that returns the common covariance (6, 6) at a pose (6,).
     pixel_variances : ndarray, shape (n,)
-        Mean variance of a coordinate of a centre, px².
+        Variance of each sticker's pixel coordinates, px², mean over both images and axes.
 
     Raises
     ------
     ShapeError
-        If shapes differ, or the state contradicts itself.
+        If pose or covariance has a wrong shape, or if ``ok``, ``reason`` and the finite or NaN pose
+        contradict each other.
 
     Examples
     --------
@@ -78,18 +78,16 @@ class Measurement:
 
     @cached_property
     def common_covariance(self) -> Array:
-        """Covariance (6, 6) of the common part; NaN where it is not known.
+        """Covariance (6, 6) of the common part; NaN if it is not known.
 
-        It is not known for poses by planes with a rig that is not exact. It is computed when it is
-        asked for, because that takes longer than to measure.
+        It is not known for the method "planes" if the rig is not known exactly. It is computed on
+        first use, because this takes longer than a measurement.
         """
         return self.common_at(self.pose)
 
     @property
     def single_covariance(self) -> Array:
-        """Covariance (6, 6) of this pose alone against the true one: noise and common part
-        together.
-        """
+        """Covariance (6, 6) of the whole error of this pose: noise and common part."""
         return self.covariance + self.common_covariance
 
     def __post_init__(self) -> None:
@@ -116,20 +114,20 @@ class Measurement:
 
 
 def _shown(covariance: Array) -> str:
-    """Show standard deviations of place and turn in words."""
+    """Show the standard deviations of position and orientation as text."""
     shift, turn = (np.sqrt(np.trace(covariance[k : k + 3, k : k + 3])) for k in (0, 3))
     return f"{1e6 * shift:.2g} um and {1e6 * turn:.2g} urad"
 
 
 def lost_measurement(reason: str) -> Measurement:
-    """Return a measurement that holds no pose, and says why."""
+    """Return the measurement of a lost frame, with the reason."""
     return measurement_without_stickers(np.full(6, np.nan), np.full((6, 6), np.nan), reason)
 
 
 def measurement_without_stickers(pose: Array, covariance: Array, reason: str = "") -> Measurement:
-    """Return a pose (6,) with its covariance (6, 6) that rests on no sticker.
+    """Return a measurement with a pose (6,) and its covariance (6, 6), but without stickers.
 
-    Where it is NaN, ``reason`` says why.
+    If the pose is NaN, ``reason`` states why the frame is lost.
     """
     points = np.zeros((0, 3))
     covariances = np.zeros((0, 3, 3))
@@ -147,11 +145,11 @@ class MeasuredPoses:
     Attributes
     ----------
     poses : ndarray, shape (N, 6)
-        Poses, NaN where a frame is lost.
+        Poses; NaN in lost frames.
     covariances : ndarray, shape (N, 6, 6)
-        Their covariances, NaN where a frame is lost.
+        Covariances of the poses; NaN in lost frames.
     stickers : ndarray, shape (N,)
-        Number of stickers used, 0 where a frame is lost.
+        Number of stickers used; 0 in lost frames.
     """
 
     poses: Array
@@ -175,7 +173,7 @@ class MeasuredPoses:
         )
 
     def without(self, dropped: NDArray[np.bool_]) -> MeasuredPoses:
-        """Return the frames, of which those that are ``dropped`` (N,) are lost."""
+        """Return the same frames, except that the frames marked in ``dropped`` (N,) are lost."""
         gone = dropped[:, None]
         return MeasuredPoses(
             np.where(gone, np.nan, self.poses),

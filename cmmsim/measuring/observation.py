@@ -1,6 +1,6 @@
-"""Stickers of one body, observed near where they are expected.
+"""Observation of the stickers of one body near their expected places.
 
-The steps are windows, detected centres, and triangulation.
+Windows are read, centres are detected in them, and both images' centres are triangulated.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from cmmsim.geometry.stereo_rig import StereoRig, triangulate
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoImages, Windows
 
-# About the size of a sticker.
+# Longest smear that can be measured: about the size of a sticker.
 LONGEST_SMEAR_PX = 8.0
-# Standard deviations of the point spread: shorter smears do not change what the fit finds.
+# In standard deviations of the point spread: shorter smears do not change the result of a fit.
 SHORTEST_SMEAR = 1.5
-# Cosine between a sticker's normal and the view, below which it is not looked for.
+# Smallest cosine between a sticker's normal and the line of sight at which it is searched.
 GRAZING = 0.15
 
 
@@ -45,13 +45,13 @@ GRAZING = 0.15
 class DetectionSettings:
     """Settings of the search for stickers.
 
-    Windows and fitted parts have sides in px, and ``radius`` is a sticker's, m. ``largest_ray_gap``
-    is the squared distance of a sticker's two rays in units of its noise (one degree of freedom, so
-    that 25 is five sigma). ``centre_error_px`` is the rms error of a centre that is not noise, such
-    as the image formation's own. It is added to the noise's covariance, as is the detector's bias.
-    ``line_error_px`` is the standard deviation by which errors of the rig move images off their
-    epipolar lines; the rays of a sticker may miss each other by as much. ``exposed_share`` is the
-    share of the time from frame to frame during which the cameras are exposed.
+    ``window_size`` and ``fit_size`` are the sides of windows and of fitted parts, px. ``radius`` is
+    the radius of a sticker, m. ``largest_ray_gap`` limits the squared distance between the two rays
+    of a sticker, in units of its variance; 25 means five sigma. ``centre_error_px`` is the rms of
+    systematic errors of a centre, such as those of the image formation. Its square is added to the
+    covariance of the centre, as is that of the detector's bias. Errors of the rig move images off
+    their epipolar lines by the standard deviation ``line_error_px``, so the two rays of a sticker
+    need not meet more closely. ``exposed_share`` is the ratio of exposure time to frame period.
     """
 
     window_size: int = 16
@@ -70,8 +70,8 @@ class DetectionSettings:
 class Outlines:
     """Ellipses of k stickers in both images.
 
-    They are symmetric matrices A (2, k, 2, 2), px, with covariances (2, k, 3, 3) of A_xx, A_xy,
-    A_yy, px².
+    ``shapes`` are symmetric matrices A (2, k, 2, 2), px. ``covariances`` (2, k, 3, 3), px², are
+    those of the entries A_xx, A_xy, A_yy.
     """
 
     shapes: Array
@@ -86,11 +86,11 @@ class Outlines:
 class StickerObservation:
     """Stickers seen by both cameras, k of them.
 
-    ``index`` (k,) points into the body's stickers. Pixels (k, 2) are the sticker centres in the
-    images as they are, distorted, with the eccentricity removed. ``points`` (k, 3) and
-    ``covariances`` (k, 3, 3) are in the camera frame, m. ``pixel_variances`` (k,) are mean
-    variances of a coordinate of both centres, px². ``outlines`` are the ellipses' shapes, where the
-    detector states them.
+    ``index`` (k,) refers to the body's stickers. Pixels (k, 2) are the sticker centres in the
+    distorted images; the eccentricity is removed. ``points`` (k, 3) and ``covariances`` (k, 3, 3)
+    are in the camera frame, m. ``pixel_variances`` (k,) are the variances of pixel coordinates,
+    px², mean over both images and axes. ``outlines`` are the ellipses of the stickers, or None if
+    the detector states no ellipses.
     """
 
     index: NDArray[np.int_]
@@ -111,9 +111,7 @@ class StickerObservation:
 
 @runtime_checkable
 class StickerExposure(Protocol):
-    """Exposure without images: the results that fits of ellipses would have in windows and whole
-    images.
-    """
+    """Exposure without images. It returns the results that fits of ellipses would have."""
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """Detect stickers in 2k windows of ``size`` px with first pixels ``corners`` (2, k, 2)."""
@@ -124,23 +122,21 @@ class StickerExposure(Protocol):
 
 @runtime_checkable
 class ManyExposures(Protocol):
-    """Exposures of two cameras, each read for itself."""
+    """Several exposures of two cameras, from which windows can be read."""
 
     def windows_of(
         self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
     ) -> Windows:
-        """Return the grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n,
-        2).
+        """Return the grey values (2, n, size, size) of windows of several exposures.
 
-        They belong to ``exposures`` (n,), in rising order.
+        The windows have first pixels ``corners`` (2, n, 2) and belong to ``exposures`` (n,), which
+        are in rising order.
         """
 
 
 @dataclass(frozen=True)
 class Observer:
-    """Observer of stickers: the rig and the noise of its cameras as known, and settings of the
-    search.
-    """
+    """Observer of stickers, with the known rig, its camera noise, and detection settings."""
 
     rig: StereoRig
     noise: CameraNoise
@@ -159,11 +155,10 @@ class Observer:
         normals: Array,
         swept: tuple[Array, Array] | None = None,
     ) -> StickerObservation:
-        """Observe stickers at ``places`` (n, 3) with ``normals`` (n, 3), body axes, near an
-        expected pose.
+        """Observe stickers of a body near an expected pose camera_from_body (4, 4).
 
-        ``swept`` holds camera_from_body at the beginning and at the end of the exposure, where they
-        are thought to be known.
+        The stickers have ``places`` (n, 3) and ``normals`` (n, 3) in body axes. ``swept`` are the
+        expected camera_from_body at the beginning and at the end of the exposure, or None.
         """
         return self.read(images, camera_from_body, places, normals).observed(swept)
 
@@ -174,19 +169,17 @@ class Observer:
         places: Array,
         normals: Array,
     ) -> StickerWindows:
-        """Read the windows of stickers at ``places`` (n, 3) with ``normals`` (n, 3), near an
-        expected pose.
+        """Read the windows around stickers of a body near an expected pose camera_from_body (4, 4).
 
-        For many exposures camera_from_body is (N, 4, 4), and sticker k of exposure j has the index
-        j n + k. All of them are looked for, fitted and triangulated like the stickers of a single
-        exposure.
+        The stickers have ``places`` (n, 3) and ``normals`` (n, 3) in body axes. For many exposures,
+        camera_from_body is (N, 4, 4), and sticker k of exposure j has the index j n + k.
         """
         moves = [move @ camera_from_body for move in self.rig.from_camera]
         centres = [apply_each(move, places).reshape(-1, 3) for move in moves]
         turned = [(normals @ move[..., :3, :3].swapaxes(-1, -2)).reshape(-1, 3) for move in moves]
         pixels, valid = self.rig.project(apply_each(camera_from_body, places).reshape(-1, 3))
         facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
-        # One ray makes no point: both cameras must see a sticker.
+        # Triangulation needs two rays, so both cameras must see a sticker.
         index = np.flatnonzero(np.all(valid & facing, axis=0))
         exposures = index // len(places)
         size = self.settings.window_size + 2 * self.detector.margin_px
@@ -211,10 +204,10 @@ class Observer:
         return StickerWindows(self, index, exposures, *body, corners, windows, offsets, found)
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
-        """Return windows (2, n, size, size) whose light is made even: that of their middles.
+        """Return windows (2, n, size, size) with vignetting removed, relative to their middles.
 
-        Only the slope of the light across a sticker would move its centre. The noise stays the same
-        to a few per mille.
+        Vignetting would move the centre of a sticker because it varies across the sticker. The
+        correction changes the noise by a few per mille only.
         """
         optics = self.settings.optics
         black = self.noise.black_level
@@ -236,12 +229,13 @@ class Observer:
 class StickerWindows:
     """Grey values around the k stickers of a body that both cameras of an observer should see.
 
-    ``index`` (k,) points into the body's stickers, and ``exposures`` (k,) show them, in rising
-    order, 0 for a single one. Stickers are expected near ``camera_from_body`` (4, 4) or (N, 4, 4),
-    at places (k, 3) m with normals (k, 3) in body axes. Windows (2, k, h, h), evenly lit, have
-    first pixels ``corners`` (2, k, 2). ``offsets`` (2, k, 2) px lead from the stickers' centres to
-    those of their ellipses (eccentricity). Without images, ``found`` is what a detector finds, and
-    the windows are empty.
+    ``index`` (k,) refers to the body's stickers. ``exposures`` (k,) are the numbers of the
+    exposures that show them, in rising order, and 0 for a single exposure. Stickers have places
+    (k, 3) m and normals (k, 3) in body axes, and the body is expected at ``camera_from_body`` (4,
+    4) or (N, 4, 4). ``windows`` (2, k, h, h), without vignetting, have first pixels ``corners`` (2,
+    k, 2). ``offsets`` (2, k, 2) px lead from the images of the stickers' centres to the centres of
+    their ellipses (eccentricity). For exposures without images, ``found`` is the detector's result,
+    and the windows are empty.
     """
 
     observer: Observer
@@ -256,7 +250,7 @@ class StickerWindows:
     found: DetectedCentres | None = None
 
     def observed(self, swept: tuple[Array, Array] | None = None) -> StickerObservation:
-        """Return the stickers in these windows; ``swept`` is that of ``Observer.observe``."""
+        """Return the stickers in these windows; see ``Observer.observe`` for ``swept``."""
         if len(self.index) == 0:
             none = np.zeros((0, 3))
             return StickerObservation(
@@ -269,15 +263,15 @@ class StickerWindows:
         seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
         systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
         spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
-        # Weighed by noise alone, rays that a wrong rig parts would meet nearer to the image that
-        # happens to be sharper.
+        # Errors of the rig part the two rays of a sticker. With weights from noise alone, the point
+        # would be too near to the ray of the sharper image.
         parted = settings.line_error_px**2
         moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
         near = apply_each(moves, self.places[:, None])[:, 0]
         left, right = seen_at
         seen = triangulate(self.observer.rig, left, right, spread[0], spread[1], near, parted)
         good = np.all(fits.good.reshape(2, -1), axis=0)
-        # Mean over two coordinates in two images.
+        # Mean variance over two coordinates in two images.
         noise = 0.25 * np.einsum("ckii->k", spread)
         outlines = _outlines(fits, settings.centre_error_px**2)
         return StickerObservation(
@@ -285,9 +279,9 @@ class StickerWindows:
         ).selected(good & (seen.ray_gap < settings.largest_ray_gap))
 
     def ellipses(self, smears: Array | None = None) -> EllipseFits:
-        """Fit ellipses to all 2k windows; good ones may have any misfit.
+        """Fit ellipses to all 2k windows, without a limit on the misfit.
 
-        ``smears`` (2k, 2) are those of ``SpotWindows``.
+        See ``SpotWindows`` for ``smears`` (2k, 2).
         """
         settings = self.observer.settings
         limits = replace(settings.limits, largest_misfit=np.inf)
@@ -302,9 +296,9 @@ class StickerWindows:
 
     @cached_property
     def ellipses_at_rest(self) -> EllipseFits:
-        """Result of ``ellipses`` if nothing moved.
+        """Ellipses fitted for a body at rest.
 
-        Streaks are told from them, and a body at rest is measured by them.
+        They serve to detect streaks, and to measure a body at rest.
         """
         return self.ellipses()
 
@@ -328,10 +322,10 @@ class StickerWindows:
         return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
 
     def _likelier(self, still: DetectedCentres, swept: tuple[Array, Array]) -> DetectedCentres:
-        """Choose, for each exposure, the result that agrees better with the images.
+        """Choose, for each exposure, between the result for a body at rest and for a moving body.
 
-        It is ``still``, or that of a body in motion: the movement is only expected, and the
-        platform may have stopped.
+        The result that agrees better with the images is chosen, because the movement ``swept`` is
+        only expected. The platform can have stopped. ``still`` is the result for a body at rest.
         """
         smears, shown = self._smears(swept)
         if still.misfits is None or not shown.any():
@@ -347,10 +341,10 @@ class StickerWindows:
         return still.with_others(np.flatnonzero(again)[taken], moving, taken)
 
     def _smears(self, swept: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the stickers' movement (2, k, 2) px during the exposure, and where it counts (k,).
+        """Return the stickers' movements (2, k, 2) px during the exposure, and a mask (k,).
 
-        It does not count if it is too short to show beside the point spread, or too long to be
-        measured.
+        The mask is False for exposures in which the longest movement is too short compared with the
+        point spread, or too long to be measured.
         """
         moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in swept)
         first, last = (
@@ -372,9 +366,9 @@ class StickerWindows:
 
 
 def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
-    """Tell whether a camera sees stickers, not at grazing incidence.
+    """Tell for each sticker (n,) whether it faces the camera, and not at grazing incidence.
 
-    They have centres (n, 3) m and normals (n, 3) in camera axes.
+    The stickers have centres (n, 3) m and normals (n, 3) in camera axes.
     """
     return np.asarray(
         -np.einsum("ni,ni->n", centres, normals) > GRAZING * np.linalg.norm(centres, axis=1)
@@ -382,9 +376,9 @@ def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
 
 
 def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
-    """Return the shapes of both images' ellipses.
+    """Return the ellipses in both images, or None if the detector states none.
 
-    ``systematic`` px² is the variance of a rim's place that is not noise.
+    ``systematic`` px² is the variance of systematic errors of the rim, which is added.
     """
     if fits.shapes is None or fits.shape_covariances is None:
         return None

@@ -1,4 +1,4 @@
-"""Measurement of one stereo frame (paper eq. 27 and 28). It knows nothing of true poses."""
+"""Measurement of one stereo frame (paper eq. 27 and 28), without use of the true pose."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ Solution = tuple[Array, Array, StickerObservation]
 def by_registration(observation: StickerObservation, places: Array) -> Solution:
     """Return camera_from_body (4, 4), its covariance (6, 6) and the stickers used, by a rigid fit.
 
-    The stickers were taught at ``places`` (n, 3). Raises LostError with fewer than three off one
-    line.
+    The body's stickers were taught at ``places`` (n, 3). Raises LostError unless at least three
+    stickers are seen that do not lie on one line.
     """
     result = register(places[observation.index], observation.points, observation.covariances)
     return result.transform, result.covariance, observation
@@ -45,8 +45,8 @@ def by_registration(observation: StickerObservation, places: Array) -> Solution:
 def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array) -> Solution:
     """Return camera_from_body (4, 4), its covariance (6, 6) and the stickers used, by three planes.
 
-    ``towards`` (3, 3) are rough normals of planes A, B, C in the camera frame. Raises LostError
-    that names the plane.
+    ``towards`` (3, 3) are rough normals of planes A, B, C in the camera frame. Raises LostError,
+    which names the plane, if a plane has too few stickers.
     """
     frame, covariance = frame_of_points(
         observation.points, observation.covariances, body.plane_index[observation.index], towards
@@ -60,15 +60,16 @@ def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array)
 
 
 def frames_by_planes(body: MarkedBody, points: Array, covariances: Array, towards: Array) -> Array:
-    """Return camera_from_body (..., 4, 4), as ``by_planes``, where all stickers are seen.
+    """Return camera_from_body (..., 4, 4) as ``by_planes`` does, for many frames.
 
-    They are at points (..., n, 3) with covariances (..., n, 3, 3); ``towards`` is (..., 3, 3).
+    All n stickers must be seen, at points (..., n, 3) with covariances (..., n, 3, 3). ``towards``
+    is (..., 3, 3).
     """
     return frames_of_points(points, covariances, body.plane_index, towards)[0] @ _planes_from(body)
 
 
 def _planes_from(body: MarkedBody) -> Array:
-    """Return planes_from_body (4, 4)."""
+    """Return planes_from_body (4, 4), from the nominal planes of the body."""
     return invert(frame_from_planes(body.normals, body.offsets))
 
 
@@ -83,18 +84,17 @@ def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
 
 
 METHODS: tuple[str, ...] = ("registration", "planes")
-# m: nominal places are known to about a millimetre.
+# m: stickers lie within about a millimetre of their nominal places.
 NOMINAL_TOLERANCE = 0.003
-# m: taught places are known to microns, points in a whole image to tenths of a millimetre.
+# m: taught places are accurate to micrometres, points from whole images to tenths of a millimetre.
 TAUGHT_TOLERANCE = 0.0005
-# Stickers by whose nominal places a body is found.
+# Fewest recognised stickers of a body with nominal places.
 FEWEST_NOMINAL = 6
 
 
 @dataclass(frozen=True)
 class PoseEstimator(Observer):
-    """Estimator that turns images into poses: an observer, the platform, and the result of
-    teaching.
+    """Estimator that computes poses of a platform from images.
 
     Parameters
     ----------
@@ -103,12 +103,12 @@ class PoseEstimator(Observer):
     platform : MarkedBody
         Body that is measured.
     taught : Taught
-        Its stickers and the place of the base.
+        Result of teaching: places of the platform's stickers, and the base frame.
     method : {"registration", "planes"}
         Method that computes a pose from the stickers.
     common_covariance : callable, optional
-        Covariance (6, 6) that all poses have in common, at a pose (6,), instead of that of
-        teaching.
+        Function that returns the covariance (6, 6) that all poses have in common, at a pose (6,).
+        By default, this covariance comes from the errors of teaching alone.
 
     Raises
     ------
@@ -136,11 +136,10 @@ class PoseEstimator(Observer):
         )
 
     def locate(self, images: StereoImages) -> Array:
-        """Return a rough camera_from_platform (4, 4) from whole images, without a prior. Raises
-        LostError.
+        """Return a rough camera_from_platform (4, 4) from whole images, without a prior pose.
 
-        Where the cameras are exposed for some time and many stickers are missing, streaks are
-        looked for as well.
+        If the exposure takes time and stickers are missing, streaks are searched as well. Raises
+        LostError.
         """
         ellipses = bright_ellipses(images, self)
         limits = self.settings.limits
@@ -162,19 +161,19 @@ class PoseEstimator(Observer):
     def measure(
         self, images: StereoImages, expected: Array, swept: tuple[Array, Array] | None = None
     ) -> tuple[Measurement, Array]:
-        """Return the measurement near an expected camera_from_platform (4, 4), and the measured
-        one.
+        """Return the measurement, and the measured camera_from_platform (4, 4).
 
-        ``swept`` holds the expected ones at the beginning and the end of the exposure. Without it,
-        stickers that are smeared over more than half a pixel give a pose worse than its covariance
-        if there is no point spread: use ``measure_anew``. Raises LostError.
+        ``expected`` is about camera_from_platform. ``swept`` are the expected transforms at the
+        beginning and at the end of the exposure. Without ``swept`` and without point spread, the
+        error of the pose exceeds its covariance if stickers move by more than half a pixel; use
+        ``measure_anew`` in this case. Raises LostError.
         """
         return self.measured(self.observe(images, expected, *self._stickers, swept), expected)
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
-        """Measure as ``measure``, with an unknown movement that is estimated from the streaks.
+        """Measure as ``measure`` does, and estimate the movement during the exposure from streaks.
 
-        Raises LostError, which states the length of the streaks where they show.
+        Raises LostError, which states the length of streaks if there are any.
         """
         if self.settings.exposed_share == 0.0:
             return self.measure(images, expected)
@@ -190,7 +189,7 @@ class PoseEstimator(Observer):
 
     @property
     def _stickers(self) -> tuple[Array, Array]:
-        """Taught places (n,3), m, and normals (n,3) of the platform's stickers, in its axes."""
+        """Taught places (n,3), m, and normals (n,3) of the stickers, in platform axes."""
         return self.taught.platform_places, self.platform.sticker_normals
 
     def _found(
@@ -207,17 +206,16 @@ class PoseEstimator(Observer):
         return place, len(stickers)
 
     def measured(self, seen: StickerObservation, near: Array) -> tuple[Measurement, Array]:
-        """Return the measurement from stickers near an expected camera_from_platform, and the
-        measured one.
+        """Return the measurement from observed stickers, and the measured camera_from_platform.
 
-        Raises LostError.
+        ``near`` is about camera_from_platform. Raises LostError.
         """
         places = self.taught.platform_places
         used, move, covariance = consistent(seen, near, self, self.platform, places)
         return self._measured(used, move, covariance)
 
     def measurement_of(self, solved: SolvedFrames, frame: int) -> Measurement:
-        """Return the measurement from one of several frames, or a lost one."""
+        """Return the measurement, or the lost measurement, of one of several solved frames."""
         if solved.lost[frame]:
             return lost_measurement(solved.reason(frame))
         used = solved.of(frame)
@@ -236,10 +234,10 @@ class PoseEstimator(Observer):
         return self.measurement(pose, spread, used), move
 
     def in_base(self, moves: Array, covariances: Array) -> tuple[Array, Array]:
-        """Return poses (..., 6) of the platform in the base frame, and their covariances (..., 6,
-        6).
+        """Return poses (..., 6) of the platform in the base frame and covariances (..., 6, 6).
 
-        ``moves`` (..., 4, 4) are camera_from_platform, ``covariances`` those of its small errors.
+        ``moves`` (..., 4, 4) are camera_from_platform. ``covariances`` (..., 6, 6) are the
+        covariances of their small errors [dt, dphi].
         """
         base_from_camera = self.taught.base_from_camera
         base_from_platform = base_from_camera @ moves
@@ -249,7 +247,7 @@ class PoseEstimator(Observer):
         return poses_of(base_from_platform), spread
 
     def measurement(self, pose: Array, covariance: Array, used: StickerObservation) -> Measurement:
-        """Return the measurement of a pose (6,) in the base frame that rests on stickers."""
+        """Return the measurement with a pose (6,) in the base frame and the stickers used."""
         return Measurement(
             pose,
             covariance,
@@ -280,21 +278,21 @@ def measure_frame(
     frame : StereoFrame
         Both images.
     estimator : PoseEstimator
-        Such as ``sensor.estimator``.
+        Estimator of the images, such as ``sensor.estimator``.
     expected : array_like, shape (4, 4), optional
         Rough camera_from_platform. Without it, stickers are searched in the whole images.
 
     Returns
     -------
     Measurement
-        Lost, with a reason, where the images show too little.
+        Pose with its covariance, or the reason why the frame is lost.
 
     Raises
     ------
     ShapeError
         If the images have another size or bit depth than the estimator's cameras.
     CmmError
-        If the arguments are no frame and no estimator.
+        If ``frame`` is not a StereoFrame, or ``estimator`` is not a PoseEstimator.
 
     Examples
     --------
@@ -321,15 +319,13 @@ def measure_frame(
 
 
 def require_estimator(estimator: object) -> None:
-    """Raise CmmError for anything but a PoseEstimator."""
+    """Raise CmmError unless ``estimator`` is a PoseEstimator."""
     wanted = "an estimator must be a PoseEstimator, such as sensor.estimator"
     require_kind(estimator, PoseEstimator, wanted)
 
 
 def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
-    """Raise ShapeError for images of another size or bit depth than the estimator's cameras
-    have.
-    """
+    """Raise ShapeError unless images have the size and bit depth of the estimator's cameras."""
     for name, image, camera in zip(
         ("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True
     ):
@@ -341,5 +337,5 @@ def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
         if image.dtype != estimator.noise.image_type:
             raise ShapeError(
                 f"the {name} image is {image.dtype}, but the camera's bit_depth "
-                f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}"
+                f"{estimator.noise.bit_depth} requires {estimator.noise.image_type}"
             )

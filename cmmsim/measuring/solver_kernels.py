@@ -1,9 +1,9 @@
-"""Compiled: the pose of a body from the stickers that are seen in one frame.
+"""Compiled functions that compute the pose of a body from its stickers in one frame.
 
-Images and drawn centres feed this solver alike, one frame or many. Taught places are laid onto the
-triangulated stickers. While a sticker differs too much, the worst sticker is left out. It differs
-from the place that the other stickers predict, or from the ellipse of a whole sticker.
-``frame_solver`` gives the reasons.
+This solver is used with and without images, and for one or many frames. Taught places are fitted to
+the triangulated stickers. Stickers that differ too much are rejected one by one, the worst one
+first. A sticker can differ from the place that the other stickers predict, or from the ellipse of
+an unhidden sticker. ``frame_solver`` explains the method.
 """
 
 from __future__ import annotations
@@ -32,18 +32,24 @@ MEASURED = 0
 TOO_FEW = 1
 ON_A_LINE = 2
 
-# Columns of a verdict, a row of numbers for each frame: its state, its stickers to begin with and
-# in the end, the one that was left out first (-1: none) with the squared misfits of its place and
-# of its worse ellipse, and the factor by which covariances have grown.
+# Columns of a verdict, which is a row of numbers per frame:
+# STATE    state of the frame
+# SEEN     number of stickers seen
+# LEFT     number of stickers that were not rejected
+# FIRST    sticker that was rejected first, or -1
+# PLACE    squared misfit of the place of this sticker
+# OUTLINE  squared misfit of the worse ellipse of this sticker
+# EXCESS   factor on the covariances
 STATE, SEEN, LEFT, FIRST, PLACE, OUTLINE, EXCESS = range(7)
 COLUMNS = 7
 
 
 class Seen(NamedTuple):
-    """Stickers of one frame or of several: whether ``used`` (n,), and where they are.
+    """Stickers of one frame or of several frames.
 
-    points (n,3) in the camera frame, m, with their informations and covariances (n,3,3). Arms and
-    gaps (n,3) are those of ``rigid_kernels``, and are overwritten.
+    ``used`` (n,) is False for rejected stickers. ``points`` (n,3) are in the camera frame, m, and
+    have ``informations`` and ``covariances`` (n,3,3). ``rigid_kernels`` explains ``arms`` and
+    ``gaps`` (n,3), which are overwritten.
     """
 
     used: Array
@@ -55,11 +61,11 @@ class Seen(NamedTuple):
 
 
 class Outlines(NamedTuple):
-    """Entries xx, xy, yy of the ellipses' shapes (n, 2, 3) in both images, px.
+    """Ellipses of stickers in both images. All arrays are empty if no ellipses are known.
 
-    ``informations`` (n, 2, 6) are the entries of their inverse covariances. Without rows, no
-    ellipses are known. The cameras see stickers with normals (n, 3) in the body's axes, and a
-    radius, m.
+    ``shapes`` (n, 2, 3) are the entries xx, xy, yy of the ellipses' matrices, px. ``informations``
+    (n, 2, 6) are the entries of the inverse covariances of these. ``normals`` (n, 3) are the
+    stickers' normals in body axes, and ``radius`` is their radius, m.
     """
 
     shapes: Array
@@ -72,12 +78,12 @@ class Outlines(NamedTuple):
 class Belief(NamedTuple):
     """Limits for the stickers of a frame.
 
-    ``largest_misfit`` limits the squared difference of one sticker from the others, and
-    ``largest_excess`` the mean square of all residuals. ``fewest`` is a number of stickers.
-    ``smallest_share`` is the share of a sticker's noise that must show in its residual.
-    ``smallest_width`` is the distance of the stickers from one line, m. ``settled`` is the turn of
-    the last step of a fit, rad. ``totals`` (f,) are sums of squared residuals, by their freedom,
-    beyond which they are larger than noise.
+    ``largest_misfit`` limits the squared misfit of one sticker, and ``largest_excess`` the mean
+    square of all residuals. ``fewest`` is the smallest number of stickers. ``smallest_share`` is
+    the smallest share of a sticker's noise that must appear in its residual. ``smallest_width`` is
+    the smallest extent of the stickers across a line through them, m. A fit ends after a step with
+    a rotation below ``settled``, rad. ``totals`` (f,) are the largest sums of squared residuals
+    that noise explains, by the number of degrees of freedom.
     """
 
     largest_misfit: float
@@ -91,9 +97,10 @@ class Belief(NamedTuple):
 
 @compiled
 def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
-    """Tell whether the places (n,3) that are used lie within ``width`` m of one line.
+    """Tell whether the used places (n,3) lie within ``width`` m of one line.
 
-    The middle eigenvalue of their scatter matrix is compared, or a lower bound of it first.
+    The middle eigenvalue of their scatter matrix is compared with ``width`` squared. A lower bound
+    of the eigenvalue is tested first, because it is faster to compute.
     """
     first = np.argmax(used)
     count = 0
@@ -113,7 +120,7 @@ def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
             yy += b * b
             yz += b * c
             zz += c * c
-    # From squares about the first place to those about the middle.
+    # Change from sums of squares about the first place to sums about the middle.
     xx -= x * x / count
     xy -= x * y / count
     xz -= x * z / count
@@ -133,10 +140,11 @@ def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
 def fit(
     seen: Seen, places: Array, settled: float, place: Array, covariance: Array, normal: Array
 ) -> float:
-    """Move ``place`` (4,4) to where the used stickers fit best; return their squared residuals.
+    """Fit ``place`` (4,4) to the used stickers and return the sum of their squared residuals.
 
-    Fills the covariance (6,6) of the place, and the arms and gaps of the stickers, which must hold
-    on entry as well. ``normal`` (6,6) is overwritten.
+    ``place`` is changed, and its ``covariance`` (6,6) is filled. The arms and gaps of the stickers
+    must belong to ``place`` on entry, and they do so again at the end. ``normal`` (6,6) is working
+    memory.
     """
     change = np.empty(6)
     total = 0.0
@@ -165,7 +173,7 @@ def fit(
 
 @compiled
 def excess_of(total: float, freedom: int, totals: Array) -> float:
-    """Return the mean square of residuals where it is larger than noise makes it, else 1."""
+    """Return the mean square of residuals if noise does not explain it, else 1."""
     if freedom < 1:
         return 1.0
     return total / freedom if total > totals[freedom] else 1.0
@@ -173,7 +181,10 @@ def excess_of(total: float, freedom: int, totals: Array) -> float:
 
 @compiled
 def outline_misfit(outlines: Outlines, n: int, side: int, place: Array, taught: Array) -> float:
-    """Return the squared difference of an ellipse from that of a whole sticker ``taught`` (3,)."""
+    """Return the squared misfit of the ellipse of sticker ``n`` in image ``side``.
+
+    It is the difference from the ellipse of an unhidden sticker at ``taught`` (3,).
+    """
     camera = outlines.cameras.figures[side]
     move = outlines.cameras.moves[side]
     point = np.empty(3)
@@ -196,10 +207,11 @@ def worst_sticker(
     seen: Seen, places: Array, outlines: Outlines, belief: Belief, place: Array,
     covariance: Array, total: float, freedom: int, misfits: Array,
 ) -> int:  # fmt: skip
-    """Return the used sticker that differs most, and fill its ``misfits`` (2,) of both kinds.
+    """Return the used sticker with the largest misfit, and fill ``misfits`` (2,).
 
-    The misfit of its place is that against its noise, or against the residuals of the others where
-    these are larger than noise.
+    ``misfits`` are the squared misfits of its place and of its worse ellipse. The misfit of its
+    place is in units of noise, or in units of the other stickers' residuals if these are larger
+    than noise.
     """
     worst = -1
     largest = -1.0
@@ -213,8 +225,8 @@ def worst_sticker(
         misfit = residual_misfit(
             seen.gaps[n], seen.covariances[n], left, belief.smallest_share, inverse
         )
-        # Judged by the others: their squares are the total less this sticker's, with three fewer
-        # numbers.
+        # The squared residuals of the other stickers are the total minus this sticker's part, with
+        # three degrees of freedom less.
         misfit /= excess_of(total - misfit, freedom - 3, belief.totals)
         outline = 0.0
         if len(outlines.shapes):
@@ -233,11 +245,13 @@ def solve(
     seen: Seen, places: Array, outlines: Outlines, belief: Belief, place: Array,
     covariance: Array, verdict: Array,
 ) -> None:  # fmt: skip
-    """Solve one frame: move ``place`` (4,4) from near to camera_from_body, fill its covariance.
+    """Solve one frame.
 
-    Stickers that contradict the others cease to be used; ``places`` (n,3) are where they were
-    taught. Covariances of the used ones grow with the residuals. The ``verdict`` of the frame, a
-    row of columns, is filled. Arms and gaps must hold on entry.
+    ``place`` (4,4) is a first guess of camera_from_body on entry, and the result at the end. Its
+    ``covariance`` (6,6) and the ``verdict`` (COLUMNS,) of the frame are filled. ``places`` (n,3)
+    are the taught places. Stickers that contradict the others are marked as not used. The
+    covariances of the used stickers are enlarged if residuals are larger than noise. Arms and gaps
+    must belong to ``place`` on entry.
     """
     normal = np.empty((6, 6))
     misfits = np.zeros(2)
@@ -245,7 +259,8 @@ def solve(
     left_out = 0
     verdict[FIRST] = -1
     verdict[SEEN] = np.sum(seen.used)
-    # One sticker at a time is left out, because a wrong one makes good ones look wrong.
+    # Only one sticker is rejected at a time, because a wrong sticker makes good stickers look
+    # wrong.
     while True:
         count = np.sum(seen.used)
         verdict[LEFT] = count
@@ -261,7 +276,7 @@ def solve(
         worst = worst_sticker(
             seen, places, outlines, belief, place, covariance, total, freedom, misfits
         )
-        # NaN differs from nothing: residuals that are no numbers single out no sticker.
+        # Without a worst sticker, all misfits are NaN.
         if worst < 0:
             verdict[STATE] = TOO_FEW
             return
@@ -289,9 +304,11 @@ def solve_frames(
     seen: Seen, places: Array, outlines: Outlines, belief: Belief, starts: Array,
     moves: Array, covariances: Array, verdicts: Array,
 ) -> None:  # fmt: skip
-    """``solve`` f frames, whose stickers are ``starts[f]`` to ``starts[f + 1]`` of all.
+    """Call ``solve`` for several frames. Frame f has the stickers ``starts[f]`` to ``starts[f +
+    1]``.
 
-    Moves (f,4,4) are camera_from_body, from near to result; fills covariances (f,6,6).
+    ``moves`` (f,4,4) are first guesses of camera_from_body on entry, and the results at the end.
+    Their ``covariances`` (f,6,6) and ``verdicts`` (f, COLUMNS) are filled.
     """
     for f in range(len(moves)):
         first = starts[f]
@@ -312,7 +329,7 @@ def solve_frames(
             outlines.cameras,
         )
         taught = places[first:last]
-        # A tracker extrapolates a pose from those that were found before, which adds up rounding.
+        # A tracker extrapolates poses from earlier results, so rounding errors accumulate.
         make_rigid(moves[f])
         for n in range(last - first):
             turn_arm(moves[f], taught[n], own.points[n], own.arms[n], own.gaps[n])

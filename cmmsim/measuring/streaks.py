@@ -1,16 +1,17 @@
 """Movement of a body during an exposure, estimated from the streaks of its stickers.
 
-A disc that moves by d px while the shutter is open is drawn out. The second moments of its light
-grow by d d' / 12, and those of an ellipse with matrix A are A A / 4. With the ellipse A_0 that the
-sticker would show at rest, its apparent ellipse therefore fulfils
+A disc that moves by d px while the shutter is open appears as a streak. The second moments of its
+light grow by d d' / 12, and the second moments of an ellipse with matrix A are A A / 4. If the
+sticker at rest shows an ellipse A_0, an ellipse A fitted to the streak therefore fulfils
 
     A A = A_0 A_0 + d d' / 3.
 
-All stickers of a rigid body share one small movement w (6,), d = P w, which is found by least
+The stickers of a rigid body share one small movement w (6,), with d = P w. It is found by least
 squares over both images. An ellipse fits a streak only roughly. The fit is therefore repeated with
-the light of the ellipse moving by the d that was found, and the rest of A A is added to d d' / 3,
-until d settles. Streaks do not show the sign of the movement. The pose refers to the middle of the
-exposure, which is the same for both signs.
+an ellipse that moves by the current d. Then A A - A_0 A_0 is the remaining part of the streak, and
+d d' / 3 is added to it to find a new d. This is repeated until d no longer changes. Streaks do not
+show the sign of the movement. The pose refers to the middle of the exposure, which is the same for
+both signs.
 """
 
 from collections.abc import Callable
@@ -28,21 +29,22 @@ from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.measuring.observation import LONGEST_SMEAR_PX, StickerWindows
 
-# Probability that stickers at rest are taken for streaks.
+# Probability that a movement is found although the stickers are at rest.
 CHANCE = 1e-4
-# Ellipses in both images together: four stickers.
+# Fewest ellipses in both images together: four stickers.
 FEWEST = 8
-# Largest squared misfit of one ellipse that counts: a partly hidden sticker is no streak.
+# Limit on the squared misfit of one ellipse, because a partly hidden sticker is not a streak.
 LARGEST_MISFIT = float(chdtri(3, CHANCE))
-# Most rounds, and a change of d far below what moves a centre or shows in an ellipse.
+# Largest number of repetitions of the fit.
 ROUNDS = 8
+# Repetition ends at a smaller change of d, which has no visible effect on centres and ellipses.
 SETTLED_PX = 0.05
-# Times that the start is found anew.
+# Number of times that the weights of the start are updated.
 REWEIGHTED = 5
 TINY_PX2 = 1e-6
-# Share of the best determined combination of movements, below which the start leaves one out.
+# Relative limit on singular values: the start omits combinations of movements below it.
 SMALLEST_SHARE = 1e-2
-# Movements by which projections are differentiated, m or rad.
+# Step of numerical derivatives by a movement, m or rad.
 UNIT = 1e-4
 
 
@@ -60,11 +62,11 @@ class Streaks:
 
 @dataclass(frozen=True)
 class _Ellipses:
-    """Ellipses fitted while their light moves by ``smears`` (k, 2) px.
+    """Ellipses fitted as if they moved by ``smears`` (k, 2) px during the exposure.
 
-    ``excess`` (k, 3) px² are xx, xy, yy of A A - A_0 A_0 + d d' / 3, and ``whiten`` (k, 3, 3) turns
-    their noise into unit matrices. ``good`` (k,) ellipses are bright and lie wholly inside their
-    windows.
+    ``excess`` (k, 3) px² are xx, xy, yy of A A - A_0 A_0 + d d' / 3. The matrices ``whiten`` (k, 3,
+    3) transform their covariances into unit matrices. ``bright`` (k,) ellipses have enough
+    contrast. ``good`` (k,) ellipses are bright and lie wholly inside their windows.
     """
 
     smears: Array
@@ -75,9 +77,10 @@ class _Ellipses:
 
     @property
     def misfit(self) -> float:
-        """Sum of squared misfits with the smears, each limited to that of a whole sticker.
+        """Sum of the squared misfits of all ellipses, each limited to LARGEST_MISFIT.
 
-        An ellipse that is not good counts like the worst, so that losing it explains nothing.
+        An ellipse that is not good counts as LARGEST_MISFIT, so that the sum does not fall if an
+        ellipse is lost.
         """
         return float(
             np.where(
@@ -87,7 +90,7 @@ class _Ellipses:
 
     @property
     def explained(self) -> bool:
-        """True if nothing but noise is left in the good ones."""
+        """True if the misfits of the good ellipses are not larger than noise."""
         return bool(
             self._squared_misfits[self.good].sum() < chdtri(3 * np.count_nonzero(self.good), CHANCE)
         )
@@ -104,10 +107,10 @@ class _Ellipses:
 
 
 def find_streaks(read: StickerWindows) -> Streaks | None:
-    """Find the movement during the exposure of the body whose stickers were read; None where none
-    shows.
+    """Return the movement during the exposure of the body whose stickers were read.
 
-    Raises LostError where the streaks are longer than can be measured.
+    The result is None if no movement is visible. Raises LostError if the streaks are longer than
+    LONGEST_SMEAR_PX.
     """
     observer = read.observer
     places = read.places
@@ -137,7 +140,7 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
     if found is None:
         _require_short(still)
         return None
-    # Six numbers of a movement must explain more than chance lets them.
+    # A movement with six parameters must reduce the misfit by more than noise explains.
     if still.misfit - found[1].misfit < chdtri(6, CHANCE):
         return None
     movement, ellipses = found
@@ -148,15 +151,15 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
 
 
 def drawn_out(length_px: float) -> str:
-    """Say in words how long the streaks are, and how long they may be."""
+    """Return a text with the length of the streaks and the limit on it."""
     return (
-        f"the exposure draws stickers out over {length_px:.1f} px, at most {LONGEST_SMEAR_PX:.1f} "
+        f"stickers move by {length_px:.1f} px during the exposure, at most {LONGEST_SMEAR_PX:.1f} "
         "px can be measured"
     )
 
 
 def _require_short(still: _Ellipses) -> None:
-    """Raise LostError where bright spots are drawn out beyond their windows."""
+    """Raise LostError if bright spots are streaks longer than LONGEST_SMEAR_PX."""
     if np.count_nonzero(still.bright) < FEWEST:
         return
     squares = 3.0 * still.excess[still.bright][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -168,10 +171,10 @@ def _require_short(still: _Ellipses) -> None:
 def _movement_and_ellipses(
     still: _Ellipses, fit: Callable[[Array], _Ellipses], by_movement: Array
 ) -> tuple[Array, _Ellipses] | None:
-    """Return the movement (6,) that explains all ellipses, or most, and the ellipses fitted with
-    it.
+    """Return the movement (6,) that explains the ellipses best, and the ellipses fitted with it.
 
-    The movement is about the stickers' middle. The result is None where too few ellipses are left.
+    The movement is about the middle of the stickers. The result is None if too few ellipses are
+    good.
     """
     best: tuple[Array, _Ellipses] | None = None
     for movement in _fitted_movements(still, by_movement, _starts(still, by_movement)):
@@ -186,14 +189,13 @@ def _movement_and_ellipses(
 def _settled(
     movement: Array, fit: Callable[[Array], _Ellipses], by_movement: Array
 ) -> tuple[Array, _Ellipses] | None:
-    """Return a movement (6,) that fits of ellipses moving with it no longer change, and these
-    ellipses.
+    """Repeat the fit from a movement (6,) until it no longer changes.
 
-    The result is None where too few are left. A movement that is longer than can be measured is
-    returned as it is, one far beyond is shortened.
+    The results are the movement and the ellipses fitted with it, or None if too few ellipses are
+    good. The repetition ends early with a movement longer than LONGEST_SMEAR_PX.
     """
     longest = float(np.linalg.norm(by_movement @ movement, axis=1).max())
-    # Far beyond the longest smear, no ellipse can be fitted.
+    # A much longer start is shortened, because ellipses could not be fitted with it.
     movement = movement * min(1.0, 2.0 * LONGEST_SMEAR_PX / max(longest, LONGEST_SMEAR_PX))
     ellipses = fit(by_movement @ movement)
     for _ in range(ROUNDS):
@@ -210,9 +212,7 @@ def _settled(
 
 
 def _moved(movement: Array, middle: Array) -> Array:
-    """Return the transform (4, 4) of a movement (6,), shift and rotation vector, about a point
-    (3,).
-    """
+    """Return the transform (4, 4) of a movement (6,): shift, and rotation about ``middle``."""
     turn = rotation_exp(movement[3:])
     return rigid(turn, movement[:3] + middle - turn @ middle)
 
@@ -220,9 +220,9 @@ def _moved(movement: Array, middle: Array) -> Array:
 def _pixels_by_movement(
     rig: StereoRig, camera_from_body: Array, places: Array, middle: Array
 ) -> Array:
-    """Return derivatives (2k, 2, 6) of the pixels of k stickers in both images by a movement.
+    """Return the derivatives (2k, 2, 6) of the pixels of k stickers by a movement (6,).
 
-    The movement is about the point ``middle`` (3,).
+    The pixels are those in both images. The movement is about the point ``middle`` (3,).
     """
     columns = [
         np.subtract(
@@ -249,7 +249,7 @@ def _outer(smears: Array) -> Array:
 def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
     """Return the entries (k, 3) px² of A A, and the matrices (k, 3, 3) that whiten them.
 
-    ``systematic`` px² is the variance of A that is not noise.
+    ``systematic`` px² is the variance of systematic errors of the entries of A.
     """
     xx, xy, yy = _entries(fits.shapes).T
     zero = np.zeros_like(xx)
@@ -265,10 +265,10 @@ def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
 
 
 def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:
-    """Return movements (6,) from which to search: of any kind, without rotation, and without shift.
+    """Return three movements (6,) from which to search: general, without rotation, without shift.
 
-    Signs may be wrong between stickers that all move along the same line, so that a search from a
-    single start may end beside the movement that explains all.
+    A single start can have wrong relative signs of the stickers' movements. A search from it can
+    then end in a local minimum.
     """
     starts = []
     for free in (slice(0, 6), slice(0, 3), slice(3, 6)):
@@ -279,12 +279,13 @@ def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:
 
 
 def _linear_movement(by_movement: Array, excess: Array) -> Array:
-    """Return the movement w (m,) whose w w' is nearest to the matrix that explains (k, 3) px² best.
+    """Return a movement w (m,) that roughly explains ``excess`` (k, 3) px².
 
-    An ellipse that went astray on its streak is far from what the others say, and counts less each
-    time.
+    ``excess`` is linear in the entries of w w', so a symmetric matrix is fitted by least squares. w
+    is its dominant eigenvector, scaled by the root of the eigenvalue. Ellipses with large residuals
+    get less weight in each repetition.
     """
-    # By the pixels that they move, metres and radians become comparable.
+    # Movements are scaled by the pixels that they move, so that m and rad become comparable.
     scale = np.sqrt((by_movement**2).sum(axis=(0, 1)))
     scaled = by_movement / scale
     rows, columns = np.triu_indices(len(scale))
@@ -312,7 +313,8 @@ def _linear_movement(by_movement: Array, excess: Array) -> Array:
 def _fitted_movements(ellipses: _Ellipses, by_movement: Array, starts: list[Array]) -> list[Array]:
     """Return the movements (6,) found from each start, the best first.
 
-    They explain the good ellipses of whole stickers; partly hidden stickers count little.
+    They are fitted to the good ellipses with a robust loss, because some stickers can be partly
+    hidden.
     """
     by_movement, excess, whiten = (
         values[ellipses.good] for values in (by_movement, ellipses.excess, ellipses.whiten)

@@ -1,8 +1,7 @@
-"""Result of teaching: the place of the base in the camera frame, and of stickers on the platform.
+"""Result of teaching: the base frame relative to the cameras, and sticker places on the platform.
 
-A teaching holds for the cameras and the places of planes and stickers of both bodies in a sensor
-file. It does not depend on noise, lens blur, timing, detector and renderer: they change how well a
-pose is seen, not which one.
+A result is valid for the cameras, planes and sticker places of one sensor file. It does not depend
+on noise, lens blur, timing, detector and renderer, because these do not change the true frames.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, pos
 from cmmsim.uncertainty.known_rig import KnownRig
 
 SHOWN_CHANGES = 3
-# Characters of a value that differs between two setups.
+# Largest number of characters of a value in a message.
 SHOWN_CHARACTERS = 40
 
 
@@ -28,25 +27,25 @@ SHOWN_CHARACTERS = 40
 class Taught:
     """Result of teaching one sensor.
 
-    It holds plain arrays, so that it can be sent to another process.
+    It consists of plain arrays, so that it can be sent to another process.
 
     Attributes
     ----------
     sensor_name : str
         Name of the sensor.
     base_from_camera : ndarray, shape (4, 4)
-        Place of the cameras.
+        Transform from the camera frame to the base frame.
     base_covariance : ndarray, shape (6, 6)
-        Covariance of its small error [dt, dphi].
+        Covariance of the small error [dt, dphi] of ``base_from_camera``.
     platform_places, place_covariances : ndarray, shapes (n, 3) and (n, 3, 3)
-        Stickers in platform axes, m.
+        Places of the platform's stickers in platform axes, m, and their covariances.
     platform_covariance : ndarray, shape (6, 6)
-        Covariance of the error of the platform frame itself, in platform axes.
+        Covariance of the small error [dt, dphi] of the platform frame, in platform axes.
     base_places : ndarray, shape (k, 3)
-        Stickers in base axes, m.
+        Places of the base's stickers in base axes, m.
     setup : str
-        Entries of the sensor file for which the teaching is valid, see ``setup_of``; empty if made
-        by hand.
+        Entries of the sensor file for which the result is valid, see ``setup_of``. It is empty for
+        a result that was not made by teaching.
     known : KnownRig or None
         Rig that was used for teaching, if it differs from the file's rig.
 
@@ -100,13 +99,14 @@ class Taught:
         base_places: Array,
         setup: str = "",
     ) -> Taught:
-        """Return a teaching result without error, such as from a certificate: all covariances are
-        zero.
+        """Return a teaching result without errors, for example from a certificate.
+
+        All covariances are zero.
 
         Parameters
         ----------
         sensor_name, base_from_camera, platform_places, base_places, setup
-            As of the class.
+            See `Taught`.
 
         Returns
         -------
@@ -126,16 +126,17 @@ class Taught:
         return f"Taught({self.sensor_name!r}, {stickers})"
 
     def calibration_covariance(self, pose: Array, method: str = "registration") -> Array:
-        """Return the covariance of the part of the pose error that teaching left, the same in every
-        frame.
+        """Return the covariance of the pose error that errors of teaching cause.
+
+        This error is the same in every frame.
 
         Parameters
         ----------
         pose : ndarray, shape (6,)
             Pose of the platform.
         method : {"registration", "planes"}
-            By "planes", the platform's frame is found anew in every image, and only the base's
-            was taught.
+            Method that computes poses. With "planes", the platform frame is found anew in every
+            image, so only the error of the base frame counts.
 
         Returns
         -------
@@ -151,8 +152,8 @@ class Taught:
 
 
 def setup_of(file: SensorFile) -> str:
-    """Return the entries that teaching depends on as JSON, the same for the same entries."""
-    # The distance has become part of the position.
+    """Return the entries of a sensor file that teaching depends on, as JSON with sorted keys."""
+    # The position contains the distance already.
     rig = file.rig.model_dump(exclude={"distance"})
     bodies = {
         name: {"planes": getattr(file, name).planes.model_dump()} for name in ("platform", "base")
@@ -162,10 +163,10 @@ def setup_of(file: SensorFile) -> str:
 
 
 def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
-    """Raise TeachingError, naming what differs, unless ``taught`` holds for a file and its
-    stickers.
+    """Raise TeachingError unless a result of teaching is valid for a sensor file.
 
-    One that was made by hand states no setup: the name of its sensor must then be the file's.
+    The message names the entries that differ. ``stickers`` is the file's number of stickers of the
+    platform. A result without a setup must have the name of the file's sensor.
     """
     if not taught.setup and taught.sensor_name != file.name:
         raise TeachingError(
@@ -173,18 +174,18 @@ def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
         )
     if taught.setup and taught.setup != setup_of(file):
         raise TeachingError(
-            f"taught belongs to sensor {taught.sensor_name!r} set up differently: "
+            f"taught belongs to sensor {taught.sensor_name!r} with other entries: "
             f"{_changes(taught.setup, setup_of(file))}; teach this sensor anew"
         )
     if len(taught.platform_places) != stickers:
         raise TeachingError(
-            f"taught holds {len(taught.platform_places)} stickers of the platform, sensor "
+            f"taught has {len(taught.platform_places)} stickers of the platform, sensor "
             f"{file.name!r} has {stickers}"
         )
 
 
 def _changes(there: str, here: str) -> str:
-    """Describe the first few entries in which two setups differ, with both values."""
+    """Describe the first entries in which two setups differ, with both values."""
     then, now = (dotted(json.loads(text)) for text in (there, here))
     keys = [key for key in sorted({*then, *now}) if then.get(key) != now.get(key)]
     shown = [
@@ -196,6 +197,6 @@ def _changes(there: str, here: str) -> str:
 
 
 def _short(value: Any) -> str:
-    """Show a value on one line, shortened where it is long."""
+    """Show a value on one line, shortened to `SHOWN_CHARACTERS`."""
     text = "nothing" if value is None else json.dumps(value)
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."

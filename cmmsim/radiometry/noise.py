@@ -1,8 +1,8 @@
 """Camera noise after the linear model of EMVA 1288.
 
-Radiance (0 to 1) becomes electrons. Shot noise, dark noise and differences from pixel to pixel are
-added. The gain K turns electrons into grey values, which are clipped and rounded. Shot noise is
-drawn as a normal variable of the Poisson variance.
+Radiance (0 to 1) is converted to electrons. Shot noise, dark noise and the fixed pattern of the
+pixels are added. The gain K converts electrons to grey values, which are clipped and rounded. Shot
+noise is drawn from a normal distribution with the variance of the Poisson distribution.
 """
 
 from dataclasses import dataclass, replace
@@ -15,11 +15,11 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 
 BIT_DEPTHS = (8, 10, 12)
-# Terms of a series, which leave 0.002 of 0.25 without noise.
+# Number of terms of the series in rounding_excess. Without noise, the remainder is 0.002 of 0.25.
 ROUNDING_TERMS = 50
-# Grey values squared: beyond, rounding_excess is 1 to 1e-11.
+# Variance, grey values squared, above which rounding_excess differs from 1 by less than 1e-11.
 NO_SWING = 1.5
-# From here on the mean of exposures is drawn at once.
+# Smallest number of exposures whose mean is drawn directly.
 MANY_EXPOSURES = 30
 T = TypeVar("T", bound=np.generic)
 Singles = NDArray[np.float32]
@@ -27,10 +27,10 @@ GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 def cut_windows(image: NDArray[T], corners: NDArray[np.int_], size: int) -> NDArray[T]:
-    """Return windows (k, size, size) of an image (height, width) with first pixels (k, 2) as (x,
-    y).
+    """Return windows (k, size, size) of an image (height, width).
 
-    Outside of the image they repeat its edge.
+    Their first pixels ``corners`` (k, 2) are (x, y). Outside of the image, windows repeat the
+    pixels at its edge.
     """
     ticks = np.arange(size)
     rows = np.clip(corners[:, 1, None] + ticks, 0, image.shape[0] - 1)
@@ -40,18 +40,18 @@ def cut_windows(image: NDArray[T], corners: NDArray[np.int_], size: int) -> NDAr
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """Differences from pixel to pixel of one camera, the same in every image (EMVA 1288: PRNU and
-    DSNU).
+    """Fixed pattern of one camera: differences between pixels that are the same in every image.
 
-    ``sensitivity`` is the sensitivity of each pixel relative to the mean, and ``offset`` its signal
-    in the dark, e-. Both are arrays of one shape.
+    In EMVA 1288, they are called PRNU and DSNU. ``sensitivity`` is the sensitivity of each pixel
+    relative to the mean. ``offset`` is the deviation of its dark signal, e-. Both arrays have the
+    same shape.
     """
 
     sensitivity: NDArray[np.float32]
     offset: NDArray[np.float32]
 
     def windows(self, corners: NDArray[np.int_], size: int) -> "FixedPattern":
-        """Return the pattern (k, size, size) in windows as of ``cut_windows``."""
+        """Return the pattern (k, size, size) in windows; see ``cut_windows``."""
         return FixedPattern(
             *(cut_windows(values, corners, size) for values in (self.sensitivity, self.offset))
         )
@@ -60,9 +60,10 @@ class FixedPattern:
 def draw_pattern(
     shape: tuple[int, int], prnu: float, dsnu: float, rng: np.random.Generator
 ) -> FixedPattern:
-    """Draw the pattern of a camera with ``shape`` (height, width).
+    """Draw the fixed pattern of a camera with ``shape`` (height, width).
 
-    It is white and normal, with relative standard deviation ``prnu``, and ``dsnu`` e-.
+    The pixels are independent and normal. ``prnu`` is the relative standard deviation of the
+    sensitivities, and ``dsnu`` the standard deviation of the offsets, e-.
     """
     sensitivity = 1.0 + np.float32(prnu) * rng.standard_normal(shape, dtype=np.float32)
     offset = np.float32(dsnu) * rng.standard_normal(shape, dtype=np.float32)
@@ -73,19 +74,19 @@ def draw_pattern(
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """EMVA 1288 figures of one camera.
+    """Noise parameters of one camera after EMVA 1288.
 
     electrons_at_white  electrons at radiance 1 after one exposure, e-
     gain                system gain K, grey values per e-
     dark_noise          temporal noise in the dark, e- rms
     full_well           saturation capacity, e-
-    black_level         grey value at no light
-    enabled             False: no noise at all; the mean grey value is still rounded
-    bit_depth           of the grey values: 8, 10 or 12; images of more than 8 are uint16
-    prnu                standard deviation of the pixels' sensitivity, relative to its mean
-    dsnu                standard deviation of the pixels' offset, e-
-    frames              exposures averaged in each grey value: they divide the temporal noise, but
-                        not the pattern
+    black_level         grey value without light
+    enabled             False for no noise; grey values are rounded nevertheless
+    bit_depth           bits of a grey value: 8, 10 or 12; images with more than 8 bits are uint16
+    prnu                standard deviation of the pixels' sensitivities, relative to their mean
+    dsnu                standard deviation of the pixels' offsets, e-
+    frames              number of exposures averaged in each grey value; averaging reduces the
+                        temporal noise, but not the fixed pattern
     """
 
     electrons_at_white: float
@@ -124,23 +125,25 @@ class CameraNoise:
         return self.black_level + self.gain * electrons
 
     def variance(self, mean_grey: Array) -> Array:
-        """Return the variance of a grey value with this mean: shot, dark, pattern and rounding
-        noise.
+        """Return the variance of a grey value with a given mean.
+
+        It is the sum of shot noise, dark noise, fixed pattern and rounding.
         """
         electrons = np.maximum((mean_grey - self.black_level) / self.gain, 0.0)
         constant, linear, quadratic = self.variance_coefficients
         return constant + electrons * (linear + electrons * quadratic)
 
     def rounding_excess(self, mean_grey: Array) -> Array:
-        """Return the largest variance of grey values with about this mean, over their usual one.
+        """Return the ratio of the largest to the usual variance of grey values near a mean.
 
-        It is 1 with noise of a grey value, and up to 3 with little noise. With little noise, the
-        noise decides whether a mean half-way between two numbers is rounded up or down.
+        The ratio is 1 if the noise is at least one grey value, and up to 3 with less noise. With
+        little noise, the variance of rounded values depends on the mean. It is largest half-way
+        between two whole numbers, because the noise then decides between rounding up and down.
 
-        The variance of a rounded normal variable whose mean lies half-way between two numbers comes
-        from the Fourier series of the rounding error: s² + 1/12 + sum over k of exp(-2 pi² k² s²)
-        (4 s² + 1 / (pi k)²). Over all means it is s² + 1/12, but the pixels of an even ground share
-        theirs.
+        In this case, the Fourier series of the rounding error gives the variance of a rounded
+        normal variable: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). On
+        average over all means, the variance is s² + 1/12, but all pixels of a uniform ground have
+        the same mean.
         """
         usual = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
         if np.all(usual > NO_SWING):
@@ -152,10 +155,11 @@ class CameraNoise:
 
     @property
     def variance_coefficients(self) -> tuple[float, float, float]:
-        """Variance of a grey value as a polynomial in its electrons: constant, linear,
-        quadratic.
+        """Coefficients of a grey value's variance as a polynomial in its electrons.
+
+        They are the constant, the linear and the quadratic coefficient.
         """
-        # A mean over exposures divides the temporal noise; the pattern stays.
+        # Averaging over exposures reduces the temporal noise, but not the fixed pattern.
         temporal = self.gain**2 / self.frames
         pattern = self.gain**2
         return (
@@ -170,14 +174,14 @@ class CameraNoise:
         rng: np.random.Generator,
         pattern: FixedPattern | None = None,
     ) -> GreyImage:
-        """Take one exposure of a radiance image (float32, 0 to 1).
+        """Return the grey values of one exposure of a radiance image (float32, 0 to 1).
 
-        ``pattern`` has the same shape, where pixels differ.
+        ``pattern`` is the fixed pattern of the same pixels, or None if they do not differ.
         """
         if not self.enabled:
             grey = np.rint(np.clip(self.mean_grey(radiance), 0.0, float(self.white_level)))
             return np.asarray(grey.astype(self.image_type))
-        # Late, as numba takes time to import.
+        # Imported late, because importing numba takes time.
         from cmmsim.radiometry.noise_kernels import expose_pixels
 
         grey = np.empty(radiance.shape, dtype=self.image_type)
@@ -191,14 +195,14 @@ class CameraNoise:
         frames: int,
         pattern: FixedPattern | None = None,
     ) -> Array:
-        """Return the mean grey values (float64) of independent exposures of a scene that stands
-        still.
+        """Return the mean grey values (float64) of independent exposures of a scene at rest.
 
-        Without noise the mean is not rounded: noisy exposures approach this mean, as their noise
-        dithers the rounding. The mean of 30 and more is drawn at once, as one normal number a pixel
-        with the mean and variance of the mean of rounded, clipped grey values. This neglects its
-        shape: grey values are skewed only where they are clipped, and their mean goes in steps of
-        1/frames, which do not show in sums over a sticker's pixels.
+        Without noise, the mean is not rounded, because noisy exposures approach the unrounded mean:
+        their noise dithers the rounding. The mean of 30 or more exposures is drawn directly, as one
+        normal number per pixel. This number has the mean and the variance of the mean of rounded
+        and clipped grey values. Its distribution is only approximately right: clipped grey values
+        are skewed, and the mean has steps of 1/frames. Both have no effect on sums over the pixels
+        of a sticker.
         """
         if not self.enabled:
             return np.clip(
@@ -215,8 +219,9 @@ class CameraNoise:
     def _lit(
         self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None
     ) -> tuple[Singles, Singles, Singles, Singles, Singles]:
-        """Return the light on each pixel, a standard normal number each, and all else for the
-        kernels.
+        """Return the arguments of the kernels: light, random numbers, parameters and pattern.
+
+        The random numbers are standard normal, one per pixel.
         """
         normal = rng.standard_normal(radiance.shape, dtype=np.float32)
         none = np.empty(0, dtype=np.float32)
@@ -229,9 +234,7 @@ class CameraNoise:
 
     @property
     def _figures(self) -> NDArray[np.float32]:
-        """Electrons at white, full well, variance in the dark, black level, gain and largest grey
-        value (6,).
-        """
+        """Parameters (6,) for the kernels, see ``noise_kernels.expose_pixels``."""
         return np.array(
             [
                 self.electrons_at_white,

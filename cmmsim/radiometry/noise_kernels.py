@@ -1,4 +1,4 @@
-"""Compiled: the grey value of each pixel in one exposure and its mean in many, see ``noise``."""
+"""Compiled functions that draw grey values of one exposure and means of many, see ``noise``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# Standard deviations within which noise is followed: 2e-9 of it lie beyond.
+# Normal noise is cut off beyond this number of standard deviations, with a probability of 2e-9.
 REACH = 6.0
-# Grey values: with as much noise, rounding adds 1/12 to the variance and 1e-9 to the mean.
+# Grey values: from this standard deviation on, rounding adds 1/12 to the variance, and at most 1e-9
+# to the mean.
 SMOOTH = 1.0
 SQRT_HALF = math.sqrt(0.5)
 
@@ -19,17 +20,17 @@ SQRT_HALF = math.sqrt(0.5)
 def expose_pixels(
     radiance: Array, normal: Array, figures: Array, sensitivity: Array, offset: Array, grey: Array
 ) -> None:
-    """Fill the grey values (n,) of pixels with radiance (n,) and a standard normal number each
-    (n,).
+    """Fill the grey values (n,) of pixels in one exposure.
 
-    All is float32, grey the camera's own type. ``figures`` (6,) are electrons at white, full well,
-    variance in the dark (e-²), black level, gain, and the largest grey value. ``sensitivity`` and
-    ``offset`` (n,) are empty unless pixels differ.
+    ``radiance`` (n,) is the light on each pixel, and ``normal`` (n,) a standard normal random
+    number per pixel. ``figures`` (6,) are electrons at white, full well, variance in the dark
+    (e-²), black level, gain, and the largest grey value. ``sensitivity`` and ``offset`` (n,) are
+    empty unless pixels differ. All arrays are float32, except that ``grey`` has the camera's type.
     """
     dark, black, gain, white = figures[2:]
     for k in range(len(radiance)):
         electrons = electrons_in(k, radiance, figures, sensitivity)
-        # Shot noise has the variance of its mean (Poisson); dark noise adds its own.
+        # The variance of shot noise equals the mean number of electrons (Poisson distribution).
         noise = normal[k] * np.sqrt(electrons + dark)
         if len(offset):
             noise += offset[k]
@@ -47,10 +48,10 @@ def average_pixels(
     frames: int,
     grey: Array,
 ) -> None:
-    """Fill the means (n,), float64, of the grey values of ``expose_pixels`` in so many exposures.
+    """Fill the mean grey values (n,), float64, of pixels in ``frames`` exposures.
 
-    They are taken as normal. Parameters are the same, but one standard normal number stands for all
-    exposures of a pixel.
+    The means are assumed to be normal. Arguments are those of ``expose_pixels``, with one random
+    number per pixel for all exposures together.
     """
     dark, black, gain, white = figures[2:]
     for k in range(len(radiance)):
@@ -62,7 +63,7 @@ def average_pixels(
 
 @compiled
 def electrons_in(k: int, radiance: Array, figures: Array, sensitivity: Array) -> float:
-    """Return the mean electrons that light sets free in pixel k, at most the full well."""
+    """Return the mean number of electrons that light releases in pixel k, at most the full well."""
     light = radiance[k] * figures[0]
     if len(sensitivity):
         light *= sensitivity[k]
@@ -71,15 +72,15 @@ def electrons_in(k: int, radiance: Array, figures: Array, sensitivity: Array) ->
 
 @compiled
 def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[float, float]:
-    """Return mean and variance of a normal number that is rounded and clipped to 0..white."""
+    """Return mean and variance of a normal variable after rounding and clipping to 0..white."""
     if deviation == 0.0 or mean - REACH * deviation > white or mean + REACH * deviation < 0.0:
         return min(max(np.rint(mean), 0.0), white), 0.0
     if deviation < SMOOTH:
-        # With little noise the steps of rounding show, and are added up one by one.
+        # With little noise, the steps of rounding matter, so their contributions are summed.
         low = max(math.floor(mean - REACH * deviation), 0.0)
         above, square = moments_above(low - mean, deviation, white - low)
         return low + above, max(square - above**2, 0.0)
-    # With more noise only clipping matters: what lies above white and below black is lost.
+    # With more noise, only clipping matters: the parts above white and below 0 are subtracted.
     over, over_square = moments_above(white - mean, deviation, np.inf)
     under, under_square = moments_above(mean, deviation, np.inf)
     lost = over_square + 2.0 * (white - mean) * over + under_square + 2.0 * mean * under
@@ -88,11 +89,12 @@ def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[flo
 
 @compiled
 def moments_above(height: float, deviation: float, most: float) -> tuple[float, float]:
-    """Return the mean and mean square excess of a rounded normal number over a whole number.
+    """Return the mean and the mean square of the excess of a rounded normal variable over a whole
+    number.
 
-    The whole number lies ``height`` above its mean, and the excess is at most ``most``. Each step
-    from one number to the next is taken with the probability that the normal number lies beyond its
-    middle.
+    The whole number lies ``height`` above the mean of the normal variable. The excess is 0 below
+    the whole number, and it is limited to ``most``. It contains each step from one whole number to
+    the next with the probability that the normal variable lies beyond the middle of this step.
     """
     steps = squares = 0.0
     for step in range(math.ceil(min(most, REACH * deviation - height))):

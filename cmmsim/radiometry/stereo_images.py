@@ -1,4 +1,4 @@
-"""Images as the estimator gets them: whole stereo frames, or windows read out of them."""
+"""Images for the estimator: whole stereo frames, and windows that are read from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class StereoFrame:
     Parameters
     ----------
     left, right : ndarray, shape (height, width)
-        Grey values, uint8, or uint16 for more than 8 bit.
+        Grey values: uint8, or uint16 for more than 8 bits.
 
     Raises
     ------
@@ -63,14 +63,12 @@ class StereoFrame:
         return f"StereoFrame(two images of {width} x {height} px, {self.left.dtype})"
 
     def show(self) -> Figure | None:
-        """Show both images side by side.
-
-        A notebook shows a picture. Elsewhere a window of Matplotlib opens.
+        """Show both images side by side, in a notebook or in a window of Matplotlib.
 
         Returns
         -------
         matplotlib.figure.Figure or None
-            The figure, to be saved, where there is no display; else None.
+            Figure, which can be saved, if there is no display; otherwise None.
 
         Examples
         --------
@@ -83,7 +81,7 @@ class StereoFrame:
 
             display(self)
             return None
-        # Late, as numba takes time to import.
+        # Imported late, because importing Matplotlib takes time.
         from matplotlib import pyplot
 
         figure, axes = pyplot.subplots(1, 2, figsize=(12.0, 5.0), layout="constrained")
@@ -97,8 +95,9 @@ class StereoFrame:
         return None
 
     def _repr_png_(self) -> bytes:
-        """Return both images side by side as a PNG, reduced where they are large."""
-        import cv2  # late, as it takes time to import
+        """Return both images side by side as a PNG, scaled down to at most SHOWN_WIDTH_PX."""
+        # Imported late, because importing OpenCV takes time.
+        import cv2
 
         highest = max(self.left.max(), self.right.max(), 255)
         both = np.hstack([self.left, self.right]) * (255.0 / highest)
@@ -109,7 +108,7 @@ class StereoFrame:
 
 
 def _in_notebook() -> bool:
-    """Tell whether a notebook runs this."""
+    """Tell whether the code runs in a notebook."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return shell is not None and hasattr(shell, "kernel")
@@ -123,13 +122,17 @@ class StereoImages(Protocol):
         """Return both whole images."""
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Return the grey values (2, n, size, size) of windows with first pixels (2, n, 2) as (x,
-        y).
+        """Return the grey values (2, n, size, size) of windows with first pixels ``corners``.
+
+        The first pixels (2, n, 2) are (x, y).
         """
 
 
 class FrameImages:
-    """Windows cut out of a stereo frame; outside of the image they repeat its edge."""
+    """Images of a stereo frame, from which windows can be read.
+
+    Outside of an image, windows repeat the pixels at its edge.
+    """
 
     def __init__(self, frame: StereoFrame) -> None:
         self._frame = frame
@@ -139,22 +142,24 @@ class FrameImages:
         return self._frame
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Return the grey values (2, n, size, size) of windows with first pixels (2, n, 2) as (x,
-        y).
+        """Return the grey values (2, n, size, size) of windows with first pixels ``corners``.
+
+        The first pixels (2, n, 2) are (x, y).
         """
         sides = zip((self._frame.left, self._frame.right), corners, strict=True)
         return np.stack([cut_windows(image, first, size) for image, first in sides])
 
 
 def readable(images: StereoImages | StereoFrame) -> StereoImages:
-    """Return images that can be read in parts, also for a whole frame. Raises CmmError for
-    others.
+    """Return images that can be read in parts, made from a StereoFrame if necessary.
+
+    Raises CmmError if ``images`` is neither a StereoFrame nor images of ``sensor.look``.
     """
     if isinstance(images, StereoFrame):
         return FrameImages(images)
     require_kind(
         images,
         StereoImages,
-        "images must be a StereoFrame(left, right) or what sensor.look returns",
+        "images must be a StereoFrame(left, right) or a result of sensor.look",
     )
     return images

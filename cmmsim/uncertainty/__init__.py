@@ -1,1 +1,1 @@
-"""Errors that all poses have in common: errors of the known rig, of teaching, and of a drift."""
+"""Common errors of all poses, due to the known rig, teaching and drift, and drift detection."""

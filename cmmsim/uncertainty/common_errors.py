@@ -1,14 +1,14 @@
 """Errors that all poses of a run have in common, from cameras, taught frames and exposure.
 
-A measured pose errs by noise, which is new in every frame. It also errs because the estimator
-assumes inexact values to be exact: the rig (24 numbers), the taught frames of base and platform
-(12), and the instant at which the right camera exposes. The error of each value is constant during
-a run.
+The noise of a measured pose is new in every frame. Other errors are constant during a run, because
+they come from parameters that the estimator assumes to be exact: the rig (24 numbers), the taught
+frames of base and platform (12), and the time at which the right camera exposes (1).
 
-To first order, these errors d move a measured pose by J(pose) d. J needs no images: centres are
-projected through a rig with errors, and measured with the known rig. Teaching with this rig also
-gives wrong frames and sticker places, which cancel much of the error. Only the difference between
-the errors at the pose and at teaching remains.
+To first order, these errors d change a measured pose by J(pose) d. J is computed without images:
+sticker centres are projected through a rig with errors and triangulated with the known rig.
+Teaching used the same known rig, so the taught frames and sticker places have errors as well. They
+cancel most of the error, so only the difference between the errors at the pose and at teaching
+remains.
 """
 
 from __future__ import annotations
@@ -46,13 +46,15 @@ NAMES = (
     *(f"taught.{body}.{name}" for body in ("base", "platform") for name in PLACE_NAMES),
     "exposure.right_later_s",
 )
-"""Names of all common errors. Those of the rig are true minus known, those of taught frames known
-against true, in the axes of base and platform."""
+"""Names of all common errors.
 
-# Poses of the teaching path: it is smooth, so that without noise few of its poses suffice.
+Errors of the rig are true minus known parameters. Errors of taught frames are small movements from
+the true to the taught frame, in the axes of base and platform."""
+
+# Number of poses on the teaching path. The path is smooth, so few poses suffice without noise.
 TEACHING_POSES = 8
 
-# Changes of the rig's parameters for central differences: ten times what a good calibration leaves.
+# Steps of the rig's parameters for central differences, ten times the errors of a calibration.
 STEPS = np.diag(
     [*2 * (0.1, 0.1, 0.1, 0.1, 1e-4, 1e-4, 1e-5, 1e-5, 1e-4), *3 * (1e-5,), *3 * (1e-5,)]
 )
@@ -60,10 +62,11 @@ STEPS = np.diag(
 
 @dataclass(frozen=True)
 class CommonErrors:
-    """Common errors by name. Each name ends with the unit.
+    """Common errors of N poses, and the changes of the poses that they cause.
 
-    ``changes`` (N, 6, k) of the poses are per unit of each error, m and rad, and ``covariance`` (k,
-    k) belongs to the errors.
+    ``names`` (k,) are the names of the errors; each name ends with the unit. ``changes`` (N, 6, k)
+    are the changes of the poses, m and rad, per unit of each error. ``covariance`` (k, k) is the
+    covariance of the errors.
     """
 
     names: tuple[str, ...]
@@ -72,14 +75,16 @@ class CommonErrors:
 
     @property
     def pose_covariances(self) -> Array:
-        """Covariances (N, 6, 6) of each pose due to the errors, which are the same in all poses."""
+        """Covariances (N, 6, 6) that the common errors cause in each pose."""
         return np.asarray(self.changes @ self.covariance @ self.changes.swapaxes(1, 2))
 
 
 @dataclass(frozen=True)
 class MeasuringGeometry:
-    """Set-up as an estimator knows it: the rig, both bodies, the result of teaching, and the pose
-    (6,) at teaching.
+    """Geometry as an estimator knows it.
+
+    It consists of the rig, both bodies, the result of teaching, and the pose ``home`` (6,) at
+    teaching.
     """
 
     rig: StereoRig
@@ -90,17 +95,16 @@ class MeasuringGeometry:
 
     @property
     def camera_from_base(self) -> Array:
-        """Place (4, 4) of the base as it was taught."""
+        """Taught transform camera_from_base (4, 4)."""
         return invert(self.taught.base_from_camera)
 
     def pose_covariance(
         self, pose: Array, rig_covariance: Array, method: str = "registration"
     ) -> Array:
-        """Return the covariance (6, 6) that a pose (6,) measured by registration has in common with
-        others.
+        """Return the covariance (6, 6) that common errors cause at a pose (6,).
 
-        It comes from taught frames and a rig with a covariance (24, 24). It is NaN for another
-        method, where it is not known.
+        The errors are those of the taught frames and of the rig, with ``rig_covariance`` (24, 24).
+        For other methods than registration, the covariance is not known, and the result is NaN.
         """
         if method != "registration":
             return np.full((6, 6), np.nan)
@@ -111,10 +115,10 @@ class MeasuringGeometry:
     ) -> CommonErrors:
         """Return the common errors of poses (N, 6) measured by registration.
 
-        They move at rates (N, 6), m/s and rad/s. ``rig_covariance`` (24, 24) belongs to the rig's
-        parameters, and ``exposure_std`` to the time by which the right camera exposes later, s.
-        Exact parameters are left out. Raises ShapeError for anything but rows of six finite
-        numbers.
+        ``rates`` (N, 6) are the time derivatives of the poses, m/s and rad/s. ``rig_covariance``
+        (24, 24) is the covariance of the rig's parameters. ``exposure_std`` is the standard
+        deviation of the delay of the right camera's exposure, s. Parameters with zero variance are
+        omitted. Raises ShapeError unless each row of poses and rates is six finite numbers.
         """
         poses = finite_array(poses, (len(poses), 6), "poses must be (N,6) and finite")
         rates = finite_array(
@@ -135,9 +139,9 @@ class MeasuringGeometry:
         return CommonErrors(tuple(NAMES[k] for k in kept), changes, covariance[np.ix_(kept, kept)])
 
     def _by_rig(self, view: _View) -> Array:
-        """Return small errors (N, 6, 24) of base_from_platform by each parameter of the rig.
+        """Return derivatives (N, 6, 24) of small errors of base_from_platform by the rig.
 
-        The errors of teaching are included.
+        The effect of the rig on teaching is included.
         """
         frames, places = self.taught_by_rig
         return (
@@ -147,10 +151,10 @@ class MeasuringGeometry:
 
     @cached_property
     def taught_by_rig(self) -> tuple[Array, Array]:
-        """Errors of teaching by each parameter of the rig.
+        """Derivatives of errors of teaching by the rig's parameters.
 
-        They are the small error (6, 24) of the taught base_from_camera, and changes (24, n, 3) of
-        the places of the platform's stickers.
+        The first result (6, 24) belongs to small errors of the taught base_from_camera. The second
+        result (24, n, 3) belongs to the taught places of the platform's stickers.
         """
         moved = [self.rig.moved(sign * step) for sign in (1.0, -1.0) for step in STEPS]
         frames, places = (
@@ -164,10 +168,10 @@ class MeasuringGeometry:
         return errors, (places[0] - places[1]) / twice[:, None, None]
 
     def _teach(self, true: Sequence[StereoRig]) -> tuple[Array, Array]:
-        """Return base_from_camera (r, 4, 4) and sticker places (r, n, 3) as the known rig teaches
-        them.
+        """Return base_from_camera (r, 4, 4) and sticker places (r, n, 3) from r teachings.
 
-        The cameras are those of r other rigs, each by itself, and there is no noise.
+        In each teaching, one of the rigs ``true`` forms the images without noise, and the known rig
+        measures them.
         """
         path = transforms_of(teaching_path(self.home, TEACHING_POSES))
         places = self.taught.platform_places
@@ -187,9 +191,10 @@ class MeasuringGeometry:
         )
 
     def _observed(self, true: Sequence[StereoRig], points: Array) -> tuple[Array, Array]:
-        """Return points (r, n, 3), and covariances (r, n, 3, 3) per px² of noise, by the known rig.
+        """Return points (r, n, 3), and covariances (r, n, 3, 3) per px² of noise.
 
-        Points (n, 3) in the camera frame are seen by the cameras of other rigs.
+        Each of the rigs ``true`` sees the points (n, 3) in the camera frame, and the known rig
+        triangulates them.
         """
         pixels = np.stack([rig.project(points)[0] for rig in true], axis=1).reshape(2, -1, 2)
         spread = np.broadcast_to(np.eye(2), (*pixels.shape[:2], 2, 2))
@@ -201,11 +206,12 @@ class MeasuringGeometry:
 
 @dataclass(frozen=True)
 class _View:
-    """Stickers seen at the poses of a run, by index (n,).
+    """Stickers that are seen at the N poses of a run.
 
-    ``frames`` (N, 4, 4) are base_from_platform. ``arms`` (N, n, 3) lead from the platform's origin
-    to the stickers, in camera axes. The changes of their pixels are ``slopes`` (2, N, n, 2, 3) by
-    their points, and ``by_rig`` (2, N, n, 2, 24) by the rig's parameters.
+    ``frames`` (N, 4, 4) are base_from_platform. ``seen`` (n,) are the indices of the stickers.
+    ``arms`` (N, n, 3) lead from the platform's origin to the stickers, in camera axes. ``slopes``
+    (2, N, n, 2, 3) are the derivatives of the stickers' pixels by their points, and ``by_rig`` (2,
+    N, n, 2, 24) their derivatives by the rig's parameters.
     """
 
     camera_from_base: Array
@@ -217,23 +223,22 @@ class _View:
 
     @property
     def levers(self) -> Array:
-        """Small errors (N, 6, 6) of base_from_platform by that of base_from_camera, both in base
-        axes.
+        """Derivatives (N, 6, 6) of small errors of base_from_platform by those of base_from_camera.
+
+        Both errors are in base axes.
         """
         levers = np.tile(np.eye(6), (len(self.frames), 1, 1))
         levers[:, :3, 3:] = -skew(self.frames[:, :3, 3])
         return levers
 
     def by_taught_frames(self) -> Array:
-        """Return small errors (N, 6, 12) of base_from_platform by those of both taught frames."""
+        """Return derivatives (N, 6, 12) of small errors of base_from_platform by taught frames."""
         turns = np.zeros((len(self.frames), 6, 6))
         turns[:, :3, :3] = turns[:, 3:, 3:] = self.frames[:, :3, :3]
         return np.concatenate([self.levers, turns], axis=2)
 
     def by_delay(self, poses: Array, rates: Array) -> Array:
-        """Return small errors (N, 6, 1) of base_from_platform, per s by which the right camera is
-        late.
-        """
+        """Return small errors (N, 6, 1) of base_from_platform per s of the right camera's delay."""
         spin = np.einsum(
             "nij,nj->ni", np.stack([euler_rates_matrix(pose) for pose in poses]), rates[:, 3:]
         )
@@ -246,23 +251,22 @@ class _View:
         return self.registered(self._points(pixels))
 
     def points_by_rig(self) -> Array:
-        """Return changes (N, n, 3, 24) of the triangulated points by each parameter of the true
-        rig.
-        """
+        """Return derivatives (N, n, 3, 24) of the triangulated points by the true rig."""
         return self._points(self.by_rig)
 
     def points_by_places(self, places: Array) -> Array:
-        """Return changes (N, n, 3, 24) of expected stickers by changes (24, n, 3) of their taught
-        places.
+        """Return derivatives (N, n, 3, 24) of the expected points by the rig.
+
+        ``places`` (24, n, 3) are the derivatives of the taught places.
         """
         turns = self.camera_from_base[:3, :3] @ self.frames[:, :3, :3]
         return np.einsum("nij,pmj->nmip", turns, places[:, self.seen])
 
     def registered(self, changes: Array) -> Array:
-        """Return small errors (N, 6, p) of base_from_platform, in base axes, by changes of
-        stickers.
+        """Return small errors (N, 6, p) of base_from_platform that changes of points cause.
 
-        The changes (N, n, 3, p) of their points are in camera axes.
+        The errors are in base axes. ``changes`` (N, n, 3, p) of the stickers' points are in camera
+        axes.
         """
         rows = np.concatenate(
             [np.broadcast_to(np.eye(3), (*self.arms.shape[:2], 3, 3)), -skew(self.arms)], axis=3
@@ -275,12 +279,13 @@ class _View:
 
     @property
     def _information(self) -> Array:
-        """Information of each point (N, n, 3, 3) per squared pixel of both images."""
+        """Information matrix (N, n, 3, 3) of each point for pixel noise of 1 px²."""
         return np.einsum("cnmki,cnmkj->nmij", self.slopes, self.slopes)
 
     def _points(self, pixels: Array) -> Array:
-        """Return changes (N, n, 3, p) of triangulated points by changes (2, N, n, 2, p) of their
-        pixels.
+        """Return changes (N, n, 3, p) of triangulated points.
+
+        ``pixels`` (2, N, n, 2, p) are the changes of their pixels.
         """
         return np.linalg.solve(
             self._information, np.einsum("cnmki,cnmkp->nmip", self.slopes, pixels)
@@ -311,9 +316,9 @@ def _seen_at_home(geometry: MeasuringGeometry) -> NDArray[np.int_]:
 
 
 def _small_error(moved: Array, other: Array) -> Array:
-    """Return [dt, dphi] (6,) by which points p of the output frame move: dt + dphi x p.
+    """Return the small movement [dt, dphi] (6,) from transform ``other`` to ``moved``.
 
-    They move from the second transform to the first.
+    A point p of the output frame moves by dt + dphi x p.
     """
     turn = moved[:3, :3] @ other[:3, :3].T
     return np.concatenate([moved[:3, 3] - turn @ other[:3, 3], rotation_log(turn)])

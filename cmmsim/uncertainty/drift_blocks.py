@@ -1,9 +1,9 @@
-"""Residuals of the stickers' pixels in a few frames, and their changes by each error of the rig.
+"""Residuals of the stickers' pixels in blocks of frames, with derivatives by errors of the rig.
 
-A body's stickers are expected where their taught places and its measured pose put them. The pose is
-estimated from the same pixels, so the part of the residuals that six numbers explain is removed.
-The misfit of the pattern and the gaps of the rays remain. With n stickers these are 4 n numbers, of
-unit variance in the 4 n - 6 directions that no pose explains, and zero in the others. The base
+The residuals of a body are differences between observed and expected pixels. Expected pixels follow
+from taught places and the measured pose. The pose of the platform is estimated from the same
+pixels, so the part of the residuals that a pose explains is removed. With n stickers, the 4 n
+residuals then have unit variance in 4 n - 6 directions and are zero in the other six. The base
 stands still, and its pose was taught, so nothing is removed from its residuals. They also show
 movements of the whole rig relative to the base.
 """
@@ -22,23 +22,25 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
 
 PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
-"""Names of a movement of both cameras together. Points of the base move by as much in the camera
-frame, about its origin.
+"""Names of the parameters of a common movement of both cameras.
+
+They describe the movement of the base in camera axes, with rotations about the base's origin.
 """
 
-# px of a centre: no detector is better, whatever it states.
+# px: its square is added to the stated variance of a centre, which can be too small.
 SMALLEST_STD_PX = 5e-4
 RIG = len(PARAMETER_NAMES)
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of b blocks of frames.
+    """Residuals of b blocks of frames, with their derivatives.
 
-    ``residuals`` (b, m) have unit variance, or zero, in any direction. Their derivatives are
-    ``by_drift`` (b, m, 30) of the rig's parameters and its place since teaching, ``by_start`` (b,
-    m, 24) of errors that the rig had at teaching already, ``by_delay`` (b, m, 1) of the time [s] by
-    which the right camera exposes later, and ``by_offsets`` (b, m, o) [px] of single centres.
+    residuals   (b, m), with variance one or zero in each direction
+    by_drift    (b, m, 30), by changes of the rig's parameters and place since teaching
+    by_start    (b, m, 24), by errors of the rig's parameters that existed at teaching already
+    by_delay    (b, m, 1), by the delay of the right camera's exposure, s
+    by_offsets  (b, m, o), by constant errors of single centres, px
     """
 
     residuals: Array
@@ -52,8 +54,9 @@ class Rows:
 class Sightings:
     """Block of frames that show the same stickers of a body.
 
-    The stickers have an ``index`` (k,) and places (k, 3) in body axes. Each frame has its time in
-    s, base_from_body as a pose (6,), pixels (2, k, 2) and their variances (k,) px².
+    ``index`` (k,) refers to the body's stickers, and ``places`` (k, 3) are in body axes. The lists
+    contain one entry per frame: the time in s, the pose (6,) of the body in the base frame, the
+    pixels (2, k, 2), and their variances (k,) px².
     """
 
     index: NDArray[np.int_]
@@ -65,7 +68,7 @@ class Sightings:
     variances: list[Array] = field(default_factory=list)
 
     def add(self, time: float, pose: Array, pixels: tuple[Array, Array], variances: Array) -> None:
-        """Add one more frame."""
+        """Add a frame."""
         self.times.append(time)
         self.poses.append(pose)
         self.pixels.append(np.array(pixels))
@@ -73,19 +76,17 @@ class Sightings:
 
     @cached_property
     def moves(self) -> Array:
-        """Transforms camera_from_body (f, 4, 4) of all frames, once there are no more."""
+        """Transforms camera_from_body (f, 4, 4) of all frames. Frames must not be added later."""
         return np.asarray(self.camera_from_base @ transforms_of(np.array(self.poses)))
 
     @property
     def middle(self) -> Array:
-        """Transform camera_from_body (4, 4) half way."""
+        """Transform camera_from_body (4, 4) in the middle frame."""
         return np.asarray(self.moves[len(self.moves) // 2])
 
     @property
     def velocities(self) -> Array:
-        """Velocities of the stickers (k, 3) in the camera frame, m/s; zero if only one frame was
-        seen.
-        """
+        """Mean velocities (k, 3) of the stickers in the camera frame, m/s; zero for one frame."""
         span = self.times[-1] - self.times[0]
         if span == 0.0:
             return np.zeros(self.places.shape)
@@ -93,9 +94,7 @@ class Sightings:
 
 
 def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
-    """Return the rows of blocks of frames with the same stickers, in which the platform was
-    measured.
-    """
+    """Return the rows of blocks of frames in which the same stickers of the platform were seen."""
     index = blocks[0].index
     moves = np.array([seen.middle for seen in blocks])
     arms = blocks[0].places @ moves[:, :3, :3].swapaxes(1, 2)
@@ -106,11 +105,11 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> R
         "bkij,bkj->bki", slopes[1], np.array([seen.velocities for seen in blocks])
     )
     residuals, roots = _whitened(geometry.rig, blocks)
-    # Orthonormal columns span the residuals that six numbers of a pose explain.
+    # Orthonormal columns that span the residuals which a change of the pose explains.
     by_pose = np.linalg.qr(_whiten(roots, slopes @ _small_movement(arms)))[0]
 
     def left(values: Array) -> Array:
-        """Remove from values (b, 4k, ...) what a pose explains."""
+        """Remove the part of values (b, 4k, ...) that a change of the pose explains."""
         return np.asarray(values - by_pose @ (by_pose.swapaxes(1, 2) @ values))
 
     drift = left(_whiten(roots, by_rig))
@@ -124,16 +123,14 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> R
 
 
 def base_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
-    """Return the rows of blocks of frames with the same stickers of the base, which stands
-    still.
-    """
+    """Return the rows of blocks of frames in which the same stickers of the base were seen."""
     index = blocks[0].index
     move = geometry.camera_from_base
     arms = blocks[0].places @ move[:3, :3].T
     slopes, by_rig = geometry.rig.derivatives(arms + move[:3, 3])
     across = slopes.transpose(1, 0, 2, 3).reshape(len(arms), 4, 3)
     rig_first = by_rig.transpose(1, 0, 2, 3).reshape(len(arms), 4, RIG)
-    # Changes of the places at which the stickers were taught.
+    # Derivatives of the taught places by the rig.
     taught = np.linalg.solve(across.swapaxes(1, 2) @ across, across.swapaxes(1, 2) @ rig_first)
     by_drift = np.concatenate([by_rig, slopes @ _small_movement(arms)], axis=-1)
     residuals, roots = _whitened(geometry.rig, blocks)
@@ -149,7 +146,7 @@ def base_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
 def stacked(rows: list[Rows], centres: tuple[int, ...]) -> Rows:
     """Join the rows of several bodies.
 
-    Each body has its own offsets, for as many stickers as ``centres`` states.
+    ``centres`` is the number of stickers of each body. Each body has its own columns of offsets.
     """
     sizes = [one.residuals.shape for one in rows]
     first = 0
@@ -169,17 +166,19 @@ NOT_OFFSETS = ("residuals", "by_drift", "by_start", "by_delay")
 
 
 def _derivatives(rig: StereoRig, points: Array) -> tuple[Array, Array]:
-    """Return derivatives (2, b, k, 2, 3) of pixels by points (b, k, 3), and (2, b, k, 2, 24) by the
-    rig.
+    """Return derivatives of the pixels of points (b, k, 3).
+
+    They are (2, b, k, 2, 3) by the points, and (2, b, k, 2, 24) by the rig's parameters.
     """
     slopes, by_rig = rig.derivatives(points.reshape(-1, 3))
     return slopes.reshape(2, *points.shape[:2], 2, 3), by_rig.reshape(2, *points.shape[:2], 2, RIG)
 
 
 def _whitened(rig: StereoRig, blocks: Sequence[Sightings]) -> tuple[Array, Array]:
-    """Return means (b, 4k) of pixels less those expected, in units of their standard deviations.
+    """Return mean differences (b, 4k) between observed and expected pixels of each block.
 
-    The second result is the roots (b, k) of their weights.
+    They are in units of their standard deviations. The second result contains the square roots (b,
+    k) of their weights.
     """
     weights = 1.0 / (
         np.array([each for seen in blocks for each in seen.variances]) + SMALLEST_STD_PX**2
@@ -194,15 +193,18 @@ def _whitened(rig: StereoRig, blocks: Sequence[Sightings]) -> tuple[Array, Array
 
 
 def _whiten(roots: Array, slopes: Array) -> Array:
-    """Return derivatives (b, 4k, p) of whitened residuals from those of pixels (2, b, k, 2, p)."""
+    """Return derivatives (b, 4k, p) of whitened residuals from derivatives of pixels.
+
+    ``slopes`` (2, b, k, 2, p) are the derivatives of pixels.
+    """
     weighted = (roots[..., None, None] * slopes).swapaxes(0, 1)
     return weighted.reshape(len(roots), 4 * roots.shape[1], -1)
 
 
 def _small_movement(arms: Array) -> Array:
-    """Return derivatives (..., 3, 6) of points by the small movement [dt, dphi] of their body.
+    """Return derivatives (..., 3, 6) of points by a small movement [dt, dphi] of their body.
 
-    The points are arms (..., 3) from the body's origin.
+    ``arms`` (..., 3) lead from the body's origin to the points.
     """
     return np.concatenate([np.broadcast_to(np.eye(3), (*arms.shape, 3)), -skew(arms)], axis=-1)
 
@@ -210,9 +212,10 @@ def _small_movement(arms: Array) -> Array:
 def _offsets(
     left: Callable[[Array], Array], roots: Array, index: NDArray[np.int_], count: int
 ) -> Array:
-    """Return derivatives (b, 4k, 4 count) by the offsets of all centres of a body.
+    """Return derivatives (b, 4k, 4 count) of whitened residuals by the offsets of all centres.
 
-    An index (k,) of them is seen.
+    The body has ``count`` stickers, of which those with ``index`` (k,) are seen. ``left`` removes
+    the part that a pose explains.
     """
     blocks, k = roots.shape
     every = np.zeros((blocks, 4 * k, 2, count, 2))

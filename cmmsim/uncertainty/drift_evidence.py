@@ -1,16 +1,17 @@
-"""Sequential likelihood ratio for a rig that moves, from rows of residuals, and its findings.
+"""Sequential likelihood ratio test for a rig that moves, from residuals, and its findings.
 
-One Gaussian model of all residuals says that the rig is as it was calibrated and taught: its errors
-are one draw of the calibration's covariance, the same in every frame. Other models let the rig walk
-at random, at one of several rates, or give it larger errors at the start than its covariance
-states. Each model is a Kalman filter that predicts the next residuals.
+All models of the residuals are Gaussian. In the first model, the rig has not changed since
+calibration and teaching: its errors have the calibration's covariance and are the same in every
+frame. In other models, the rig's parameters perform a random walk at one of several rates, or have
+larger errors from the start than the covariance states. Each model is a Kalman filter that predicts
+the next residuals.
 
-The ratio is the mean likelihood of the other models over the likelihood of the first model. While
-the first model is true, this ratio is a martingale with mean 1. It exceeds 1 / chance at any time
-of a run, however long, with at most that probability (Ville's inequality), so no correction for
-repeated tests is needed. Sources: J. Ville, Étude critique de la notion de collectif (1939); H.
-Robbins, Statistical methods related to the law of the iterated logarithm, Ann. Math. Statist. 41
-(1970).
+The likelihood ratio is the mean likelihood of the other models divided by the likelihood of the
+first model. If the first model is true, this ratio is a martingale with mean 1. The probability
+that it exceeds 1 / chance at any time of a run, however long, is then at most ``chance`` (Ville's
+inequality). Therefore no correction for repeated tests is needed. Sources: J. Ville, Étude critique
+de la notion de collectif (1939); H. Robbins, Statistical methods related to the law of the iterated
+logarithm, Ann. Math. Statist. 41 (1970).
 """
 
 from __future__ import annotations
@@ -29,30 +30,31 @@ from cmmsim.uncertainty.drift_blocks import PLACES_OF_RIG, RIG, Rows
 SIZES = np.array(
     [*2 * (*4 * (0.1,), 1e-4, 1e-4, 1e-5, 1e-5, 1e-4), *6 * (2e-5,), *len(PLACES_OF_RIG) * (2e-5,)]
 )
-"""Sizes of a drift that matters, of each parameter: a tenth of a pixel, 20 um, 20 urad."""
+"""Size of a relevant drift, for each parameter: a tenth of a pixel, 20 um, 20 urad."""
 
 RATES = (0.05, 0.5, 5.0)
-"""Standard deviations of random walks after WALK_FRAMES, in SIZES: a drift that comes in hours,
-minutes, seconds.
+"""Standard deviations of random walks after WALK_FRAMES frames, in units of SIZES.
+
+They stand for drifts within hours, minutes and seconds.
 """
 
 WALK_FRAMES = 1000
 NAMES = (*PARAMETER_NAMES, *PLACES_OF_RIG)
-# Share of what residuals say of a drift at which no further parameter is named.
+# Explained share of the evidence for a drift at which no further parameter is named.
 EXPLAINED = 0.97
+# Largest number of parameters that a finding names.
 MOST_NAMED = 3
-# Part of a direction, in SIZES, by which a parameter belongs to its name.
+# Smallest component of a direction, in units of SIZES, whose parameter is part of its name.
 LARGE_PART = 0.3
 ALWAYS_UNSEEN = ("scale of rig and taught places together",)
 
 
 class Filter:
-    """Kalman filter of unknowns (n,), of which the first w walk at random and are zero at first.
+    """Kalman filter of n unknowns. The first w of them are zero at first and walk at random.
 
-    It has the information form, since one product of the derivatives serves all models, and few
-    unknowns walk. The density of the unknowns x is proportional to exp(constant + right x - x
-    precision x / 2). Source: B. D. O. Anderson and J. B. Moore, Optimal Filtering (1979), section
-    6.3.
+    The filter is in information form, so that all models share the products of derivatives. The
+    density of the unknowns x is proportional to exp(constant + right x - x precision x / 2).
+    Source: B. D. O. Anderson and J. B. Moore, Optimal Filtering (1979), section 6.3.
     """
 
     def __init__(self, prior_std: Array, walk_std: Array) -> None:
@@ -62,10 +64,10 @@ class Filter:
         self._constant = -float(np.log(prior_std).sum())
 
     def step(self, gram: Array, right: Array, squared: float, frames: int) -> None:
-        """Update with residuals r of unit variance and derivatives D (m, n), ``frames`` frames
-        after the last update.
+        """Update with residuals r (m,) of unit variance, which have derivatives D (m, n).
 
-        They are given as D'D (n, n), D'r (n,) and r'r.
+        ``gram`` is D'D, ``right`` is D'r, and ``squared`` is r'r. ``frames`` is the number of
+        frames since the last update.
         """
         if len(self._walk):
             self._walk_on(frames)
@@ -80,7 +82,7 @@ class Filter:
             self.precision[range(w), range(w)] = 1.0 / walked
             self._constant -= 0.5 * float(np.log(walked).sum())
             return
-        # The unknowns before the step are integrated out, and those after it take their place.
+        # The unknowns before the step are integrated out. The unknowns after the step replace them.
         both = np.column_stack([self.precision[:w], self.right[:w]])
         lower, part = _factored(self.precision[:w, :w] + np.diag(1.0 / walked), both)
         self.precision -= part[:, :-1].T @ part[:, :-1]
@@ -91,14 +93,14 @@ class Filter:
     @property
     def log_likelihood(self) -> float:
         """Log-likelihood of all residuals so far."""
-        # Nothing was seen yet.
+        # No update yet.
         if not self.precision[0, 0]:
             return 0.0
         lower, part = _factored(self.precision, self.right)
         return self._constant + 0.5 * float(part @ part) - float(np.log(np.diag(lower)).sum())
 
     def told_of(self, first: int) -> tuple[Array, Array]:
-        """Return the marginal information (d, d) and score (d,) of the first d unknowns."""
+        """Return the marginal information (d, d) and score (d,) of the ``first`` d unknowns."""
         others = np.linalg.solve(self.precision[first:, first:], self.precision[first:, :first])
         return (
             self.precision[:first, :first] - self.precision[:first, first:] @ others,
@@ -109,20 +111,23 @@ class Filter:
 def _factored(matrix: Array, right: Array) -> tuple[Array, Array]:
     """Return the lower Cholesky factor L of a matrix (n, n), and L^-1 right, (n,) or (n, p).
 
-    The upper part is left as it was. SciPy's own callers of LAPACK take longer than the work.
+    The upper part of the first result has no meaning. LAPACK is called directly, because SciPy's
+    functions have a larger overhead than the computation itself.
     """
     lower, failed = dpotrf(matrix, lower=True, clean=False)
     if failed:
-        raise np.linalg.LinAlgError(f"no positive definite matrix: minor {failed} of {len(matrix)}")
+        raise np.linalg.LinAlgError(
+            f"the matrix is not positive definite: minor {failed} of {len(matrix)}"
+        )
     return lower, dtrtrs(lower, right, lower=True)[0]
 
 
 @dataclass(frozen=True)
 class Told:
-    """Information on a drift, in units of SIZES, from residuals alone, without the prior.
+    """Information about a drift in units of SIZES, from residuals alone, without the prior.
 
-    It is ``information`` (d, d), and ``score`` (d,), which is information times estimate.
-    ``from_start`` says that the rig was so at teaching already.
+    ``information`` (d, d) is the inverse covariance, and ``score`` (d,) is the information times
+    the estimate. ``from_start`` is True if the rig had these errors at teaching already.
     """
 
     information: Array
@@ -133,9 +138,10 @@ class Told:
 class Evidence:
     """Filters of all models.
 
-    ``calibration`` (24, r) is the part of SIZES that the calibration leaves of the rig's
-    parameters, for r independent numbers of unit variance. ``delay_std`` is in s, and
-    ``offset_std`` (o,) in px of single centres. ``place_shows`` says that the rig's place shows.
+    The errors of the calibration, in units of SIZES, are ``calibration`` (24, r) times r
+    independent numbers of unit variance. ``delay_std`` is the standard deviation of the right
+    camera's delay, s. ``offset_std`` (o,) are those of constant errors of single centres, px.
+    ``place_shows`` is True if the residuals depend on the rig's place, because the base is seen.
     """
 
     def __init__(
@@ -156,7 +162,7 @@ class Evidence:
     def log_ratio(self) -> float:
         """Logarithm of the likelihood ratio of a moved rig to an unmoved rig.
 
-        The former is the mean over the models.
+        The likelihood of a moved rig is the mean over its models.
         """
         others = np.array([one.log_likelihood for one in (*self._walking.values(), self._wrong)])
         return float(
@@ -164,9 +170,7 @@ class Evidence:
         )
 
     def products(self, rows: Rows) -> Array:
-        """Return the products (b, n, n) of residuals and derivatives of b blocks, as ``step`` takes
-        them.
-        """
+        """Return the products (b, n, n) of residuals and derivatives of b blocks, for ``step``."""
         by_start = rows.by_start * SIZES[:RIG]
         known = [by_start @ self._calibration, self._delay_std * rows.by_delay, rows.by_offsets]
         by_drift = (rows.by_drift * SIZES)[..., : self._size]
@@ -174,7 +178,7 @@ class Evidence:
         return np.asarray(every.swapaxes(1, 2) @ every)
 
     def step(self, products: Array, frames: int) -> None:
-        """Update with a block's products (n, n), ``frames`` frames after the last update."""
+        """Update with the products (n, n) of a block, ``frames`` frames after the last update."""
         self._frames += frames
         size = self._size
         drifted = np.delete(np.arange(len(products) - 1), slice(self._size, self._size + RIG))
@@ -194,13 +198,13 @@ class Evidence:
 
     @property
     def sensitivity(self) -> Array:
-        """Information (d, d) about a drift in SIZES, of the slowest that is watched for."""
+        """Information (d, d) about a drift at the slowest rate, in units of SIZES."""
         slow = min(RATES)
         return _without_prior(self._walking[slow], self._size, self._walked(slow))[0]
 
     @property
     def told(self) -> Told:
-        """Statement of the likeliest of the models with a movement."""
+        """Information about the drift from the most likely model of a moved rig."""
         rate, walking = max(self._walking.items(), key=lambda item: item[1].log_likelihood)
         from_start = self._wrong.log_likelihood > walking.log_likelihood
         if from_start:
@@ -208,17 +212,14 @@ class Evidence:
         return Told(*_without_prior(walking, self._size, self._walked(rate)), from_start)
 
     def _walked(self, rate: float) -> float:
-        """Return the variance of a walk after all frames."""
+        """Return the variance of a random walk after all frames so far."""
         return rate**2 * max(self._frames, 1) / WALK_FRAMES
 
 
 def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[Array, Array]:
-    """Return the information (d, d) and score (d,) of residuals about the first d unknowns.
-
-    The prior's contributions are subtracted.
-    """
+    """Return information (d, d) and score (d,) about the first d unknowns, without the prior."""
     information, score = filtered.told_of(size)
-    # Nothing has been seen, and nothing has walked.
+    # No update yet, so there is no prior to subtract.
     if not information.any():
         return information, score
     return information - np.eye(size) / prior_variance, score
@@ -226,8 +227,9 @@ def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[
 
 @dataclass(frozen=True)
 class Movement:
-    """Movement of one parameter of the rig and its standard deviation, in the unit at the end of
-    the parameter's name.
+    """Movement of one parameter of the rig and its standard deviation.
+
+    The name of the parameter ends with the unit.
     """
 
     name: str
@@ -242,29 +244,29 @@ class Movement:
 
 @dataclass(frozen=True)
 class Finding:
-    """Statement on a rig from the residuals of a run.
+    """Result of a drift watch over a run.
 
     Attributes
     ----------
     noticed_s, noticed_frame : float and int, or None
-        Time and frame at which the rig no longer fitted; None where it did all along.
+        Time and frame at which a movement was detected; None if none was detected.
     evidence, limit : float
         Largest logarithm of the likelihood ratio, and its limit.
     chance : float
-        Probability with which a rig that fits exceeds the limit in a run, however long.
+        Probability of a false alarm in a run, however long.
     frames, judged_frames : int
-        All frames, and those in which enough stickers were seen.
+        Number of all frames, and of frames in which enough stickers were seen.
     movements : tuple of Movement
-        Smallest set of parameters that explains the residuals at the end of the run, in falling
-        order of effect. Other parameters of nearly the same effect might be the true cause. Empty
-        where nothing was noticed.
+        Few parameters whose movement explains the residuals at the end of the run, in falling order
+        of effect. Other parameters with nearly the same effect might be the true cause. Empty if no
+        movement was detected.
     explained : float
-        Share that the movements explain.
+        Share of the evidence that the movements explain.
     from_start : bool
-        True if the rig was wrong at teaching already.
+        True if the parameters were probably wrong at teaching already.
     unseen : tuple of str
-        Directions in which a drift of a tenth of a pixel, 20 um or 20 urad would not show, named
-        by the parameters that move together.
+        Directions in which a drift of a tenth of a pixel, 20 um or 20 urad could not be detected.
+        Each is named by the parameters that move together.
     """
 
     noticed_s: float | None
@@ -281,7 +283,7 @@ class Finding:
 
     @property
     def warning(self) -> str | None:
-        """Sentence that says what is wrong; None where nothing is."""
+        """Sentence that describes the detected movement; None if none was detected."""
         if self.noticed_s is None:
             return None
         moved = ", ".join(map(str, self.movements))
@@ -293,18 +295,19 @@ class Finding:
         return (
             f"the cameras {since}: noticed after {self.noticed_s:.2f} s; at the end of the run, "
             f"{100 * self.explained:.0f} % of what the stickers show is explained by {what} of "
-            f"{moved} (a false alarm has a chance of {self.chance:g} a run)"
+            f"{moved} (the probability of a false alarm is {self.chance:g} per run)"
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers and texts."""
+        """Return the finding as a dictionary of plain numbers and texts."""
         return asdict(self) | {"warning": self.warning, "unseen": list(self.unseen)}
 
 
 def movements(told: Told) -> tuple[tuple[Movement, ...], float]:
-    """Return the fewest parameters whose movement explains what residuals say, and their share.
+    """Return a few parameters whose movement explains the residuals, and the explained share.
 
-    They are found one after the other; each explains most of what those before leave.
+    They are chosen one after the other. Each is the parameter that, together with the parameters
+    before, explains most.
     """
     information = told.information
     score = told.score
@@ -329,10 +332,10 @@ def movements(told: Told) -> tuple[tuple[Movement, ...], float]:
 
 
 def unseen_directions(information: Array) -> tuple[str, ...]:
-    """Return names of the directions of which residuals say less than one standard deviation of
-    SIZES.
+    """Return names of the directions in which the standard deviation of a drift exceeds SIZES.
 
-    The least seen comes first.
+    Directions that the residuals never show come first. The other directions follow in rising order
+    of information.
     """
     values, vectors = np.linalg.eigh(information)
     named = [

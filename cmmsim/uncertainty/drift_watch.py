@@ -20,38 +20,39 @@ from cmmsim.uncertainty.known_rig import KnownRig
 
 # Probability of a false alarm in a run.
 CHANCE = 0.01
-# Most frames whose residuals are averaged before they count.
+# Largest number of frames in a block. The residuals of a block are averaged.
 BLOCK = 6
-# Blocks that are counted at once, so that a long run takes no more memory than a short one.
+# Number of blocks that are evaluated together. Longer runs then need no more memory.
 TOGETHER = 64
-# Fewest stickers of a frame that can say something.
+# Fewest stickers of a frame that is used.
 FEWEST = 4
-# Error of a centre that teaching and the image of a sticker leave, the same while it stands still.
+# Standard deviation of a centre's error from teaching and image formation. This error is constant
+# while the sticker stands still.
 TAUGHT_OFFSET_PX = 3e-4
 
 
 class DriftWatch:
-    """Watch for movements of the rig since it was calibrated and taught.
+    """Detection of movements of the rig since its calibration and teaching.
 
     Parameters
     ----------
     geometry : MeasuringGeometry
-        Geometry that is known.
+        Geometry as the estimator knows it.
     known : KnownRig, optional
-        Accuracy of its rig; exact unless given.
+        Accuracy of the geometry's rig. By default, the rig is exact.
     frame_period : float
         Time from frame to frame, s.
     chance : float
         Probability of a false alarm in a run, however long.
     offset_px : float
-        Error of a centre for reasons that are not noise.
+        Standard deviation of a centre's systematic error.
     base : bool
-        True if the base's stickers are given as well.
+        True if the base's stickers are observed as well.
 
     Raises
     ------
     CmmError
-        If ``chance`` is no probability.
+        If ``chance`` is not between 0 and 1.
 
     Examples
     --------
@@ -72,7 +73,9 @@ class DriftWatch:
         base: bool = False,
     ) -> None:
         if not 0.0 < chance < 1.0:
-            raise CmmError(f"the chance of a false alarm lies between 0 and 1, got {chance!r}")
+            raise CmmError(
+                f"the probability of a false alarm must lie between 0 and 1, got {chance!r}"
+            )
         self.geometry = geometry
         self.chance = chance
         self.watches_base = base
@@ -83,7 +86,7 @@ class DriftWatch:
         self.restart()
 
     def restart(self) -> None:
-        """Begin a new run, and forget what was found."""
+        """Begin a new run, without findings from earlier runs."""
         taught = self.geometry.taught
         known = self._known
         centres = len(taught.platform_places) + (
@@ -95,7 +98,7 @@ class DriftWatch:
             else known.covariance / np.outer(SIZES[:RIG], SIZES[:RIG])
         )
         values, vectors = np.linalg.eigh(covariance)
-        # Parameters that are known exactly leave directions without variance.
+        # Directions without variance belong to parameters that are known exactly.
         kept = values > 1e-12 * max(float(values[-1]), 1e-300)
         delay_std = 0.0 if known is None else known.exposure_std
         offsets = np.full(4 * centres, self._offset_std)
@@ -109,16 +112,15 @@ class DriftWatch:
         self._noticed: int | None = None
 
     def look(self, measurement: Measurement, images: StereoImages, observer: Observer) -> None:
-        """Take the next frame, as ``add``; watched stickers of the base are looked for in its
-        images.
-        """
+        """Use the next frame as ``add`` does, and observe the base in its images if watched."""
         self.add(
             measurement, self._base_in(images, observer) if len(measurement.target_ids) else None
         )
 
     def _base_in(self, images: StereoImages, observer: Observer) -> StickerObservation | None:
-        """Return the base's stickers in a frame; None where nobody watches them, or too few
-        agree.
+        """Return the stickers of the base in a frame.
+
+        The result is None if the base is not watched, or if too few stickers agree.
         """
         if not self.watches_base:
             return None
@@ -132,9 +134,9 @@ class DriftWatch:
             return None
 
     def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
-        """Take the next frame; ``base`` holds the base's stickers observed in it.
+        """Use the next frame. ``base`` contains the stickers of the base that it shows.
 
-        A lost frame only says that time passes.
+        For a lost frame, only the time is advanced.
         """
         time = self._frames * self._period
         self._frames += 1
@@ -175,7 +177,7 @@ class DriftWatch:
         )
 
     def _goes_on(self, measurement: Measurement, base: StickerObservation | None) -> bool:
-        """Tell whether the same stickers are seen as in the frames that wait to be counted."""
+        """Tell whether a frame shows the same stickers as the block that is being filled."""
         if self._platform is None or not np.array_equal(self._platform_ids, measurement.target_ids):
             return False
         seen = None if base is None or not self.watches_base else base.index
@@ -184,7 +186,7 @@ class DriftWatch:
         return np.array_equal(self._base.index, seen)
 
     def _begin(self, measurement: Measurement, base: StickerObservation | None) -> None:
-        """Let frames with these stickers wait to be counted."""
+        """Begin a block of frames with the stickers of this frame."""
         taught = self.geometry.taught
         self._platform_ids = measurement.target_ids
         index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
@@ -195,7 +197,7 @@ class DriftWatch:
             self._base = Sightings(base.index, taught.base_places[base.index], camera_from_base)
 
     def _close(self, end: int) -> None:
-        """Make a block of the frames that wait, after so many frames of the run."""
+        """End the block that is being filled, after ``end`` frames of the run."""
         if self._platform is None:
             return
         self._blocks.append(_Block(self._platform, self._base, end))
@@ -204,9 +206,10 @@ class DriftWatch:
             self._count()
 
     def _count(self) -> None:
-        """Count the blocks.
+        """Evaluate the finished blocks.
 
-        Matrices are small: a second thread of the BLAS takes ten times as long.
+        BLAS is limited to one thread: with more, it takes ten times as long on these small
+        matrices.
         """
         with self._threads.limit(limits=1, user_api="blas"):
             for block, products in zip(self._blocks, self._products(), strict=True):
@@ -219,9 +222,9 @@ class DriftWatch:
         self._blocks.clear()
 
     def _products(self) -> list[Array]:
-        """Return the products of each block, as the evidence takes them.
+        """Return the products of each block for ``Evidence.step``.
 
-        Blocks with the same stickers are computed together.
+        The products of blocks with the same stickers are computed together.
         """
         alike: dict[tuple[bytes, bytes | None], list[int]] = {}
         for number, block in enumerate(self._blocks):
@@ -243,9 +246,9 @@ class DriftWatch:
 
 @dataclass(frozen=True)
 class _Block:
-    """Frames with the same stickers of the platform, and of the base where it is watched.
+    """Frames with the same stickers of the platform, and of the base if it is watched.
 
-    ``end`` is the number of frames of the run that had passed.
+    ``end`` is the number of frames of the run up to the end of the block.
     """
 
     platform: Sightings
@@ -254,7 +257,7 @@ class _Block:
 
     @property
     def stickers(self) -> tuple[bytes, bytes | None]:
-        """Key of the stickers."""
+        """Key that is equal for blocks with the same stickers."""
         return (
             self.platform.index.tobytes(),
             None if self.base is None else self.base.index.tobytes(),

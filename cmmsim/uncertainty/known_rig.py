@@ -1,4 +1,4 @@
-"""A stereo rig as it is known: its parameters, and their covariance."""
+"""Stereo rig with the parameters that a calibration found, and their covariance."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from cmmsim.geometry.camera import INTRINSIC_NAMES
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 
-# Negative eigenvalues that rounding may leave of a covariance, over the largest, in units of its
-# standard deviations.
+# Tolerance for rounding errors in a covariance that is scaled to unit variances. It applies to the
+# symmetry and, per row, to negative eigenvalues.
 ROUNDING = 1e-9
 
 PHOTOGRAPHED = (
     np.diag([*2 * (1.0, 1.0, 0.5, 0.5, 2e-3, 2e-3, 1e-4, 1e-4, 0.0), *3 * (5e-5,), *3 * (1e-4,)])
     ** 2
 )
-"""Covariance (24, 24) of a rig that was calibrated by fifteen photographs of a board.
+"""Covariance (24, 24) of a rig that was calibrated from fifteen photographs of a board.
 
-Real photographs gave focal lengths to 1 px and principal points to 0.5 px. The other entries are
-consistent with these."""
+With real photographs, the standard deviations were 1 px for focal lengths and 0.5 px for principal
+points. The other entries are assumed, consistently with these."""
 
 
 @dataclass(frozen=True)
 class KnownRig:
-    """Rig that is known with a covariance.
+    """Known parameters of a rig, with the covariance of their errors.
 
     Parameters
     ----------
     rig : StereoRig
-        Rig as it is known.
+        Rig with the known parameters.
     covariance : ndarray, shape (24, 24)
         Covariance of true minus known parameters, in the order of PARAMETER_NAMES. Rows of exact
         parameters are zero.
     exposure_std : float
-        Standard deviation of the time by which the right camera exposes later, s.
+        Standard deviation of the delay of the right camera's exposure, s.
 
     Raises
     ------
     CmmError
-        If this is no covariance; the message names the first parameter at fault.
+        If the matrix is not a covariance.
     """
 
     rig: StereoRig
@@ -62,14 +62,14 @@ class KnownRig:
         )
         if len(bad):
             raise CmmError(
-                f"the covariance of a rig is none: that of {PARAMETER_NAMES[bad[0]]} is negative "
-                "or not symmetric"
+                "the covariance of a rig is not valid: the row of "
+                f"{PARAMETER_NAMES[bad[0]]} has a negative variance or is not symmetric"
             )
         least = float(np.linalg.eigvalsh(unit)[0])
         if least < -len(unit) * ROUNDING:
             raise CmmError(
-                f"the covariance of a rig is none: its smallest eigenvalue is {least:.3g}, in "
-                "units of std"
+                "the covariance of a rig is not valid: scaled to unit variances, its smallest "
+                f"eigenvalue is {least:.3g}"
             )
         covariance.setflags(write=False)
         object.__setattr__(self, "covariance", covariance)
@@ -78,7 +78,7 @@ class KnownRig:
     def drawn(
         cls, true: StereoRig, covariance: Array, rng: np.random.Generator, exposure_std: float = 0.0
     ) -> KnownRig:
-        """Draw what a calibration with this covariance (24, 24) would have found of a true rig."""
+        """Draw a random result of a calibration of a true rig with this covariance (24, 24)."""
         std, unit = _standardised(cls(true, covariance).covariance)
         values, vectors = np.linalg.eigh(unit)
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
@@ -86,10 +86,10 @@ class KnownRig:
         return cls(true.moved(-std * draw), covariance, exposure_std)
 
     def line_std(self, points: Array) -> float:
-        """Return the largest standard deviation, px, of images of points off their epipolar lines.
+        """Return the largest standard deviation of the distance from epipolar lines, px.
 
-        The lines are those of the known rig, whose errors move images of points (n, 3) in the
-        camera frame.
+        Errors of the known rig cause these distances. The largest value is that over all points (n,
+        3) in the camera frame.
         """
         std = np.sqrt(np.diag(self.covariance))
         moved = []
@@ -108,8 +108,9 @@ class KnownRig:
         )
 
     def _off_lines(self, true: StereoRig, points: Array) -> Array:
-        """Return signed distances (n,) px of right images of points from the epipolar lines of left
-        ones.
+        """Return signed distances (n,) px of right images from the epipolar lines of left images.
+
+        The rig ``true`` forms the images of the points (n, 3), and the known rig has the lines.
         """
         left, right = (
             np.column_stack([camera.undistort(pixels)[0], np.ones(len(points))])
@@ -120,23 +121,23 @@ class KnownRig:
 
 
 def _standardised(covariance: Array) -> tuple[Array, Array]:
-    """Return standard deviations (24,), and a covariance (24, 24) in their units."""
+    """Return the standard deviations (24,), and the covariance (24, 24) scaled by them."""
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(std > 0.0, std, 1.0)
     return std, covariance / np.outer(scale, scale)
 
 
 def rig_changes(changes: Mapping[str, float]) -> Array:
-    """Return changes (24,) of a rig's parameters from those that are named, in their units.
+    """Return changes (24,) of all parameters of a rig from changes by name, in the same units.
 
-    Raises CmmError for a name that is none of PARAMETER_NAMES, and ShapeError for a number that is
-    not finite.
+    Raises CmmError for a name that is not one of PARAMETER_NAMES, and ShapeError for a number that
+    is not finite.
     """
     values = np.zeros(len(PARAMETER_NAMES))
     for name, value in changes.items():
         if name not in PARAMETER_NAMES:
             raise CmmError(
-                f"a rig has no parameter {name!r}: it has left. and right. with "
+                f"a rig has no parameter {name!r}: valid are left. and right. with "
                 f"{', '.join(INTRINSIC_NAMES)}, and right_from_left. with {', '.join(PLACE_NAMES)}"
             )
         values[PARAMETER_NAMES.index(name)] = finite_array(

@@ -63,7 +63,7 @@ def sized(*sides):
     [
         (
             lambda: sized(2.0, 0.5, 0.5),
-            r"2000 x 500 x 500 mm is not wh.*corner \(-1000, .*px.*largest cube.*682 mm",
+            r"2000 x 500 x 500 mm is not wh.*corner \(-1000, .*px.*largest visible cube.*682 mm",
         ),
         (lambda: sized(0.5, 0.5, 3.0), r"front face comes within \d+ mm"),
         (lambda: sized(0.5, 0.05, 0.5), "at least 100 mm"),
@@ -240,7 +240,7 @@ def test_noise_free_latency_is_exact_and_needs_a_motion():
         assert found.mean == pytest.approx(latency, abs=1e-9)
         assert found.std < 1e-9
     times = np.arange(10) / 60.0
-    with pytest.raises(cmmsim.ShapeError, match="never stands still"):
+    with pytest.raises(cmmsim.ShapeError, match="without standstill"):
         estimate_latency(times, np.zeros((10, 3)), lambda t: np.zeros((len(t), 3)), 0.5)
     with pytest.raises(cmmsim.ShapeError, match="four reports"):
         estimate_latency(times[:3], np.zeros((3, 3)), ellipse, 0.5)

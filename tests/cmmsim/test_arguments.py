@@ -95,7 +95,7 @@ def test_images_of_another_size_or_depth_are_refused(sensor, shape):
     deep = cmmsim.StereoFrame(*(image.astype(np.uint16) for image in (DARK.left, DARK.right)))
     refused(
         lambda: cmmsim.measure_frame(deep, sensor.estimator),
-        "is uint16, but the camera's bit_depth 8 makes uint8",
+        "is uint16, but the camera's bit_depth 8 requires uint8",
     )
     refused(
         lambda: cmmsim.Tracker(sensor.estimator).measure(cmmsim.StereoFrame(bad, DARK.right)),
@@ -108,7 +108,7 @@ def test_images_of_another_size_or_depth_are_refused(sensor, shape):
     [
         (
             lambda s: cmmsim.load_sensor("ctrack780", taught=3),
-            "taught must be what .*, got 3 of type int",
+            "taught must be a result of .*, got 3 of type int",
         ),
         (
             lambda s: cmmsim.load_sensor("ctrack780", progress=3),
@@ -124,10 +124,13 @@ def test_images_of_another_size_or_depth_are_refused(sensor, shape):
         ),
         (
             lambda s: cmmsim.Sensor("ctrack780"),
-            "made of a SensorFile; .*, got ctrack780 of type str",
+            "Sensor takes a SensorFile; .*, got ctrack780 of type str",
         ),
         (lambda s: s.capture(np.zeros(5)), "six finite numbers"),
-        (lambda s: s.look(s.home, 3), "obstacles must be transforms by name.*, got 3 of type int"),
+        (
+            lambda s: s.look(s.home, 3),
+            "obstacles must be a mapping to transforms.*, got 3 of type int",
+        ),
         (lambda s: s.measure(s.home, {"crank9": np.eye(4)}), "'crank9'.*crank1"),
         (
             lambda s: s.measure(s.home, {"crank1": MOVED.T}),
@@ -147,7 +150,7 @@ def test_images_of_another_size_or_depth_are_refused(sensor, shape):
         ),
         (
             lambda s: s.move_rig({"middle.cx_px": 1.0}),
-            "a rig has no parameter 'middle.cx_px': it has left. and right. with fx_px, ",
+            "a rig has no parameter 'middle.cx_px': valid are left. and right. with fx_px, ",
         ),
         (
             lambda s: s.move_rig({"left.k1": np.nan}),
@@ -201,7 +204,7 @@ def test_images_of_another_size_or_depth_are_refused(sensor, shape):
         ),
         (
             lambda s: cmmsim.rod_transform(np.ones(3), np.ones(3)),
-            r"a rod of 0 m from .* m points nowhere",
+            r"a rod of 0 m from .* m has no direction",
         ),
         (
             lambda s: cmmsim.rod_transform(np.zeros(3), np.ones(2)),

@@ -135,7 +135,7 @@ def test_scene_with_other_noise_keeps_contrast_and_ground_and_cannot_have_less_t
     assert shot[0] / both[0] == pytest.approx(shot[1] / both[1], rel=1e-9)
     refused(
         lambda: SCENE.with_noise(0.001),
-        r"0\.10% of the contrast is less than that of rounding, 0\.16%",
+        r"0\.10% of the contrast is less than the noise of rounding, 0\.16%",
     )
 
 
@@ -225,7 +225,7 @@ def test_a_detector_that_returns_something_else_is_named():
         ),
         (
             "tests.nowhere:detect",
-            "detector 'tests.nowhere:detect' is no importable module:name: No module named",
+            "detector 'tests.nowhere:detect' cannot be imported: No module named",
         ),
         (f"{__name__}:missing", "has no attribute 'missing'; its folder must be on PYTHONPATH"),
         (f"{__name__}:SIZE", "is of type int, which cannot be called"),

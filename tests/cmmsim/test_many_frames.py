@@ -170,12 +170,14 @@ def test_what_moves_is_measured_as_it_moves():
 def test_rows_of_numbers_are_asked_for_and_may_be_none(renderer):
     sensor = exact(renderer=renderer)
     two = [sensor.home] * 2
-    with pytest.raises(cmmsim.ShapeError, match="there is a pose near each pose"):
+    with pytest.raises(cmmsim.ShapeError, match="near needs six finite numbers per pose"):
         sensor.measure_many(two, near=sensor.home)
-    with pytest.raises(cmmsim.ShapeError, match="a pose rate to each pose, six finite numbers"):
+    with pytest.raises(
+        cmmsim.ShapeError, match="each pose needs a pose rate of six finite numbers"
+    ):
         sensor.measure_many(two, two[0])
     for wrong in ([[1.0, 2.0], [1.0]], None, np.array(1.0)):
-        with pytest.raises(cmmsim.ShapeError, match="poses are rows of six finite numbers"):
+        with pytest.raises(cmmsim.ShapeError, match="each pose is a row of six finite numbers"):
             sensor.measure_many(wrong)
     for none in ([], np.zeros((0, 6))):
         empty = sensor.measure_many(none)

@@ -61,7 +61,7 @@ def test_each_run_drifts_from_its_own_beginning_and_what_teaching_sees_stands_st
         (
             {"right.centre": 1.0},
             100,
-            "a rig has no parameter 'right.centre': it has left. and right. with fx_px",
+            "a rig has no parameter 'right.centre': valid are left. and right. with fx_px",
         ),
         ({"right.cx_px": np.nan}, 100, "the change of right.cx_px must be a finite number"),
         ({"right.cx_px": 0.1}, 1, "at least 2, got 1"),

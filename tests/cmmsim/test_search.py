@@ -45,7 +45,7 @@ BESIDE = apply(pose_to_transform([0.0, 0.3, 0.0, 0.3, 0.0, 0.0]), LAYOUT)
     [
         (
             cloud(np.arange(3), 0, 1)[0],
-            "platform: 3 of 18 stickers recognised among 3 points, at least 4 needed",
+            "platform: 3 of 18 stickers recognised among 3 points, at least 4 are needed",
         ),
         (cloud(np.arange(0), 2, 1)[0], "platform: 0 of 18 stickers recognised among 2 points"),
         (np.zeros((0, 3)), "platform: 0 of 18 stickers recognised among 0 points"),

@@ -25,7 +25,7 @@ BESIDE = {"translation": [-0.91, 0.01, 0.33], "rotation_vector": [0.02, -0.66, -
         ({"rig.baseline": "wide"}, "rig.baseline: .*number.*'wide'"),
         (
             {"rig.baseline": -1.0},
-            "rig.baseline: -1 is beyond what a machine can have, 1e-06 to 1000 m",
+            "rig.baseline: -1 is out of range, must be 1e-06 to 1000 m",
         ),
         ({"camera.dsnu": float("nan")}, "camera.dsnu: .*finite"),
         ({"camera.bit_depth": 9}, "camera.bit_depth: .*8, 10 or 12.*9"),
@@ -50,17 +50,17 @@ BESIDE = {"translation": [-0.91, 0.01, 0.33], "rotation_vector": [0.02, -0.66, -
         ),
         (
             {"timing.exposure": 0.02},
-            "timing: exposure 0.02 s is longer than a frame of 60 Hz, 0.01667 s$",
+            "timing: exposure 0.02 s is longer than the frame period at 60 Hz, 0.01667 s$",
         ),
         (
             {"stickers.placement": [0.002, 0.001]},
-            r"placement \[0.002, 0.001\] m is the smallest and the largest",
+            r"placement \[0.002, 0.001\] m must be the smallest and the largest",
         ),
         ({"stickers.ring_radius": 0.002}, "ring_radius 0.002 m must be at least radius 0.003 m"),
         ({"stickers.sticker_level": 8}, "sticker_level 8 must be above ring_level 8"),
         (
             {"stickers.per_plane": 50},
-            r"per_plane = 50 puts stickers 0\.0\d+ m apart on plane A.* 0\.018 m",
+            r"per_plane = 50, stickers on plane A are 0\.0\d+ m apart.* 0\.018 m",
         ),
         # what no body and no rig can be
         (
@@ -75,15 +75,15 @@ BESIDE = {"translation": [-0.91, 0.01, 0.33], "rotation_vector": [0.02, -0.66, -
         ),
         (
             {"rig.right_from_left": BESIDE | {"translation": [0.91, 0.01, 0.33]}},
-            "right camera must stand on the right",
+            "right camera must stand to the right",
         ),
         (
             {"rig.right_from_left": BESIDE | {"translation": [0.0, 0.0, 0.0]}},
             "at least 0.001 m apart",
         ),
         # what no change can be
-        ({3: 4}, "key 3 of the changes is no name"),
-        ([1], r"changes = \[1\] must be given by key"),
+        ({3: 4}, "key 3 of the changes is not a text"),
+        ([1], r"changes = \[1\] must be a mapping of keys"),
         ({"based_on": "nothing"}, "based_on = 'nothing' cannot be changed"),
     ],
 )
@@ -100,9 +100,9 @@ def test_what_is_wrong_is_named_in_one_line(changes, message):
         (b'based_on = "ctrack78"', r"mine.toml: based_on: unknown sensor .*ctrack78.*ctrack780"),
         (
             b'based_on = "mine.toml"',
-            "which is itself based on 'mine.toml': name a sensor whose file is complete",
+            "is itself based on 'mine.toml': name a sensor with a complete file",
         ),
-        (b'based_on = "ctrack780_29hz"', "which is itself based on 'ctrack780'"),
+        (b'based_on = "ctrack780_29hz"', "is itself based on 'ctrack780'"),
         (b"based_on = 3", "based_on: Input should be a valid string"),
     ],
 )

@@ -126,7 +126,8 @@ def test_streaks_beyond_the_limit_are_lost_with_their_length():
     pose, rate = sensor.home, [0, 0.82, 0, 0, 0, 0]
     assert np.linalg.norm(true_movements(sensor, pose, rate), axis=-1).max() > LONGEST_SMEAR_PX
     with pytest.raises(
-        LostError, match=r"draws stickers out over (8|9)\.\d px, at most 8\.0 px can be measured"
+        LostError,
+        match=r"stickers move by (8|9)\.\d px during the exposure, at most 8\.0 px can be measured",
     ):
         sensor.estimator.measure_anew(sensor.look(pose, pose_rate=rate), camera_from(sensor, pose))
 

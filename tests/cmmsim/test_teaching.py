@@ -128,7 +128,7 @@ def test_one_kept_from_before_setups_were_stated_or_put_together_by_hand_needs_t
     with pytest.raises(cmmsim.TeachingError, match="'ctrack780', not to 'ctrack780_29hz'"):
         load(taught=by_hand, name="ctrack780_29hz")
     with pytest.raises(
-        cmmsim.TeachingError, match="holds 18 stickers of the platform, sensor 'ctrack780' has 12"
+        cmmsim.TeachingError, match="has 18 stickers of the platform, sensor 'ctrack780' has 12"
     ):
         load({"stickers.per_plane": 4}, taught=by_hand)
 
@@ -203,4 +203,8 @@ def test_teaching_names_the_stickers_that_no_image_shows():
 
 def test_planes_that_meet_in_no_point_cannot_be_taught():
     sensor = teaching_itself({"platform.planes.B.normal": [0.0, 0.0, 1.0]})
-    refused(sensor.teach, r"planes A, B and C meet in no point.*volume of 0", cmmsim.TeachingError)
+    refused(
+        sensor.teach,
+        r"planes A, B and C do not meet in one point.*volume of 0",
+        cmmsim.TeachingError,
+    )

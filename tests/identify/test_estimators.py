@@ -192,7 +192,7 @@ def test_what_is_missing_or_unknown_is_said_before_anything_is_written(
     for arguments, says in (
         (("--out", tmp_path / "none"), "no run folder"),
         (("--out", tmp_path), "cmmsim validate"),
-        (("--out", folder, "--add", "magic:wand"), "'magic:wand' is no importable module:name"),
+        (("--out", folder, "--add", "magic:wand"), "'magic:wand' cannot be imported"),
     ):
         assert command("estimators", *arguments) == 1
         assert says in one_line(capsys.readouterr().err)

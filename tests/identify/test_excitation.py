@@ -280,9 +280,7 @@ def test_the_best_candidate_is_chosen_by_a_criterion_of_ones_own(tmp_path, monke
     sizes = [np.linalg.norm(free.of(trajectory)) for trajectory in drawn]
     assert np.linalg.norm(free.of(chosen)) == pytest.approx(min(sizes))
     assert scenario_from_toml(scenario.to_toml()) == scenario
-    with pytest.raises(
-        ScenarioError, match="criterion 'own_criterion:beauty' is no importable module:name"
-    ):
+    with pytest.raises(ScenarioError, match="criterion 'own_criterion:beauty' cannot be imported"):
         design_trajectories(design_of(quick(criterion="own_criterion:beauty"), robot), 3)
     with pytest.raises(
         ScenarioError,
