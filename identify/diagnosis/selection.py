@@ -14,7 +14,7 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.fit import Point, fit
-from identify.diagnosis.ranking import ALIKE, Ranked, Rows, misfit_of, rank, together
+from identify.diagnosis.ranking import ALIKE, NEAR, Ranked, Rows, misfit_of, rank, together
 from identify.estimation.explanation import Misfit
 from identify.estimation.output_error import OutputErrorProblem
 
@@ -23,6 +23,9 @@ CHANCE = 0.01
 
 MOST = 3
 """Largest number of causes or groups that are selected."""
+
+CLOSE = 0.8
+"""Share of the best statistic from which on a cause that is tried at a size is fitted, too."""
 
 
 @dataclass(frozen=True)
@@ -81,33 +84,21 @@ def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -
             break
         alike = together(ranking, rows, now.beside_all.part(now.residual))
         best = alike[0]
-        # a group may be asked after one of its members
-        new = [k for k, place in enumerate(best.candidate.places) if place not in places]
-        added = tuple(best.candidate.places[k] for k in new)
-        beside = companions(causes, added)
-        # a column that was tried at a size is exact there
-        starts = [
-            causes[best.candidate.places[k]].tried[:1] or best.score.sizes[k : k + 1] for k in new
-        ]
-        added = (*added, *beside)
-        sizes = np.concatenate([now.sizes, *starts, np.zeros(len(beside))])
-        columns = np.hstack([now.columns, point.columns[:, added]])
-        try:
-            kept, fitted = _fitted(
-                problem, now.parameters, causes, (*places, *added), sizes, columns
-            )
-        except DynamicsError:
-            # the model with the cause does not run: no more can be said
-            break
-        enough = now.cost - fitted.cost > np.log(len(now.residual))
-        if not (enough and set(added) & set(kept)):
-            # to first order it explained something, and fitted it does not
+        trial = _trial(problem, point, now, causes, places, best)
+        rival = _rival(causes, best, ranking)
+        other = rival and _trial(problem, point, now, causes, places, rival)
+        if rival and other and (trial is None or other.point.cost < trial.point.cost - NEAR):
+            # fitted, the two can be told apart
+            trial = other
+            best = rival
+            alike = (rival,)
+        if trial is None:
             break
         names = tuple(one.candidate.name for one in alike[1:])
-        one = Selected(best, added, now.cost - fitted.cost, names)
-        chosen = _of_places((*chosen, one), kept)
-        places = kept
-        now = fitted
+        one = Selected(best, trial.added, now.cost - trial.point.cost, names)
+        places = trial.places
+        chosen = _of_places((*chosen, one), places)
+        now = trial.point
         ranking = tuple(
             one
             for one in rank(causes, point.columns, now.residual, now.beside_all, rows)
@@ -116,6 +107,64 @@ def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -
         )
     before, after = (misfit_of(rows, one.residual) for one in (point, now))
     return Selection(chosen, places, now, first, before, after)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Candidate that was fitted beside those before it.
+
+    added: places of its causes. places: those of all causes that are left, in the order of the
+    point's sizes.
+    """
+
+    added: tuple[int, ...]
+    places: tuple[int, ...]
+    point: Point
+
+
+def _trial(
+    problem: OutputErrorProblem,
+    first: Point,
+    now: Point,
+    causes: Sequence[Cause],
+    places: tuple[int, ...],
+    best: Ranked,
+) -> Trial | None:
+    """Fit a candidate beside the causes at some places, or return None where that does not help.
+
+    first: optimum without any cause, with the columns of all. now: optimum with those at places.
+    """
+    # a group may be asked after one of its members
+    new = [k for k, place in enumerate(best.candidate.places) if place not in places]
+    own = tuple(best.candidate.places[k] for k in new)
+    beside = companions(causes, own)
+    added = (*own, *beside)
+    # a column that was tried at a size is exact there
+    starts = [
+        causes[place].tried[:1] or best.score.sizes[[k]] for k, place in zip(new, own, strict=True)
+    ]
+    sizes = np.concatenate([now.sizes, *starts, np.zeros(len(beside))])
+    columns = np.hstack([now.columns, first.columns[:, added]])
+    try:
+        kept, point = _fitted(problem, now.parameters, causes, (*places, *added), sizes, columns)
+    except DynamicsError:
+        # the model with the cause does not run
+        return None
+    enough = now.cost - point.cost > np.log(len(now.residual))
+    return Trial(added, kept, point) if enough and set(added) & set(kept) else None
+
+
+def _rival(causes: Sequence[Cause], best: Ranked, ranking: Sequence[Ranked]) -> Ranked | None:
+    """Return a cause that may do better than the best candidate once it is fitted, or None.
+
+    The statistic of one that is tried at a size is the roughest.
+    """
+    for one in ranking:
+        cause = causes[one.candidate.places[0]]
+        close = one.score.statistic > CLOSE * best.score.statistic
+        if cause.tried and close and cause.group != causes[best.candidate.places[0]].group:
+            return one
+    return None
 
 
 def companions(causes: Sequence[Cause], places: tuple[int, ...]) -> tuple[int, ...]:
