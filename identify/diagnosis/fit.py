@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from identify.arrays import Array, triangular_factor
 from identify.diagnosis.cause import Cause, with_causes
-from identify.diagnosis.score import Beside, Score, cause_columns, parameter_columns, score
+from identify.diagnosis.score import Beside, Score, allowed, cause_columns, parameter_columns, score
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.output_error import OutputErrorProblem
 
@@ -144,10 +144,11 @@ def fit(
 
     Raises LoopFailure if the model is unstable at the start.
     """
-    bounds = problem.bounds
+    there = with_causes(problem, causes, sizes)
+    bounds = there.bounds
     steps = steps_of(causes)
     least = np.array([one.least for one in causes])
-    parameters = start
+    parameters = allowed(there, start)
     # A cause that is tried at a size stays there until the parameters have followed. The chord to
     # it, by which it was ranked, leads the search astray.
     columns = columns * [float(not one.tried) for one in causes]

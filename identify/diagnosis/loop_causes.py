@@ -212,15 +212,20 @@ def laws(settings: LoopSettings) -> tuple[Cause, ...]:
     if other is None:
         return ()
 
-    def under_it(settings: LoopSettings, size: float) -> LoopSettings:
+    def law(settings: LoopSettings, size: float) -> LoopSettings:
         return replace(settings, drives=replace(settings.drives, law=other))
+
+    def under_it(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
+        changed = in_each_run(in_settings(law))(problem, size)
+        # the law has gains that must be above zero
+        return replace(changed, guess=replace(problem.guess, drive=other))
 
     return (
         Cause(
             name=f"drives of the law {other}",
             unit="",
             group="law of the drives",
-            change=in_each_run(in_settings(under_it)),
+            change=under_it,
             step=0.0,
             remedy=lambda size: f"--set model.drive={other}, or --set model.drive=auto",
             tried=(1.0,),

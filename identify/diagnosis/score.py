@@ -63,12 +63,19 @@ def parameter_columns(problem: OutputErrorProblem, parameters: Array) -> tuple[A
     return np.concatenate(parts), np.vstack(rows)
 
 
+def allowed(problem: OutputErrorProblem, parameters: Array) -> Array:
+    """Return parameters (p,) that a problem's law of the drives allows, raised where it must be."""
+    bounds = problem.bounds
+    above = np.isin(bounds.layout.names, problem.guess.above_zero)
+    return np.where(above, np.maximum(parameters, bounds.lower), parameters)
+
+
 def each_residuals(problems: Sequence[OutputErrorProblem], parameters: Array) -> list[Array | None]:
     """Return the `residuals` (m,) of each problem, None where its model is unstable."""
 
     def of(problem: OutputErrorProblem) -> Array | None:
         try:
-            return residuals(problem, parameters)
+            return residuals(problem, allowed(problem, parameters))
         except DynamicsError:
             return None
 
