@@ -8,18 +8,18 @@ Sensor
     Sensor.teach()                     -> Taught, for sensors with the same cameras and bodies
     require_opengl()                   raises OpenGLMissingError if pyrender cannot draw
 
-Images from elsewhere
+Images from other sources
     measure_frame(StereoFrame(left, right), sensor.estimator)  -> Measurement
-    Tracker(sensor.estimator).measure(images)                  -> Measurement, frame after frame
+    Tracker(sensor.estimator).measure(images)                  -> Measurement of successive frames
 
 Cameras that drift
     Sensor.drift_rig({"right.cx_px": 0.1}, frames)  moves the true rig, not the estimator's rig
-    Sensor.watch_drift()                            -> DriftWatch, whose `finding` names a change
+    Sensor.watch_drift()                            -> DriftWatch; its `finding` names a movement
 
 Geometry
     pose_to_transform(pose), transform_to_pose(transform)  poses (6,) and transforms (4, 4)
     PinholeCamera, StereoRig                               cameras with lenses, as in `sensor.rig`
-    rod(length, radius), rod_transform(start, end)         a body that may hide stickers
+    rod(length, radius), rod_transform(start, end)         a body that can hide stickers
 
 Faults of images
     FaultGenerator(sensor.estimator).draw(kind, pose, rng)  -> Fault

@@ -17,9 +17,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cmmsim.errors import CmmError, ShapeError
 
-# Characters of a refused value that a message shows.
+# Largest number of characters of a refused value in a message.
 SHOWN_CHARACTERS = 120
-# Bytes of a file: far more than a person writes, and still read within seconds.
+# Largest number of bytes of a file. People write far smaller files, and larger ones take long to
+# read.
 LARGEST = 500_000
 # Largest nesting depth of tables and lists, and largest number of parts of a dotted key.
 DEEPEST = 16
@@ -28,7 +29,7 @@ TOO_DEEP = f"keys, tables or lists more than {DEEPEST} deep"
 # scripts takes 4 bytes.
 NAME = r"^\w[\w .+-]*$"
 LONGEST_NAME = 60
-# Complaints about one file that a message lists.
+# Largest number of errors of one file in a message.
 MOST_COMPLAINTS = 8
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 _TEXTS = re.compile(
@@ -67,7 +68,7 @@ def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDAr
 
 
 def require_kind(value: object, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raise CmmError, beginning with the text ``wanted``, unless a value is of type ``kind``."""
+    """Raise CmmError unless a value is of type ``kind``. Its message begins with ``wanted``."""
     if not isinstance(value, kind):
         raise CmmError(f"{wanted}, got {_shown(value)} of type {type(value).__name__}")
 
@@ -107,7 +108,7 @@ def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
         with place.open("rb") as file:
             content = file.read(LARGEST + 1)
         if len(content) > LARGEST:
-            raise refusal(f"{source} has more than {LARGEST:,} bytes, which no such file needs")
+            raise refusal(f"{source} has more than {LARGEST:,} bytes, which is the limit")
         return content.decode("utf-8")
     except OSError as error:
         raise refusal(f"cannot read {source}: {error.strerror or error}") from error
@@ -186,7 +187,7 @@ def _fault(content: dict[str, Any]) -> str:
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             return "an integer beyond 64 bits"
         elif not isinstance(value, (str, int, float)):
-            return f"a date or time, {value}, which no such file needs"
+            return f"a date or time, {value}, which is not allowed"
     return ""
 
 
@@ -226,5 +227,5 @@ def checked_seed(seed: int) -> int:
     except TypeError:
         number = -1
     if number < 0:
-        raise CmmError(f"a seed is a whole number from 0 on, got {seed!r}")
+        raise CmmError(f"a seed must be a whole number, 0 or more, got {seed!r}")
     return number

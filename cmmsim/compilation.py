@@ -38,8 +38,8 @@ class CompilationWarning(UserWarning):
 def compiled(function: F) -> Dispatcher[F]:
     """Compile a kernel on its first call, or load it from the cache.
 
-    The cache is a folder beside the source, or the user's cache folder if that cannot be written
-    to. Cached code is not loaded if an untrusted user could have written it.
+    The cache is a folder beside the source if this is writable, and otherwise the user's cache
+    folder. Cached code is not loaded if an untrusted user could have written it.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     try:
@@ -54,7 +54,7 @@ def compiled(function: F) -> Dispatcher[F]:
         _save_closed, kernel._cache.save_overload, kernel._cache.cache_path
     )
     # numba checks only whether the function's own file has changed, but kernels call kernels of
-    # other files. The digest covers all of them.
+    # other files. Therefore a digest of all kernels is used instead.
     file = kernel._cache._cache_file
     file._source_stamp = _stamp()
     # numba unpickles a cache index only if the version matches. With the digest in the version, it

@@ -280,8 +280,7 @@ def _round(
     bounds = _bounds(scene, condition.psf_px, centres, shapes, fit_size + 2)
     scores = []
     for detector in detectors:
-        # The errors in windows with noise show the noise; in the same windows without noise, the
-        # bias.
+        # Windows with noise show the whole error, and the same windows without noise the bias.
         found, without_noise = (
             detector.detect(
                 SpotWindows(

@@ -1,4 +1,4 @@
-"""Random faults of stereo images, for tests that a measurement corrects or refuses such images.
+"""Random faults of stereo images. A measurement must still be right, or refuse the images.
 
     faults = cmmsim.FaultGenerator(sensor.estimator)
     fault = faults.draw("false_discs", pose, np.random.default_rng(1))
@@ -29,9 +29,9 @@ from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator
 
 # Sides of the boxes that hide stickers, m.
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)
-# Half of all faults that change several stickers change at most this number of them.
+# With probability one half, a fault changes at most this number of stickers.
 FEW = 4
-# The method with the name of a kind, after an underscore, returns its marks or the whole fault.
+# For each kind, the method of FaultGenerator with the name _<kind> returns marks or a whole fault.
 KINDS = (
     *(
         "hidden",

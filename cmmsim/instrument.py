@@ -183,7 +183,7 @@ class Instrument:
         return self.true_cameras.at_rest
 
     def teach(self, progress: Progress | None = None) -> Taught:
-        """Teach the frames of base and platform, unless that has been done.
+        """Teach the frames of base and platform, unless they are taught already.
 
         Parameters
         ----------
@@ -273,7 +273,7 @@ class Instrument:
         changes : mapping of str to float
             Amounts by name, as in `move_rig`. An empty mapping ends the drift.
         frames : int
-            Number of frames over which the amounts are reached. Later frames do not drift further.
+            Number of frames until the amounts are reached. Afterwards, the rig does not change.
 
         Raises
         ------

@@ -29,7 +29,7 @@ from cmmsim.without_images.drawn_stickers import StatisticalStereoCamera
 
 T = TypeVar("T")
 R = TypeVar("R")
-# Frames that are drawn and measured together.
+# Number of frames that are drawn and measured together.
 BLOCK = 32
 
 
@@ -66,7 +66,7 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Many
     rngs = frames.rngs
     expected = frames.expected
     half = 0.5 * camera.exposure * rates
-    # The movement is that of the true pose, applied to the expected pose.
+    # The true movement during the exposure is applied to the expected pose.
     back = expected @ invert(transforms_of(poses))
     first = back @ transforms_of(poses - half)
     last = back @ transforms_of(poses + half)

@@ -187,7 +187,7 @@ class Teacher:
         return seen
 
     def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
-        """Return a text that names the missing stickers outside of an image; empty if none is."""
+        """Return a text that names the missing stickers outside of an image, or an empty text."""
         outside = missing[~np.all(self.observer.rig.project(points[missing])[1], axis=0)]
         return (
             f"; {', '.join(body.sticker_ids[outside])} lie outside of an image"
@@ -320,7 +320,7 @@ def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]
 class WindowSizes:
     """Sides in px of windows, and of the fitted part around the bright spot.
 
-    ``growth`` is the ratio of the fitted part's side to its smallest side.
+    ``growth`` is the ratio of the fitted part's side to its smallest allowed side.
     """
 
     window: int
@@ -328,7 +328,7 @@ class WindowSizes:
     growth: float
 
     def plan(self) -> TeachingPlan:
-        """Return a teaching plan with windows enlarged by the same factor."""
+        """Return a teaching plan with windows enlarged by the factor ``growth``."""
         plan = TeachingPlan()
         names = ("base_window", "first_window", "platform_window")
         return replace(

@@ -118,7 +118,7 @@ class Tracker:
             return None
 
     def _found(self, images: StereoImages) -> tuple[Measurement, Array]:
-        """Return the measurement after a search of the whole images, without any prior pose."""
+        """Return the measurement after a search of the whole images."""
         found = self._estimator.locate(images)
         if self._last is None:
             return self._estimator.measure_anew(images, found)

@@ -254,8 +254,8 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
                 break
     if not (seen and seen[0] < 0.0 <= seen[-1]):
         raise AcceptanceError(
-            f"{path.name}: the bar must be measured at rest and in motion, but no frame of one of "
-            f"them is measured: {reason}"
+            f"{path.name}: the bar is measured in no frame at rest, or in no frame in motion: "
+            f"{reason}"
         )
     errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
     given_up = reason if in_a_row == GIVEN_UP else ""

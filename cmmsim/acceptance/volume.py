@@ -191,8 +191,8 @@ def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: fl
 class MeasuringLine:
     """Measuring line from ``start`` (3,) to ``end`` (3,), m in volume axes.
 
-    ``lengths`` (k,) are the test lengths, m. All begin at the start, and the longest ends at the
-    end.
+    ``lengths`` (k,) are the test lengths, m. All test lengths begin at ``start``, and the longest
+    extends to ``end``.
     """
 
     name: str

@@ -55,8 +55,8 @@ def change(content: dict[str, Any], changes: Mapping[str, Any], source: str) -> 
     """Apply changes to the content of a file.
 
     Unknown keys are accepted here; the schema refuses them later. ``source`` names the content in
-    messages. Raises SensorFileError for a change of ``based_on``, for a value instead of a section,
-    and for an entry inside a value.
+    messages. Raises SensorFileError for a change of ``based_on``, and if a change treats a section
+    as a value or a value as a section.
     """
     for path, value in dotted(changes).items():
         if path == "based_on":

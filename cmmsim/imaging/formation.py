@@ -29,7 +29,7 @@ from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.pose import Array, frozen
 from cmmsim.imaging.renderer import Drawable, Renderer, View, Views
 
-# Coefficients of a quadratic from its values at -1, 0 and 1.
+# Matrix that maps the values of a quadratic at -1, 0 and 1 to its coefficients.
 _QUADRATIC = frozen([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
 # Fine pixels along each side of a pixel. The point spread smooths the errors of resampling; without
 # a point spread, sharp edges need more fine pixels.
@@ -187,9 +187,9 @@ class ImageFormation:
 def _shown_places(
     camera: PinholeCamera, corners: NDArray[np.int_], size: int, margin: int, fine_size: int
 ) -> Array:
-    """Return the ideal places (k, 3, 3, 2) of the first, middle and last fine rows and columns.
+    """Return the ideal places (k, 3, 3, 2) of nodes in k windows with their margins.
 
-    Rows and columns are those of k windows with their margins.
+    The nodes are the fine pixels in the first, middle and last row and column of a window.
     """
     half = 0.5 * (size + 2 * margin) * (1.0 - 1.0 / fine_size)
     ticks = 0.5 * (size - 1) + half * np.array([-1.0, 0.0, 1.0])

@@ -66,7 +66,7 @@ def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: 
             right = float(width)
             for k in range(len(half_planes)):
                 a, b, c = half_planes[k]
-                # Each half plane shortens the scan line from one of its ends.
+                # Each half plane limits the covered part of the scan line at one end.
                 room = c - b * at - a * x
                 if a > 0.0:
                     right = min(right, room / a)

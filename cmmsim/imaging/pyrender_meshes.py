@@ -90,7 +90,7 @@ def _joined(pieces: Sequence[Mesh]) -> Mesh:
 def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
     """Return a disc whose level falls to the level ``around`` it within a band at its rim."""
     width = min(RIM_SAMPLES * sample, disc.radius)
-    middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # as much light as the sharp disc
+    middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # same total light as the sharp disc
     sides = _sides(disc.radius, sample)
     corners = np.concatenate(
         [_corners(disc, middle - 0.5 * width, sides), _corners(disc, middle + 0.5 * width, sides)]
@@ -158,8 +158,8 @@ class Laid:
     """Windows that need no depth test.
 
     ``solid`` (n,) is the patch of a window's only solid, or -1 if a depth test is needed.
-    ``filled`` (n,) states whether this solid fills the window. ``ringed`` (n,) is the stack to
-    whose lowest disc's level the window can be cleared, or -1.
+    ``filled`` (n,) states whether this solid fills the window. If a window can be cleared to the
+    level of the lowest disc of a stack, ``ringed`` (n,) is this stack, and otherwise -1.
     """
 
     solid: NDArray[np.int_]
@@ -263,8 +263,7 @@ class LaidSolids:
         )
 
     def _seen_over(self, solid: int, view: Exposure) -> NDArray[np.bool_]:
-        """Return a mask of the patches that are visible without a depth test if only they are
-        drawn.
+        """Return a mask of the patches that can be drawn over each other without a depth test.
 
         They are the solid itself and the stacks on it that face the camera.
         """

@@ -118,7 +118,7 @@ class _Uploaded:
 
 
 class _Atlas:
-    """Frame buffers of pyrender, into whose cells windows are drawn."""
+    """Drawing of windows into the cells of one large frame buffer, with shaders of pyrender."""
 
     def __init__(self, pyrender: Any) -> None:
         from OpenGL import GL

@@ -29,7 +29,7 @@ def sub_frame_poses(
 ) -> list[Array]:
     """Return, for each of N exposures, poses (m, 6) whose mean image is the image of the exposure.
 
-    Each exposure is divided into m equal parts, and the poses are those in the middle of the parts.
+    Each exposure is divided into m equal parts, and each pose belongs to the middle of a part.
     ``poses`` (N, 6) are the poses in the middle of the exposures, and ``pose_rates`` (N, 6) are
     constant. ``sticker_pixels`` returns the places (2, N, n, 2) px of all stickers at poses (N, 6).
     Raises CmmError if a sticker moves too far for MOST_SUB_FRAMES parts.
@@ -180,9 +180,7 @@ class VirtualStereoCamera:
     def whole_exposure(
         self, side: int, moments: Sequence[Array], supersampling: int
     ) -> NDArray[np.float32]:
-        """Return the mean radiance (height, width) of one whole image over the moments of an
-        exposure.
-        """
+        """Return the mean radiance (height, width) of one whole image over all moments."""
         return whole_image(self.formation, self.rig.cameras[side], moments, supersampling)
 
     def centre_error_px(self, quality: Quality) -> float:

@@ -4,8 +4,8 @@ The taught places are fitted to the observed stickers. Stickers are rejected one
 one first, in two cases:
 
 - The place of a sticker differs from the place that the other stickers predict. This test is data
-  snooping. The residual r is compared with its own covariance S - J C J'. It is smaller than the
-  sticker's noise S, because each sticker pulls the pose towards itself.
+  snooping. The residual r is compared with its own covariance S - J C J'. This covariance is
+  smaller than that of the sticker's noise, S, because each sticker pulls the pose towards itself.
 - The ellipse of a sticker in one image differs from the ellipse of an unhidden sticker. If a
   sticker is partly hidden or touches another bright spot, its centre and its rim both move.
 
@@ -198,9 +198,9 @@ def lost_reason(verdict: Array, first: str, left: Array) -> str:
     outline = verdict[kernels.OUTLINE]
     misfit = f"{place:.0f} of its place" if place >= outline else f"{outline:.0f} of its outline"
     return (
-        f"{seen} visible stickers contradict each other, {count} are left and {seen - count} "
-        f"rejected; at least {FEWEST}, and more than the rejected ones, must be left; rejected "
-        f"first was {first} with squared misfit {misfit}, at most {LARGEST_MISFIT:.1f}"
+        f"{seen} visible stickers contradict each other, {count} are left after {seen - count} "
+        f"were rejected; at least {FEWEST} and more than the rejected ones are needed; the first "
+        f"rejected one is {first} with squared misfit {misfit}, at most {LARGEST_MISFIT:.1f}"
     )
 
 

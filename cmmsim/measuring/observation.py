@@ -35,7 +35,7 @@ from cmmsim.radiometry.stereo_images import StereoImages, Windows
 
 # Longest smear that can be measured: about the size of a sticker.
 LONGEST_SMEAR_PX = 8.0
-# In standard deviations of the point spread: shorter smears do not change the result of a fit.
+# Shortest smear that changes the result of a fit, in standard deviations of the point spread.
 SHORTEST_SMEAR = 1.5
 # Smallest cosine between a sticker's normal and the line of sight at which it is searched.
 GRAZING = 0.15
@@ -48,10 +48,11 @@ class DetectionSettings:
     ``window_size`` and ``fit_size`` are the sides of windows and of fitted parts, px. ``radius`` is
     the radius of a sticker, m. ``largest_ray_gap`` limits the squared distance between the two rays
     of a sticker, in units of its variance; 25 means five sigma. ``centre_error_px`` is the rms of
-    systematic errors of a centre, such as those of the image formation. Its square is added to the
-    covariance of the centre, as is that of the detector's bias. Errors of the rig move images off
-    their epipolar lines by the standard deviation ``line_error_px``, so the two rays of a sticker
-    need not meet more closely. ``exposed_share`` is the ratio of exposure time to frame period.
+    systematic errors of a centre, such as errors of the image formation. The squares of this error
+    and of the detector's bias are added to the variances of a centre. ``line_error_px`` is the
+    standard deviation of an image's distance from its epipolar line due to errors of the rig; it
+    increases the allowed distance between two rays. ``exposed_share`` is the ratio of exposure time
+    to frame period.
     """
 
     window_size: int = 16
@@ -70,8 +71,8 @@ class DetectionSettings:
 class Outlines:
     """Ellipses of k stickers in both images.
 
-    ``shapes`` are symmetric matrices A (2, k, 2, 2), px. ``covariances`` (2, k, 3, 3), px², are
-    those of the entries A_xx, A_xy, A_yy.
+    ``shapes`` are symmetric matrices A (2, k, 2, 2), px. ``covariances`` (2, k, 3, 3), px², are the
+    covariances of the entries A_xx, A_xy, A_yy.
     """
 
     shapes: Array

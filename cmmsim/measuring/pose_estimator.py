@@ -163,9 +163,9 @@ class PoseEstimator(Observer):
     ) -> tuple[Measurement, Array]:
         """Return the measurement, and the measured camera_from_platform (4, 4).
 
-        ``expected`` is about camera_from_platform. ``swept`` are the expected transforms at the
-        beginning and at the end of the exposure. Without ``swept`` and without point spread, the
-        error of the pose exceeds its covariance if stickers move by more than half a pixel; use
+        ``expected`` is a first guess of camera_from_platform. ``swept`` are the expected transforms
+        at the beginning and at the end of the exposure. Without ``swept`` and without point spread,
+        the error of the pose exceeds its covariance if stickers move by more than half a pixel; use
         ``measure_anew`` in this case. Raises LostError.
         """
         return self.measured(self.observe(images, expected, *self._stickers, swept), expected)
@@ -208,7 +208,7 @@ class PoseEstimator(Observer):
     def measured(self, seen: StickerObservation, near: Array) -> tuple[Measurement, Array]:
         """Return the measurement from observed stickers, and the measured camera_from_platform.
 
-        ``near`` is about camera_from_platform. Raises LostError.
+        ``near`` is a first guess of camera_from_platform. Raises LostError.
         """
         places = self.taught.platform_places
         used, move, covariance = consistent(seen, near, self, self.platform, places)

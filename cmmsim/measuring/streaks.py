@@ -281,9 +281,9 @@ def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:
 def _linear_movement(by_movement: Array, excess: Array) -> Array:
     """Return a movement w (m,) that roughly explains ``excess`` (k, 3) px².
 
-    ``excess`` is linear in the entries of w w', so a symmetric matrix is fitted by least squares. w
-    is its dominant eigenvector, scaled by the root of the eigenvalue. Ellipses with large residuals
-    get less weight in each repetition.
+    The model of ``excess`` is linear in the entries of w w'. First, a symmetric matrix is fitted by
+    least squares, with less weight for ellipses with large residuals. Then w is the dominant
+    eigenvector of this matrix, times the square root of its eigenvalue.
     """
     # Movements are scaled by the pixels that they move, so that m and rad become comparable.
     scale = np.sqrt((by_movement**2).sum(axis=(0, 1)))

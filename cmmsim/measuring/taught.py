@@ -185,11 +185,11 @@ def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
 
 
 def _changes(there: str, here: str) -> str:
-    """Describe the first entries in which two setups differ, with both values."""
+    """Describe the first entries that differ between the setups of a teaching and of a file."""
     then, now = (dotted(json.loads(text)) for text in (there, here))
     keys = [key for key in sorted({*then, *now}) if then.get(key) != now.get(key)]
     shown = [
-        f"{key} {_short(then.get(key))} there, {_short(now.get(key))} here"
+        f"{key} was {_short(then.get(key))}, is {_short(now.get(key))}"
         for key in keys[:SHOWN_CHANGES]
     ]
     more = len(keys) - len(shown)

@@ -141,9 +141,9 @@ class CameraNoise:
         between two whole numbers, because the noise then decides between rounding up and down.
 
         In this case, the Fourier series of the rounding error gives the variance of a rounded
-        normal variable: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). On
-        average over all means, the variance is s² + 1/12, but all pixels of a uniform ground have
-        the same mean.
+        normal variable: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). The usual
+        variance s² + 1/12 is the average over all means. The pixels of a uniform ground all have
+        the same mean, so their variance can differ from this average.
         """
         usual = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
         if np.all(usual > NO_SWING):
@@ -201,8 +201,8 @@ class CameraNoise:
         their noise dithers the rounding. The mean of 30 or more exposures is drawn directly, as one
         normal number per pixel. This number has the mean and the variance of the mean of rounded
         and clipped grey values. Its distribution is only approximately right: clipped grey values
-        are skewed, and the mean has steps of 1/frames. Both have no effect on sums over the pixels
-        of a sticker.
+        are skewed, and the mean has steps of 1/frames. Neither matters for sums over the pixels of
+        a sticker.
         """
         if not self.enabled:
             return np.clip(

@@ -24,7 +24,7 @@ PHOTOGRAPHED = (
 """Covariance (24, 24) of a rig that was calibrated from fifteen photographs of a board.
 
 With real photographs, the standard deviations were 1 px for focal lengths and 0.5 px for principal
-points. The other entries are assumed, consistently with these."""
+points. The other entries are assumed such that they are consistent with these two."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class KnownRig:
         )
         if len(bad):
             raise CmmError(
-                "the covariance of a rig is not valid: the row of "
-                f"{PARAMETER_NAMES[bad[0]]} has a negative variance or is not symmetric"
+                "the covariance of a rig is not valid: the variance of "
+                f"{PARAMETER_NAMES[bad[0]]} is negative, or its row is not symmetric"
             )
         least = float(np.linalg.eigvalsh(unit)[0])
         if least < -len(unit) * ROUNDING:
@@ -82,7 +82,7 @@ class KnownRig:
         std, unit = _standardised(cls(true, covariance).covariance)
         values, vectors = np.linalg.eigh(unit)
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-        # The covariance is that of true minus known.
+        # The covariance belongs to true minus known parameters, so the draw is subtracted.
         return cls(true.moved(-std * draw), covariance, exposure_std)
 
     def line_std(self, points: Array) -> float:
@@ -110,7 +110,8 @@ class KnownRig:
     def _off_lines(self, true: StereoRig, points: Array) -> Array:
         """Return signed distances (n,) px of right images from the epipolar lines of left images.
 
-        The rig ``true`` forms the images of the points (n, 3), and the known rig has the lines.
+        The rig ``true`` forms the images of the points (n, 3). The epipolar lines are those of the
+        known rig.
         """
         left, right = (
             np.column_stack([camera.undistort(pixels)[0], np.ones(len(points))])

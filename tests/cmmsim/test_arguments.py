@@ -64,7 +64,7 @@ def test_what_is_no_rigid_transform_is_refused(transform, message):
 def test_what_is_no_seed_is_refused(seed):
     refused(
         lambda: cmmsim.load_sensor("ctrack780", seed=seed),
-        "a seed is a whole number from 0 on, got",
+        "a seed must be a whole number, 0 or more, got",
     )
 
 

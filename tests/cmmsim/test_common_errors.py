@@ -120,8 +120,8 @@ def test_draws_of_a_rig_spread_as_its_covariance_says_and_what_is_none_is_refuse
     assert (np.abs(np.cov(drawn.T) - covariance)[:4, :4] < 4.0 * chance).all()
     assert np.abs(drawn[:, 4:]).max() < 1e-9
     for spoilt, words in (
-        (-np.eye(24), "left.fx_px is negative"),
-        (np.eye(24) + np.triu(root + 1), "not symmetric"),
+        (-np.eye(24), "variance of left.fx_px is negative"),
+        (np.eye(24) + np.triu(root + 1), "row is not symmetric"),
     ):
         with pytest.raises(CmmError, match=words):
             KnownRig(rig, spoilt)
