@@ -238,7 +238,7 @@ def test_a_dot_alone_has_the_median_of_its_ground_for_neighbours():
 
 
 def test_boards_that_cannot_be_drawn_are_refused():
-    with pytest.raises(CalibrationError, match="take the renderer pyrender, or a dot board"):
+    with pytest.raises(CalibrationError, match="use the renderer pyrender, or a board of dots"):
         rendered(PERFECT, CHESSBOARD, 1)
     with pytest.raises(CalibrationError, match=r"shows the whole board of 2\.5 x 2 m"):
         board_poses(PERFECT, DOTS.model_copy(update={"spacing": 0.25}), 1, np.random.default_rng(0))
@@ -285,7 +285,7 @@ def test_rendered_boards_give_the_true_cameras(rig, board, count, seed, renderer
 def test_calibrated_sensor_file_is_one(tmp_path):
     found = calibrate(DOTS, views_of(rendered(PERFECT, DOTS, 8, seed=3)[1], DOTS), (800, 600))
     with pytest.raises(
-        CalibrationError, match="800 x 600 px, those of the sensor file ctrack780 2048 x 1536"
+        CalibrationError, match="800 x 600 px, but the sensor file ctrack780 states 2048 x 1536"
     ):
         sensor_template("ctrack780", tmp_path).filled(found)
     text = (

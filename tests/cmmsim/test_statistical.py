@@ -296,7 +296,11 @@ def test_images_are_refused():
     )
     refused(lambda: sensor.capture(sensor.home), message)
     refused(lambda: sensor.look(sensor.home).windows(np.zeros((2, 1, 2), int), 16), message)
-    refused(lambda: sensor.measure_many([sensor.home[:5]]), "rows of six", cmmsim.CmmError)
+    refused(
+        lambda: sensor.measure_many([sensor.home[:5]]),
+        "a row of six finite numbers",
+        cmmsim.CmmError,
+    )
 
 
 def test_long_streaks_are_refused():
