@@ -45,8 +45,10 @@ class Mark(Protocol):
 
 @dataclass(frozen=True)
 class DiscMark:
-    """Opaque ellipse with a centre (2,) px, a symmetric shape matrix (2, 2) px, which maps the unit
-    circle to the rim, and a radiance 0 to 1.
+    """Opaque ellipse.
+
+    It has a centre (2,) px and a radiance 0 to 1. Its symmetric shape matrix (2, 2) px maps the
+    unit circle to the rim.
     """
 
     side: int
@@ -198,7 +200,7 @@ class Fault:
     """Fault of a stereo frame.
 
     ``marks`` are laid over the images. If ``swapped`` is True, the left and the right image are
-    exchanged. ``obstacles`` are transforms base_from_body (4, 4) of bodies that stand before the
+    exchanged. ``obstacles`` are transforms base_from_body (4, 4) of bodies in front of the
     platform, by their names in ``fault_bodies``.
 
     Examples

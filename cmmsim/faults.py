@@ -102,7 +102,7 @@ class FaultGenerator:
         ==================  ===============================================================
         hidden              stickers that are covered in one image or in both
         half_hidden         stickers that are cut off by a straight edge
-        obstacles           bodies before the platform
+        obstacles           bodies in front of the platform
         one_camera_dark     one black image
         one_camera_covered  one image of a single grey level
         false_discs         discs that look like stickers, each in one image only

@@ -200,7 +200,7 @@ class Sensor(Instrument):
         Parameters
         ----------
         pose, obstacles, pose_rate
-            As in `look`, which also lists the errors. Only the renderer uses them.
+            As in `look`, which also lists the errors. The estimator does not use them.
 
         Returns
         -------

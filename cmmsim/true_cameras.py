@@ -51,8 +51,8 @@ class Drift:
 class TrueCameras:
     """Both true cameras in front of platform and base, with all stickers at their true places.
 
-    The methods `add_bodies`, `move` and `drift` belong to `add_bodies`, `move_rig` and `drift_rig`
-    of `Sensor`, which describe arguments and errors.
+    `Sensor.add_bodies`, `Sensor.move_rig` and `Sensor.drift_rig` describe the arguments and errors
+    of `add_bodies`, `move` and `drift`.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
     """
     position = np.array(section.position)
     target = np.array(section.target)
-    # The horizontal axis of a view straight up or down is not defined.
+    # For a vertical line of sight, the horizontal axis of the cameras is not defined.
     if np.linalg.norm(np.cross(target - position, [0.0, 0.0, 1.0])) < 1e-6:
         raise SensorFileError(
             f"rig.target {list(section.target)} must not be equal to rig.position "

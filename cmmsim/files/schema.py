@@ -219,7 +219,7 @@ class Camera(Section):
     ``pattern_seed`` is the seed of the fixed pattern.
     """
 
-    electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a pixel that is white")
+    electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a white pixel")
     gain: GreyPerElectron = quantity(..., "grey values per electron", "system gain")
     dark_noise: Electrons = quantity(..., "electrons", "temporal noise in the dark, rms")
     full_well: Electrons = quantity(..., "electrons", "saturation capacity of a pixel")

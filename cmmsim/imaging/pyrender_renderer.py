@@ -93,9 +93,9 @@ def _shared_atlas() -> "_Atlas":
 class _Patch:
     """Patch in OpenGL's memory.
 
-    ``indices`` is the number of indices of its triangles, in order from front to back. The same
-    number of indices in reverse order begins at ``backwards``, in bytes. ``solid`` is False for a
-    stack of discs.
+    The indices of its triangles are stored twice: from front to back, and in reverse order.
+    ``indices`` is their number, and ``backwards`` is the first byte of the reverse order. ``solid``
+    is False for a stack of discs.
     """
 
     vertex_array: int
@@ -128,7 +128,7 @@ class _Atlas:
         self._pyrender = pyrender
         self._context = pyrender.OffscreenRenderer(64, 64)
         self._viewport = _called("glViewport", *[ctypes.c_int] * 4)
-        address = ctypes.c_size_t  # PyOpenGL asks what pointers point to
+        address = ctypes.c_size_t  # a plain number, because PyOpenGL would inspect a pointer
         self._draw_elements = _called(
             "glDrawElements", ctypes.c_uint, ctypes.c_int, ctypes.c_uint, address
         )

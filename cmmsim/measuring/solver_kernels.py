@@ -64,8 +64,8 @@ class Outlines(NamedTuple):
     """Ellipses of stickers in both images. All arrays are empty if no ellipses are known.
 
     ``shapes`` (n, 2, 3) are the entries xx, xy, yy of the ellipses' matrices, px. ``informations``
-    (n, 2, 6) are the entries of the inverse covariances of these. ``normals`` (n, 3) are the
-    stickers' normals in body axes, and ``radius`` is their radius, m.
+    (n, 2, 6) are the entries of the inverse covariances of these entries. ``normals`` (n, 3) are
+    the stickers' normals in body axes, and ``radius`` is the stickers' radius, m.
     """
 
     shapes: Array

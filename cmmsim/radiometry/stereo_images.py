@@ -16,7 +16,7 @@ from cmmsim.radiometry.noise import GreyImage, cut_windows
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Width of the picture in a notebook.
+# Largest width of both images together in a notebook.
 SHOWN_WIDTH_PX = 1600
 Windows = GreyImage | NDArray[np.float64]
 

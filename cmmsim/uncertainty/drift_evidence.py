@@ -100,7 +100,7 @@ class Filter:
         return self._constant + 0.5 * float(part @ part) - float(np.log(np.diag(lower)).sum())
 
     def told_of(self, first: int) -> tuple[Array, Array]:
-        """Return the marginal information (d, d) and score (d,) of the ``first`` d unknowns."""
+        """Return marginal information (d, d) and score (d,) of the first d unknowns, d = first."""
         others = np.linalg.solve(self.precision[first:, first:], self.precision[first:, :first])
         return (
             self.precision[:first, :first] - self.precision[:first, first:] @ others,
@@ -140,8 +140,9 @@ class Evidence:
 
     The errors of the calibration, in units of SIZES, are ``calibration`` (24, r) times r
     independent numbers of unit variance. ``delay_std`` is the standard deviation of the right
-    camera's delay, s. ``offset_std`` (o,) are those of constant errors of single centres, px.
-    ``place_shows`` is True if the residuals depend on the rig's place, because the base is seen.
+    camera's delay, s. ``offset_std`` (o,) are the standard deviations of constant errors of single
+    centres, px. ``place_shows`` is True if the base is observed, because the residuals then depend
+    on the rig's place.
     """
 
     def __init__(
