@@ -77,7 +77,7 @@ class Board(Section):
 
     @property
     def symmetries(self) -> list[NDArray[np.int_]]:
-        """Orders (points,) of the points that look the same in a picture.
+        """Orders (points,) in which the points of the board look the same in a picture.
 
         They belong to the unturned board, to half a turn, and to quarter turns if the board has as
         many rows as columns. An asymmetric grid with an odd number of rows has one order only. A
@@ -107,8 +107,7 @@ class Board(Section):
 def read_board(path: str | Path) -> Board:
     """Read the board of a TOML file.
 
-    Raises CalibrationError, which lists the valid names for an unknown key, and shows the value for
-    an invalid value.
+    Raises CalibrationError for an unknown key, with the valid names, and for an invalid value.
     """
     source = f"board file {path}"
     content = parsed(read_text(path, source, CalibrationError), source, CalibrationError)

@@ -284,7 +284,7 @@ def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> f
 def search_dots(bright: NDArray[np.uint8], board: Board) -> Array | None:
     """Return rough centres (rows * columns, 2) px of bright dots in the board's order, or None.
 
-    The single threshold is tried first, then OpenCV in a reduced image and in the whole one.
+    Otsu's threshold is tried first, then OpenCV in a reduced image, then OpenCV in the whole image.
     """
     rough = read_at_once(bright, board) if board.kind == "dots" else None
     for side in (FIND_SIDE_PX, max(bright.shape)):

@@ -1,7 +1,7 @@
 """Common errors of the points of one view, found from the views' scores, and their covariance.
 
 The adjustment assumes that errors of pixels are independent. In photographs a bent board, uneven
-light or the bias of the corner search displaces neighbouring points in common. A view then carries
+light or the bias of the corner search displaces neighbouring points together. A view then carries
 less information than its number of points suggests. The scores of the views show this, while the
 size of the residuals does not. The score of view v is s_v = J_v' r_v, with the residuals r_v and
 their derivatives J_v by the common unknowns after the view's own pose is eliminated. The sum over

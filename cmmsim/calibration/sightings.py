@@ -15,8 +15,8 @@ from cmmsim.geometry.pose import Array
 
 SIDES = ("left", "right")
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
-# Percentile of an image with more than 8 bits that becomes 255. A fixed scale would not do: images
-# of 12-bit cameras use 1/16 of the range of 16 bits.
+# Percentile of an image with more than 8 bits that becomes 255. A fixed scale is unsuitable,
+# because images of 12-bit cameras use 1/16 of the range of 16 bits.
 WHITE_SHARE = 99.9
 HOW_PAIRED = "pairs are made in the order of the sorted file names"
 

@@ -16,9 +16,9 @@ If the rim comes near the edge of the window, lines are missing, and the centre 
 tenth of a pixel. Such a window is not good. EDGE_PX is the distance from the edge that the lines
 need.
 
-Gradients of a sharp edge are not exact. Without noise, and tilted by 45 degrees, the error of the
-centre is about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. The covariance does not
-include this bias.
+Gradients of a sharp edge are not exact. For images without noise of stickers tilted by 45 degrees,
+the error of the centre is about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. The
+covariance does not include this bias.
 """
 
 import numpy as np

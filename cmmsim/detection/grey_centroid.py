@@ -102,9 +102,9 @@ def whole_inside(
 def _weights(windows: Array, threshold: float) -> tuple[Array, Array]:
     """Return the excess (n, h, h) of grey values over the threshold, and the contrast (n,).
 
-    Pixels are divided at the mean of the darkest and the brightest grey value. The ground is the
-    median of the darker pixels, and the contrast the median of the brighter pixels minus the
-    ground.
+    The mean of the darkest and the brightest grey value separates dark from bright pixels. The
+    ground is the median of the dark pixels. The contrast is the median of the bright pixels minus
+    the ground.
     """
     flat = np.sort(windows.reshape(len(windows), -1), axis=1)
     count = flat.shape[1]

@@ -15,7 +15,8 @@ import numpy as np
 from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.matrix_kernels import from_entries, inverse_entries
 
-# Largest error of an undistorted point, in normalised coordinates of its distorted image.
+# Largest distance between a distorted point and the image of the undistorted point that is found
+# for it, in normalised coordinates.
 CONVERGED = 1e-12
 MOST_STEPS = 60
 # Largest number of Gauss-Newton steps of a triangulation.

@@ -156,12 +156,12 @@ def invert(transform: Array) -> Array:
 
 
 def apply(transform: Array, points: Array) -> Array:
-    """Return points (..., 3) after a transform (4, 4)."""
+    """Return points (..., 3) transformed by a transform (4, 4)."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def apply_each(transforms: Array, points: Array) -> Array:
-    """Return points (..., n, 3) after each of the transforms (..., 4, 4).
+    """Return points (..., n, 3) transformed by each of the transforms (..., 4, 4).
 
     ``points`` is one set (n, 3) for all transforms, or one set per transform (..., n, 3).
     """

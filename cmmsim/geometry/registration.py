@@ -9,7 +9,7 @@ from cmmsim.geometry.pose import Array
 
 # Gauss-Newton steps after the unweighted start.
 STEPS = 2
-# Points do not determine a rotation if their spread about one line is smaller than this, m.
+# Points do not determine a rotation if their spread perpendicular to one line is below this, m.
 SMALLEST_SPREAD = 0.005
 
 

@@ -74,7 +74,7 @@ def multiply(first: Array, second: Array, product: Array) -> None:
 
 @compiled
 def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
-    """Fill ``carried`` (3,) with a point (3,) after a transform (4, 4).
+    """Fill ``carried`` (3,) with a point (3,) transformed by a transform (4, 4).
 
     ``shift`` is 1 for a point, and 0 for a direction, which is only rotated.
     """

@@ -63,8 +63,9 @@ class Limits(NamedTuple):
 
     The cosine between the normal of a sticker and the direction to each camera exceeds ``grazing``.
     ``thin_px`` and ``thin_std_px`` are mean and standard deviation of the smallest half width of an
-    ellipse. ``largest_gap`` is the largest squared distance of the two rays. No body covers any
-    part of the image within ``clear`` m of the sticker. ``vignetting`` is that of the lens.
+    ellipse. ``largest_gap`` is the largest squared distance of the two rays. No body may hide a
+    point of the sticker's plane within ``clear`` m of its centre. ``vignetting`` is that of the
+    lens.
     ``parted`` px² is the variance of the rays' distance that is due to errors of the rig.
     """
 

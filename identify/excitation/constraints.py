@@ -272,7 +272,7 @@ class MotionConstraints:
             Limit(CONDITIONING, condition_number(link_rows) / most, (most,), "", ("",)),
         ]
         self._box_units = chart.units
-        # Visibility has many rows, so it is left out if all poses of the box are visible.
+        # Visibility has many rows, so it is omitted if the stickers are visible in the whole box.
         if not self.always_in_sight:
             names = [
                 f"sticker {sight.platform.sticker_ids[k]}, {side} camera, {what}"

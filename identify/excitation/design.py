@@ -127,7 +127,7 @@ class Design:
         """Set up the search with admissible random trajectories.
 
         Raises ScenarioError if there is no such criterion. Raises TrajectoryError if the method
-        needs a whole number of periods and the run has none.
+        needs a whole number of periods but the duration of the run is not one.
         """
         if self.settings.method != "random":
             check_periods(self.settings)
@@ -152,7 +152,7 @@ def design_trajectories(
 
     Raises ScenarioError if there is no such criterion. Raises TrajectoryError if no random
     trajectory of this amplitude is within the limits, if a search needs a whole number of periods
-    but the run has none, or if a search finds nothing.
+    but the duration of the run is not one, or if a search finds nothing.
     """
     progress = progress or SilentProgress()
     settings = design.settings

@@ -236,7 +236,7 @@ INTERIOR = 0.98
 """Factor that moves a start inside the limits, which an interior-point method needs."""
 
 FAR = 0.5
-"""Used share of a limit below which the limit is left out at first."""
+"""Used share of a limit below which the limit is ignored at first."""
 
 ALWAYS = "box"
 """Limit that is always included. Without it a criterion would be unbounded."""
@@ -255,7 +255,7 @@ def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progre
     an exact Hessian of a regressor would take longer. There are several starts because the
     criterion has many local optima.
 
-    Limits far from a start are left out at first. If the result violates such limits, they are
+    Limits far from a start are ignored at first. If the result violates such limits, they are
     added, and IPOPT continues. If a trajectory exceeds a limit between the instants of the
     constraints, it is shrunk towards home until it is admissible at the finer instants of the
     check.

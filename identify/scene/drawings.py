@@ -158,7 +158,7 @@ def _explain(figure: Figure, view: StereoView, arrows: float | None) -> None:
     words = [f"{len(found.ids)} stickers found on the {name}" for name, found in view.found.items()]
     note = None
     if arrows is not None:
-        note = f"arrows: detected less true centre, {arrows:g} times enlarged"
+        note = f"arrows: detected minus true centre, {arrows:g} times enlarged"
     small = {"title_fontsize": 8, "fontsize": 8, "frameon": False}
     figure.legend(handles, words, title=note, loc="outside lower center", ncols=2, **small)
 

@@ -278,7 +278,7 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
     layout = asked.side.robot.layout
     pid = layout.joint_pid
     groups = asked.group_errors(found.parameters)
-    # Gains that the drive law does not read are zero, and are left out.
+    # Gains that the drive law does not use are zero, and are omitted.
     read = np.flatnonzero(asked.true[pid]) + pid.start
     gains = found.parameters[read] / asked.true[read] - 1
     distances = (

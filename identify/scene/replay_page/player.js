@@ -129,8 +129,8 @@ class Replay {
     }
     this.choice = document.getElementById("difference");
     const known = Object.keys(this.data.poses);
-    if (known.includes("true")) this.choice.append(new Option("measured and models, less the true pose", "true"));
-    if (known.includes("identified")) this.choice.append(new Option("residuals: measured less the model", "residual"));
+    if (known.includes("true")) this.choice.append(new Option("measured pose and models minus the true pose", "true"));
+    if (known.includes("identified")) this.choice.append(new Option("residuals: measured pose minus the model", "residual"));
     this.choice.closest("section").hidden = !this.choice.options.length;
     this.choice.addEventListener("change", () => { this.drawCurves(); this.seek(this.frame); });
     this.drawCurves();
@@ -213,7 +213,7 @@ class Replay {
   writeFigures() {
     const truth = this.pose("true", this.frame);
     const kinds = Object.keys(this.data.poses).filter((kind) => kind !== "true");
-    const head = ["", truth ? "true" : "", ...kinds.map((kind) => (truth ? `${SHORT[kind]} less true` : SHORT[kind]))];
+    const head = ["", truth ? "true" : "", ...kinds.map((kind) => (truth ? `${SHORT[kind]} minus true` : SHORT[kind]))];
     const rows = NAMES.map((name, k) => {
       const [large, small] = k < 3 ? ["mm", "µm"] : ["mrad", "µrad"];
       const cells = kinds.map((kind) => {
