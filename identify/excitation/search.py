@@ -304,7 +304,7 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
             return SearchResult(
                 admissible, problem.value(admissible), values, gradients, iterations, reason
             )
-        # Continue with the violated limits, from a point inside all limits.
+        # Continue from a point inside all limits, and include the violated limits.
         counted = counted | broken
         z = INTERIOR * admissible
 

@@ -95,7 +95,7 @@ class StereoEye:
         """
         drawn = self._sensor.look(pose, self._cell.obstacles(pose))
         if self._region is not None and self._sensor.renderer == "analytic":
-            # The analytic renderer can draw only a part of the image, which is faster.
+            # The analytic renderer can draw a part of the image alone, which is faster.
             corners, side = self._region
             images: NDArray = drawn.windows(corners[:, None], side)[:, 0]
         else:

@@ -239,7 +239,7 @@ def _camera(painter: Painter, camera: ViewingCamera) -> None:
 
 
 def _triad(painter: Painter, axes: Axes, labels: bool) -> None:
-    """Draw the axes of the base, 0.15 m long, over all bodies, because they lie in the robot."""
+    """Draw the axes of the base, 0.15 m long, over all bodies, which would otherwise hide them."""
     for name, direction in zip("xyz", np.eye(3), strict=True):
         ends = np.array([np.zeros(3), 0.15 * direction])
         painter.line(ends, DARK, 1.4, towards=1.0)

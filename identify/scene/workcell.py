@@ -113,7 +113,10 @@ class Workcell:
 
     @cached_property
     def bodies(self) -> tuple[Solid, ...]:
-        """Platform in its own frame and, with a sensor, base with stickers in the base frame."""
+        """Platform in its own frame, and base with stickers in the base frame.
+
+        Without a sensor, there is only the platform.
+        """
         if self.sensor is None:
             assert self.robot is not None
             return (_plate("platform", self.robot.geometry.platform_joints),)

@@ -16,7 +16,10 @@ from identify.experiment.run import Latencies
 USUAL = Latencies()
 
 NEARLY_EXACT = 1e-3
-"""Factor of the stated covariance for exact poses, because an observer needs a covariance > 0."""
+"""Factor of the stated covariance for exact poses.
+
+It is not zero, because an observer needs a positive definite covariance.
+"""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,10 @@ MODELS = ("initial", "identified", "true")
 """Names of the models: the scenario's initial guess, the identified model, and the true plant."""
 
 FIRST_RUN = 2_000_000
-"""Number of the first run. It differs from all other runs, and so do its random streams."""
+"""Number of the first run.
+
+The runs of an identification have smaller numbers, so the random streams are separate.
+"""
 
 EXACT = ("sensor", "model", "latency")
 """Parts that are made exact, one at a time, to determine their share of the error."""

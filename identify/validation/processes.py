@@ -1,4 +1,4 @@
-"""Work distributed to processes of this machine. The processes end with their command."""
+"""Distribution of work to processes of this machine that end with their parent process."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
