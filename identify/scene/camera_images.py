@@ -1,7 +1,4 @@
-"""Camera images of a pose, cropped to the robot, and the detected stickers.
-
-The detector is the detector of `cmmsim`.
-"""
+"""Camera images of a pose, cropped to the robot, and the stickers that `cmmsim` detects in them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -34,7 +34,7 @@ def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
         _add(scene, body.name, body.vertices, body.faces, SOLIDS[body.name], place)
         _add_stickers(scene, body)
     for part, ends in zip(cell.parts, cell.rods(at), strict=True):
-        # Rods are upright, so that the page can place a rod in each frame by one matrix.
+        # A rod lies along the z axis of its node, so that the page can place it with one matrix.
         mesh = trimesh.creation.cylinder(part.segment.radius, segment=_upright(ends), sections=20)
         colour = leg_colour(cell, part.leg, part.body)
         _add(scene, part.name, mesh.vertices, mesh.faces, colour, rod_transform(*ends))
@@ -56,7 +56,7 @@ def _add_stickers(scene: trimesh.Scene, body: Solid) -> None:
         if discs:
             name = f"{body.name} {words}"
             mesh = trimesh.util.concatenate(discs)
-            # As a child of the body, the stickers move with it.
+            # The stickers are a child node of the body, so that they move with it.
             _add(scene, name, mesh.vertices, mesh.faces, colour, np.eye(4), body.name)
 
 
