@@ -23,7 +23,7 @@ LANES = 8
 
 
 def room_for_derivatives(parameters: int, start: int) -> int:
-    """Number of columns for the derivatives of one number, a multiple of LANES.
+    """Number of columns for the derivatives of one quantity, rounded up to a multiple of LANES.
 
     There is one column for each parameter, for the length of a step, and for each entry of a start
     state.
@@ -33,7 +33,7 @@ def room_for_derivatives(parameters: int, start: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class RigidGroups:
-    """Groups (k, r) of the r inertial parameters of a robot on which its motion depends.
+    """The k groups (k, r) of a robot's r inertial parameters. Its motion depends only on them.
 
     Each group is a linear combination of the parameters. `pivots` (k,) are the indices of one
     parameter of each group, in ascending order. This parameter has the coefficient 1 in its group

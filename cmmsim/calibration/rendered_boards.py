@@ -171,7 +171,7 @@ def _drawn_numbers(
 def _poses_of(
     rig: StereoRig, middle: Array, depth: float, side: int, cells: NDArray[np.int_], numbers: Array
 ) -> Array:
-    """Return poses left_from_board (n, 4, 4) of a board with its middle (3,) in given cells.
+    """Return poses left_from_board (n, 4, 4) that show the middle (3,) of a board in given cells.
 
     ``cells`` (n,) are cells of the image of camera ``side``, and ``depth`` is the mean depth, m.
     Numbers (n, 6) from 0 to 1 determine the exact depth, the pixel and the tilt. The front first

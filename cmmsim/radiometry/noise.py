@@ -15,7 +15,8 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 
 BIT_DEPTHS = (8, 10, 12)
-# Number of terms of the series in rounding_excess. Without noise, the remainder is 0.002 of 0.25.
+# Number of terms of the series in rounding_excess. Without noise, the series is 0.25, and the terms
+# that are left out add up to 0.002.
 ROUNDING_TERMS = 50
 # Variance, grey values squared, above which rounding_excess differs from 1 by less than 1e-11.
 NO_SWING = 1.5
@@ -134,16 +135,16 @@ class CameraNoise:
         return constant + electrons * (linear + electrons * quadratic)
 
     def rounding_excess(self, mean_grey: Array) -> Array:
-        """Return the ratio of the largest to the usual variance of grey values near a mean.
+        """Return the largest variance of grey values near a mean over their average variance.
 
         The ratio is 1 if the noise is at least one grey value, and up to 3 with less noise. With
         little noise, the variance of rounded values depends on the mean. It is largest half-way
         between two whole numbers, because the noise then decides between rounding up and down.
 
-        In this case, the Fourier series of the rounding error gives the variance of a rounded
-        normal variable: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). The usual
-        variance s² + 1/12 is the average over all means. The pixels of a uniform ground all have
-        the same mean, so their variance can differ from this average.
+        At such a mean, the Fourier series of the rounding error gives the variance of a rounded
+        normal variable: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). The
+        average variance over all means is s² + 1/12. The pixels of a uniform ground all have the
+        same mean, so their variance can differ from this average.
         """
         usual = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
         if np.all(usual > NO_SWING):
@@ -197,12 +198,12 @@ class CameraNoise:
     ) -> Array:
         """Return the mean grey values (float64) of independent exposures of a scene at rest.
 
-        Without noise, the mean is not rounded, because noisy exposures approach the unrounded mean:
-        their noise dithers the rounding. The mean of 30 or more exposures is drawn directly, as one
-        normal number per pixel. This number has the mean and the variance of the mean of rounded
-        and clipped grey values. Its distribution is only approximately right: clipped grey values
-        are skewed, and the mean has steps of 1/frames. Neither matters for sums over the pixels of
-        a sticker.
+        The mean is not rounded, even if the noise is turned off: noise dithers the rounding, so the
+        mean of many noisy exposures approaches the unrounded mean. The mean of 30 or more exposures
+        is drawn directly, as one normal number per pixel. This number has the mean and the variance
+        of the mean of rounded and clipped grey values. Its distribution is only approximately
+        right: clipped grey values are skewed, and the mean has steps of 1/frames. Neither matters
+        for sums over the pixels of a sticker.
         """
         if not self.enabled:
             return np.clip(

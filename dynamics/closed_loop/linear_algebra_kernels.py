@@ -1,6 +1,6 @@
 """Small dense linear algebra, for vectors and for rows of derivatives.
 
-A row of derivatives belongs to one unknown, and each of its columns to one variable.
+A row holds the derivatives of one unknown, and each column those with respect to one variable.
 """
 
 from dynamics.compiled.kernel import Array, add_row, kernel, part

@@ -90,7 +90,7 @@ def estimators(
             min=4,
             max=40,
             help="Bits of an encoder per turn, or over the travel of a linear joint.",
-            show_default="17, 1 um steps",
+            show_default="17; linear: 1 um steps",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the joint instruments' noise.")] = 0,
@@ -227,8 +227,8 @@ def variation(
     paper's table 5).
 
     The runs are the validation runs of validation.nc, as in the paper, or newly recorded runs,
-    which are stored as variation.nc. The masses of the links vary most. They act only through
-    accelerations, so fast trajectories determine them better than long trajectories.
+    which are stored as variation.nc. The masses of the links vary most. Only accelerations separate
+    them from the other parameters, so fast trajectories determine them better than long ones.
 
     Reads scenario.toml and validation.nc from the folder; with --designed, trajectories.json in
     place of validation.nc.
@@ -301,7 +301,7 @@ def compare_excitation(
     from identify.record.known_geometry import KnownGeometry
 
     scenario = setup.scenario
-    # The methods are compared with the geometry of the robot file, so no calibration is needed.
+    # The comparison uses the geometry of the robot file, so no calibration is needed.
     setup = replace(setup, calibrated=KnownGeometry(setup.nominal))
     design = setup.design
     times = scenario.timing.frame_times(design.settings.duration_s)
@@ -324,10 +324,10 @@ def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:
         used = ", ".join(f"{worst.name} {100 * worst.share:.2f} %" for worst in nearest)
         typer.echo(f"{entry.method}: share of each limit used: {used}")
     typer.echo(
-        "maximised: the criterion (information: of the linearised loop). index: the paper's "
+        "maximised: the criterion (if information, of the linearised loop). index: the paper's "
         "observability index, eq. 39. narrows: factor by which a run reduces the prior uncertainty "
         "of the parameters, with the simulated loop; - if that loop is unstable. Candidates and "
-        f"functions took {found.preparation_seconds:.1f} s. Files: {folder}"
+        f"functions were prepared in {found.preparation_seconds:.1f} s. Files: {folder}"
     )
 
 

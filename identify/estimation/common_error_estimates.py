@@ -44,9 +44,9 @@ class CommonErrorEstimates:
 
 
 def most_likely(run: LoopModel, parameters: Array) -> Array:
-    """Return the most likely common errors (k,) of a run `with_common_errors` at the optimum (p,).
+    """Return the most likely common errors (k,) of a run at the optimal parameters (p,).
 
-    They are in prior standard deviations.
+    The run is one returned by `with_common_errors`. The errors are in prior standard deviations.
     """
     assert run.marginal is not None
     missed = replace(run, marginal=None).misses(parameters).ravel() - run.marginal.had
@@ -74,10 +74,11 @@ def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[A
 
 
 def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
-    """Return the first run of each draw of common errors, and a matrix for all runs.
+    """Return one run for each distinct set of common errors, and a matrix for all runs.
 
-    Records that state the same errors with the same covariance share a draw. The matrix (k, d) maps
-    the independent numbers of the first runs (d,) to those of all runs (k,), record by record.
+    Records that state the same errors with the same covariance share one set. The matrix (k, d)
+    maps the standard normal numbers (d,) drawn for the returned runs to those (k,) of all runs, in
+    the order of the records.
     """
     firsts: list[LoopModel] = []
     for run in runs:
@@ -99,7 +100,7 @@ def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
 def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Array]:
     """Return the covariance (p, p) of an estimate due to each kind of common errors.
 
-    moved (p, k): effect of each independent number on the estimate, run by run.
+    moved (p, k): change of the estimate by each standard normal number of `shared_draws`.
     """
     of_common: dict[str, Array] = {}
     for run in runs:

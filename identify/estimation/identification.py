@@ -68,11 +68,11 @@ def identify(
         A record is incomplete, for example without a scenario or scale anchor, or has an invalid
         value, such as a seed that is not a whole number.
     EstimationError
-        An argument is not a Robot or Scenario, a record is of another robot, timing or servo or is
-        not suitable for an identification, or the model is unstable with both the initial guess
-        and the warm start.
+        An argument is not a Robot or Scenario. A record is of another robot, timing or servo, or
+        is not suitable for an identification. The model is unstable both at the initial guess and
+        at the warm start.
     ScenarioError
-        The robot has no such parameter set, or no model can have the initial guess.
+        The robot has no such parameter set, or the initial guess is not valid for the model.
     dynamics.DynamicsError
         The robot cannot reach a pose of the record.
 
@@ -117,7 +117,7 @@ def identify(
     judged = last.linearised()
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
-    # Residuals of a right model are white only under the logged commands.
+    # Residuals of a right model are white only if the logged commands drive it.
     driven = by_commands.linearised() if closed_loop else judged
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, settings.qr_threshold, solution, uncertainty, explained)
@@ -167,7 +167,7 @@ class Asked:
 def asked_of(
     record: xr.Dataset | Sequence[xr.Dataset], robot: Robot | None, scenario: Scenario | None
 ) -> Asked:
-    """Return what `identify` is asked with, for the same arguments and with the same errors."""
+    """Return the checked inputs of `identify`. Takes its arguments and raises its errors."""
     records = [record] if isinstance(record, xr.Dataset) else list(record)
     if not records:
         raise EstimationError("no record to identify from")
@@ -198,9 +198,9 @@ def output_error_problem(
     RecordError
         A record has no scale anchor, or no measured poses.
     EstimationError
-        A record does not fit, or is not suitable for an identification.
+        A record is of another robot, timing or servo, or is not suitable for an identification.
     ScenarioError
-        There is no parameter set for the initial guess, or no model can have the guess.
+        There is no parameter set for the initial guess, or the guess is not valid for the model.
     """
     robot = side.robot
     groups = structure(robot).rigid_groups

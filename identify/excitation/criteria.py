@@ -4,9 +4,10 @@ A criterion is a function (robot, scenario, unknowns, typical) -> Criterion, nam
 `identify.own_parts` or given as ``module:function``. `typical` is the z of a trajectory that
 excites all parameters. It can be used to scale the criterion.
 
-The observability index is the geometric mean of the singular values of H over sqrt(m). Only the
-columns of the base parameters are linearly independent: H = H_1 C with the pivot columns H_1 and
-the base combinations C (rank, p). The product of the nonzero singular values is therefore
+Let H be the stacked regressor of m samples, with one column for each of the p parameters. The
+observability index is the geometric mean of the singular values of H over sqrt(m). Only the columns
+of the base parameters are linearly independent: H = H_1 C with the pivot columns H_1 and the base
+combinations C (rank, p). The product of the nonzero singular values is therefore
 sqrt(det(H_1^T H_1) det(C C^T)), for any choice of pivots, and
 
     ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(m) / 2.
@@ -15,9 +16,10 @@ The rank (zeta in the paper) depends on the robot and not on the trajectory, so 
 judged on the same subspace. As in the paper, the columns of H are not scaled, and the gains of the
 joint controller are not included.
 
-H_1 is divided by the triangular factor R of one trajectory. This removes the units of the
-parameters and makes H_1^T H_1 well conditioned. The inverse of R is rounded to numbers on which all
-processors agree, and the constant is computed from the rounded inverse.
+H_1 is divided by a triangular matrix R, the factor of the QR factorisation of H_1 for the
+trajectory `typical`. This removes the units of the parameters and makes H_1^T H_1 well conditioned.
+The inverse of R is rounded to numbers on which all processors agree. The logarithm of the
+determinant of this rounded inverse is then subtracted, so that the index does not change.
 
 A run of whole periods is sampled over one period, because the index does not depend on their
 number. Any other run is sampled from start to end.
@@ -179,7 +181,7 @@ def _rounded_triangle(inverse: Array) -> Array:
     """Round an inverse triangular factor by `agreed`, without making it singular.
 
     If a motion hardly excites some parameter, entries can be so large that other diagonal entries
-    would be rounded to zero. These are rounded relative to their row up to the diagonal.
+    would be rounded to zero. Such a diagonal entry is rounded relative to its own size.
     """
     rounded = agreed(inverse)
     for k in np.flatnonzero(np.diag(rounded) == 0.0):

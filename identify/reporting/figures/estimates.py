@@ -107,8 +107,8 @@ def group_figure(
     """Draw the parameters of each base parameter, with their shares.
 
     A row is a base parameter that combines several parameters, and a column is a parameter. The
-    area of a dot is the share of coefficient times initial guess. The dot is open if this is
-    subtracted. A star marks an identified base parameter.
+    area of a dot is the share of the parameter, by coefficient times initial guess. The dot is open
+    if the parameter is subtracted. A star marks an identified base parameter.
     """
     sums = {name: group for name, group in groups.items() if len(group["coefficients"]) > 1}
     columns = [
@@ -134,7 +134,7 @@ def group_figure(
     axes = figure.subplots()
     if not labels:
         axes.set_axis_off()
-        axes.set_title("The motion shows each of its parameters separately: there are no sums")
+        axes.set_title("The motion shows every parameter separately: there are no sums")
         return figure
     dot_matrix(axes, shares[:, used], labels, [columns[k] for k in used])
     _key(axes, (1.0, 0.25, 0.05), "share of the sum", "subtracted")

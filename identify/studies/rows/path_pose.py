@@ -2,8 +2,8 @@
 
 The path is a random trajectory with the scenario's settings of the excitation. Exposure, latency,
 its jitter and dropout have the scenario's values. A row is a short stretch of the path from a
-random instant on. Its pictures are measured together. Stickers are looked for at their true places
-on the path, without search and without tracking. A measured pose refers to the middle of its
+random instant on. All its pictures are measured in one call. Stickers are looked for at their true
+places on the path, without search and without tracking. A measured pose refers to the middle of its
 exposure. The row has the error of the measured poses, and the error of the pose in use, which is
 the last pose that has arrived. Teaching is exact by default.
 """
@@ -38,16 +38,16 @@ INSTANTS_PER_FRAME = 16
 COLUMNS = {
     "frames": Column("1", "stereo pictures taken"),
     "lost_frames": Column(
-        "1", "frames without a pose; of the other figures only the pose in use includes them"
+        "1", "frames without a pose; they count only in the errors of the pose in use"
     ),
     "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
     **POSE_COLUMNS,
     "used_position_rms_um": Column(
-        "um", "error of the position in use at all times, the last arrived position", main=True
+        "um", "error of the last arrived position, at all times along the path", main=True
     ),
     "used_orientation_rms_urad": Column(
         "urad",
-        "error of the orientation in use at all times, the last arrived orientation",
+        "error of the last arrived orientation, at all times along the path",
         main=True,
     ),
 }
@@ -61,7 +61,7 @@ class PathPoseOptions(Section):
     )
     teaching: Teaching = Field(
         "exact",
-        description="exact: without error; sensor: the sensor teaches itself, seeded by the row",
+        description="exact: taught without error; sensor: taught from images, seeded by the row",
     )
 
 
@@ -79,7 +79,7 @@ READS = Reads(
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseOptions) -> Row:
     """Compute one row.
 
-    Raises EstimationError if fewer than two poses were measured, and the errors of the sensor.
+    Raises EstimationError if fewer than two poses were measured, and any exception of the sensor.
     """
     eye = row_sensor(Setup(scenario).sensor_plan, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
