@@ -96,7 +96,7 @@ def read_bytes(
     try:
         place = Path(path)
         if place.exists() and not (place.is_file() or place.is_dir()):
-            raise refusal(f"cannot read {source}: it is no regular file")
+            raise refusal(f"cannot read {source}: it is not a regular file")
         with place.open("rb") as file:
             content = file.read(largest + 1)
     except (OSError, ValueError) as error:

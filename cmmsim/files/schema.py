@@ -221,7 +221,7 @@ class Camera(Section):
 
     electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a white pixel")
     gain: GreyPerElectron = quantity(..., "grey values per electron", "system gain")
-    dark_noise: Electrons = quantity(..., "electrons", "temporal noise in the dark, rms")
+    dark_noise: Electrons = quantity(..., "electrons", "dark noise, rms")
     full_well: Electrons = quantity(..., "electrons", "saturation capacity of a pixel")
     black_level: Grey = quantity(0.0, "grey values", "grey value without light")
     noise: bool = quantity(True, "", "true for images with noise")

@@ -72,8 +72,8 @@ def test_a_file_that_is_large_endless_or_none_is_refused(tmp_path):
     assert "500,000 bytes" in refused(cmmsim.checks.read_text, path, "file x", SensorFileError)
     path.unlink()
     path.symlink_to("/dev/zero")
-    assert "no regular file" in refused(read_bytes, path, "file x", RobotFileError)
-    assert "no regular file" in refused(cmmsim.checks.read_text, path, "file x", SensorFileError)
+    assert "not a regular file" in refused(read_bytes, path, "file x", RobotFileError)
+    assert "not a regular file" in refused(cmmsim.checks.read_text, path, "file x", SensorFileError)
     assert "unknown robot" in refused(load_robot, "a\0b")
 
 

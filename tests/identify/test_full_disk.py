@@ -713,7 +713,7 @@ def test_a_kernel_that_finds_no_room_in_the_cache_is_a_warning_and_computes(disk
     found.loader.exec_module(module)
     before = content(disk.path)
     disk.change(f"size={used(disk.path)[0] * PAGE}")
-    with pytest.warns(CompilationWarning, match=f"kept in {disk.path}.*No space left on device"):
+    with pytest.warns(CompilationWarning, match=f"saved in {disk.path}.*No space left on device"):
         assert module.doubled(21) == 42
     assert content(disk.path) == before
 

@@ -190,7 +190,7 @@ def another_program(request):
         threading.Thread(target=answer, daemon=True).start()
         yield (
             f"tcp://127.0.0.1:{server.getsockname()[1]}",
-            "another protocol" if request.param else "says nothing",
+            "another protocol" if request.param else "does not answer",
         )
 
 
