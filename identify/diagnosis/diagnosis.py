@@ -73,7 +73,8 @@ class Finding:
 
     def __str__(self) -> str:
         sizes = "; ".join(
-            str(one) if len(self.sizes) == 1 else f"{one.name}: {one}" for one in self.sizes
+            str(one) if len(self.sizes) == 1 or one.name == self.name else f"{one.name}: {one}"
+            for one in self.sizes
         )
         others = ", or ".join(self.alike[:NAMED])
         more = f", or {len(self.alike) - NAMED} more" if len(self.alike) > NAMED else ""
