@@ -4,7 +4,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import wraps
 from multiprocessing import parent_process
@@ -24,7 +25,18 @@ register(_CasadiBlas)
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+
+
+def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Return what a function returns for each item, computed on all cores.
+
+    Threads are enough for runs of the compiled loop, which does not hold Python's lock. The
+    function must not call CasADi, which is not safe in threads.
+    """
+    with ThreadPoolExecutor(cores()) as pool:
+        return list(pool.map(function, items))
 
 
 def one_thread(function: Callable[P, R]) -> Callable[P, R]:

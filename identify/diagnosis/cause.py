@@ -83,6 +83,16 @@ def in_each_run(change: Callable[[LoopModel, float], LoopModel]) -> Change:
     return changed
 
 
+def pose_columns(problem: OutputErrorProblem, parameters: Array, changes: Sequence[Array]) -> Array:
+    """Return the columns (m, k) of changes (N, 6, k) of each run's poses against the measured."""
+    known, _ = problem.known(parameters)
+    parts = [np.zeros((len(known), changes[0].shape[2]))]
+    for run, change in zip(problem.runs, changes, strict=True):
+        white = run.without_common(np.asarray(run.whitener @ change[run.ok]))
+        parts.append(white.reshape(-1, change.shape[2]))
+    return np.vstack(parts)
+
+
 def with_causes(
     problem: OutputErrorProblem, causes: Sequence[Cause], sizes: Array
 ) -> OutputErrorProblem:

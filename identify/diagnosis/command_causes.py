@@ -48,13 +48,13 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
     timing = problem.runs[0].settings.timing
 
     def later(run: LoopModel, size: float) -> LoopModel:
-        return replace(run, acted=possible(run, stated_latencies(run) + size))
+        return replace(run, acted=possible(run, run.stated_latencies + size))
 
     def drifting(run: LoopModel, size: float) -> LoopModel:
         seconds = np.arange(len(run.ok)) / timing.frame_rate_hz
-        return replace(run, acted=possible(run, stated_latencies(run) + size * seconds))
+        return replace(run, acted=possible(run, run.stated_latencies + size * seconds))
 
-    earliest = min(float(stated_latencies(run).min()) for run in problem.runs)
+    earliest = min(float(run.stated_latencies.min()) for run in problem.runs)
     longest = max(len(run.ok) for run in problem.runs) / timing.frame_rate_hz
     return (
         Cause(
@@ -83,13 +83,6 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
             least=-earliest / longest,
         ),
     )
-
-
-def stated_latencies(run: LoopModel) -> Array:
-    """Return the latencies (N,) of a run's commands, s, as record or timing state them."""
-    if run.acted is not None:
-        return run.acted
-    return np.full(len(run.ok), run.settings.timing.latency_s)
 
 
 def possible(run: LoopModel, latencies: Array) -> Array:

@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.ranking import Ranked, Rows
 from identify.diagnosis.selection import Selected, Selection
-from identify.estimation.explanation import MISFIT_STDS, Misfit, whiteness
+from identify.estimation.explanation import MISFIT_STDS, Misfit, by_frames, whiteness
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -219,7 +219,7 @@ def noise_finding(selection: Selection, rows: Rows, whole: float) -> Finding | N
     """
     left = selection.after
     off = (left.found - left.expected) / left.std
-    residuals, ok = rows.of_all_frames(selection.point.residual)
+    residuals, ok = by_frames(rows.of_runs(selection.point.residual), rows.frames)
     if abs(off) < MISFIT_STDS or whiteness(residuals, ok).suspicious:
         return None
     count = int(ok.sum())

@@ -12,17 +12,16 @@ What the changed lever arms do to the torques is left out. It shows in the fit, 
 itself is moved.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 
 from dynamics.closure import Closure
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, in_each_run, with_geometry
+from identify.diagnosis.cause import Cause, in_each_run, pose_columns, with_geometry
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
-from identify.runtime import cores
+from identify.runtime import in_threads
 
 STEPS = {"m": 1e-5, "rad": 1e-4}
 """Change of a number for differences, by its unit."""
@@ -105,17 +104,12 @@ def _number(name: str, unit: str, place: int, direction: Array) -> Cause:
 
 def geometry_columns(problem: OutputErrorProblem, parameters: Array) -> Array:
     """Return the columns (m, n + g) of the zeros of n joints, then of all geometric numbers."""
-    known, _ = problem.known(parameters)
-    robot = problem.runs[0].robot
-    count = robot.layout.joints + len(robot.geometry.number_names)
-    parts = [np.zeros((len(known), count))]
+    changes = []
     for run in problem.runs:
         by_zeros = _zero_poses(run, parameters)
         by_numbers = _moved_poses(run, run.model_poses(parameters), by_zeros)
-        moved = np.concatenate([by_zeros, by_numbers], axis=2)
-        white = run.without_common(np.asarray(run.whitener @ moved[run.ok]))
-        parts.append(white.reshape(-1, moved.shape[2]))
-    return np.vstack(parts)
+        changes.append(np.concatenate([by_zeros, by_numbers], axis=2))
+    return pose_columns(problem, parameters, changes)
 
 
 def _moved_poses(run: LoopModel, poses: Array, by_zeros: Array) -> Array:
@@ -146,8 +140,6 @@ def _zero_poses(run: LoopModel, parameters: Array) -> Array:
         for one in np.eye(layout.joints)
         for by in (step * one, -step * one)
     ]
-    # threads are enough: the compiled loop runs without Python's lock
-    with ThreadPoolExecutor(cores()) as pool:
-        poses = list(pool.map(lambda end: end.model_poses(parameters), ends))
+    poses = in_threads(lambda end: end.model_poses(parameters), ends)
     pairs = zip(poses[::2], poses[1::2], strict=True)
     return np.stack([(more - less) / (2 * step) for more, less in pairs], axis=2)

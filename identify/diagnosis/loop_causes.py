@@ -16,7 +16,7 @@ import numpy as np
 from dynamics.closed_loop import ClosedLoopRun, FrictionLaw, LoopSettings
 from dynamics.closed_loop.drives import DriveName
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, in_each_run
+from identify.diagnosis.cause import Cause, Change, in_each_run
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
@@ -53,9 +53,9 @@ def joint_rates(run: LoopModel, found: ClosedLoopRun) -> Array:
     return np.einsum("nij,nj->ni", run.robot.pose_jacobian(found.pose), found.pose_rate)
 
 
-def in_settings(change: Callable[[LoopSettings, float], LoopSettings]) -> Callable[..., LoopModel]:
-    """Return the change of a run that changes its loop's settings."""
-    return lambda run, size: replace(run, settings=change(run.settings, size))
+def in_settings(change: Callable[[LoopSettings, float], LoopSettings]) -> Change:
+    """Return the change of a problem that changes the loop's settings of each of its runs."""
+    return in_each_run(lambda run, size: replace(run, settings=change(run.settings, size)))
 
 
 def friction_causes(run: LoopModel, typical: float) -> tuple[Cause, ...]:
@@ -75,7 +75,7 @@ def friction_causes(run: LoopModel, typical: float) -> tuple[Cause, ...]:
         name="friction that is smooth about rest",
         unit=unit,
         group=FRICTION,
-        change=in_each_run(in_settings(smoothed)),
+        change=in_settings(smoothed),
         step=2e-3 * typical,
         remedy=lambda size: (
             f"--set model.friction=smoothed --set model.smoothing_velocity_{key}={size:.3g}"
@@ -105,7 +105,7 @@ def _static(name: str, velocity: float, unit: str, key: str) -> Cause:
         name=f"velocity over which it fades, beyond {velocity:.3g} {unit}",
         unit=unit,
         group=f"width of static friction, {name}",
-        change=in_each_run(in_settings(faded)),
+        change=in_settings(faded),
         step=0.05 * velocity,
         remedy=lambda size: (
             f"and --set model.stribeck_velocity_{key}={velocity + size:.3g} in place of that"
@@ -117,7 +117,7 @@ def _static(name: str, velocity: float, unit: str, key: str) -> Cause:
         name=f"static friction, fading over {name} motion",
         unit="1",
         group=FRICTION,
-        change=in_each_run(in_settings(stribeck)),
+        change=in_settings(stribeck),
         step=0.02,
         remedy=lambda size: (
             f"--set model.friction=stribeck --set model.static_ratio={1 + size:.3g} "
@@ -173,8 +173,7 @@ def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Arr
     _, coulomb, viscous, _ = run.robot.layout.split(parameters + run.payload)
     friction = run.settings.friction
     carried = found.torque - coulomb * friction.level(rates) - viscous * rates
-    latencies = run.latencies
-    late = run.settings.timing.latency_s if latencies is None else latencies
+    late = run.stated_latencies if run.latencies is None else run.latencies
     period = 1.0 / run.settings.timing.frame_rate_hz
     acting = found.time + late + period / 2
     return np.stack([np.interp(acting, found.time, one) for one in carried.T], axis=1)
@@ -194,7 +193,7 @@ def torque_limit(run: LoopModel, peak: float) -> Cause:
         name="torque limit of the drives",
         unit="1",
         group="torque limit of the drives",
-        change=in_each_run(in_settings(limited)),
+        change=in_settings(limited),
         step=0.01,
         remedy=lambda size: (
             f"state control.torque_limit_{key} = {peak * (1 - size):.4g} with the record: the "
@@ -216,7 +215,7 @@ def laws(settings: LoopSettings) -> tuple[Cause, ...]:
         return replace(settings, drives=replace(settings.drives, law=other))
 
     def under_it(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
-        changed = in_each_run(in_settings(law))(problem, size)
+        changed = in_settings(law)(problem, size)
         # the law has gains that must be above zero
         return replace(changed, guess=replace(problem.guess, drive=other))
 
@@ -244,7 +243,7 @@ def finer_steps(settings: LoopSettings) -> Cause:
         name="steps of the model that are too coarse",
         unit="",
         group="steps of the model",
-        change=in_each_run(in_settings(finer)),
+        change=in_settings(finer),
         step=0.0,
         remedy=lambda size: f"--set model.steps_per_frame={steps}",
         tried=(1.0,),

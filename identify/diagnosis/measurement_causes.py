@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, in_each_run
+from identify.diagnosis.cause import Cause, in_each_run, pose_columns
 from identify.estimation.output_error import OutputErrorProblem
 from identify.files.dataset import POSE
 from identify.model.loop_model import LoopModel
@@ -77,7 +77,7 @@ def _shared(name: str, place: int, std: float) -> Cause:
 
 def shared_columns(problem: OutputErrorProblem, parameters: Array) -> Array:
     """Return the columns (m, k) of the errors that all poses have in common."""
-    return _columns_of(problem, parameters, [run.common.changes for run in problem.runs])
+    return pose_columns(problem, parameters, [run.common.changes for run in problem.runs])
 
 
 def gross_errors(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
@@ -130,17 +130,7 @@ def frame_columns(
     changes = [np.zeros((*run.measured.shape, 6 * len(places))) for run in problem.runs]
     for place, (number, frame) in enumerate(places):
         changes[number][frame, :, 6 * place : 6 * place + 6] = np.eye(6)
-    return _columns_of(problem, parameters, changes)
-
-
-def _columns_of(problem: OutputErrorProblem, parameters: Array, changes: list[Array]) -> Array:
-    """Return columns (m, k) of errors that change the measured poses of each run (N, 6, k)."""
-    known, _ = problem.known(parameters)
-    parts = [np.zeros((len(known), changes[0].shape[2]))]
-    for run, change in zip(problem.runs, changes, strict=True):
-        white = run.without_common(np.asarray(run.whitener @ change[run.ok]))
-        parts.append(white.reshape(-1, change.shape[2]))
-    return np.vstack(parts)
+    return pose_columns(problem, parameters, changes)
 
 
 def suspicious_frames(residuals: Array, ok: NDArray[np.bool_]) -> NDArray[np.int_]:

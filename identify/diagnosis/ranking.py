@@ -24,7 +24,6 @@ from identify.arrays import Array
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.score import Beside, Score, score
 from identify.estimation.explanation import (
-    LAGS,
     Misfit,
     coloured_score_covariance,
     misfit_of_white,
@@ -105,35 +104,21 @@ class Rows:
         """Return the part of residuals (m, ...) that is of poses."""
         return rows[self.known :]
 
-    def of_all_frames(self, residual: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the residuals (N, 6) of all runs by frames, NaN where lost, and the good ones.
-
-        Between two runs there are as many lost frames as the test for whiteness has lags.
-        """
-        parts = []
-        good = []
-        first = self.known
-        for ok in self.frames:
-            own = np.full((len(ok) + LAGS, 6), np.nan)
-            last = first + 6 * int(ok.sum())
-            own[: len(ok)][ok] = residual[first:last].reshape(-1, 6)
-            parts.append(own)
-            good.append(np.concatenate([ok, np.zeros(LAGS, dtype=bool)]))
-            first = last
-        return np.concatenate(parts), np.concatenate(good)
+    def of_runs(self, rows: Array) -> list[Array]:
+        """Return the part (n, 6, ...) of residuals (m, ...) that is of each run's good frames."""
+        ends = np.cumsum([6 * int(ok.sum()) for ok in self.frames])
+        parts = np.split(self.of_poses(rows), ends[:-1])
+        return [one.reshape(len(one) // 6, 6, *one.shape[1:]) for one in parts]
 
     def spread(self, residual: Array, directions: Array) -> Array:
         """Return the covariance (d, d) of U^T r for residuals as correlated as r (m,).
 
         directions (m, d): the columns of U.
         """
+        each = zip(self.of_runs(residual), self.of_runs(directions), self.frames, strict=True)
         total = np.zeros((directions.shape[1],) * 2)
-        first = self.known
-        for ok in self.frames:
-            own = slice(first, first + 6 * int(ok.sum()))
-            first = own.stop
-            rows = directions[own].reshape(int(ok.sum()), 6, directions.shape[1])
-            total += coloured_score_covariance(residual[own].reshape(-1, 6), rows, ok)
+        for own, rows, ok in each:
+            total += coloured_score_covariance(own, rows, ok)
         return total
 
 

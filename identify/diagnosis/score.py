@@ -18,7 +18,6 @@ Philosophical Society 44(1), 1948. Sörbom, Model modification, Psychometrika 54
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +26,7 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, with_causes
 from identify.estimation.output_error import OutputErrorProblem
-from identify.runtime import cores
+from identify.runtime import in_threads
 
 HIDDEN = 1e-5
 """Share of a column's length below which nothing is left of it beside the parameters.
@@ -79,10 +78,7 @@ def each_residuals(problems: Sequence[OutputErrorProblem], parameters: Array) ->
         except DynamicsError:
             return None
 
-    # Threads are enough: the compiled loop runs without Python's lock. Problems are made before,
-    # since CasADi, which moves robots, bears no threads.
-    with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(of, problems))
+    return in_threads(of, problems)
 
 
 def cause_columns(
@@ -99,7 +95,10 @@ def cause_columns(
         # one that is there or not has no derivative, and one that is only tried none at nothing
         if one.quick is None and one.step and (sizes[place] or not one.tried)
     ]
-    columns[:, slow] = _differences(problem, parameters, causes, sizes, slow)
+    for place, column in zip(
+        slow, _differences(problem, parameters, causes, sizes, slow), strict=True
+    ):
+        columns[:, place] = column
     there = with_causes(problem, causes, sizes)
     for quick in {one.quick[0] for one in causes if one.quick is not None}:
         found = quick(there, parameters)
@@ -115,8 +114,11 @@ def _differences(
     causes: Sequence[Cause],
     sizes: Array,
     places: Sequence[int],
-) -> Array:
-    """Return central differences (m, q) for the causes at some places, one-sided at least sizes."""
+) -> list[Array | float]:
+    """Return central differences (m,) for the causes at some places, one-sided at least sizes.
+
+    They are NaN where the model is unstable.
+    """
     spans = [(max(-causes[k].step, causes[k].least - sizes[k]), causes[k].step) for k in places]
     moves = np.eye(len(causes))[list(places)]
     ends = [
@@ -125,12 +127,10 @@ def _differences(
         for by in span
     ]
     found = each_residuals(ends, parameters)
-    columns = [
+    return [
         np.nan if less is None or more is None else (more - less) / (high - low)
         for less, more, (low, high) in zip(found[::2], found[1::2], spans, strict=True)
     ]
-    rows = len(residuals(problem, parameters))
-    return np.array([np.broadcast_to(one, rows) for one in columns]).reshape(-1, rows).T
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ effect of the noise on the plant. Its residuals are coloured even if it is right
 tested.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -253,17 +254,26 @@ def explanation(
 def _residuals(
     driven: OutputErrorProblem, parameters: Array, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the whitened residuals (N, 6) of all records, and which frames (N,) are good.
+    """Return the whitened residuals (N, 6) of all records, and which frames (N,) are good."""
+    runs = driven.runs
+    return by_frames([run.white_misses(parameters, rng) for run in runs], [run.ok for run in runs])
 
+
+def by_frames(
+    residuals: Sequence[Array], frames: Sequence[NDArray[np.bool_]]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return residuals (N, 6) of several records one after the other, and the good frames (N,).
+
+    residuals (n, 6) of each record are those of its good frames, and frames say which these are.
     Residuals of lost poses are NaN. Between two records there is a gap as long as the largest lag
     of the test for whiteness.
     """
     gap = np.full((LAGS, 6), np.nan)
-    residuals = []
-    ok = []
-    for run in driven.runs:
-        rows = np.full(run.measured.shape, np.nan)
-        rows[run.ok] = run.white_misses(parameters, rng)
-        residuals += [rows, gap]
-        ok += [run.ok, np.zeros(LAGS, dtype=bool)]
-    return np.concatenate(residuals), np.concatenate(ok)
+    parts = []
+    good = []
+    for own, ok in zip(residuals, frames, strict=True):
+        rows = np.full((len(ok), 6), np.nan)
+        rows[ok] = own
+        parts += [rows, gap]
+        good += [ok, np.zeros(LAGS, dtype=bool)]
+    return np.concatenate(parts), np.concatenate(good)

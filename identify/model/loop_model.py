@@ -5,7 +5,6 @@ covariance of the sensor's noise and of the errors that all measured poses have 
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,7 +30,7 @@ from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
 from identify.record.stored_common_errors import NONE, CommonErrors, Marginal
-from identify.runtime import cores
+from identify.runtime import in_threads
 
 LONG_GAP_S = 0.5
 """Longest time, s, of consecutive lost frames without a warning.
@@ -153,9 +152,7 @@ class LoopModel:
             for k in moving
             for sign in (1.0, -1.0)
         ]
-        # Threads are enough, because the compiled loop runs without Python's global lock.
-        with ThreadPoolExecutor(cores()) as pool:
-            found = list(pool.map(lambda end: shown(self.having(end).simulate(parameters)), ends))
+        found = in_threads(lambda end: shown(self.having(end).simulate(parameters)), ends)
         for place, k in enumerate(moving):
             more, less = found[2 * place : 2 * place + 2]
             high, low = ends[2 * place : 2 * place + 2]
@@ -167,6 +164,13 @@ class LoopModel:
         return np.concatenate([modes, by_geometry], axis=2)
 
     @property
+    def stated_latencies(self) -> Array:
+        """Latencies (N,) of the commands, s, as the record or the timing states them."""
+        if self.acted is not None:
+            return self.acted
+        return np.full(len(self.ok), self.settings.timing.latency_s)
+
+    @property
     def latencies(self) -> Array | None:
         """Latencies (N,) of the model's commands, s. None: all have the latency of the timing.
 
@@ -174,10 +178,9 @@ class LoopModel:
         """
         if self.drawn is None or not self.common.latency_std:
             return self.acted
-        stated = self.acted
-        if stated is None:
-            stated = np.full(len(self.ok), self.settings.timing.latency_s)
-        return np.maximum(stated + self.common.latency_std * float(self.drawn[-1]), 0.0)
+        return np.maximum(
+            self.stated_latencies + self.common.latency_std * float(self.drawn[-1]), 0.0
+        )
 
     @property
     def _lowest(self) -> Array:

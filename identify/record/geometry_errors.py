@@ -11,7 +11,6 @@ noise. The derivatives of the loop closure determine these directions.
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,7 +22,7 @@ from dynamics.closure import Closure
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.record.run_error_covariance import covariance_fault, factor, noticed_directions
-from identify.runtime import cores
+from identify.runtime import in_threads
 
 COVARIANCE = "geometry_covariance"
 PREFIX = "geometry."
@@ -62,9 +61,7 @@ class GeometryErrors:
         The changes are zero along unnoticed directions. poses_of: function that returns the poses
         (N, 6) of a run of a robot near the known robot.
         """
-        # Threads are enough, because the compiled loop runs without Python's global lock.
-        with ThreadPoolExecutor(cores()) as pool:
-            found = list(pool.map(poses_of, [robot for pair in self._moved for robot in pair]))
+        found = in_threads(poses_of, [robot for pair in self._moved for robot in pair])
         modes = np.zeros((*self.poses.shape, len(self.covariance)))
         for place, (more, less) in enumerate(zip(found[::2], found[1::2], strict=True)):
             modes[:, :, place] = (more - less) / 2.0
